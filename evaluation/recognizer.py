@@ -1,0 +1,387 @@
+"""How well the recognizer hears: error rates, delays, confusions, cost.
+
+Measured for the full traceback and for the live output rule, N = 1 to 6 (Li et al. 2011, eq. 4):
+
+- phone error rate (insertions + deletions + substitutions over the reference's units, ``sil`` not
+  counted), by speaker, with a bootstrap interval over speakers;
+- viseme error rate: units as mouth shapes (Li 2011, table 1), compound finals split, equal
+  neighbours counted once because the mouth does not move between them;
+- output delay: media time when a unit is put out, minus its true onset by forced alignment;
+- CPU seconds per second of sound, by stage.
+
+Every recording is a session of its own, so the live mean starts from the prior each time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.decoder import Decoder
+from services.recognizer.features import SAMPLE_RATE_HZ, LogMel
+from services.recognizer.pipeline import Recognizer, recognize
+from services.recognizer.resample import Resampler
+from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from services.synthesizer.visemes import SHAPES
+from shared.errors import UserError
+from shared.phones import FINALS, INITIALS, SILENCE, UNIT_INDEX, UNITS, Phone
+from training.align import align_units, spoken
+from training.corpus import RowErrors, Utterance, read_corpus
+from training.feature_cache import read_audio
+
+AGREEMENTS = (1, 2, 3, 4, 5, 6)
+_CHUNK_SAMPLES = 160  # sound is fed as it would arrive, 10 ms at a time
+_NUM_RESAMPLES = 2000
+
+
+@dataclass(slots=True, kw_only=True)
+class ErrorCounts:
+    """Errors of recognised units against the reference."""
+
+    insertions: int = 0
+    deletions: int = 0
+    substitutions: int = 0
+    reference: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Errors per reference unit."""
+        return (self.insertions + self.deletions + self.substitutions) / max(1, self.reference)
+
+    def __add__(self, other: ErrorCounts) -> ErrorCounts:
+        return ErrorCounts(
+            insertions=self.insertions + other.insertions,
+            deletions=self.deletions + other.deletions,
+            substitutions=self.substitutions + other.substitutions,
+            reference=self.reference + other.reference,
+        )
+
+
+@dataclass(slots=True, kw_only=True)
+class Score:
+    """One way of output on all recordings."""
+
+    name: str
+    phones: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
+    visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
+    delays_s: list[float] = field(default_factory=list)
+    num_put_out: int = 0
+    num_heard_right: int = 0
+
+    def summary(self, rng: np.random.Generator) -> dict[str, object]:
+        """Rates, intervals and delay percentiles."""
+        out: dict[str, object] = {"output": self.name}
+        for measure, by_speaker in (("phone", self.phones), ("viseme", self.visemes)):
+            total = sum(by_speaker.values(), ErrorCounts())
+            out[f"{measure}_error_rate"] = total.rate
+            out[f"{measure}_interval_95"] = bootstrap_interval(list(by_speaker.values()), rng)
+            out[f"{measure}_errors"] = asdict(total)
+            out[f"{measure}_error_rate_by_speaker"] = {
+                speaker: counts.rate for speaker, counts in sorted(by_speaker.items())
+            }
+        if self.delays_s:
+            p50, p95 = np.percentile(self.delays_s, [50, 95])
+            out["delay_ms"] = {"p50": 1000 * float(p50), "p95": 1000 * float(p95)}
+        return out
+
+
+def matched_pairs(
+    reference: Sequence[str], heard: Sequence[str]
+) -> list[tuple[int | None, int | None]]:
+    """Align two strings with the fewest errors (Levenshtein 1966).
+
+    Returns
+    -------
+    list of tuple
+        Pairs of positions; None in the first place is an insertion, in the second a deletion.
+
+    Examples
+    --------
+    >>> matched_pairs(["n", "i"], ["n", "i", "h"])
+    [(0, 0), (1, 1), (None, 2)]
+    """
+    rows, columns = len(reference) + 1, len(heard) + 1
+    cost = np.zeros((rows, columns), dtype=np.int64)
+    cost[:, 0] = np.arange(rows)
+    cost[0] = np.arange(columns)
+    for i in range(1, rows):
+        for j in range(1, columns):
+            change = reference[i - 1] != heard[j - 1]
+            cost[i, j] = min(cost[i - 1, j - 1] + change, cost[i - 1, j] + 1, cost[i, j - 1] + 1)
+    pairs: list[tuple[int | None, int | None]] = []
+    i, j = rows - 1, columns - 1
+    while i or j:
+        change = bool(i and j and reference[i - 1] != heard[j - 1])
+        if i and j and cost[i, j] == cost[i - 1, j - 1] + change:
+            i, j = i - 1, j - 1
+            pairs.append((i, j))
+        elif i and cost[i, j] == cost[i - 1, j] + 1:
+            i -= 1
+            pairs.append((i, None))
+        else:
+            j -= 1
+            pairs.append((None, j))
+    return pairs[::-1]
+
+
+def count_errors(reference: Sequence[str], heard: Sequence[str]) -> ErrorCounts:
+    """Count the fewest insertions, deletions and substitutions between two strings."""
+    counts = ErrorCounts(reference=len(reference))
+    for i, j in matched_pairs(reference, heard):
+        if i is None:
+            counts.insertions += 1
+        elif j is None:
+            counts.deletions += 1
+        elif reference[i] != heard[j]:
+            counts.substitutions += 1
+    return counts
+
+
+def mouth_shapes(units: Iterable[str]) -> list[str]:
+    """Shapes that the mouth goes through (Li 2011, table 1), equal neighbours once."""
+    shapes = [shape for unit in units if unit != SILENCE for shape, _ in SHAPES[unit]]
+    return [shape for shape, _ in groupby(shapes)]
+
+
+def bootstrap_interval(
+    by_speaker: Sequence[ErrorCounts], rng: np.random.Generator
+) -> tuple[float, float]:
+    """95 % interval of the error rate when speakers are drawn anew (Efron 1979)."""
+    errors = np.array([c.insertions + c.deletions + c.substitutions for c in by_speaker])
+    lengths = np.array([c.reference for c in by_speaker])
+    picks = rng.integers(len(by_speaker), size=(_NUM_RESAMPLES, len(by_speaker)))
+    rates = errors[picks].sum(axis=1) / np.maximum(1, lengths[picks].sum(axis=1))
+    low, high = np.percentile(rates, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def evaluate_recognizer(
+    model: AcousticModel,
+    corpus: Path,
+    split: str,
+    *,
+    agreements: Sequence[int] = AGREEMENTS,
+    confusion_picture: Path | None = None,
+) -> dict[str, object]:
+    """Measure a model on one split of a corpus.
+
+    Parameters
+    ----------
+    model
+        The acoustic model.
+    corpus
+        A corpus folder that :func:`training.corpus.read_corpus` reads.
+    split
+        Its split, such as ``dev`` or ``test``.
+    agreements
+        Values of N to try.
+    confusion_picture
+        Where to write a picture of the confusions, if anywhere.
+
+    Raises
+    ------
+    UserError
+        If there is no such corpus or split.
+    """
+    errors = RowErrors()
+    utterances = [u for u in read_corpus(corpus, errors) if u.split == split]
+    if not utterances:
+        raise UserError(f"{corpus} has no recordings in the split {split!r}; name another split")
+    full = Score(name="full traceback")
+    live = [Score(name=f"N = {agreement}") for agreement in agreements]
+    confusion = np.zeros((len(UNITS), len(UNITS)), dtype=np.int64)
+    seconds = 0.0
+    for utterance in track(utterances, description=f"recognising {split}"):
+        samples = read_audio(utterance.path)
+        seconds += len(samples) / SAMPLE_RATE_HZ
+        truth = _truth(model, utterance, samples)
+        heard = spoken(recognize(model, samples, SAMPLE_RATE_HZ))
+        _score(full, utterance.speaker, truth, heard)
+        # The full traceback says everything when the recording ends.
+        full.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
+        _confuse(confusion, truth, heard)
+        for score, agreement in zip(live, agreements, strict=True):
+            phones, put_out_s = _live(model, samples, agreement)
+            _score(score, utterance.speaker, truth, phones)
+            score.delays_s += _delays(truth, phones, put_out_s)
+    if confusion_picture is not None:
+        draw_confusions(confusion, confusion_picture)
+    rng = np.random.default_rng(0)
+    return {
+        "split": split,
+        "recordings": len(utterances),
+        "speakers": len({utterance.speaker for utterance in utterances}),
+        "seconds": seconds,
+        "bad_rows": len(errors.messages),
+        "scores": [score.summary(rng) for score in (full, *live)],
+        "most_confused": most_confused(confusion),
+        "cpu_per_audio_second": cpu_by_stage(model, read_audio(utterances[0].path)),
+    }
+
+
+def print_scores(results: dict[str, object], console: Console) -> None:
+    """Print the figures as tables."""
+    table = Table(title=f"{results['split']}: {results['recordings']} recordings")
+    for column in (
+        "output",
+        "phone error %",
+        "95 %",
+        "ins / del / sub %",
+        "viseme error %",
+        "95 %",
+    ):
+        table.add_column(column, justify="right")
+    table.add_column("delay p50 / p95 ms", justify="right")
+    scores = results["scores"]
+    assert isinstance(scores, list)  # noqa: S101 (narrows the type for the checker)
+    for score in scores:
+        kinds = score["phone_errors"]
+        split = " / ".join(
+            f"{100 * kinds[kind] / max(1, kinds['reference']):.1f}"
+            for kind in ("insertions", "deletions", "substitutions")
+        )
+        delay = score.get("delay_ms")
+        table.add_row(
+            score["output"],
+            f"{100 * score['phone_error_rate']:.1f}",
+            _interval(score["phone_interval_95"]),
+            split,
+            f"{100 * score['viseme_error_rate']:.1f}",
+            _interval(score["viseme_interval_95"]),
+            f"{delay['p50']:.0f} / {delay['p95']:.0f}" if delay else "",
+        )
+    console.print(table)
+    console.print(f"CPU seconds per second of sound: {json.dumps(results['cpu_per_audio_second'])}")
+
+
+def _interval(bounds: tuple[float, float]) -> str:
+    return f"{100 * bounds[0]:.1f} - {100 * bounds[1]:.1f}"
+
+
+def _truth(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float32]) -> list[Phone]:
+    units = iter(UNITS[unit] for unit in utterance.units)
+    syllables = [tuple(next(units) for _ in range(length)) for length in utterance.syllables]
+    return spoken(align_units(model, samples, SAMPLE_RATE_HZ, syllables))
+
+
+def _live(
+    model: AcousticModel, samples: NDArray[np.float32], agreement: int
+) -> tuple[list[Phone], list[float]]:
+    """Units in the order they were put out, and the media time that had been heard by then."""
+    recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ, agreement=agreement)
+    phones, put_out_s = [], []
+    for start in range(0, len(samples), _CHUNK_SAMPLES):
+        chunk = samples[start : start + _CHUNK_SAMPLES]
+        for event in recognizer.accept_waveform(chunk):
+            if isinstance(event, Phone) and not event.final and event.unit != SILENCE:
+                phones.append(event)
+                put_out_s.append((start + len(chunk)) / SAMPLE_RATE_HZ)
+    for event in recognizer.input_finished():
+        if isinstance(event, Phone) and not event.final and event.unit != SILENCE:
+            phones.append(event)
+            put_out_s.append(len(samples) / SAMPLE_RATE_HZ)
+    return phones, put_out_s
+
+
+def _score(score: Score, speaker: str, truth: Sequence[Phone], heard: Sequence[Phone]) -> None:
+    said, got = [phone.unit for phone in truth], [phone.unit for phone in heard]
+    for by_speaker, counts in (
+        (score.phones, count_errors(said, got)),
+        (score.visemes, count_errors(mouth_shapes(said), mouth_shapes(got))),
+    ):
+        by_speaker[speaker] = by_speaker.get(speaker, ErrorCounts()) + counts
+
+
+def _delays(
+    truth: Sequence[Phone], heard: Sequence[Phone], put_out_s: Sequence[float]
+) -> list[float]:
+    """Delays of the units that were heard right."""
+    pairs = matched_pairs([phone.unit for phone in truth], [phone.unit for phone in heard])
+    return [
+        put_out_s[j] - truth[i].onset_s
+        for i, j in pairs
+        if i is not None and j is not None and truth[i].unit == heard[j].unit
+    ]
+
+
+def _confuse(confusion: NDArray[np.int64], truth: Sequence[Phone], heard: Sequence[Phone]) -> None:
+    """Count pairs; the silence row holds insertions, its column deletions."""
+    for i, j in matched_pairs([phone.unit for phone in truth], [phone.unit for phone in heard]):
+        row = SILENCE if i is None else truth[i].unit
+        column = SILENCE if j is None else heard[j].unit
+        confusion[UNIT_INDEX[row], UNIT_INDEX[column]] += 1
+
+
+def most_confused(confusion: NDArray[np.int64], count: int = 15) -> list[dict[str, object]]:
+    """Return the commonest confusions; ``sil`` as the said unit means an insertion."""
+    wrong = confusion.copy()
+    np.fill_diagonal(wrong, 0)
+    order = np.argsort(wrong, axis=None)[::-1][:count]
+    return [
+        {"said": UNITS[row], "heard": UNITS[column], "times": int(wrong[row, column])}
+        for row, column in zip(*np.unravel_index(order, wrong.shape), strict=True)
+    ]
+
+
+def draw_confusions(confusion: NDArray[np.int64], path: Path) -> None:
+    """Draw the confusion matrix, rows normalised; the last row is insertions, column deletions."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (slow to load)
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    names = [*INITIALS, *FINALS, "-"]
+    share = confusion / np.maximum(1, confusion.sum(axis=1, keepdims=True))
+    figure = Figure(figsize=(11, 10), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    picture = axes.imshow(share, cmap="viridis", vmin=0, vmax=1)
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    axes.set_xlabel("heard (-: nothing)")
+    axes.set_ylabel("said (-: nothing)")
+    figure.colorbar(picture, label="share of what was said", shrink=0.8)
+    figure.savefig(path, dpi=110)
+
+
+def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, float]:
+    """CPU seconds per second of sound of each stage, fed 10 ms at a time."""
+    chunks = [samples[at : at + _CHUNK_SAMPLES] for at in range(0, len(samples), _CHUNK_SAMPLES)]
+    blocks = [
+        samples[at : at + BLOCK_SAMPLES]
+        for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
+    ]
+    log_mel_stage, stream, decoder = LogMel(), model.stream(), Decoder(model.topology)
+    detector, resampler = VoiceActivityDetector(), Resampler(48_000)
+    at_48_khz = np.repeat(samples, 3)
+    log_mel = LogMel().accept_waveform(samples)
+    scores = model.stream().accept(log_mel)
+    decoder.accept(scores[0])  # compiled before the clock starts
+    decoder.reset()
+
+    def run(
+        stage: Callable[[NDArray[np.float32]], object], pieces: Iterable[NDArray[np.float32]]
+    ) -> float:
+        begin = time.process_time()
+        for piece in pieces:
+            stage(piece)
+        return (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples)
+
+    return {
+        "resampler_from_48_khz": run(
+            resampler.accept_waveform, np.array_split(at_48_khz, len(chunks))
+        ),
+        "voice_activity": run(detector.accept_block, blocks),
+        "log_mel": run(log_mel_stage.accept_waveform, chunks),
+        "acoustic_model": run(stream.accept, (log_mel[t : t + 1] for t in range(len(log_mel)))),
+        "decoder": run(decoder.accept, scores),
+    }

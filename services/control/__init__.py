@@ -1,0 +1,1 @@
+"""Control: sessions, placement, health and speech events."""

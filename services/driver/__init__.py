@@ -1,0 +1,1 @@
+"""Driver: FAP frames in, a rendered head out (window, video)."""

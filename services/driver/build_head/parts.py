@@ -1,0 +1,241 @@
+"""The parts MakeHuman's base mesh lacks or has too coarse: eyeballs, teeth and hair.
+
+All lengths are MakeHuman decimetres, y up, z towards the viewer, x to the subject's left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class Part:
+    """One piece of the head with a material of its own."""
+
+    vertices: Float  # (V, 3)
+    triangles: Index  # (F, 3)
+    uv: Float  # (V, 2), v downwards as in glTF
+    colors: Float  # (V, 3) linear factor on the texture
+
+
+def grid_triangles(rows: int, columns: int) -> Index:
+    """Triangulate a grid of ``rows * columns`` vertices, row by row."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    halves = [
+        np.stack([corner, corner + columns, corner + columns + 1], axis=1),
+        np.stack([corner, corner + columns + 1, corner + 1], axis=1),
+    ]
+    return np.stack(halves, axis=1).reshape(-1, 3)
+
+
+# ---- eyes -------------------------------------------------------------------------------------
+
+IRIS_ANGLE = np.radians(25.0)  # half the angle the iris spans, seen from the eye's centre
+PUPIL_ANGLE = np.radians(9.5)
+# rings of vertices from the front pole backwards; ring 2 is the pupil's edge, ring 6 the iris's
+_EYE_RINGS = np.radians([0.0, 5.0, 9.5, 13.0, 17.0, 21.0, 25.0, 30.0, 38.0, 48.0, 60.0, 75.0, 95.0])
+_EYE_SEGMENTS = 32
+
+
+def eyeball(centre: Float, radius: float) -> Part:
+    """Make a sphere, open at the back, whose texture is a view from the front."""
+    turn = np.linspace(0.0, 2 * np.pi, _EYE_SEGMENTS + 1)
+    angle, turn = np.meshgrid(_EYE_RINGS, turn, indexing="ij")
+    bulge = 1.0 + 0.035 * np.clip(1 - angle / np.radians(32.0), 0, 1) ** 1.0  # the cornea
+    direction = np.stack(
+        [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=2
+    )
+    vertices = centre + radius * (bulge[..., None] * direction).reshape(-1, 3)
+    reach = (angle / _EYE_RINGS[-1]).ravel()  # the texture's radius counts angle, not projection
+    uv = 0.5 + 0.5 * np.stack([reach * np.cos(turn).ravel(), -reach * np.sin(turn).ravel()], axis=1)
+    triangles = grid_triangles(*angle.shape)
+    return Part(vertices, triangles, uv, np.ones((len(vertices), 3)))
+
+
+def pupil_growth(part: Part, centre: Float) -> Float:
+    """Radial directions (V, 3) of unit length at the pupil's edge, for the FAPs 29 and 30."""
+    angle = np.repeat(_EYE_RINGS, _EYE_SEGMENTS + 1)
+    weight = np.interp(angle, [0.0, PUPIL_ANGLE, IRIS_ANGLE], [0.0, 1.0, 0.0])
+    outward = (part.vertices - centre) * [1.0, 1.0, 0.0]
+    length = np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
+    return weight[:, None] * outward / length
+
+
+# ---- teeth ------------------------------------------------------------------------------------
+
+# widths in mm from the middle outwards: incisors, canine, premolars, molars
+UPPER_TEETH = (8.4, 6.6, 7.4, 6.8, 6.6, 9.5, 9.0)
+LOWER_TEETH = (5.4, 5.8, 6.6, 6.9, 7.0, 10.0, 9.5)
+_TOOTH_COLUMNS = 6
+# profile of a tooth row from the gum in front over the cutting edge to the back:
+# (outwards, away from the edge, texture row)
+_PROFILE = np.array(
+    [
+        [-0.035, 0.185, 0.00],
+        [-0.004, 0.135, 0.16],
+        [0.006, 0.095, 0.32],
+        [0.006, 0.055, 0.48],
+        [0.000, 0.018, 0.62],
+        [-0.008, 0.002, 0.70],
+        [-0.022, 0.004, 0.76],
+        [-0.042, 0.045, 0.84],
+        [-0.060, 0.130, 1.00],
+    ]
+)
+
+
+def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: float) -> Part:
+    """Sweep the profile of a tooth along the dental arch.
+
+    Parameters
+    ----------
+    widths
+        Width of each tooth of one half in mm, from the middle outwards.
+    edge_y, front_z
+        Where the cutting edge of the front teeth is.
+    up
+        1 where the gum lies above the edge, -1 where it lies below.
+    """
+    half = np.concatenate([[0.0], np.cumsum(widths)]) / 100.0
+    bounds = np.concatenate([-half[:0:-1], half])
+    place = np.concatenate(
+        [
+            np.linspace(a, b, _TOOTH_COLUMNS, endpoint=False)
+            for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+        ]
+        + [bounds[-1:]]
+    )
+    phase = np.concatenate([np.tile(np.arange(_TOOTH_COLUMNS), 2 * len(widths)), [0]])
+    swell = np.sin(np.pi * phase / _TOOTH_COLUMNS)  # 0 between two teeth, 1 in the middle of one
+
+    # the arch: half an ellipse, walked by its length
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 2001)
+    arch = np.stack([0.275 * np.sin(angle), 0.44 * np.cos(angle)], axis=1)
+    walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(arch, axis=0), axis=1))])
+    walked -= walked[-1] / 2
+    at = np.interp(place, walked, angle)
+    x, z = 0.275 * np.sin(at), front_z - 0.44 + 0.44 * np.cos(at)
+    outward = np.stack([np.sin(at) / 0.275, np.zeros_like(at), np.cos(at) / 0.44], axis=1)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+
+    back = np.abs(place) / half[-1]
+    rows = []
+    for out, away, _ in _PROFILE:
+        on_tooth = np.clip(1 - away / 0.1, 0, 1)
+        lift = away + 0.010 * (1 - swell) ** 2 * np.clip(1 - away / 0.03, 0, 1)
+        lift = lift + 0.012 * back**2  # the row rises towards the molars
+        push = out + 0.010 * (swell - 1) * (0.3 + on_tooth)
+        point = np.stack([x, edge_y + up * lift, z], axis=1) + outward * push[:, None]
+        rows.append(point)
+    vertices = np.concatenate(rows)
+    columns = len(place)
+    uv = np.stack(
+        [np.tile(place / half[-1] * 0.5 + 0.5, len(rows)), np.repeat(_PROFILE[:, 2], columns)],
+        axis=1,
+    )
+    triangles = grid_triangles(len(rows), columns)
+    if up > 0:
+        triangles = triangles[:, ::-1]
+    shade = np.clip(1.0 - 0.75 * np.tile(back, len(rows)) ** 1.3, 0.12, 1.0)
+    shade *= np.repeat(np.interp(_PROFILE[:, 2], [0.0, 0.3, 0.7, 1.0], [0.45, 0.9, 1, 0.4]), columns)
+    return Part(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))
+
+
+# ---- hair -------------------------------------------------------------------------------------
+
+_SKULL = np.array([0.0, 5.93, 0.42])
+
+
+def _bezier(points: Float, t: Float) -> Float:
+    """Evaluate quadratic curves with control points (3, A, 2) at (T,) as (A, T, 2)."""
+    first, middle, last = points[:, :, None, :]
+    s = t[None, :, None]
+    return (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
+
+
+def hair_sheet(side: float, rise: float, strands: int, steps: int, seed: int) -> Part:
+    """Comb one side of a bob from the parting over the ear down to the jaw.
+
+    Parameters
+    ----------
+    side
+        1 for the subject's left, -1 for the right.
+    rise
+        Distance from the innermost layer, dm.
+    strands, steps
+        Size of the grid across and along the hair.
+    seed
+        Of the small irregularities.
+    """
+    noise = np.random.default_rng(seed)
+    across = np.linspace(0.0, 1.0, strands)
+    # in degrees about the skull's centre: azimuth from the front, elevation
+    azimuth_end = np.interp(across, [0.0, 0.25, 1.0], [63.0, 84.0, 180.0])
+    start = np.stack(
+        [np.zeros(strands), np.interp(across, [0, 0.35, 1], [38.0, 66.0, 112.0])], axis=1
+    )
+    middle = np.stack(
+        [
+            np.interp(across, [0.0, 0.3, 1.0], [47.0, 80.0, 175.0]),
+            np.interp(across, [0.0, 0.3, 1.0], [37.0, 62.0, 75.0]),
+        ],
+        axis=1,
+    )
+    end = np.stack([azimuth_end, np.full(strands, -6.0)], axis=1)
+    on_skull = np.linspace(0.0, 1.0, steps // 2 + 1)
+    angles = np.radians(_bezier(np.stack([start, middle, end]), on_skull))
+    azimuth, elevation = angles[..., 0], angles[..., 1]
+    radii = np.array([0.745, 0.925, 0.90]) + rise
+    swell = 1.0 + 0.03 * np.sin(np.pi * on_skull)[None, :]
+    skull = np.stack(
+        [
+            side * np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+            np.cos(elevation) * np.cos(azimuth),
+        ],
+        axis=2,
+    ) * (radii * swell[..., None])
+    skull += _SKULL
+
+    # below the ears the hair hangs and turns inwards at the tips
+    drop = np.linspace(0.0, 1.0, steps - steps // 2)[1:]
+    length = np.interp(across, [0.0, 0.15, 0.5, 1.0], [1.02, 1.08, 1.10, 1.06])
+    length = length + 0.02 * noise.standard_normal(strands)
+    last, before = skull[:, -1], skull[:, -2]
+    lean = (last - before) / np.maximum(np.linalg.norm(last - before, axis=1, keepdims=True), 1e-9)
+    out = np.stack([side * np.sin(azimuth[:, -1]), np.zeros(strands), np.cos(azimuth[:, -1])], axis=1)
+    sway = 0.05 * np.sin(np.pi * np.minimum(drop * 0.9, 1))[None, :] - 0.17 * drop[None, :] ** 3
+    hang = (
+        last[:, None]
+        - length[:, None, None] * drop[None, :, None] * np.array([0.0, 1.0, 0.0])
+        + out[:, None] * (sway * (1 + 0.05 * noise.standard_normal((strands, 1))))[..., None]
+    )
+    hang += 0.04 * (lean * [1, 0, 1])[:, None] * drop[None, :, None]
+    points = np.concatenate([skull, hang], axis=1)  # (strands, rows, 3)
+    # lie over the ear
+    low = np.clip((6.35 - points[..., 1]) / 0.70, 0, 1)
+    low = low * low * (3 - 2 * low)
+    aside = np.exp(-(((azimuth[:, -1:] - np.radians(97)) / np.radians(30)) ** 2))
+    points += (0.10 * low * aside)[..., None] * out[:, None]
+    rows = points.shape[1]
+    walked = np.linspace(0.0, 1.0, rows)
+    uv = np.stack(
+        [
+            np.broadcast_to(across[:, None], (strands, rows)),
+            np.broadcast_to(walked[None, :], (strands, rows)),
+        ],
+        axis=2,
+    )
+    # the thin front edge comes last, over the hair behind it
+    triangles = grid_triangles(strands, rows)[::-1]
+    if side < 0:
+        triangles = triangles[:, ::-1]
+    return Part(
+        points.reshape(-1, 3), triangles, uv.reshape(-1, 2), np.ones((strands * rows, 3))
+    )

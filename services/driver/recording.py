@@ -1,0 +1,83 @@
+"""One session's video as its FAP frames and sound arrive.
+
+Images are made at the video's own rate from the FAP frames around them, by media time, so the
+video is in sync whatever the rates are and however late the frames come.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.render import Renderer
+from services.driver.video import VideoWriter
+from shared.messages import MEDIA_RATE_HZ
+
+Faps = NDArray[np.float32]
+
+
+class Recording:
+    """Writes images and sound to a video; the file appears when it is closed."""
+
+    def __init__(self, path: Path, renderer: Renderer, frame_rate_hz: float) -> None:
+        self.path = path
+        self.num_images = 0
+        self.ended = False
+        self._renderer = renderer
+        self._frame_rate_hz = frame_rate_hz
+        self._frames: deque[tuple[float, Faps]] = deque()
+        self._num_samples = 0
+        self._writer = VideoWriter(
+            path, renderer.width_px, renderer.height_px, frame_rate_hz, MEDIA_RATE_HZ
+        )
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the picture so far."""
+        return self.num_images / self._frame_rate_hz
+
+    def accept_frame(self, time_s: float, faps: Faps) -> None:
+        """Take a FAP frame; times do not decrease."""
+        if not self._frames or time_s > self._frames[-1][0]:
+            self._frames.append((time_s, faps))
+
+    def accept_sound(self, media_time: int, samples: NDArray[np.float32]) -> None:
+        """Take sound of shape ``(n,)``; what is missing before it becomes silence."""
+        missing = media_time - self._num_samples
+        if missing > 0:
+            samples = np.concatenate([np.zeros(missing, np.float32), samples])
+        elif missing < 0:
+            samples = samples[-missing:]
+        self._writer.write_sound(samples)
+        self._num_samples += len(samples)
+
+    def step(self) -> bool:
+        """Render one image if the FAP frames for it are here; return whether one was due."""
+        time_s = self.num_images / self._frame_rate_hz
+        while len(self._frames) > 1 and self._frames[1][0] <= time_s:
+            self._frames.popleft()
+        if not self._frames:
+            return False
+        last_s = self._frames[-1][0]
+        if time_s > last_s:
+            return False
+        self._writer.write_image(self._renderer.draw(self._at(time_s)))
+        self.num_images += 1
+        return True
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.close()
+
+    def _at(self, time_s: float) -> Faps:
+        (begin_s, begin), (end_s, end) = (
+            self._frames[0],
+            self._frames[min(1, len(self._frames) - 1)],
+        )
+        if time_s <= begin_s or end_s <= begin_s:
+            return begin
+        weight = np.float32((time_s - begin_s) / (end_s - begin_s))
+        return begin + (end - begin) * weight

@@ -1,0 +1,381 @@
+"""Draw a head with OpenGL, without a display (EGL) or into a window that is already there.
+
+Lighting (linear colours): a sky-and-ground ambient term (scaled by the baked occlusion in the
+vertex colours), a warm key light from the front upper left, a cool fill light and a rim light;
+skin wraps the key light round the terminator, red farthest, as light scattered under it does.
+The highlights follow Blinn-Phong with Schlick's Fresnel factor.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import av
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head import Head, Part
+from shared.errors import UserError
+
+UInt8 = NDArray[np.uint8]
+Float32 = NDArray[np.float32]
+
+DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Where a head is seen from; lengths in m, in the head's axes."""
+
+    position: tuple[float, float, float] = (0.0, 0.034, 1.05)
+    target: tuple[float, float, float] = (0.0, 0.014, 0.0)
+    field_of_view_deg: float = 17.5  # vertical
+
+
+BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))  # sRGB, middle and edge
+
+# Light is worked out at the vertices (they lie about 1 mm apart) and interpolated: on software GL
+# that takes a third of the time of lighting every pixel. Only the eyes' small highlights need it.
+_VERTEX = """
+#version 330
+uniform mat4 view_projection;
+uniform vec3 eye;
+uniform vec3 wrap;
+uniform float gloss;
+uniform float shine;
+uniform float two_sided;
+in vec3 in_position;
+in vec3 in_normal;
+in vec2 in_uv;
+in vec3 in_color;
+out vec2 uv;
+out vec3 light;
+out float high;
+out vec3 normal;
+
+const vec3 KEY = normalize(vec3(-0.42, 0.50, 0.80));
+const vec3 FILL = normalize(vec3(0.75, 0.10, 0.60));
+const vec3 RIM = normalize(vec3(0.55, 0.45, -0.70));
+const vec3 KEY_COLOR = vec3(1.22, 1.12, 1.02);
+const vec3 FILL_COLOR = vec3(0.34, 0.38, 0.44);
+const vec3 RIM_COLOR = vec3(0.45, 0.47, 0.50);
+const vec3 SKY = vec3(0.46, 0.48, 0.52);
+const vec3 GROUND = vec3(0.30, 0.25, 0.22);
+
+void main() {
+    vec3 n = in_normal;
+    vec3 v = normalize(eye - in_position);
+    float facing = dot(n, v);
+    if (two_sided > 0.0 && facing < 0.0) { n = -n; facing = -facing; }
+    float key = dot(n, KEY);
+    light = mix(GROUND, SKY, 0.5 + 0.5 * n.y)
+        + KEY_COLOR * max((key + wrap) / (1.0 + wrap), 0.0) / (1.0 + wrap)
+        + FILL_COLOR * max(dot(n, FILL) * 0.7 + 0.3, 0.0)
+        + RIM_COLOR * max(dot(n, RIM), 0.0);
+    light *= in_color;
+    float grazing = 1.0 - max(facing, 0.0);
+    float fresnel = 0.04 + 0.5 * grazing * grazing * grazing * grazing;
+    high = pow(max(dot(n, normalize(KEY + v)), 0.0), gloss) * max(key, 0.0) * (0.6 + fresnel);
+    high = (high + fresnel * 0.10) * shine * min(1.0, in_color.g * 1.6);
+    uv = in_uv;
+    normal = in_normal;
+    gl_Position = view_projection * vec4(in_position, 1.0);
+}
+"""
+
+# textures and pictures are taken as squared for linear light: close to sRGB, and cheap
+_FRAGMENT = """
+#version 330
+uniform sampler2D base;
+in vec2 uv;
+in vec3 light;
+in float high;
+out vec4 color;
+void main() {
+    vec4 texel = texture(base, uv);
+    color = vec4(sqrt(texel.rgb * texel.rgb * light + high), texel.a);
+}
+"""
+
+_EYE_FRAGMENT = """
+#version 330
+uniform sampler2D base;
+uniform vec3 half_way;
+in vec2 uv;
+in vec3 light;
+in vec3 normal;
+out vec4 color;
+void main() {
+    vec3 texel = texture(base, uv).rgb;
+    float high = pow(max(dot(normalize(normal), half_way), 0.0), 400.0);
+    color = vec4(sqrt(texel * texel * light + 1.6 * high), 1.0);
+}
+"""
+
+_BACKDROP = """
+#version 330
+uniform vec3 middle;
+uniform vec3 edge;
+in vec2 place;
+out vec4 color;
+void main() {
+    color = vec4(mix(middle, edge, min(1.0, dot(place, place) * 0.55)), 1.0);
+}
+"""
+
+_BACKDROP_VERTEX = """
+#version 330
+in vec2 corner;
+out vec2 place;
+void main() {
+    place = corner - vec2(0.0, 0.25);
+    gl_Position = vec4(corner, 0.99999, 1.0);
+}
+"""
+
+_EYES = ("eye_left", "eye_right")
+_KEY = np.array([-0.42, 0.50, 0.80]) / np.linalg.norm([-0.42, 0.50, 0.80])  # as in the shader
+
+# part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
+_MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
+    "skin": ((0.55, 0.34, 0.28), 22.0, 0.16),
+    "garment": ((0.25, 0.25, 0.25), 8.0, 0.05),
+    "eye_left": ((0.4, 0.36, 0.36), 8.0, 0.0),
+    "eye_right": ((0.4, 0.36, 0.36), 8.0, 0.0),
+    "teeth_upper": ((0.4, 0.36, 0.32), 60.0, 0.30),
+    "teeth_lower": ((0.4, 0.36, 0.32), 60.0, 0.30),
+    "tongue": ((0.5, 0.3, 0.3), 30.0, 0.20),
+    "hair": ((0.3, 0.3, 0.3), 14.0, 0.12),
+    "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
+}
+
+
+def standalone_context() -> moderngl.Context:
+    """Open OpenGL 3.3 without a display.
+
+    Raises
+    ------
+    UserError
+        If the GL libraries are missing or give no context.
+    """
+    try:
+        return moderngl.create_standalone_context(require=330, backend="egl")
+    except Exception as error:  # moderngl raises bare Exception
+        missing = [name for name in ("EGL", "GL") if ctypes.util.find_library(name) is None]
+        found = f"lib{' and lib'.join(missing)} not found" if missing else str(error)
+        raise UserError(
+            f"OpenGL does not start without a display ({found}); install the Debian packages"
+            f" {DEBIAN_PACKAGES}"
+        ) from error
+
+
+def decode_image(encoded: bytes) -> UInt8:
+    """Decode a JPEG or PNG into (H, W, 4)."""
+    with av.open(io.BytesIO(encoded)) as container:
+        frame = next(container.decode(video=0))
+        pixels: UInt8 = frame.to_ndarray(format="rgba")
+    return pixels
+
+
+class Renderer:
+    """Pictures of one head.
+
+    Parameters
+    ----------
+    head
+        Whom to draw.
+    width_px, height_px
+        Size of a picture.
+    background
+        sRGB colours of the middle and the edge, each 0 to 1; None for transparent pictures.
+    samples
+        Anti-aliasing samples a pixel; 0 for none.
+    camera
+        Where from.
+    context
+        OpenGL context of a window to draw into; by default one without a display.
+
+    Raises
+    ------
+    UserError
+        If OpenGL cannot start or the size is not positive.
+    """
+
+    def __init__(
+        self,
+        head: Head,
+        width_px: int,
+        height_px: int,
+        *,
+        background: tuple[tuple[float, ...], tuple[float, ...]] | None = BACKGROUND,
+        samples: int = 4,
+        camera: Camera | None = None,
+        context: moderngl.Context | None = None,
+    ) -> None:
+        if width_px < 1 or height_px < 1:
+            raise UserError(f"a picture of {width_px} x {height_px} pixels; give a positive size")
+        self.head = head
+        self._background = background
+        self._camera = camera or Camera()
+        self._context = context or standalone_context()
+        self._own_context = context is None
+        self._samples = min(samples, self._context.max_samples)
+        self._program = self._context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
+        self._eye_program = self._context.program(
+            vertex_shader=_VERTEX, fragment_shader=_EYE_FRAGMENT
+        )
+        self._backdrop_program = self._context.program(
+            vertex_shader=_BACKDROP_VERTEX, fragment_shader=_BACKDROP
+        )
+        corners = np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32)
+        self._backdrop = self._context.vertex_array(
+            self._backdrop_program, [(self._context.buffer(corners), "2f", "corner")]
+        )
+        self._moving = self._context.buffer(reserve=head.vertices.nbytes * 2, dynamic=True)
+        self._stage = np.empty((len(head.vertices), 6), dtype=np.float32)
+        self._load_parts()
+        self._targets: list[Any] = []
+        self.resize(width_px, height_px)
+
+    def _load_parts(self) -> None:
+        head, context = self.head, self._context
+        fixed = np.concatenate([head.uv, head.colors], axis=1).astype(np.float32)
+        fixed_buffer = context.buffer(fixed.tobytes())
+        self._textures: dict[str, Any] = {}
+        for name, encoded in head.textures.items():
+            pixels = decode_image(encoded)
+            texture = context.texture(pixels.shape[1::-1], 4, pixels.tobytes())
+            texture.build_mipmaps()
+            texture.filter = (moderngl.LINEAR_MIPMAP_NEAREST, moderngl.LINEAR)
+            texture.repeat_x = texture.repeat_y = False
+            self._textures[name] = texture
+        self._arrays = {}
+        for part in head.parts:
+            indices = context.buffer(head.triangles[part.triangles].tobytes())
+            program = self._eye_program if part.name in _EYES else self._program
+            self._arrays[part.name] = context.vertex_array(
+                program,
+                [
+                    (self._moving, "3f 3f", "in_position", "in_normal"),
+                    (fixed_buffer, "2f 3f", "in_uv", "in_color"),
+                ],
+                indices,
+            )
+
+    def resize(self, width_px: int, height_px: int) -> None:
+        """Change the size of the pictures."""
+        self.size = (width_px, height_px)
+        for target in self._targets:
+            target.release()
+        self._targets = []
+        if self._own_context:
+            color = self._context.renderbuffer(self.size, 4)
+            self._result = self._context.framebuffer(
+                [color], self._context.depth_renderbuffer(self.size)
+            )
+            self._canvas = self._result
+            if self._samples > 1:
+                self._canvas = self._context.framebuffer(
+                    [self._context.renderbuffer(self.size, 4, samples=self._samples)],
+                    self._context.depth_renderbuffer(self.size, samples=self._samples),
+                )
+                self._targets.append(self._canvas)
+            self._targets.append(self._result)
+
+    def draw(self, faps: Float32) -> UInt8:
+        """Draw one picture.
+
+        Parameters
+        ----------
+        faps
+            Facial animation parameters (68,), FAP units.
+
+        Returns
+        -------
+        Pixels (H, W, 3), top row first; (H, W, 4) with alpha if the background is transparent.
+        """
+        self._paint(faps, self._canvas)
+        if self._canvas is not self._result:
+            self._context.copy_framebuffer(self._result, self._canvas)
+        channels = 4 if self._background is None else 3
+        width, height = self.size
+        raw = self._result.read(components=channels, alignment=1)
+        return np.frombuffer(raw, np.uint8).reshape(height, width, channels)[::-1]
+
+    def draw_on_screen(self, faps: Float32) -> None:
+        """Draw into the window the context came from."""
+        screen = self._context.detect_framebuffer()
+        screen.viewport = (0, 0, *self.size)
+        self._paint(faps, screen)
+
+    def _paint(self, faps: Float32, target: Any) -> None:
+        context = self._context
+        self._stage[:, :3], self._stage[:, 3:] = self.head.pose(faps)
+        self._moving.write(self._stage)
+        target.use()
+        target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        eye = np.array(self._camera.position)
+        for program in (self._program, self._eye_program):
+            program["view_projection"].write(self._view_projection().T.tobytes())
+            program["eye"] = self._camera.position
+        half_way = _KEY + eye / np.linalg.norm(eye)
+        self._eye_program["half_way"] = tuple(half_way / np.linalg.norm(half_way))
+        context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        for part in self.head.parts:
+            if not part.transparent:
+                self._draw_part(part)
+        if self._background is not None:  # behind all that hides it, before what lets it through
+            middle, edge = self._background
+            self._backdrop_program["middle"] = middle
+            self._backdrop_program["edge"] = edge
+            self._backdrop.render()
+        context.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
+        # the second pair keeps the alpha of transparent pictures right
+        context.blend_func = (
+            moderngl.SRC_ALPHA,
+            moderngl.ONE_MINUS_SRC_ALPHA,
+            moderngl.ONE,
+            moderngl.ONE_MINUS_SRC_ALPHA,
+        )
+        for part in self.head.parts:
+            if part.transparent:
+                self._draw_part(part)
+
+    def _draw_part(self, part: Part) -> None:
+        program = self._eye_program if part.name in _EYES else self._program
+        wrap, gloss, shine = _MATERIALS[part.name]
+        for name, value in (
+            ("wrap", wrap), ("gloss", gloss), ("shine", shine),
+            ("two_sided", float(part.transparent)),
+        ):  # fmt: skip
+            if name in program:
+                program[name] = value
+        self._textures[part.texture].use()
+        self._arrays[part.name].render()
+
+    def _view_projection(self) -> Float32:
+        eye = np.array(self._camera.position)
+        ahead = np.array(self._camera.target) - eye
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(right, ahead), -ahead])
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = axes, -axes @ eye
+        near, far = 0.1, 5.0
+        scale = 1.0 / np.tan(np.radians(self._camera.field_of_view_deg) / 2)
+        width, height = self.size
+        projection = np.zeros((4, 4))
+        projection[0, 0], projection[1, 1] = scale * height / width, scale
+        projection[2, 2:] = (far + near) / (near - far), 2 * far * near / (near - far)
+        projection[3, 2] = -1.0
+        return np.asarray(projection @ view, dtype=np.float32)
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        if self._own_context:
+            self._context.release()

@@ -1,0 +1,201 @@
+"""The driver as a service: FAP frames in, a head in a window or a video out.
+
+Reacts to: start, stop (control), fap, end (synthesizer), sound (recognizer).
+Emits: recorded (control).
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from services.driver.head import Head
+from services.driver.recording import Recording
+from services.driver.render import Renderer
+from services.driver.window import HeadWindow
+from shared.bus import Socket
+from shared.clock import to_seconds
+from shared.config import DriverConfig
+from shared.errors import UserError
+from shared.faps import NUM_FAPS
+from shared.logs import LOG
+from shared.messages import (
+    EndOfFaps,
+    Error,
+    FapFrame,
+    Joined,
+    Recorded,
+    Sound,
+    StartSession,
+)
+from shared.service import Service
+
+RENDER_BUDGET_S = 0.2  # of recording in one turn of the loop, so that heartbeats go on
+NUM_PUBLISHERS = 2  # recognizer and synthesizer
+STALL_S = 1.0  # without frames the window says so
+
+
+@dataclass(slots=True)
+class _Follower:
+    """What the driver knows of one session."""
+
+    start: StartSession
+    socket: Socket
+    publishers: set[str] = field(default_factory=set)  # that confirmed the subscriptions
+    sequence: int = 0
+    recording: Recording | None = None
+
+
+class DriverService(Service):
+    """The driver process."""
+
+    name = "driver"
+
+    def __init__(self, config: DriverConfig) -> None:
+        super().__init__(config)
+        self._config = config
+        self._followers: dict[str, _Follower] = {}
+        self._unfinished: list[tuple[str, Recording]] = []
+        self._head = Head.load()
+        self._renderer: Renderer | None = None
+        self._faps = np.zeros(NUM_FAPS, np.float32)
+        self._frame_s = time.monotonic()
+        self._stalled = False
+        self._window = self._open_window()
+
+    def start_session(self, start: StartSession) -> bool:
+        """Follow a session's frames; confirm once the subscriptions are in effect."""
+        self.stop_session(start.session)
+        socket = self.bus.connect_subscriber(start.phones, start.faps)
+        follower = _Follower(start=start, socket=socket)
+        self.listen(
+            socket,
+            {
+                Joined: lambda message, _: self._on_joined(follower, message),
+                FapFrame: lambda message, _: self._on_frame(follower, message),
+                Sound: lambda message, _: self._on_sound(follower, message),
+                EndOfFaps: lambda message, _: self._on_end(follower),
+            },
+        )
+        kinds = (FapFrame, EndOfFaps, Sound) if start.record else (FapFrame, EndOfFaps)
+        socket.subscribe_session(kinds, start.session)
+        if start.record:
+            follower.recording = self._begin_recording(start.session)
+        self._followers[start.session] = follower
+        return False
+
+    def stop_session(self, session: str) -> None:
+        """Follow a session no longer; finish its video with what has come."""
+        follower = self._followers.pop(session, None)
+        if follower is not None:
+            self.unlisten(follower.socket)
+            self._end_recording(follower)
+
+    def on_tick(self, now_s: float) -> None:
+        """Draw what is due."""
+        if self._window is not None:
+            if self._window.closed:
+                LOG.info("the window was closed")
+                self._window = None
+            else:
+                self._window.draw(self._shown(now_s))
+        self._render_until(time.monotonic() + RENDER_BUDGET_S)
+
+    def on_drain(self) -> bool:
+        """Finish the videos that are under way."""
+        for session in list(self._followers):
+            self.stop_session(session)
+        self._render_until(time.monotonic() + RENDER_BUDGET_S)
+        return not self._unfinished
+
+    # --- from the publishers -------------------------------------------------------------------
+
+    def _on_joined(self, follower: _Follower, joined: Joined) -> None:
+        follower.publishers.add(joined.publisher)
+        if len(follower.publishers) == NUM_PUBLISHERS:
+            self.session_started(follower.start)
+
+    def _on_frame(self, follower: _Follower, frame: FapFrame) -> None:
+        missed = frame.sequence - follower.sequence - 1
+        if follower.sequence and missed > 0:
+            self.metrics.count("frames_missed", missed)
+        follower.sequence = frame.sequence
+        self._faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
+        self._frame_s = time.monotonic()
+        if follower.recording is not None:
+            follower.recording.accept_frame(to_seconds(frame.media_time), self._faps)
+
+    def _on_sound(self, follower: _Follower, sound: Sound) -> None:
+        if follower.recording is not None:
+            samples = np.frombuffer(sound.pcm, "<i2").astype(np.float32) / np.float32(32768)
+            follower.recording.accept_sound(sound.media_time, samples)
+
+    def _on_end(self, follower: _Follower) -> None:
+        self._end_recording(follower)
+
+    # --- the window ----------------------------------------------------------------------------
+
+    def _open_window(self) -> HeadWindow | None:
+        has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        if self._config.view == "none" or (self._config.view == "auto" and not has_display):
+            return None
+        return HeadWindow(self._head, self._config.width_px, self._config.height_px)
+
+    def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+        """Return the newest frame, or while none comes one that fades to rest."""
+        silent_s = now_s - self._frame_s
+        if silent_s > STALL_S and not self._stalled and self._followers:
+            LOG.warning("no FAP frames for %g s: the face goes to rest", STALL_S)
+        self._stalled = silent_s > STALL_S
+        fade = np.float32(np.clip(1.0 - (silent_s - STALL_S) / 0.3, 0.0, 1.0))
+        return self._faps * fade
+
+    # --- recording -----------------------------------------------------------------------------
+
+    def _begin_recording(self, session: str) -> Recording | None:
+        config = self._config
+        try:
+            if self._renderer is None:
+                self._renderer = Renderer(self._head, config.width_px, config.height_px)
+            path = Path(config.out) / f"{session}.mp4"
+            return Recording(path, self._renderer, config.frame_rate_hz)
+        except UserError as error:
+            self._report(session, "no-video", str(error))
+            return None
+
+    def _end_recording(self, follower: _Follower) -> None:
+        if follower.recording is not None:
+            self._unfinished.append((follower.start.session, follower.recording))
+            follower.recording = None
+
+    def _render_until(self, end_s: float) -> None:
+        for follower in self._followers.values():
+            while follower.recording is not None and time.monotonic() < end_s:
+                if not follower.recording.step():
+                    break
+        while self._unfinished and time.monotonic() < end_s:
+            session, recording = self._unfinished[0]
+            if recording.step():
+                continue
+            self._unfinished.pop(0)
+            recording.close()
+            self.metrics.count("videos")
+            LOG.info("wrote %s", recording.path, extra={"session": session})
+            if self.control is not None:
+                self.control.send(
+                    Recorded(
+                        session=session,
+                        path=str(recording.path),
+                        num_images=recording.num_images,
+                        duration_s=recording.duration_s,
+                    )
+                )
+
+    def _report(self, session: str, code: str, text: str) -> None:
+        LOG.error(text, extra={"session": session})
+        if self.control is not None:
+            self.control.send(Error(session=session, code=code, text=text))

@@ -1,0 +1,1 @@
+"""Gateway: the head in a browser, with sound and microphone."""

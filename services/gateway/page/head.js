@@ -1,0 +1,137 @@
+// The head: a GLB whose morph targets and joints are named by FAPs (services/driver/glb.py).
+
+import * as THREE from "three";
+import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+
+const RADIANS_PER_UNIT = 1e-5;
+const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
+const PORTRAIT_ASPECT = 0.8; // narrower windows step back, so that the face still fits
+
+export class Head {
+  #renderer;
+  #scene = new THREE.Scene();
+  #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
+  #controls;
+  #morphs = []; // [influences, target, FAP index, weight per FAP unit]
+  #joints = []; // { node, rest, turns: [[FAP index, axis]] }
+  #fovYDegrees = 22;
+  #stale = true;
+  #turn = new THREE.Quaternion();
+
+  constructor(canvas) {
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    this.#controls = new OrbitControls(this.#camera, canvas);
+    this.#controls.enablePan = false;
+    this.#controls.minAzimuthAngle = -1.2;
+    this.#controls.maxAzimuthAngle = 1.2;
+    this.#controls.minPolarAngle = 1.1;
+    this.#controls.maxPolarAngle = 1.9;
+    this.#controls.addEventListener("change", () => (this.#stale = true));
+    this.#light();
+    new ResizeObserver(() => this.#resize(canvas)).observe(canvas);
+  }
+
+  /** Load a head into a canvas. */
+  static async load(canvas, url) {
+    const head = new Head(canvas);
+    head.#add(await new GLTFLoader().loadAsync(url));
+    return head;
+  }
+
+  #add(gltf) {
+    const about = gltf.scene.userData.kouxing ?? gltf.scene.getObjectByName("kouxing").userData.kouxing;
+    gltf.scene.traverse((node) => {
+      if (!node.isMesh) return;
+      node.frustumCulled = false; // bounds do not follow the morph targets
+      for (const { name, number, unitsPerWeight } of about.faps) {
+        const target = node.morphTargetDictionary?.[name];
+        if (target !== undefined) {
+          this.#morphs.push([node.morphTargetInfluences, target, number - 1, 1 / unitsPerWeight]);
+        }
+      }
+    });
+    this.#findJoints(gltf.scene, about.faps);
+    this.#scene.add(gltf.scene);
+    this.#frame(about.camera);
+  }
+
+  /** Take on a face: 68 values in FAP units. */
+  pose(faps) {
+    for (const [influences, target, index, scale] of this.#morphs) {
+      influences[target] = faps[index] * scale;
+    }
+    for (const { node, rest, turns } of this.#joints) {
+      node.quaternion.copy(rest);
+      for (const [index, axis] of turns) {
+        this.#turn.setFromAxisAngle(axis, faps[index] * RADIANS_PER_UNIT);
+        node.quaternion.multiply(this.#turn);
+      }
+    }
+    this.#stale = true;
+  }
+
+  /** Draw, if anything has changed. */
+  draw() {
+    if (!this.#stale) return;
+    this.#stale = false;
+    this.#renderer.render(this.#scene, this.#camera);
+  }
+
+  #findJoints(scene, faps) {
+    const byNode = new Map();
+    for (const { name, number, rotation } of faps) {
+      if (rotation) {
+        const turns = byNode.get(rotation.node) ?? [];
+        const order = TURN_ORDER.findIndex((word) => name.includes(word));
+        turns.push([number - 1, new THREE.Vector3(...rotation.axis), order]);
+        byNode.set(rotation.node, turns);
+      }
+    }
+    for (const [name, turns] of byNode) {
+      const node = scene.getObjectByName(name);
+      turns.sort((a, b) => a[2] - b[2]);
+      if (node) this.#joints.push({ node, rest: node.quaternion.clone(), turns });
+    }
+  }
+
+  #frame({ target, position, fovYDegrees }) {
+    this.#fovYDegrees = fovYDegrees;
+    this.#camera.position.set(...position);
+    this.#controls.target.set(...target);
+    const distance = this.#camera.position.distanceTo(this.#controls.target);
+    this.#controls.minDistance = 0.5 * distance;
+    this.#controls.maxDistance = 1.5 * distance;
+    this.#controls.update();
+    this.#resize(this.#renderer.domElement);
+  }
+
+  /** A key from the front upper left, a fill, a rim, and soft light from everywhere. */
+  #light() {
+    this.#scene.add(new THREE.HemisphereLight(0xffffff, 0xb9a79c, 1.9));
+    for (const [color, intensity, x, y, z] of [
+      [0xfff4e8, 1.7, -0.6, 0.8, 1.2],
+      [0xe6eeff, 0.7, 1, 0.1, 0.9],
+      [0xffffff, 0.6, 0.4, 0.9, -1],
+    ]) {
+      const light = new THREE.DirectionalLight(color, intensity);
+      light.position.set(x, y, z);
+      this.#scene.add(light);
+    }
+  }
+
+  #resize(canvas) {
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (width === 0 || height === 0) return;
+    const aspect = width / height;
+    const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
+    const widened = half * Math.max(1, PORTRAIT_ASPECT / aspect);
+    this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
+    this.#camera.aspect = aspect;
+    this.#camera.updateProjectionMatrix();
+    this.#renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    this.#renderer.setSize(width, height, false);
+    this.#stale = true;
+    this.draw();
+  }
+}

@@ -1,0 +1,78 @@
+// The WebSocket to the gateway that brings everything to be seen and heard; proto/GATEWAY.md.
+
+const FAP_TYPE = 1;
+const SOUND_TYPE = 2;
+const HEADER_BYTES = 16;
+export const NUM_FAPS = 68;
+const RETRY_MS = [300, 5000];
+
+export function socketUrl(path) {
+  return `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
+}
+
+/** Connects, and connects again by itself for as long as the page is open. */
+export class Link {
+  #handlers;
+  #chosen;
+  #socket = null;
+  #retryMs = RETRY_MS[0];
+
+  /**
+   * @param {string} chosen session to look at; "" for the newest
+   * @param handlers { state(connected), fap(mediaTime, values), sound(mediaTime, samples), text(object) }
+   */
+  constructor(chosen, handlers) {
+    this.#chosen = chosen;
+    this.#handlers = handlers;
+    this.#connect();
+  }
+
+  /** Look at another session; "" for the newest. */
+  follow(session) {
+    this.#chosen = session;
+    this.#send({ follow: session });
+  }
+
+  /** Have the gateway speak the sample sentence, and look at it. */
+  play(what) {
+    this.#send({ play: what });
+  }
+
+  #send(wish) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(wish));
+  }
+
+  #connect() {
+    const query = this.#chosen ? `?session=${encodeURIComponent(this.#chosen)}` : "";
+    const socket = new WebSocket(socketUrl(`/viewer${query}`));
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      this.#retryMs = RETRY_MS[0];
+      this.#handlers.state(true);
+    };
+    socket.onmessage = (event) => this.#receive(event.data);
+    socket.onclose = () => {
+      this.#handlers.state(false);
+      setTimeout(() => this.#connect(), this.#retryMs);
+      this.#retryMs = Math.min(RETRY_MS[1], this.#retryMs * 2);
+    };
+    this.#socket = socket;
+  }
+
+  #receive(data) {
+    if (typeof data === "string") {
+      this.#handlers.text(JSON.parse(data));
+      return;
+    }
+    const header = new DataView(data);
+    const mediaTime = header.getFloat64(8, true);
+    switch (header.getUint8(0)) {
+      case FAP_TYPE:
+        this.#handlers.fap(mediaTime, new Float32Array(data, HEADER_BYTES, NUM_FAPS));
+        break;
+      case SOUND_TYPE:
+        this.#handlers.sound(mediaTime, new Int16Array(data, HEADER_BYTES));
+        break;
+    }
+  }
+}

@@ -1,0 +1,165 @@
+// When to show and sound what: the only clock between sound and picture is media time (samples at
+// 16 kHz since the session's first sample). Pure code: time is handed in, nothing is drawn.
+
+export const SAMPLES_PER_MS = 16;
+const FIRST_DELAY_MS = 120; // before anything has been measured
+const DEAD_ZONE_MS = 30;
+const ADJUST_EVERY_MS = 500;
+const WINDOW_MS = 10000; // that the percentiles are taken over: a single hiccup must not count
+const ENOUGH = 20; // frames before the percentile is believed
+const JUMP_MS = 300; // a stream that is later, or earlier, by this: begin anew
+const MAX_BEHIND_MS = 3000; // media time that leaps ahead by this: begin anew at once
+const MAX_FRAMES = 1000;
+
+/** Lateness (arrival - media time, ms) over the last seconds. */
+class Lateness {
+  #entries = [];
+
+  add(nowMs, latenessMs) {
+    this.#entries.push([nowMs, latenessMs]);
+    const oldest = nowMs - WINDOW_MS;
+    while (this.#entries[0][0] < oldest) this.#entries.shift();
+  }
+
+  get count() {
+    return this.#entries.length;
+  }
+
+  /** The greatest of the last moment. */
+  newest(nowMs) {
+    const recent = this.#entries.filter((entry) => entry[0] > nowMs - ADJUST_EVERY_MS);
+    return recent.length ? Math.max(...recent.map((entry) => entry[1])) : Infinity;
+  }
+
+  percentile(fraction) {
+    const sorted = this.#entries.map((entry) => entry[1]).sort((a, b) => a - b);
+    return sorted[Math.min(sorted.length - 1, Math.floor(fraction * sorted.length))];
+  }
+}
+
+/**
+ * The playout clock.
+ *
+ * Media time m is shown at m + offset on the page's clock. Sound reaches us as soon as it was
+ * heard, its FAP frame some 60 to 100 ms later, so sound has to wait: the target of the offset is
+ * the 95th percentile of (frame arrival - media time) plus one display frame. The difference
+ * between the page's clock and the sender's is in every lateness alike and drops out.
+ *
+ * The network's and the clocks' drift moves the target. Every half second, if the offset is off by
+ * more than the dead zone (30 ms, unnoticeable: ITU-R BT.1359 puts detectability at 45 and 125 ms),
+ * half of the error is corrected, so that one bad second is not answered by a leap.
+ */
+export class Playout {
+  displayFrameMs = 1000 / 60;
+  outputLatencyMs = 0; // of the loudspeaker; sound must leave that much earlier
+  #offsetMs = null;
+  #adjustedMs = 0;
+
+  constructor() {
+    this.reset();
+  }
+
+  /** Forget everything: another session, or the stream paused. */
+  reset() {
+    this.#offsetMs = null;
+    this.frames = new Lateness();
+    this.soundStarts = new Lateness();
+    this.soundEnds = new Lateness();
+  }
+
+  get offsetMs() {
+    return this.#offsetMs;
+  }
+
+  /** How long sound waits for its picture, ms; null before any sound. */
+  get delayMs() {
+    if (this.#offsetMs === null || this.soundEnds.count === 0) return null;
+    return this.#offsetMs - this.soundEnds.percentile(0.05);
+  }
+
+  /** Media time that is due now, samples; null before anything arrived. */
+  mediaAt(nowMs) {
+    return this.#offsetMs === null ? null : (nowMs - this.#offsetMs) * SAMPLES_PER_MS;
+  }
+
+  /** Take the arrival of a frame whose media time advances. */
+  frameArrived(nowMs, mediaTime) {
+    const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
+    this.#resyncIfFar(latenessMs);
+    this.frames.add(nowMs, latenessMs);
+    this.#offsetMs ??= latenessMs + FIRST_DELAY_MS / 2;
+  }
+
+  /** Take the arrival of a chunk of sound. */
+  soundArrived(nowMs, mediaTime, numSamples) {
+    const startMs = nowMs - mediaTime / SAMPLES_PER_MS;
+    const endMs = startMs - numSamples / SAMPLES_PER_MS;
+    this.#resyncIfFar(endMs);
+    this.soundStarts.add(nowMs, startMs);
+    this.soundEnds.add(nowMs, endMs);
+    this.#offsetMs ??= endMs + FIRST_DELAY_MS;
+  }
+
+  /** Correct the offset if it is time to; return whether it changed. */
+  adjust(nowMs) {
+    if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return false;
+    if (this.frames.count < ENOUGH) return false;
+    this.#adjustedMs = nowMs;
+    if (this.frames.newest(nowMs) < this.#offsetMs - JUMP_MS) {
+      this.reset(); // what was held up on the way has come, and the stream is live again
+      return false;
+    }
+    const frameMs = this.frames.percentile(0.95);
+    // A long chunk of sound is as late as its first sample.
+    const soundMs = this.soundStarts.count ? this.soundStarts.percentile(0.95) + this.outputLatencyMs : -Infinity;
+    const errorMs = Math.max(frameMs, soundMs) + this.displayFrameMs - this.#offsetMs;
+    if (Math.abs(errorMs) <= DEAD_ZONE_MS) return false;
+    this.#offsetMs += errorMs / 2;
+    return true;
+  }
+
+  /** Follow the sound card's clock, which is never quite the page's. */
+  follow(measuredOffsetMs) {
+    if (this.#offsetMs !== null) this.#offsetMs += 0.05 * (measuredOffsetMs - this.#offsetMs);
+  }
+
+  #resyncIfFar(latenessMs) {
+    if (this.#offsetMs === null) return;
+    const lateMs = latenessMs - this.#offsetMs;
+    if (lateMs > JUMP_MS || lateMs < -MAX_BEHIND_MS) this.reset();
+  }
+}
+
+/** FAP frames in order of media time, and the face between two of them. */
+export class FapTrack {
+  #frames = []; // [media time, Float32Array]
+
+  reset() {
+    this.#frames.length = 0;
+  }
+
+  /** Add a frame; return whether it advances media time. */
+  push(mediaTime, values) {
+    const last = this.#frames.at(-1);
+    if (last !== undefined && mediaTime <= last[0]) {
+      // While the sound pauses media time stands still, and the face still goes to rest.
+      if (mediaTime === last[0]) last[1] = values;
+      return false;
+    }
+    this.#frames.push([mediaTime, values]);
+    if (this.#frames.length > MAX_FRAMES) this.#frames.shift();
+    return true;
+  }
+
+  /** Write the face at a media time; return false if there is none yet. */
+  sample(mediaTime, out) {
+    const frames = this.#frames;
+    while (frames.length > 2 && frames[1][0] <= mediaTime) frames.shift();
+    if (frames.length === 0) return false;
+    const [t0, a] = frames[0];
+    const [t1, b] = frames[Math.min(1, frames.length - 1)];
+    const mix = t1 > t0 ? Math.min(1, Math.max(0, (mediaTime - t0) / (t1 - t0))) : 1;
+    for (let i = 0; i < out.length; i++) out[i] = a[i] + mix * (b[i] - a[i]);
+    return true;
+  }
+}

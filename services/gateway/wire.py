@@ -1,0 +1,81 @@
+"""What goes over the browser's WebSockets; ``proto/GATEWAY.md`` describes it.
+
+Binary messages, little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media time (samples at
+16 kHz), then the payload, which so begins on a multiple of four.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+
+from shared.errors import UserError
+
+_HEADER = struct.Struct("<B3xId")
+FAP_TYPE = 1  # payload: 68 float32, FAP units
+SOUND_TYPE = 2  # payload: int16, 16 kHz mono
+
+SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
+RATES_HZ = (8000, 48000)
+
+
+def binary(kind: int, epoch: int, media_time: int, payload: bytes) -> bytes:
+    """Return a binary message."""
+    return _HEADER.pack(kind, epoch, media_time) + payload
+
+
+def text(kind: str, **fields: object) -> str:
+    """Return a JSON message."""
+    return json.dumps({"type": kind, **fields}, ensure_ascii=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hello:
+    """What a browser's microphone will send."""
+
+    sample_rate_hz: int
+    num_channels: int
+    encoding: str  # s16le or f32le
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of one sample of all channels."""
+        return SAMPLE_BYTES[self.encoding] * self.num_channels
+
+
+def parse_hello(message: str) -> Hello:
+    """Return the first message of a microphone.
+
+    Raises
+    ------
+    UserError
+        Naming the field that is missing or out of range.
+    """
+    fields = parse_object(message)
+    rate_hz, num_channels = fields.get("sample_rate_hz"), fields.get("num_channels", 1)
+    encoding = fields.get("encoding", "s16le")
+    if type(rate_hz) is not int or not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+        raise UserError(f"sample_rate_hz must be a whole number of {RATES_HZ[0]} to {RATES_HZ[1]}")
+    if type(num_channels) is not int or num_channels not in (1, 2):
+        raise UserError("num_channels must be 1 or 2")
+    if not isinstance(encoding, str) or encoding not in SAMPLE_BYTES:
+        raise UserError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
+    return Hello(sample_rate_hz=rate_hz, num_channels=num_channels, encoding=encoding)
+
+
+def parse_object(message: str) -> dict[str, object]:
+    """Return a JSON object.
+
+    Raises
+    ------
+    UserError
+        If it is none.
+    """
+    try:
+        fields = json.loads(message)
+    except (ValueError, RecursionError):
+        fields = None
+    if not isinstance(fields, dict):
+        raise UserError("expected a JSON object")
+    return fields

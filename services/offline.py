@@ -1,0 +1,107 @@
+"""Audio file to phones, FAP frames and video in one process, without running services.
+
+The same recognizer and synthesizer as live, fed in the same 20 ms steps: the frames are those that
+the services would send.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head import Head
+from services.driver.recording import Recording
+from services.driver.render import Renderer
+from services.recognizer.gmm import load_model
+from services.recognizer.pcm import slices
+from services.recognizer.pipeline import Recognizer
+from services.recognizer.resample import Resampler
+from services.synthesizer.live import LiveSynthesizer
+from services.synthesizer.parameters import load_parameters
+from services.synthesizer.service import REST_S
+from shared.audio_file import open_audio
+from shared.messages import MEDIA_RATE_HZ
+from shared.phones import Phone, SpeechChange
+
+ProgressCallback = Callable[[float], None]  # takes the share that is done, 0 to 1
+Frame = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+
+
+def mono_16k(path: Path) -> NDArray[np.float32]:
+    """Return a file's samples as the recognizer hears them: 16 kHz mono, shape ``(n,)``.
+
+    Raises
+    ------
+    UserError
+        As ``shared.audio_file.open_audio``.
+    """
+    source = open_audio(path, block_s=1.0)
+    resampler = Resampler(source.sample_rate_hz, source.num_channels)
+    parts = [resampler.accept_waveform(block) for block in source.blocks]
+    return np.concatenate([*parts, resampler.finish()])
+
+
+def live_frames(
+    samples: NDArray[np.float32],
+    *,
+    frame_rate_hz: float = 50.0,
+    look_ahead_s: float = 0.06,
+    on_progress: ProgressCallback = lambda _share: None,
+) -> tuple[list[Phone], list[Frame]]:
+    """Return the phones and FAP frames that the live system makes of 16 kHz mono samples."""
+    recognizer = Recognizer(load_model(), sample_rate_hz=MEDIA_RATE_HZ)
+    synthesizer = LiveSynthesizer(
+        load_parameters(), frame_rate_hz=frame_rate_hz, look_ahead_s=look_ahead_s
+    )
+    phones: list[Phone] = []
+    frames: list[Frame] = []
+
+    def take(results: list[Phone | SpeechChange]) -> None:
+        for result in results:
+            if isinstance(result, Phone):
+                phones.append(result)
+                synthesizer.accept_phone(result)
+            else:
+                synthesizer.accept_speech(result)
+
+    num_heard = 0
+    for part in slices(samples, 0):
+        num_heard += len(part)
+        take(recognizer.accept_waveform(part))
+        frames += synthesizer.advance(num_heard / MEDIA_RATE_HZ)
+        on_progress(num_heard / len(samples))
+    take(recognizer.input_finished())
+    end_s = num_heard / MEDIA_RATE_HZ
+    synthesizer.accept_speech(SpeechChange(active=False, time_s=end_s))
+    frames += synthesizer.advance(end_s + look_ahead_s + REST_S)
+    return phones, frames
+
+
+def render_video(
+    samples: NDArray[np.float32],
+    frames: list[Frame],
+    path: Path,
+    *,
+    width_px: int,
+    height_px: int,
+    frame_rate_hz: float,
+    on_progress: ProgressCallback = lambda _share: None,
+) -> int:
+    """Write a video of FAP frames with their sound; return the number of images.
+
+    Raises
+    ------
+    UserError
+        If the video cannot be written or nothing can be drawn on this system.
+    """
+    recording = Recording(path, Renderer(Head.load(), width_px, height_px), frame_rate_hz)
+    recording.accept_sound(0, samples)
+    for time_s, faps in frames:
+        recording.accept_frame(time_s, faps)
+    while recording.step():
+        on_progress(min(1.0, recording.duration_s / max(frames[-1][0], 1e-9)))
+    recording.close()
+    return recording.num_images

@@ -1,0 +1,1 @@
+"""Recognizer: audio chunks in, phones with times out."""

@@ -1,0 +1,196 @@
+"""Gaussian mixture acoustic model: log scores of HMM states for one feature frame.
+
+Source: Li et al. 2011, section 3.1 (one mixture per state, diagonal covariances); the density is
+the HTK book's eq. 7.2 (Young et al. 2009).
+
+======== ========================================= =====================
+symbol   meaning                                   shape
+======== ========================================= =====================
+x        normalised, rotated feature frame         (39,)
+A        rotation that decorrelates (STC)          (39, 39)
+w        mixture weights                           (states, mixtures)
+means    component means                           (states, mixtures, 39)
+covars   component variances                       (states, mixtures, 39)
+======== ========================================= =====================
+
+log b(x) = logsumexp_m [ log w_m - 1/2 sum_k (log 2 pi covars_mk + (x_k - means_mk)^2 / covars_mk) ]
+
+written as a product of [x^2, x, 1] with a matrix made once. The rotation is Gales 1999,
+"Semi-tied covariance matrices", one for all states.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic_model import Topology
+from services.recognizer.features import (
+    NUM_FEATURES,
+    NUM_STATIC,
+    Differences,
+    LiveMean,
+    cepstra,
+)
+from services.recognizer.model_file import (
+    Archive,
+    topology_arrays,
+    topology_from,
+    write_archive,
+)
+
+FORMAT = "gmm 1"
+_MOST_MIXTURES = 1024
+_WIDEST = 4  # half width of the differences, feature frames
+
+_LOWEST_LOG = -1e30  # an absent component's weight: finite, so that no NaN can arise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GaussianMixtures:
+    """The densities of all states."""
+
+    weights: NDArray[np.float32]  # (states, mixtures), rows sum to 1
+    means: NDArray[np.float32]  # (states, mixtures, 39)
+    covars: NDArray[np.float32]  # (states, mixtures, 39)
+
+    def score_matrix(self) -> NDArray[np.float32]:
+        """Matrix that maps [x^2, x, 1] to component log densities, (79, states * mixtures)."""
+        num_states, num_mixtures, num_features = self.means.shape
+        covars = self.covars.astype(np.float64)
+        means = self.means.astype(np.float64)
+        with np.errstate(divide="ignore"):
+            log_weights = np.maximum(np.log(self.weights.astype(np.float64)), _LOWEST_LOG)
+        constant = log_weights - 0.5 * (np.log(2 * np.pi * covars) + means**2 / covars).sum(-1)
+        matrix = np.concatenate([-0.5 / covars, means / covars, constant[..., None]], axis=-1)
+        shape = (num_states * num_mixtures, 2 * num_features + 1)
+        return np.ascontiguousarray(matrix.reshape(shape).T, dtype=np.float32)
+
+
+def mixture_scores(
+    frames: NDArray[np.float32], matrix: NDArray[np.float32], num_mixtures: int
+) -> NDArray[np.float32]:
+    """Log densities of states.
+
+    Parameters
+    ----------
+    frames
+        Shape (n, 39).
+    matrix
+        From :meth:`GaussianMixtures.score_matrix`, shape (79, states * mixtures).
+    num_mixtures
+        Components of each state.
+
+    Returns
+    -------
+    NDArray
+        Shape (n, states).
+    """
+    ones = np.ones((len(frames), 1), dtype=np.float32)
+    components = np.concatenate([frames * frames, frames, ones], axis=1) @ matrix
+    components = components.reshape(len(frames), -1, num_mixtures)
+    peak = components.max(axis=2)
+    components -= peak[..., None]
+    np.exp(components, out=components)
+    log_density: NDArray[np.float32] = peak + np.log(components.sum(axis=2))
+    return log_density
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GmmModel:
+    """A Gaussian mixture HMM with its front end; implements ``AcousticModel``."""
+
+    topology: Topology
+    mixtures: GaussianMixtures
+    rotation: NDArray[np.float32]  # (39, 39)
+    prior_mean: NDArray[np.float32]  # (13,) cepstral mean of the training corpus
+    half_width: int  # of the differences
+
+    def stream(self) -> GmmStream:
+        """Start a stream of scores for one speaker."""
+        return GmmStream(self)
+
+    def save(self, path: Path) -> None:
+        """Write the model as an npz file (arrays only, no pickle)."""
+        arrays = {
+            "format": np.array(FORMAT),
+            **topology_arrays(self.topology),
+            "weights": self.mixtures.weights,
+            "means": self.mixtures.means,
+            "covars": self.mixtures.covars,
+            "rotation": self.rotation,
+            "prior_mean": self.prior_mean,
+            "half_width": np.array(self.half_width),
+        }
+        write_archive(path, arrays)
+
+
+class GmmStream:
+    """Scores of one speaker's speech, segment by segment."""
+
+    def __init__(self, model: GmmModel) -> None:
+        self._model = model
+        self._matrix = model.mixtures.score_matrix()
+        self._mean = LiveMean(model.prior_mean)
+        self._differences = Differences(model.half_width)
+        self.look_ahead_frames = self._differences.look_ahead_frames
+
+    def accept(self, log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take log-mel frames, shape (n, 41); return the scores ready, (m, states)."""
+        return self._score(self._differences.accept(cepstra(log_mel)))
+
+    def finish(self) -> NDArray[np.float32]:
+        """End the segment: return the scores still owed. The mean is kept for the next one."""
+        scores = self._score(self._differences.finish())
+        self._differences = Differences(self._model.half_width)
+        return scores
+
+    def reset(self) -> None:
+        """Forget the segment and the speaker."""
+        self._differences = Differences(self._model.half_width)
+        self._mean.reset()
+
+    def _score(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        normalised = self._mean.normalise(features)
+        scores = np.empty((len(features), self._model.topology.num_states), dtype=np.float32)
+        num_mixtures = self._model.mixtures.weights.shape[1]
+        for row in range(len(features)):  # row by row: a product's rounding depends on its height
+            frame = normalised[row : row + 1] @ self._model.rotation
+            scores[row] = mixture_scores(frame, self._matrix, num_mixtures)[0]
+        return scores
+
+
+def gmm_from(archive: Archive) -> GmmModel:
+    """Build the model after checking every size; ValueError says what does not fit."""
+    topology = topology_from(archive)
+    num_mixtures = archive.array("weights", None).shape[-1]
+    if not 1 <= num_mixtures <= _MOST_MIXTURES:
+        raise ValueError(f"{num_mixtures} mixture components")
+    half_width = int(archive.array("half_width", ()))
+    if not 1 <= half_width <= _WIDEST:
+        raise ValueError(f"half width of the differences {half_width}")
+    shape = (topology.num_states, num_mixtures)
+    mixtures = GaussianMixtures(
+        weights=archive.floats("weights", *shape),
+        means=archive.floats("means", *shape, NUM_FEATURES),
+        covars=archive.floats("covars", *shape, NUM_FEATURES),
+    )
+    if (mixtures.covars <= 0).any() or (mixtures.weights < 0).any():
+        raise ValueError("weights or variances are negative")
+    return GmmModel(
+        topology=topology,
+        mixtures=mixtures,
+        rotation=archive.floats("rotation", NUM_FEATURES, NUM_FEATURES),
+        prior_mean=archive.floats("prior_mean", NUM_STATIC),
+        half_width=half_width,
+    )
+
+
+def load_model() -> GmmModel:  # until every caller imports services.recognizer.load
+    """Load the model that ships."""
+    from services.recognizer.load import load_model as load  # noqa: PLC0415
+
+    return load()  # type: ignore[return-value]

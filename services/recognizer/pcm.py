@@ -1,0 +1,66 @@
+"""Audio bytes of a session's encoding as samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+WIRE_TYPES = {"s16le": np.dtype("<i2"), "f32le": np.dtype("<f4")}
+FULL_SCALE = 32768.0
+SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
+
+
+class BadAudio(ValueError):
+    """Bytes that are no audio of the agreed encoding."""
+
+
+def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
+    """Return samples of shape ``(n, channels)`` in [-1, 1]; louder ones are clipped.
+
+    Raises
+    ------
+    BadAudio
+        If the length fits no whole number of sample frames, or a sample is NaN or infinite.
+    """
+    wire_type = WIRE_TYPES[encoding]
+    frame_bytes = wire_type.itemsize * num_channels
+    if len(pcm) % frame_bytes:
+        raise BadAudio(
+            f"{len(pcm)} bytes are no whole number of {encoding} frames of {num_channels} channels "
+            f"({frame_bytes} bytes each); was another encoding or channel count opened?"
+        )
+    samples = np.frombuffer(pcm, wire_type).reshape(-1, num_channels)
+    if encoding == "s16le":
+        return samples.astype(np.float32) / np.float32(FULL_SCALE)
+    if not np.isfinite(samples).all():
+        raise BadAudio("the chunk holds NaN or infinite samples; it was dropped")
+    return np.clip(samples, -1.0, 1.0).astype(np.float32)
+
+
+def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
+    """Cut samples where the stream's sample index is a multiple of 20 ms.
+
+    What is known at each multiple then does not depend on how the client cut its chunks.
+    """
+    begin = 0
+    while begin < len(samples):
+        end = begin + SLICE - (num_before + begin) % SLICE
+        yield samples[begin:end]
+        begin = end
+
+
+def pcm16_of(samples: NDArray[np.float32]) -> bytes:
+    """Return mono samples in [-1, 1] as little-endian int16 bytes."""
+    scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
+    return scaled.astype("<i2").tobytes()
+
+
+def level_db(samples: NDArray[np.float32]) -> float:
+    """Return the RMS level relative to full scale, -120 for silence."""
+    if len(samples) == 0:
+        return -120.0
+    power = float(np.mean(np.square(samples, dtype=np.float64)))
+    return max(-120.0, 10.0 * math.log10(power + 1e-12))

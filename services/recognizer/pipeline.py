@@ -1,0 +1,357 @@
+"""Sound in, units out: the recognizer without sockets.
+
+    samples -> resampler -> log-mel -> [in speech] acoustic model -> Viterbi -> output rule
+
+Source: Li et al. 2011, sections 1 and 2.2.
+
+Time is media time: seconds from the session's first sample. Feature frame ``t`` stands for the
+10 ms around the middle of its window. A chunk of any size gives the same result as any other
+cutting of the same sound: every step works on whole frames and whole detector blocks, in order.
+
+Algorithmic delay of a unit after its onset, with ``h`` the half width of the differences and ``N``
+the agreement: 25 ms window + 2h * 10 ms look-ahead + (N - 1) * 10 ms (the paper counts the first
+and the last: 45 ms for N = 3). At the beginning of speech the voice detector adds its own.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.decoder import Decoder, Segment, segments_after
+from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S, LogMel
+from services.recognizer.output_rule import OutputRule
+from services.recognizer.resample import Resampler
+from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
+
+PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
+_PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
+_SIL = UNIT_INDEX[SILENCE]
+_UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
+
+
+def frame_time_s(frame: int) -> float:
+    """Time of the boundary before a feature frame: halfway between two windows' middles."""
+    return frame * HOP_S + (WINDOW_S - HOP_S) / 2
+
+
+@dataclass(frozen=True, slots=True)
+class VoiceBegins:
+    """Speech begins; its first scored frame is ``frame``."""
+
+    frame: int
+
+
+@dataclass(frozen=True, slots=True)
+class VoiceEnds:
+    """Speech has ended before ``frame``."""
+
+    frame: int
+
+
+ScoreEvent = VoiceBegins | VoiceEnds | NDArray[np.float32]
+
+
+class SpeechScores:
+    """State scores of the frames that are speech, in order, with its beginnings and ends.
+
+    Parameters
+    ----------
+    model
+        The acoustic model.
+    sample_rate_hz
+        Rate of the input, 8000 to 48000.
+    num_channels
+        Channels of the input.
+    """
+
+    def __init__(self, model: AcousticModel, sample_rate_hz: int, num_channels: int = 1) -> None:
+        self._stream = model.stream()
+        self._resampler = Resampler(sample_rate_hz, num_channels)
+        self._detector = VoiceActivityDetector()
+        self._reset_frames()
+
+    def _reset_frames(self) -> None:
+        self._log_mel = LogMel()
+        self._block = np.empty(0, dtype=np.float32)
+        self._recent: deque[NDArray[np.float32]] = deque(maxlen=_PRE_ROLL_FRAMES)
+        self._num_frames = 0
+        self._speaking = False
+        self._ended_at = 0
+
+    @property
+    def num_frames_done(self) -> int:
+        """Feature frames whose scores, if they are speech, have been returned."""
+        return max(0, self._num_frames - self._stream.look_ahead_frames)
+
+    def accept_waveform(self, samples: NDArray[np.float32]) -> list[ScoreEvent]:
+        """Take samples of shape (n,) or (n, channels); return what became known."""
+        return self._accept(self._resampler.accept_waveform(samples))
+
+    def finish(self) -> list[ScoreEvent]:
+        """End the stream: what is still owed."""
+        events = self._accept(self._resampler.finish())
+        return events + self.end_speech()
+
+    def end_speech(self) -> list[ScoreEvent]:
+        """End the speech now, as if it had become quiet."""
+        self._detector.quieten()
+        return self._end() if self._speaking else []
+
+    def reset(self) -> None:
+        """Start a new session: new clock, new speaker."""
+        self._stream.reset()
+        self._resampler.reset()
+        self._detector.reset()
+        self._reset_frames()
+
+    def _accept(self, samples: NDArray[np.float32]) -> list[ScoreEvent]:
+        events: list[ScoreEvent] = []
+        while len(samples):  # cut where the detector's blocks end, whatever the chunks are
+            piece = samples[: BLOCK_SAMPLES - len(self._block)]
+            samples = samples[len(piece) :]
+            self._block = np.concatenate([self._block, piece])
+            events += self._frames(self._log_mel.accept_waveform(piece))
+            if len(self._block) == BLOCK_SAMPLES:
+                events += self._judge()
+                self._block = self._block[:0]
+        return events
+
+    def _frames(self, log_mel: NDArray[np.float32]) -> list[ScoreEvent]:
+        self._num_frames += len(log_mel)
+        if not self._speaking:
+            self._recent.extend(log_mel)
+            return []
+        return _if_any(self._stream.accept(log_mel))
+
+    def _judge(self) -> list[ScoreEvent]:
+        speech = self._detector.accept_block(self._block).is_speech
+        if speech and not self._speaking:
+            self._speaking = True
+            first = max(self._ended_at, self._num_frames - len(self._recent))
+            pre_roll = np.array(self._recent)[first - self._num_frames :]
+            self._recent.clear()
+            return [VoiceBegins(first), *_if_any(self._stream.accept(pre_roll))]
+        if self._speaking and not speech:
+            return self._end()
+        return []
+
+    def _end(self) -> list[ScoreEvent]:
+        self._speaking = False
+        self._ended_at = self._num_frames
+        return [*_if_any(self._stream.finish()), VoiceEnds(self._num_frames)]
+
+
+def _if_any(scores: NDArray[np.float32]) -> list[ScoreEvent]:
+    return [scores] if len(scores) else []
+
+
+class Recognizer:
+    """Recognises units live.
+
+    A unit is put out with ``final`` false and the unit's mean duration as soon as the output rule
+    allows (Li 2011, eq. 4). When the next unit is put out or speech ends, the same ``index``
+    follows with ``final`` true, its onset and its measured duration.
+
+    The paper leaves what was put out as it is. Here the best string may correct it: a unit that the
+    search has given up for another comes again under its ``index`` with the other unit, and units
+    that the rule passed over are added, ``final`` at once. ``sil`` within speech is a unit like any
+    other.
+
+    Parameters
+    ----------
+    model
+        The acoustic model, shared by any number of recognizers.
+    sample_rate_hz
+        Rate of the input, 8000 to 48000.
+    num_channels
+        Channels of the input; they are averaged.
+    agreement
+        N of the output rule.
+
+    Raises
+    ------
+    UserError
+        If the rate or the channels are out of range.
+
+    Examples
+    --------
+    >>> recognizer = Recognizer(load_model(), sample_rate_hz=48_000)
+    >>> for chunk in microphone:
+    ...     events = recognizer.accept_waveform(chunk)
+    """
+
+    def __init__(
+        self,
+        model: AcousticModel,
+        *,
+        sample_rate_hz: int,
+        num_channels: int = 1,
+        agreement: int = 3,
+    ) -> None:
+        self._durations_s = model.topology.duration_mean_s
+        self._scores = SpeechScores(model, sample_rate_hz, num_channels)
+        self._decoder = Decoder(model.topology)
+        self._rule = OutputRule(agreement, last_output=_SIL)
+        self._num_phones = 0
+        self._begin(0)
+
+    @property
+    def time_s(self) -> float:
+        """Media time up to which everything that can be said has been said."""
+        return self._scores.num_frames_done * HOP_S
+
+    def accept_waveform(self, samples: NDArray[np.float32]) -> list[Phone | SpeechChange]:
+        """Take sound.
+
+        Parameters
+        ----------
+        samples
+            Shape (n,) or (n, channels), in [-1, 1], at the input's rate.
+
+        Returns
+        -------
+        list
+            What became known, in the order of media time.
+
+        Raises
+        ------
+        UserError
+            If the samples have another shape or are no numbers.
+        """
+        return self._follow(self._scores.accept_waveform(samples))
+
+    def input_finished(self) -> list[Phone | SpeechChange]:
+        """No more sound will come: return all that is still owed."""
+        return self._follow(self._scores.finish())
+
+    def flush(self) -> list[Phone | SpeechChange]:
+        """End the speech now (an interruption); the clock and the speaker's mean go on."""
+        return self._follow(self._scores.end_speech())
+
+    def reset(self) -> None:
+        """Start a new session: the clock at 0, the speaker unknown."""
+        self._scores.reset()
+        self._begin(0)
+        self._num_phones = 0
+
+    def _begin(self, frame: int) -> None:
+        self._start_frame = frame
+        self._done = 0  # frame of the decoder up to which units are final
+        self._decoder.reset()
+        self._rule.reset()
+        self._open: Phone | None = None  # put out, not yet final
+
+    def _follow(self, events: list[ScoreEvent]) -> list[Phone | SpeechChange]:
+        out: list[Phone | SpeechChange] = []
+        for event in events:
+            if isinstance(event, VoiceBegins):
+                self._begin(event.frame)
+                out.append(SpeechChange(active=True, time_s=frame_time_s(event.frame)))
+            elif isinstance(event, VoiceEnds):
+                rest = segments_after(self._decoder.finish(), self._done)
+                if rest and rest[-1].unit == _SIL and self._open is not None and len(rest) > 1:
+                    rest.pop()  # the end of speech says it
+                out += self._settle(rest)
+                out.append(SpeechChange(active=False, time_s=frame_time_s(event.frame)))
+            else:
+                for row in event:
+                    out += self._frame(row)
+        return out
+
+    def _frame(self, scores: NDArray[np.float32]) -> list[Phone | SpeechChange]:
+        unit, start, confidence = self._decoder.accept(scores)
+        if not self._rule.accept(unit):
+            return []
+        settled = self._settle(self._decoder.path_since(self._done))
+        self._open = Phone(
+            index=self._take_index(),
+            unit=UNITS[unit],
+            onset_s=frame_time_s(self._start_frame + max(start, self._done)),
+            duration_s=float(self._durations_s[unit]),
+            confidence=confidence,
+            final=False,
+        )
+        return [*settled, self._open]
+
+    def _settle(self, segments: list[Segment]) -> list[Phone | SpeechChange]:
+        """Put out units as final; the first takes the place of the open one."""
+        phones: list[Phone | SpeechChange] = []
+        for segment in segments:
+            self._done = segment.end
+            if self._open is None and not phones and segment.unit == _SIL:
+                continue  # before the first unit nothing but silence was said
+            onset_s = frame_time_s(self._start_frame + segment.start)
+            confidence = self._open.confidence if self._open else _UNSEEN_CONFIDENCE
+            phones.append(
+                Phone(
+                    index=self._take_index(),
+                    unit=UNITS[segment.unit],
+                    onset_s=onset_s,
+                    duration_s=frame_time_s(self._start_frame + segment.end) - onset_s,
+                    confidence=confidence,
+                    final=True,
+                )
+            )
+            self._open = None
+        return phones
+
+    def _take_index(self) -> int:
+        """Return the open unit's index, or the next one if no unit is open."""
+        if self._open is not None:
+            return self._open.index
+        self._num_phones += 1
+        return self._num_phones - 1
+
+
+def recognize(
+    model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int
+) -> list[Phone]:
+    """Recognise a whole recording with the full traceback (no output rule, nothing provisional).
+
+    Parameters
+    ----------
+    model
+        The acoustic model.
+    samples
+        Shape (n,) or (n, channels), in [-1, 1].
+    sample_rate_hz
+        Their rate.
+
+    Returns
+    -------
+    list of Phone
+        Units of all stretches of speech with their onsets and durations, ``sil`` included.
+    """
+    num_channels = 1 if samples.ndim == 1 else samples.shape[1]
+    scores = SpeechScores(model, sample_rate_hz, num_channels)
+    decoder = Decoder(model.topology)
+    phones: list[Phone] = []
+    offset = 0
+    sureness: list[float] = []
+    for event in [*scores.accept_waveform(samples), *scores.finish()]:
+        if isinstance(event, VoiceBegins):
+            offset = event.frame
+            decoder.reset()
+            sureness = []
+        elif isinstance(event, VoiceEnds):
+            for segment in decoder.finish():
+                onset_s = frame_time_s(offset + segment.start)
+                phones.append(
+                    Phone(
+                        index=len(phones),
+                        unit=UNITS[segment.unit],
+                        onset_s=onset_s,
+                        duration_s=frame_time_s(offset + segment.end) - onset_s,
+                        confidence=float(np.mean(sureness[segment.start : segment.end])),
+                        final=True,
+                    )
+                )
+        else:
+            sureness += [decoder.accept(row)[2] for row in event]
+    return phones

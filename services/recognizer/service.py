@@ -1,0 +1,289 @@
+"""The recognizer as a service: audio chunks in, phones and speech events out.
+
+Reacts to: audio, finish (clients), start, stop, drop (control), ack (synthesizer).
+Emits: phone, speech, progress, spoken (synthesizer, acknowledged), the same phones, speech and the
+sound itself (observers), speech (control), error (clients).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+import time
+
+from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.gmm import load_model
+from services.recognizer.pcm import BadAudio, level_db, pcm16_of, samples_of, slices
+from services.recognizer.pipeline import Recognizer
+from services.recognizer.resample import Resampler
+from shared.bus import Socket
+from shared.clock import to_samples
+from shared.config import RecognizerConfig, reachable
+from shared.logs import LOG
+from shared.messages import (
+    MEDIA_RATE_HZ,
+    Acknowledge,
+    AudioChunk,
+    EndOfAudio,
+    EndOfPhones,
+    Error,
+    Message,
+    PhoneHeard,
+    Progress,
+    Sound,
+    Speech,
+    StartSession,
+)
+from shared.phones import Phone, SpeechChange
+from shared.reliable import ReliableSender
+from shared.service import Service
+
+GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, less is jitter
+BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
+
+
+class _Stream:
+    """One session's audio on its way to phones."""
+
+    def __init__(self, start: StartSession, model: AcousticModel, agreement: int) -> None:
+        self.start = start
+        self.link: ReliableSender | None = None
+        self.sequence_in = 0
+        self.sequence_out = 0
+        self.heard_s = time.monotonic()
+        self.finished = False
+        self.speaking = False
+        self.media_time_in: int | None = None  # of the next chunk, if nothing is lost
+        self._model = model
+        self._agreement = agreement
+        self._next_index = 0
+        self.restart(0)
+
+    def restart(self, media_time: int) -> None:
+        """Begin anew at a media time: after a pause in the stream or an interruption."""
+        self.origin = media_time
+        self.num_samples = 0
+        self._index_base = self._next_index
+        self._resampler = Resampler(self.start.sample_rate_hz, self.start.num_channels)
+        self._recognizer = Recognizer(
+            self._model, sample_rate_hz=MEDIA_RATE_HZ, agreement=self._agreement
+        )
+
+    @property
+    def media_time(self) -> int:
+        """Up to here the audio has been heard."""
+        return self.origin + self.num_samples
+
+    def accept(self, pcm: bytes) -> list[Message]:
+        """Take a chunk in the session's encoding; return what is to be said about it."""
+        samples = samples_of(pcm, self.start.encoding, self.start.num_channels)
+        rate_hz = self.start.sample_rate_hz
+        if self.media_time_in is not None:
+            self.media_time_in += len(samples) * MEDIA_RATE_HZ // rate_hz
+        mono = self._resampler.accept_waveform(samples)
+        messages: list[Message] = [Sound(media_time=self.media_time, pcm=pcm16_of(mono))]
+        for part in slices(mono, self.num_samples):
+            self.num_samples += len(part)
+            messages += self._as_messages(self._recognizer.accept_waveform(part))
+            messages.append(Progress(media_time=self.media_time, level_db=level_db(part)))
+        return messages
+
+    def finish(self) -> list[Message]:
+        """End the audio; return what is left to say."""
+        mono = self._resampler.finish()
+        sound = Sound(media_time=self.media_time, pcm=pcm16_of(mono))
+        self.num_samples += len(mono)
+        results = [*self._recognizer.accept_waveform(mono), *self._recognizer.input_finished()]
+        said = self._as_messages(results)
+        if self.speaking:
+            self.speaking = False
+            said.append(Speech(media_time=self.media_time, active=False))
+        return [sound, *said, Progress(media_time=self.media_time, level_db=-120.0)]
+
+    def _as_messages(self, results: list[Phone | SpeechChange]) -> list[Message]:
+        messages: list[Message] = []
+        for result in results:
+            if isinstance(result, SpeechChange):
+                self.speaking = result.active
+                media_time = self.origin + to_samples(result.time_s)
+                messages.append(Speech(media_time=media_time, active=result.active))
+            else:
+                index = self._index_base + result.index
+                self._next_index = max(self._next_index, index + 1)
+                messages.append(
+                    PhoneHeard(
+                        media_time=self.origin + to_samples(result.onset_s),
+                        index=index,
+                        unit=result.unit,
+                        duration=to_samples(result.duration_s),
+                        confidence=result.confidence,
+                        final=result.final,
+                    )
+                )
+        return messages
+
+
+class RecognizerService(Service):
+    """The recognizer process."""
+
+    name = "recognizer"
+
+    def __init__(self, config: RecognizerConfig) -> None:
+        super().__init__(config)
+        self._agreement = config.agreement
+        self._streams: dict[str, _Stream] = {}
+        self._synthesizers: dict[str, Socket] = {}  # by endpoint
+        self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
+        self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
+        self.endpoints = {
+            "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),
+            "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
+        }
+        self._model = load_model()
+        self.listen(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_finish})
+        self.listen(self._phones, {})
+
+    def start_session(self, start: StartSession) -> bool:
+        """Make a stream, or after a crash of the synthesizer give the old one a new link."""
+        stream = self._streams.get(start.session)
+        if stream is None or stream.start.token != start.token:
+            stream = _Stream(start, self._model, self._agreement)
+            self._streams[start.session] = stream
+        if stream.link is None or stream.start.epoch != start.epoch:
+            stream.start = start
+            socket = self._connect(start.phone_input)
+            stream.link = ReliableSender(socket, start.session, start.epoch)
+        return True
+
+    def stop_session(self, session: str) -> None:
+        """Forget a session."""
+        self._streams.pop(session, None)
+
+    def flush_session(self, session: str) -> None:
+        """Forget what was being said; the next audio begins anew."""
+        stream = self._streams.get(session)
+        if stream is not None:
+            stream.restart(stream.media_time)
+            if stream.speaking:
+                stream.speaking = False
+                self._say(stream, [Speech(media_time=stream.media_time, active=False)])
+
+    def on_tick(self, now_s: float) -> None:
+        """Repeat what the synthesizer did not acknowledge, and let audio wait if it is behind."""
+        backlog = 0
+        for stream in self._streams.values():
+            if stream.link is not None:
+                self.metrics.count("resent", stream.link.tick(now_s))
+                backlog = max(backlog, stream.link.backlog)
+        self.pause(self._audio, paused=backlog > BACKLOG_LIMIT)
+
+    def on_drain(self) -> bool:
+        """Finish every utterance and wait until the synthesizer has it."""
+        for stream in self._streams.values():
+            self._finish(stream)
+        return all(s.link is None or s.link.backlog == 0 for s in self._streams.values())
+
+    def idle_s(self) -> dict[str, float]:
+        """Return the seconds since each session's last audio."""
+        now_s = time.monotonic()
+        return {name: now_s - stream.heard_s for name, stream in self._streams.items()}
+
+    # --- from clients ----------------------------------------------------------------------------
+
+    def _on_audio(self, chunk: AudioChunk, sender: bytes) -> None:
+        stream = self._admit(chunk, sender)
+        if stream is None:
+            return
+        started_s = time.perf_counter()
+        if stream.media_time_in is None:
+            stream.restart(chunk.media_time)
+            stream.media_time_in = chunk.media_time
+        elif chunk.media_time > stream.media_time_in + GAP:
+            self.metrics.count("audio_gaps")
+            self._say(stream, stream.finish())
+            stream.restart(chunk.media_time)
+            stream.media_time_in = chunk.media_time
+        try:
+            said = stream.accept(chunk.pcm)
+        except BadAudio as error:
+            self._refuse(chunk, sender, "bad-audio", str(error))
+            return
+        self._say(stream, said)
+        self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
+
+    def _on_finish(self, end: EndOfAudio, sender: bytes) -> None:
+        stream = self._admit(end, sender)
+        if stream is not None:
+            self._finish(stream)
+
+    def _admit(self, message: AudioChunk | EndOfAudio, sender: bytes) -> _Stream | None:
+        """Return the session's stream if the sender may write to it, in order."""
+        stream = self._streams.get(message.session)
+        if stream is None:
+            text = f"there is no session {message.session!r} here; open it at control"
+            self._refuse(message, sender, "unknown-session", text)
+        elif not secrets.compare_digest(stream.start.token.encode(), message.token.encode()):
+            text = f"the token is not that of session {message.session!r}"
+            self._refuse(message, sender, "bad-token", text)
+        elif stream.finished:
+            text = f"session {message.session!r} has ended; open another"
+            self._refuse(message, sender, "finished", text)
+        elif message.sequence <= stream.sequence_in:
+            text = f"sequence {message.sequence} came after {stream.sequence_in}; it must grow"
+            self._refuse(message, sender, "replayed", text)
+        else:
+            stream.sequence_in = message.sequence
+            stream.heard_s = time.monotonic()
+            return stream
+        return None
+
+    def _refuse(self, message: Message, sender: bytes, code: str, text: str) -> None:
+        self.warn(code, text, message.session)
+        self._audio.send(
+            Error(session=message.session, media_time=message.media_time, code=code, text=text),
+            to=sender,
+        )
+
+    # --- out -------------------------------------------------------------------------------------
+
+    def _finish(self, stream: _Stream) -> None:
+        if not stream.finished:
+            stream.finished = True
+            self._say(stream, [*stream.finish(), EndOfPhones(media_time=stream.media_time)])
+            LOG.info("end of audio", extra={"session": stream.start.session})
+
+    def _say(self, stream: _Stream, messages: list[Message]) -> None:
+        now_s = time.monotonic()
+        for message in messages:
+            if isinstance(message, Sound):
+                stream.sequence_out += 1
+                self._phones.send(_addressed(message, stream))
+                continue
+            if stream.link is not None:
+                stream.link.send(message, now_s)
+            if isinstance(message, PhoneHeard | Speech):
+                stream.sequence_out += 1
+                self._phones.send(_addressed(message, stream))
+            if isinstance(message, Speech) and self.control is not None:
+                self.control.send(_addressed(message, stream))
+
+    def _connect(self, endpoint: str) -> Socket:
+        if endpoint not in self._synthesizers:
+            socket = self.bus.connect_dealer(endpoint)
+            self._synthesizers[endpoint] = socket
+            self.listen(socket, {Acknowledge: self._on_acknowledge, Error: self._on_error})
+        return self._synthesizers[endpoint]
+
+    def _on_acknowledge(self, ack: Acknowledge, _sender: bytes) -> None:
+        stream = self._streams.get(ack.session)
+        if stream is not None and stream.link is not None and ack.epoch == stream.start.epoch:
+            stream.link.acknowledge(ack.sequence, time.monotonic())
+
+
+def _addressed(message: Message, stream: _Stream) -> Message:
+    return dataclasses.replace(
+        message,
+        session=stream.start.session,
+        epoch=stream.start.epoch,
+        sequence=stream.sequence_out,
+    )

@@ -1,0 +1,177 @@
+"""Streams audio to a running system, in real time or as fast as it is taken."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from shared.audio_file import AudioSource, Samples
+from shared.bus import Socket
+from shared.client import Client, Session
+from shared.errors import UserError
+from shared.messages import EndOfFaps, Event, PhoneHeard
+from shared.phones import SILENCE
+
+QUEUE_WAIT_S = 0.005
+END_LIMIT_S = 30.0  # for the last frames after the last sample
+VIDEO_LIMIT_S = 3600.0
+QUIET_PEAK = 1e-3  # below this (-60 dBFS) a file is called silent
+CLIPPED_SHARE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Spoken:
+    """What came of streaming one source."""
+
+    session: str
+    duration_s: float
+    num_phones: int
+    video: str  # path on the driver's host, empty if none was recorded
+
+
+def speak(
+    source: AudioSource,
+    control: str,
+    console: Console,
+    *,
+    session: str = "",
+    record: bool = False,
+    paced: bool = True,
+) -> Spoken:
+    """Stream a source through a running system and wait until its last frame is out.
+
+    Raises
+    ------
+    UserError
+        If the system does not answer, refuses the session or stops answering.
+    """
+    with Client(control) as client:
+        opened = client.open_session(
+            session=session,
+            encoding="f32le",
+            sample_rate_hz=source.sample_rate_hz,
+            num_channels=source.num_channels,
+            record=record,
+            paced=paced,
+        )
+        output = opened.subscribe(EndOfFaps)
+        phones = opened.subscribe(PhoneHeard)
+        events = client.bus.connect_subscriber(opened.opened.events)
+        events.subscribe(Event, opened.name)
+        try:
+            duration_s, clipped, peak = _stream(source, opened, events, console, paced=paced)
+            opened.finish()
+            _wait_for_end(output, opened, events, console)
+            num_phones = _count_phones(phones)
+            video = _wait_for_video(events, console) if record else ""
+        finally:
+            with contextlib.suppress(UserError):  # closed already, or control is gone
+                opened.close()
+    _comment(console, source.name, num_phones, clipped, peak)
+    return Spoken(opened.name, duration_s, num_phones, video)
+
+
+def _stream(
+    source: AudioSource, session: Session, events: Socket, console: Console, *, paced: bool
+) -> tuple[float, float, float]:
+    """Send everything; return seconds sent, the share of clipped samples and the peak."""
+    num_sent = num_clipped = 0
+    peak = 0.0
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
+        begin_s = time.monotonic()
+        try:
+            for block in source.blocks:
+                _send(session, block)
+                num_sent += len(block)
+                num_clipped += int(np.count_nonzero(np.abs(block) >= 0.999).item())
+                peak = max(peak, float(np.abs(block).max()))
+                sent_s = num_sent / source.sample_rate_hz
+                progress.update(task, completed=sent_s)
+                _heed(session, events, console)
+                if paced and source.duration_s is not None:
+                    time.sleep(max(0.0, begin_s + sent_s - time.monotonic()))
+        except KeyboardInterrupt:
+            console.print("stopping")
+    duration_s = num_sent / source.sample_rate_hz
+    return duration_s, num_clipped / max(1, num_sent * source.num_channels), peak
+
+
+def _send(session: Session, block: Samples) -> None:
+    end_s = time.monotonic() + END_LIMIT_S
+    while not session.send(block):
+        if time.monotonic() > end_s:
+            raise UserError(
+                f"the recognizer has taken no audio for {END_LIMIT_S:g} s; is it running?"
+            )
+        time.sleep(QUEUE_WAIT_S)
+
+
+def _wait_for_end(output: Socket, session: Session, events: Socket, console: Console) -> None:
+    """Wait for the last frame; with much audio queued that may take a while."""
+    while True:
+        if output.wait(0.2) and any(isinstance(r.message, EndOfFaps) for r in output.receive()):
+            return
+        _heed(session, events, console)
+
+
+def _heed(session: Session, events: Socket, console: Console) -> None:
+    """Show what the services complain about.
+
+    Raises
+    ------
+    UserError
+        If the session is lost.
+    """
+    for error in session.errors():
+        console.print(f"[yellow]{error.code}: {error.text}")
+        if error.code in ("unknown-session", "bad-token", "finished"):
+            raise UserError("the session was lost; speak again to open a new one")
+    for received in events.receive():
+        event = received.message
+        if isinstance(event, Event) and event.name == "session-closed":
+            raise UserError(f"the session was closed: {event.detail}")
+        if isinstance(event, Event) and event.name == "error":
+            console.print(f"[yellow]{event.detail}")
+
+
+def _count_phones(phones: Socket) -> int:
+    indices: set[int] = set()
+    while phones.wait(0.0):
+        for received in phones.receive():
+            message = received.message
+            if isinstance(message, PhoneHeard) and message.unit != SILENCE:
+                indices.add(message.index)
+    return len(indices)
+
+
+def _wait_for_video(events: Socket, console: Console) -> str:
+    end_s = time.monotonic() + VIDEO_LIMIT_S
+    with console.status("writing the video"):
+        while time.monotonic() < end_s:
+            if not events.wait(0.2):
+                continue
+            for received in events.receive():
+                event = received.message
+                if isinstance(event, Event) and event.name == "recorded":
+                    return event.detail
+                if isinstance(event, Event) and event.name in ("error", "session-closed"):
+                    console.print(f"[yellow]no video: {event.detail}")
+                    return ""
+    raise UserError("the driver wrote no video; see 'kouxing status'")
+
+
+def _comment(console: Console, name: str, num_phones: int, clipped: float, peak: float) -> None:
+    if num_phones == 0:
+        reason = "it is silent" if peak < QUIET_PEAK else "is there a voice in it?"
+        console.print(f"[yellow]{name}: no speech was heard; {reason}")
+    if clipped > CLIPPED_SHARE:
+        console.print(
+            f"[yellow]{name}: {clipped:.0%} of the samples are clipped; record at a lower level"
+        )

@@ -1,0 +1,1 @@
+"""Synthesizer: phones in, FAP frames out."""

@@ -1,0 +1,9 @@
+"""Runs the synthesizer as a process of its own."""
+
+import sys
+
+from services.command_line import main
+
+if __name__ == "__main__":
+    sys.argv.insert(1, "synthesizer")
+    main()

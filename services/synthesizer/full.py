@@ -1,0 +1,67 @@
+"""The full model, offline: units with their times in, all FAP frames out.
+
+Source: Wang & Cai 2003, eq. 6: every frame blends all visemes and silences. Li et al. 2011, 3.2,
+schemes 1 (units of a forced alignment) and 2 (recognised units with their times).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.synthesizer.blending import blend
+from services.synthesizer.parameters import VisemeParameters
+from services.synthesizer.timeline import Timeline, build_timeline
+from services.synthesizer.visemes import MOUTH_FAPS
+from shared.faps import NUM_FAPS
+from shared.phones import Phone
+
+_BLOCK_S = 2.0
+# Further away a viseme weighs less than a face can show, whatever its parameters.
+_REACH_S = 1.5
+
+
+def synthesize(
+    parameters: VisemeParameters,
+    phones: Sequence[Phone],
+    num_frames: int,
+    frame_rate_hz: float = 50.0,
+) -> NDArray[np.float32]:
+    """FAP frames of an utterance.
+
+    Parameters
+    ----------
+    parameters : VisemeParameters
+    phones : sequence of Phone
+        With their true times; holes between them and ``sil`` are pauses.
+    num_frames : int
+        Frame ``k`` is at ``k / frame_rate_hz`` seconds.
+    frame_rate_hz : float
+
+    Returns
+    -------
+    array (num_frames, 68)
+        FAP units.
+    """
+    timeline = build_timeline(phones)
+    time_s = np.arange(num_frames) / frame_rate_hz
+    faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
+    block = max(int(_BLOCK_S * frame_rate_hz), 1)
+    for first in range(0, num_frames, block):
+        times = time_s[first : first + block]
+        near = _within(timeline, times[0] - _REACH_S, times[-1] + _REACH_S)
+        faps[first : first + block, np.array(MOUTH_FAPS) - 1] = blend(parameters, near, times)
+    return faps
+
+
+def _within(timeline: Timeline, start_s: float, end_s: float) -> Timeline:
+    near = timeline.select((timeline.centre_end_s >= start_s) & (timeline.centre_start_s <= end_s))
+    silent = (timeline.silence_end_s >= start_s) & (timeline.silence_start_s <= end_s)
+    return replace(
+        near,
+        silence_start_s=timeline.silence_start_s[silent],
+        silence_end_s=timeline.silence_end_s[silent],
+    )

@@ -1,0 +1,1 @@
+"""What more than one service uses: messages, codec, bus, service loop, phones, FAPs."""

@@ -1,0 +1,163 @@
+"""Audio files and microphones as blocks of samples."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import soundfile
+import soxr
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+
+LOWEST_RATE_HZ = 8_000
+HIGHEST_RATE_HZ = 48_000  # what the wire carries; files above are resampled to it
+Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
+
+
+@dataclass(frozen=True, slots=True)
+class AudioSource:
+    """Audio as it comes: a rate, one or two channels, and blocks of shape ``(n, channels)``."""
+
+    name: str
+    sample_rate_hz: int
+    num_channels: int
+    duration_s: float | None  # None where the end is not known
+    blocks: Iterator[Samples]
+
+
+def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
+    """Open an audio file (wav, flac, ogg, mp3, ...) for reading block by block.
+
+    Files above 48 kHz are resampled to 48 kHz, and channels beyond the second are left out.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, empty, no audio, below 8 kHz, or (while reading) holds samples
+        that are no numbers.
+    """
+    try:
+        file = soundfile.SoundFile(path)
+    except (soundfile.LibsndfileError, OSError) as error:
+        if not path.is_file():
+            raise UserError(f"{path}: there is no such file") from None
+        if path.stat().st_size == 0:
+            raise UserError(f"{path}: the file is empty") from None
+        raise UserError(
+            f"{path}: this is no audio that can be read ({error}); give wav, flac, ogg or mp3"
+        ) from None
+    if file.frames == 0:
+        raise UserError(f"{path}: the file holds no samples; was the recording cut off?")
+    if file.samplerate < LOWEST_RATE_HZ:
+        raise UserError(
+            f"{path}: {file.samplerate} Hz is too low for speech; give {LOWEST_RATE_HZ} Hz or more"
+        )
+    rate_hz = min(file.samplerate, HIGHEST_RATE_HZ)
+    return AudioSource(
+        name=path.name,
+        sample_rate_hz=rate_hz,
+        num_channels=min(2, file.channels),
+        duration_s=file.frames / file.samplerate,
+        blocks=_file_blocks(file, path, rate_hz, block_s),
+    )
+
+
+def read_audio(path: Path) -> tuple[Samples, int]:
+    """Return all samples of a file, shape ``(n, channels)``, and their rate in Hz.
+
+    Raises
+    ------
+    UserError
+        As ``open_audio``.
+    """
+    source = open_audio(path, block_s=1.0)
+    return np.concatenate(list(source.blocks)), source.sample_rate_hz
+
+
+def raw_audio(stream: IO[bytes], sample_rate_hz: int, num_channels: int) -> AudioSource:
+    """Read raw little-endian int16 samples from a pipe."""
+
+    def blocks() -> Iterator[Samples]:
+        frame_bytes = 2 * num_channels
+        rest = b""
+        while data := stream.read(frame_bytes * sample_rate_hz // 50):
+            data = rest + data
+            whole = len(data) - len(data) % frame_bytes
+            rest = data[whole:]
+            pcm = np.frombuffer(data[:whole], "<i2").reshape(-1, num_channels)
+            yield pcm.astype(np.float32) / np.float32(32768)
+
+    return AudioSource("standard input", sample_rate_hz, num_channels, None, blocks())
+
+
+def microphone(sample_rate_hz: int = 16_000) -> AudioSource:
+    """Read the default microphone until interrupted.
+
+    Raises
+    ------
+    UserError
+        If the system has no sound library or no microphone.
+    """
+    try:
+        import sounddevice  # noqa: PLC0415 - fails to import where PortAudio is missing
+    except OSError:
+        raise UserError(
+            "the microphone needs the PortAudio library: apt-get install libportaudio2"
+        ) from None
+    heard: queue.SimpleQueue[Samples] = queue.SimpleQueue()
+    try:
+        stream = sounddevice.InputStream(
+            samplerate=sample_rate_hz,
+            channels=1,
+            dtype="float32",
+            blocksize=sample_rate_hz // 50,
+            callback=lambda data, *_: heard.put(data.copy()),
+        )
+    except (sounddevice.PortAudioError, ValueError) as error:
+        raise UserError(f"no microphone can be opened: {error}") from None
+
+    def blocks() -> Iterator[Samples]:
+        with stream:
+            while True:
+                yield heard.get()
+
+    return AudioSource("microphone", sample_rate_hz, 1, None, blocks())
+
+
+def _file_blocks(
+    file: soundfile.SoundFile, path: Path, rate_hz: int, block_s: float
+) -> Iterator[Samples]:
+    num_channels = min(2, file.channels)
+    resampler = (
+        soxr.ResampleStream(file.samplerate, rate_hz, num_channels, dtype="float32")
+        if rate_hz != file.samplerate
+        else None
+    )
+    num_read = 0
+    with file:
+        while True:
+            try:
+                block = file.read(round(block_s * file.samplerate), "float32", always_2d=True)
+            except soundfile.LibsndfileError as error:
+                raise UserError(
+                    f"{path}: damaged at {num_read / file.samplerate:.2f} s: {error}"
+                ) from None
+            if not np.isfinite(block).all():
+                raise UserError(
+                    f"{path}: NaN or infinite samples near {num_read / file.samplerate:.2f} s; "
+                    "export the file again, for example as 16-bit PCM"
+                )
+            num_read += len(block)
+            samples = np.clip(block[:, :num_channels], -1.0, 1.0)
+            if resampler is not None:
+                samples = resampler.resample_chunk(samples, last=len(block) == 0)
+            if len(samples):
+                yield np.ascontiguousarray(samples, np.float32)
+            if len(block) == 0:
+                return

@@ -1,0 +1,264 @@
+"""ZeroMQ sockets that carry messages; the only module that imports zmq.
+
+Services bind, clients connect. Every socket has explicit limits on message size, queue length and
+linger; what is no message is returned as ``BadMessage`` and costs nobody else anything.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import secrets
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import zmq
+
+from shared.codec import BadMessage, decode, encode, topic
+from shared.errors import UserError
+from shared.messages import MAX_MESSAGE_BYTES, Joined, Message
+
+QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
+MAX_PARTS = 4
+MAX_BATCH = 200  # messages taken from one socket before the others get their turn
+RECONNECT_MS = (50, 1000)
+HANDSHAKE_MS = 2000
+_SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
+_ENDPOINT = re.compile(r"^tcp://(?P<host>\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.*-]+):(?P<port>\d{1,5}|\*)$")
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One message, or why the parts were none, and who sent it (ROUTER sockets only)."""
+
+    message: Message | BadMessage
+    sender: bytes = b""
+
+
+def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
+    """Return host and port of ``tcp://host:port``.
+
+    Raises
+    ------
+    UserError
+        Naming the configuration key, if the endpoint is not of that form.
+    """
+    match = _ENDPOINT.match(endpoint)
+    if match is None or (match["port"] != "*" and int(match["port"]) > 65535):
+        raise UserError(f"{key}: {endpoint!r} is no endpoint; write tcp://HOST:PORT")
+    return match["host"], match["port"]
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address can only be reached from this machine."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+class Socket:
+    """One ZeroMQ socket that sends and receives messages, never blocking."""
+
+    def __init__(self, raw: zmq.Socket[bytes], *, routes: bool, publishes: bool) -> None:
+        self._raw = raw
+        self._routes = routes
+        self._publishes = publishes
+        self._name = secrets.token_hex(8)
+
+    @property
+    def endpoint(self) -> str:
+        """The endpoint that was bound, with its port."""
+        return self._raw.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    @property
+    def file_descriptor(self) -> int:
+        """Readable when something may have happened (edge-triggered)."""
+        return int(self._raw.getsockopt(zmq.FD))
+
+    def send(self, message: Message, *, to: bytes = b"") -> bool:
+        """Send a message, on a ROUTER to one peer; return whether it could be queued."""
+        parts = encode(message)
+        if self._routes:
+            parts.insert(0, to)
+        try:
+            self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
+        except zmq.Again:
+            return False
+        return True
+
+    def send_raw(self, parts: list[bytes]) -> None:
+        """Send parts as they are; for tests that play a broken peer."""
+        self._raw.send_multipart(parts)
+
+    def subscribe(self, kind: type[Message], session: str | None) -> None:
+        """Subscribe to a kind of message, of one session or (None) of all."""
+        self._raw.setsockopt(zmq.SUBSCRIBE, _filter(kind, session))
+
+    def subscribe_session(self, kinds: Iterable[type[Message]], session: str) -> None:
+        """Subscribe to kinds of message of one session, and ask for confirmation.
+
+        Every publisher answers with one ``joined`` message once all of them are in effect there:
+        subscriptions keep their order, and that to ``joined`` goes last.
+        """
+        for kind in (*kinds, Joined):
+            self.subscribe(kind, session)
+
+    def unsubscribe(self, kind: type[Message], session: str | None) -> None:
+        """Take a subscription back."""
+        self._raw.setsockopt(zmq.UNSUBSCRIBE, _filter(kind, session))
+
+    def receive(self) -> Iterator[Received]:
+        """Yield what has arrived, up to a fair batch.
+
+        On a publishing socket a new subscription to ``joined/<session>/`` is answered with a
+        ``joined`` message, so that subscribers know from when on they miss nothing.
+        """
+        for _ in range(MAX_BATCH):
+            try:
+                parts = self._raw.recv_multipart(flags=zmq.DONTWAIT)
+            except zmq.Again:
+                return
+            if self._publishes:
+                self._greet(parts)
+                continue
+            sender = parts.pop(0) if self._routes else b""
+            if len(parts) > MAX_PARTS:
+                yield Received(BadMessage("parts", "too many parts"), sender)
+                continue
+            try:
+                yield Received(decode(parts), sender)
+            except BadMessage as error:
+                yield Received(error, sender)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Return whether something arrived within the time."""
+        return bool(self._raw.poll(int(timeout_s * 1000)))
+
+    def close(self) -> None:
+        """Close; queued messages have up to a second to leave."""
+        self._raw.close(linger=1000)
+
+    @property
+    def raw(self) -> zmq.Socket[bytes]:
+        """For the poller of this module only."""
+        return self._raw
+
+    def _greet(self, parts: list[bytes]) -> None:
+        prefix = f"\x01{Joined.kind}/".encode()
+        session = parts[0].removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
+        if parts[0].startswith(prefix) and _SESSION.match(session):
+            self.send(Joined(session=session, publisher=self._name))
+
+
+def _filter(kind: type[Message], session: str | None) -> bytes:
+    return f"{kind.kind}/".encode() if session is None else topic(kind, session)
+
+
+class Bus:
+    """The sockets of one process."""
+
+    def __init__(self) -> None:
+        self._context = zmq.Context()
+        self._sockets: list[Socket] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def bind_router(self, endpoint: str, key: str) -> Socket:
+        """Bind a socket that many peers send commands or data to."""
+        return self._bind(zmq.ROUTER, endpoint, key)
+
+    def bind_publisher(self, endpoint: str, key: str) -> Socket:
+        """Bind a socket that many peers subscribe to."""
+        return self._bind(zmq.XPUB, endpoint, key)
+
+    def connect_dealer(self, endpoint: str) -> Socket:
+        """Connect to a router; messages queue until it is there."""
+        return self._connect(zmq.DEALER, endpoint)
+
+    def connect_subscriber(self, *endpoints: str) -> Socket:
+        """Connect to publishers; nothing arrives before ``subscribe``."""
+        return self._connect(zmq.SUB, *endpoints)
+
+    def poller(self) -> Poller:
+        """Return a poller for sockets of this bus."""
+        return Poller()
+
+    def drop(self, socket: Socket) -> None:
+        """Close one socket early."""
+        self._sockets.remove(socket)
+        socket.close()
+
+    def close(self) -> None:
+        """Close every socket and the context."""
+        for socket in self._sockets:
+            socket.close()
+        self._sockets.clear()
+        self._context.term()
+
+    def _open(self, kind: int) -> zmq.Socket[bytes]:
+        raw = self._context.socket(kind)
+        raw.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        raw.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
+        raw.setsockopt(zmq.RCVHWM, QUEUE_LENGTH)
+        raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
+        raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
+        raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        raw.setsockopt(zmq.LINGER, 0)
+        return raw
+
+    def _bind(self, kind: int, endpoint: str, key: str) -> Socket:
+        split_endpoint(endpoint, key)
+        raw = self._open(kind)
+        raw.setsockopt(zmq.IPV6, "[" in endpoint)
+        if kind == zmq.XPUB:
+            raw.setsockopt(zmq.XPUB_VERBOSE, 1)
+        try:
+            raw.bind(endpoint)
+        except zmq.ZMQError as error:
+            raw.close(linger=0)
+            raise UserError(
+                f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
+                "is another system running, or the address not this host's?"
+            ) from None
+        socket = Socket(raw, routes=kind == zmq.ROUTER, publishes=kind == zmq.XPUB)
+        self._sockets.append(socket)
+        return socket
+
+    def _connect(self, kind: int, *endpoints: str) -> Socket:
+        raw = self._open(kind)
+        for endpoint in endpoints:
+            split_endpoint(endpoint, "endpoint")
+            raw.setsockopt(zmq.IPV6, "[" in endpoint)
+            raw.connect(endpoint)
+        socket = Socket(raw, routes=False, publishes=False)
+        self._sockets.append(socket)
+        return socket
+
+
+class Poller:
+    """Waits on several sockets at once."""
+
+    def __init__(self) -> None:
+        self._poller = zmq.Poller()
+        self._sockets: dict[zmq.Socket[bytes], Socket] = {}
+
+    def add(self, socket: Socket) -> None:
+        """Watch a socket."""
+        self._sockets[socket.raw] = socket
+        self._poller.register(socket.raw, zmq.POLLIN)
+
+    def remove(self, socket: Socket) -> None:
+        """Stop watching a socket."""
+        del self._sockets[socket.raw]
+        self._poller.unregister(socket.raw)
+
+    def wait(self, timeout_s: float) -> list[Socket]:
+        """Return the sockets that have something, in the order they were added."""
+        ready = dict(self._poller.poll(max(0, int(timeout_s * 1000))))
+        return [socket for raw, socket in self._sockets.items() if raw in ready]

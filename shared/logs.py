@@ -1,0 +1,55 @@
+"""JSON lines on standard error, with the session where one is concerned; never what was said."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import time
+
+LOG = logging.getLogger("kouxing")
+
+
+class _JsonFormatter(logging.Formatter):
+    def __init__(self, service: str) -> None:
+        super().__init__()
+        self._service = service
+
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, object] = {
+            "time": round(record.created, 3),
+            "level": record.levelname.lower(),
+            "service": self._service,
+            "message": record.getMessage(),
+        }
+        session = getattr(record, "session", "")
+        if session:
+            line["session"] = session
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line, ensure_ascii=False)
+
+
+class RateLimit:
+    """Lets a warning of one kind through at most once in ``period_s``."""
+
+    def __init__(self, period_s: float = 5.0) -> None:
+        self._period_s = period_s
+        self._last_s: dict[str, float] = {}
+
+    def allows(self, name: str) -> bool:
+        """Return whether a warning of this kind may be written now."""
+        now_s = time.monotonic()
+        if now_s - self._last_s.get(name, -self._period_s) < self._period_s:
+            return False
+        self._last_s[name] = now_s
+        return True
+
+
+def configure(service: str, level: str) -> None:
+    """Send this process's log to standard error as JSON lines."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonFormatter(service))
+    LOG.handlers[:] = [handler]
+    LOG.setLevel(level.upper())
+    LOG.propagate = False

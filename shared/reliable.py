@@ -1,0 +1,105 @@
+"""A stream of messages that survives a reconnect.
+
+Sequence numbers, cumulative acknowledgement and a ring of what was not acknowledged yet: ZeroMQ
+drops what is in flight when a peer goes away, and a high-water mark does not prevent it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+
+from shared.bus import Socket
+from shared.messages import Acknowledge, Message
+
+RESEND_AFTER_S = 0.5
+ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
+MAX_UNACKNOWLEDGED = 4096  # beyond this the oldest are let go: the face lives in the present
+
+
+class ReliableSender:
+    """The sending end for one session."""
+
+    def __init__(self, socket: Socket, session: str, epoch: int) -> None:
+        self._socket = socket
+        self._session = session
+        self._epoch = epoch
+        self._next = 1
+        self._waiting: deque[Message] = deque(maxlen=MAX_UNACKNOWLEDGED)
+        self._heard_s = 0.0
+
+    @property
+    def backlog(self) -> int:
+        """Number of messages not acknowledged yet."""
+        return len(self._waiting)
+
+    def send(self, message: Message, now_s: float) -> Message:
+        """Send a message with the next number; return it as it was sent."""
+        numbered = dataclasses.replace(
+            message, session=self._session, epoch=self._epoch, sequence=self._next
+        )
+        self._next += 1
+        if not self._waiting:
+            self._heard_s = now_s
+        self._waiting.append(numbered)
+        self._socket.send(numbered)
+        return numbered
+
+    def acknowledge(self, up_to: int, now_s: float) -> None:
+        """Forget what the receiver has."""
+        while self._waiting and self._waiting[0].sequence <= up_to:
+            self._waiting.popleft()
+            self._heard_s = now_s
+
+    def tick(self, now_s: float) -> int:
+        """Send again what has waited too long; return how many messages that were."""
+        if not self._waiting or now_s - self._heard_s < RESEND_AFTER_S:
+            return 0
+        self._heard_s = now_s
+        for message in self._waiting:
+            self._socket.send(message)
+        return len(self._waiting)
+
+
+class ReliableReceiver:
+    """The receiving end for one session: each message once and in order."""
+
+    def __init__(self, socket: Socket, session: str) -> None:
+        self._socket = socket
+        self._session = session
+        self._epoch = -1
+        self._last = 0
+        self._acknowledged = 0
+        self._peer = b""
+
+    def accept(self, message: Message, sender: bytes) -> bool:
+        """Return whether this message is the next one; others are to be ignored.
+
+        The first message of a greater epoch starts anew at whatever number it carries.
+        """
+        self._peer = sender
+        if message.epoch < self._epoch:
+            return False
+        if message.epoch > self._epoch:
+            self._epoch = message.epoch
+            self._last = message.sequence - 1
+            self._acknowledged = self._last
+        if message.sequence != self._last + 1:
+            self._send_acknowledgement()  # tells what to send again, if anything
+            return False
+        self._last = message.sequence
+        if self._last - self._acknowledged >= ACKNOWLEDGE_EVERY:
+            self._send_acknowledgement()
+        return True
+
+    def tick(self) -> None:
+        """Acknowledge what came since the last time."""
+        if self._last > self._acknowledged:
+            self._send_acknowledgement()
+
+    def _send_acknowledgement(self) -> None:
+        self._acknowledged = self._last
+        self._socket.send(
+            Acknowledge(session=self._session, epoch=self._epoch, sequence=self._last),
+            to=self._peer,
+        )

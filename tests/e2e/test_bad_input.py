@@ -1,0 +1,256 @@
+"""Bad input of every kind: a clear answer, no service dies, other sessions go on."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import zmq
+
+from shared.bus import Bus, Socket
+from shared.client import Client, Refused, Session
+from shared.messages import (
+    AudioChunk,
+    EndOfAudio,
+    Error,
+    FapFrame,
+    Heartbeat,
+    Message,
+    OpenSession,
+    PhoneHeard,
+    Progress,
+)
+from tests.e2e.following import samples_of_file, stream
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+
+
+@pytest.fixture
+def client(system: System) -> Iterator[Client]:
+    with Client(system.control) as made:
+        yield made
+
+
+@pytest.fixture
+def witness(system: System, client: Client) -> Iterator[Session]:
+    """Another session, which must go on whatever happens to the tested one."""
+    opened = client.open_session(encoding="f32le", paced=False)
+    output = opened.subscribe(FapFrame)
+    yield opened
+    opened.send(samples_of_file(DEMO / "hello-female.wav")[:16000])
+    end_s = time.monotonic() + 10
+    num_frames = 0
+    while num_frames < 40:
+        assert time.monotonic() < end_s, "the other session does not go on"
+        output.wait(0.1)
+        num_frames += sum(isinstance(r.message, FapFrame) for r in output.receive())
+    opened.close()
+    system.assert_all_alive()
+
+
+def answers(socket: Socket, deadline_s: float = 5.0) -> Iterator[Error]:
+    end_s = time.monotonic() + deadline_s
+    while time.monotonic() < end_s:
+        socket.wait(0.1)
+        for received in socket.receive():
+            if isinstance(received.message, Error):
+                yield received.message
+
+
+def first_error(session: Session) -> Error:
+    end_s = time.monotonic() + 5
+    while time.monotonic() < end_s:
+        for error in session.errors():
+            return error
+        time.sleep(0.02)
+    raise AssertionError("no error came")
+
+
+def test_nan_is_refused_and_the_session_goes_on(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="f32le")
+    session.send(np.array([0.0, np.nan, 0.0], np.float32))
+    assert first_error(session).code == "bad-audio"
+    output = session.subscribe(FapFrame)
+    session.send(np.zeros(8000, np.float32))
+    assert output.wait(5.0)
+    session.close()
+
+
+def test_half_a_sample_is_refused(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="s16le", num_channels=2)
+    session.send_pcm(b"\0" * 6, 1)
+    error = first_error(session)
+    assert error.code == "bad-audio"
+    assert "2 channels" in error.text
+    session.close()
+
+
+def test_empty_chunks_and_silence_and_clipping_are_taken(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="f32le", paced=False)
+    output = session.subscribe(FapFrame)
+    session.send(np.zeros(0, np.float32))
+    session.send(np.zeros(8000, np.float32))
+    session.send(np.full(8000, 1e9, np.float32))
+    end_s = time.monotonic() + 10
+    newest = -1
+    while newest < 12000:
+        assert time.monotonic() < end_s
+        output.wait(0.1)
+        for received in output.receive():
+            assert isinstance(received.message, FapFrame)
+            assert np.isfinite(np.frombuffer(received.message.values, "<f4")).all()
+            newest = received.message.media_time
+    assert list(session.errors()) == []
+    session.close()
+
+
+def test_an_unknown_session_is_named(system: System, client: Client, witness: Session) -> None:
+    audio = client.bus.connect_dealer(witness.opened.audio)
+    audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))
+    error = next(answers(audio))
+    assert (error.code, error.session) == ("unknown-session", "nobody")
+    with pytest.raises(Refused, match="nobody") as caught:
+        client.close_session("nobody", "t")
+    assert caught.value.code == "unknown-session"
+
+
+def test_a_foreign_token_and_a_replay_are_refused(client: Client, witness: Session) -> None:
+    thief = client.bus.connect_dealer(witness.opened.audio)
+    thief.send(AudioChunk(session=witness.name, token="guess", sequence=1, pcm=b""))
+    thief.send(EndOfAudio(session=witness.name, token="guess", sequence=2))
+    codes = answers(thief)
+    assert [next(codes).code, next(codes).code] == ["bad-token", "bad-token"]
+    with pytest.raises(Refused) as caught:
+        client.close_session(witness.name, "guess")
+    assert caught.value.code == "bad-token"
+    token = witness.opened.token
+    witness.send(np.zeros(320, np.float32))
+    time.sleep(0.2)
+    thief.send(AudioChunk(session=witness.name, token=token, sequence=1, pcm=b""))
+    assert next(answers(thief)).code == "replayed"
+
+
+def test_a_second_client_with_the_same_name_is_refused(
+    system: System, client: Client, witness: Session
+) -> None:
+    with Client(system.control) as other, pytest.raises(Refused, match="choose another name"):
+        other.open_session(session=witness.name)
+
+
+def test_audio_after_the_end_is_refused(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="f32le")
+    session.finish()
+    session.send(np.zeros(320, np.float32))
+    assert first_error(session).code == "finished"
+    session.close()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"sample_rate_hz": 192000},
+        {"sample_rate_hz": 0},
+        {"num_channels": 6},
+        {"encoding": "u8"},
+        {"session": "../../etc/passwd"},
+        {"session": "x" * 65},
+    ],
+)
+def test_what_the_wire_cannot_carry_is_refused(
+    client: Client, witness: Session, system: System, fields: dict[str, object]
+) -> None:
+    socket = client.bus.connect_dealer(system.control)
+    socket.send(OpenSession(request="r", **fields))  # type: ignore[arg-type]
+    error = next(answers(socket))
+    assert error.code == "bad-message"
+    assert next(iter(fields)) in error.text or "topic" in error.text
+
+
+GARBAGE: list[list[bytes]] = [
+    [b""],
+    [b"\xff" * 40],
+    [b"fap/x/", b"\xc1"],
+    [b"audio/x/"] * 3,
+    [b"a"] * 50,
+    [os.urandom(30), os.urandom(2000)],
+    [b"open//", b"\x81" * 3000],
+    [b"x" * 500_000, b""],
+]
+
+
+def test_garbage_on_every_port_harms_nobody(system: System, witness: Session) -> None:
+    context = zmq.Context()
+    for name, port in system.ports.items():
+        for kind in (zmq.DEALER, zmq.SUB, zmq.XSUB, zmq.PUSH):
+            raw = context.socket(kind)
+            raw.setsockopt(zmq.LINGER, 200)
+            raw.connect(f"tcp://127.0.0.1:{port}")
+            if kind == zmq.SUB:
+                raw.setsockopt(zmq.SUBSCRIBE, b"\xff\x00garbage")
+                raw.setsockopt(zmq.SUBSCRIBE, b"joined/\xff\xfe/")
+                raw.setsockopt(zmq.SUBSCRIBE, b"joined//")
+            else:
+                for parts in GARBAGE:
+                    if kind != zmq.PUSH or len(parts) == 1:
+                        raw.send_multipart(parts)
+            raw.close()
+        with socket.create_connection(("127.0.0.1", port)) as plain:
+            plain.sendall(b"GET / HTTP/1.1\r\n\r\n" + os.urandom(500))
+        assert name
+    context.term()
+    system.assert_all_alive()
+
+
+def test_messages_of_other_sockets_are_refused_kindly(system: System, witness: Session) -> None:
+    misplaced: list[Message] = [
+        PhoneHeard(session="s", index=0, unit="a", duration=1, confidence=1.0, final=True),
+        PhoneHeard(
+            session=witness.name, index=0, unit="qqqq", duration=1, confidence=1.0, final=True
+        ),
+        Progress(session="nobody", level_db=0.0, sequence=5),
+        Heartbeat(service="recognizer", instance="ghost", state="draining", sent_ns=0),
+        FapFrame(session=witness.name, values=b"\0" * 272, mask=b"\0" * 9),
+    ]
+    with Bus() as bus:
+        for port in system.ports.values():
+            dealer = bus.connect_dealer(f"tcp://127.0.0.1:{port}")
+            for message in misplaced:
+                dealer.send(message)
+            dealer.wait(0.2)
+    system.assert_all_alive()
+
+
+def test_a_gap_in_media_time_keeps_the_new_time(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="f32le", paced=False)
+    output = session.subscribe(FapFrame)
+    token, pcm = session.opened.token, np.zeros(1600, "<f4").tobytes()
+    audio = client.bus.connect_dealer(session.opened.audio)
+    for sequence, media_time in ((1, 0), (2, 1600), (5, 160_000), (6, 161_600), (7, 163_200)):
+        audio.send(
+            AudioChunk(
+                session=session.name,
+                token=token,
+                sequence=sequence,
+                media_time=media_time,
+                pcm=pcm,
+            )
+        )
+    newest, end_s = 0, time.monotonic() + 10
+    while newest < 163_000:
+        assert time.monotonic() < end_s, newest
+        output.wait(0.1)
+        for received in output.receive():
+            assert isinstance(received.message, FapFrame)
+            newest = received.message.media_time
+    session.close()
+
+
+def test_a_client_that_goes_away_leaves_no_trace(system: System, witness: Session) -> None:
+    with Client(system.control) as vanishing:
+        vanishing.open_session(session="ghost", encoding="f32le").send(np.zeros(320, np.float32))
+    assert stream(system.control, np.zeros(3200, np.float32)).ended

@@ -1,0 +1,164 @@
+"""A wav through real processes over real sockets: phones, FAP frames, video."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shared.bus import Socket
+from shared.client import Client
+from shared.messages import FapFrame
+from shared.phones import UNITS
+from tests.e2e.following import Heard, samples_of_file, stream
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+OPEN_JAW, RAISE_B_MIDLIP = 2, 4  # indices of FAP 3 and 5
+
+
+@pytest.fixture(scope="module")
+def heard(system: System) -> Heard:
+    return stream(system.control, samples_of_file(DEMO / "hello-female.wav"))
+
+
+def test_every_frame_arrives_in_order_and_on_time(heard: Heard) -> None:
+    times = np.array([frame.media_time for frame in heard.frames])
+    assert [f.sequence for f in heard.frames] == list(range(1, len(heard.frames) + 1))
+    np.testing.assert_array_equal(np.diff(times), 320)
+    assert times[0] == 0
+    assert times[-1] >= len(samples_of_file(DEMO / "hello-female.wav"))
+
+
+def test_phones_are_units_of_the_paper_and_final_in_the_end(heard: Heard) -> None:
+    assert len(heard.units) > 20
+    assert set(heard.units) <= set(UNITS)
+    finals = {phone.index: phone.final for phone in heard.phones}
+    assert all(finals.values())
+
+
+def test_speech_begins_and_ends(heard: Heard) -> None:
+    states = [speech.active for speech in heard.speech]
+    assert states[0]
+    assert not states[-1]
+    assert all(a != b for a, b in itertools.pairwise(states))
+
+
+def test_the_mouth_moves_while_there_is_speech_and_rests_before_and_after(heard: Heard) -> None:
+    faps = heard.faps
+    begin = heard.speech[0].media_time // 320
+    mouth = list(range(2, 13)) + list(range(50, 60))
+    assert np.abs(faps[: max(1, begin - 5), mouth]).max() < 1
+    assert np.abs(faps[-1, mouth]).max() < 1
+    assert faps[:, OPEN_JAW].max() > 200
+    assert np.isfinite(faps).all()
+
+
+def test_the_sound_is_the_audio_that_was_sent(heard: Heard) -> None:
+    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in heard.sounds])
+    sent = samples_of_file(DEMO / "hello-female.wav")
+    np.testing.assert_allclose(sound / 32768, sent, atol=1e-4)
+
+
+@pytest.mark.parametrize("chunk", [97, 1600, 8000])
+def test_frames_do_not_depend_on_the_chunks(system: System, heard: Heard, chunk: int) -> None:
+    again = stream(system.control, samples_of_file(DEMO / "hello-female.wav"), chunk=chunk)
+    assert again.units == heard.units
+    np.testing.assert_allclose(again.faps, heard.faps, atol=1e-3)
+
+
+def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
+    samples = samples_of_file(DEMO / "vowels-male.wav")
+    live = stream(system.control, samples, paced=True)
+    fast = stream(system.control, samples)
+    np.testing.assert_allclose(live.faps[: len(fast.faps)], fast.faps, atol=1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [8000, 22050, 44100, 48000])
+def test_any_rate_is_heard(system: System, rate_hz: int) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")
+    positions = np.arange(int(len(samples) * rate_hz / 16000)) * (16000 / rate_hz)
+    resampled = np.interp(positions, np.arange(len(samples)), samples).astype(np.float32)
+    result = stream(system.control, resampled, sample_rate_hz=rate_hz, chunk=rate_hz // 50)
+    assert len(result.units) > 15
+    assert abs(result.frames[-1].media_time - len(samples)) < 16000
+
+
+def test_a_stalled_stream_leads_to_rest_and_then_goes_on(system: System) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")
+    with Client(system.control) as client:
+        session = client.open_session(encoding="f32le")
+        output = session.subscribe(FapFrame)
+        for begin in range(0, 16000, 320):
+            session.send(samples[begin : begin + 320])
+            time.sleep(0.005)
+        frames = [frame for frame in _arriving(output, 1.5) if isinstance(frame, FapFrame)]
+        values = np.frombuffer(frames[-1].values, "<f4")
+        assert np.abs(values[2:13]).max() < 1, "the face is at rest although no audio came"
+        assert frames[-1].media_time <= 16000, "media time stands still with the audio"
+        session.send(samples[16000:24000])
+        later = [frame for frame in _arriving(output, 1.0) if isinstance(frame, FapFrame)]
+        assert later[-1].media_time > 16000
+        session.close()
+
+
+def _arriving(output: Socket, seconds: float) -> list[object]:
+    messages: list[object] = []
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        output.wait(0.05)
+        messages += [received.message for received in output.receive()]
+    return messages
+
+
+def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")[:24000]
+    with Client(system.control) as client:
+        session = client.open_session(encoding="f32le", paced=False)
+        output = session.subscribe(FapFrame)
+        for begin in range(0, 24000, 8000):
+            session.send(samples[begin : begin + 8000])
+        frames = _arriving_frames(output, until=24000 - 1600)
+        assert np.abs(frames[-1][2:13]).max() > 50, "the mouth is open in mid-sentence"
+        session.flush()
+        session.send(np.zeros(8000, np.float32))
+        after = _arriving_frames(output, until=24000 + 8000 - 1600)
+        session.close()
+    assert len(after) > 20
+    assert np.abs(np.array(after)[8:, 2:13]).max() < 1, "150 ms are 7.5 frames"
+
+
+def _arriving_frames(output: Socket, until: int) -> list[NDArray[np.float32]]:
+    """Return the FAPs of the frames up to a media time."""
+    frames: list[NDArray[np.float32]] = []
+    end_s = time.monotonic() + 30
+    while time.monotonic() < end_s:
+        output.wait(0.1)
+        for received in output.receive():
+            if isinstance(received.message, FapFrame):
+                frames.append(np.frombuffer(received.message.values, "<f4"))
+                if received.message.media_time >= until:
+                    return frames
+    raise AssertionError("the frames did not come")
+
+
+def test_the_driver_records_picture_and_sound_in_sync(system: System) -> None:
+    samples = samples_of_file(DEMO / "vowels-male.wav")
+    stream(system.control, samples, session="film", record=True)
+    path = system.folder / "film.mp4"
+    end_s = time.monotonic() + 60
+    while not path.exists():
+        assert time.monotonic() < end_s, system.log("driver")
+        time.sleep(0.1)
+    with av.open(str(path)) as film:
+        images = sum(1 for _ in film.decode(video=0))
+    with av.open(str(path)) as film:
+        sound_s = sum(f.samples for f in film.decode(audio=0)) / film.streams.audio[0].rate
+    expected_s = len(samples) / 16000
+    assert images / 25 == pytest.approx(expected_s, abs=0.6)
+    assert images / 25 >= expected_s - 0.05
+    assert sound_s == pytest.approx(expected_s, abs=0.15)

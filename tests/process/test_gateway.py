@@ -1,0 +1,438 @@
+"""One real gateway process between a scripted system and WebSocket clients."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import queue
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+
+from shared.bus import Bus
+from shared.clock import now_ns
+from shared.faps import MASK_BYTES, NUM_FAPS
+from shared.messages import (
+    AudioChunk,
+    CloseSession,
+    Done,
+    EndOfAudio,
+    EndOfFaps,
+    Error,
+    FapFrame,
+    Heartbeat,
+    HeartbeatSeen,
+    Message,
+    OpenSession,
+    PhoneHeard,
+    ServiceState,
+    SessionOpened,
+    Sound,
+    Speech,
+    StartSession,
+    StatusReport,
+    StatusRequest,
+    StopSession,
+)
+
+pytestmark = pytest.mark.process
+
+ROOT = Path(__file__).parents[2]
+LOCAL = "tcp://127.0.0.1:*"
+TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls so
+FACE = struct.pack(f"<{NUM_FAPS}f", *range(NUM_FAPS))
+
+
+class ScriptedSystem:
+    """Plays control, recognizer and synthesizer on a thread of its own."""
+
+    def __init__(self) -> None:
+        self.bus = Bus()
+        self.commands = self.bus.bind_router(LOCAL, "commands")
+        self.audio = self.bus.bind_router(LOCAL, "audio")
+        self.phones = self.bus.bind_publisher(LOCAL, "phones")
+        self.faps = self.bus.bind_publisher(LOCAL, "faps")
+        self.running = ["recognizer", "synthesizer"]
+        self.refuse = False
+        self.page = ""
+        self.gateway = b""
+        self.started: list[str] = []  # sessions that the gateway has confirmed
+        self.closed: list[str] = []
+        self.audio_messages: list[Message] = []
+        self._openings: dict[str, tuple[OpenSession, bytes]] = {}
+        self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._stop = False
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop = True
+        self._thread.join()
+        self.bus.close()
+
+    def do(self, job: Callable[[], object]) -> None:
+        """Run something on the thread that owns the sockets, and wait for it."""
+        done = threading.Event()
+        self._jobs.put(job)
+        self._jobs.put(done.set)
+        assert done.wait(5)
+
+    def start(self, session: str) -> None:
+        message = StartSession(
+            session=session,
+            epoch=1,
+            request=f"start-{session}",
+            token=TOKEN,
+            encoding="s16le",
+            sample_rate_hz=16000,
+            num_channels=1,
+            record=False,
+            paced=True,
+            phone_input=self.audio.endpoint,
+            phones=self.phones.endpoint,
+            faps=self.faps.endpoint,
+        )
+        self.commands.send(message, to=self.gateway)
+
+    def publish_all(self, session: str) -> None:
+        self.phones.send(Sound(session=session, media_time=320, pcm=b"\x01\x00\xff\x7f"))
+        self.phones.send(Speech(session=session, media_time=320, active=True))
+        self.phones.send(
+            PhoneHeard(
+                session=session,
+                media_time=320,
+                index=0,
+                unit="iao",
+                duration=1600,
+                confidence=0.5,
+                final=False,
+            )
+        )
+        self.faps.send(
+            FapFrame(session=session, media_time=320, values=FACE, mask=bytes(MASK_BYTES))
+        )
+
+    def _run(self) -> None:
+        poller = self.bus.poller()
+        for socket_ in (self.commands, self.audio, self.phones, self.faps):
+            poller.add(socket_)
+        while not self._stop:
+            while not self._jobs.empty():
+                self._jobs.get()()
+            for socket_ in poller.wait(0.005):
+                for received in socket_.receive():
+                    if socket_ is self.commands:
+                        self._on_command(received.message, received.sender)
+                    elif isinstance(received.message, Message):
+                        self.audio_messages.append(received.message)
+
+    def _on_command(self, message: object, sender: bytes) -> None:
+        answer: Message | None = None
+        match message:
+            case Heartbeat():
+                self.gateway = sender
+                self.page = message.endpoints["page"]
+                now = now_ns()
+                answer = HeartbeatSeen(sent_ns=message.sent_ns, received_ns=now, replied_ns=now)
+            case Done():
+                self.started.append(message.session)
+                if message.session in self._openings:
+                    self._opened(*self._openings[message.session], message.session)
+            case OpenSession() if self.refuse:
+                answer = Error(code="no-service", text="start one", request=message.request)
+            case OpenSession():
+                session = message.session or f"s{len(self._openings)}"
+                self._openings[session] = (message, sender)
+                self.start(session)
+            case CloseSession():
+                self.closed.append(message.session)
+                self.commands.send(StopSession(session=message.session), to=self.gateway)
+                answer = Done(session=message.session, request=message.request)
+            case StatusRequest():
+                states = [
+                    ServiceState(
+                        service=name,
+                        instance=name,
+                        state="ready",
+                        age_s=0,
+                        clock_offset_ms=0,
+                        endpoints={},
+                        metrics={},
+                    )
+                    for name in self.running
+                ]
+                answer = StatusReport(request=message.request, services=states, sessions=[])
+        if answer is not None:
+            self.commands.send(answer, to=sender)
+
+    def _opened(self, opening: OpenSession, client: bytes, session: str) -> None:
+        self.commands.send(
+            SessionOpened(
+                session=session,
+                request=opening.request,
+                token=TOKEN,
+                audio=self.audio.endpoint,
+                phones=self.phones.endpoint,
+                faps=self.faps.endpoint,
+                events=self.faps.endpoint,
+            ),
+            to=client,
+        )
+
+
+class GatewayProcess:
+    """A gateway that has registered with the scripted control."""
+
+    def __init__(self, system: ScriptedSystem) -> None:
+        self.system = system
+        self.process = spawn(KOUXING_CONTROL=system.commands.endpoint)
+        wait_until(lambda: bool(system.page))
+        self.page = system.page
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            return self.process.wait(10)
+        finally:
+            self.process.kill()
+
+
+def spawn(**environment: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "services.gateway"],
+        cwd=ROOT,
+        env={**os.environ, "KOUXING_GATEWAY_PORT": "0", **environment},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > end_s:
+            raise TimeoutError
+        time.sleep(0.01)
+
+
+async def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
+    await asyncio.to_thread(wait_until, condition, limit_s)
+
+
+async def receive_json(browser: aiohttp.ClientWebSocketResponse, kind: str) -> dict[str, Any]:
+    """Return the next text message of a kind."""
+    while True:
+        message = await browser.receive(5)
+        if message.type is aiohttp.WSMsgType.TEXT and json.loads(message.data)["type"] == kind:
+            found: dict[str, Any] = json.loads(message.data)
+            return found
+        if message.type in (aiohttp.WSMsgType.CLOSED, aiohttp.WSMsgType.CLOSE):
+            raise EOFError(kind)
+
+
+@pytest.fixture
+def system() -> Iterator[ScriptedSystem]:
+    system = ScriptedSystem()
+    yield system
+    system.close()
+
+
+@pytest.fixture
+def gateway(system: ScriptedSystem) -> Iterator[GatewayProcess]:
+    gateway = GatewayProcess(system)
+    yield gateway
+    gateway.stop()
+    assert gateway.process.stderr is not None
+    gateway.process.stderr.close()
+
+
+def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayProcess) -> None:
+    async def look() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer") as newest,
+            http.ws_connect(f"{gateway.page}viewer?session=other") as other,
+        ):
+            await receive_json(newest, "status")
+            system.do(lambda: system.start("one"))
+            await until(lambda: system.started == ["one"])
+            system.do(lambda: system.publish_all("one"))
+            assert (await receive_json(newest, "session"))["session"] == "one"
+            got = [await newest.receive(5) for _ in range(4)]
+            binary = {m.data[0]: m.data for m in got if m.type is aiohttp.WSMsgType.BINARY}
+            texts = [json.loads(m.data) for m in got if m.type is aiohttp.WSMsgType.TEXT]
+            assert struct.unpack_from("<B3xId", binary[1]) == (1, 0, 320.0)
+            assert binary[1][16:] == FACE
+            assert binary[2][16:] == b"\x01\x00\xff\x7f"
+            assert {text["type"] for text in texts} == {"speech", "phone"}
+            assert next(text for text in texts if text["type"] == "phone")["unit"] == "iao"
+
+            await other.send_json({"follow": "one"})
+            assert (await receive_json(other, "session"))["session"] == "one"
+            system.do(lambda: system.commands.send(StopSession(session="one"), to=system.gateway))
+            assert (await receive_json(newest, "session"))["session"] is None
+            await other.send_str("[[[[")
+            assert (await receive_json(other, "error"))["code"] == "refused"
+
+    asyncio.run(look())
+
+
+def test_viewers_hear_what_is_missing(system: ScriptedSystem, gateway: GatewayProcess) -> None:
+    async def look() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer") as browser,
+        ):
+            while (await receive_json(browser, "status"))["missing"]:
+                pass
+            system.running.remove("recognizer")
+            assert (await receive_json(browser, "status"))["missing"] == ["recognizer"]
+
+    asyncio.run(look())
+
+
+def test_a_microphone_streams_and_says_its_last(
+    system: ScriptedSystem, gateway: GatewayProcess
+) -> None:
+    async def speak() -> None:
+        async with aiohttp.ClientSession() as http:
+            async with http.ws_connect(f"{gateway.page}microphone") as browser:
+                await browser.send_json({"sample_rate_hz": 48000, "num_channels": 1})
+                session = (await receive_json(browser, "opened"))["session"]
+                for _ in range(5):
+                    await browser.send_bytes(b"\x01\x00" * 960)
+                await until(lambda: len(system.audio_messages) == 5)
+            await until(lambda: len(system.audio_messages) == 6)
+            assert not system.closed  # before the last frame has come
+            system.do(lambda: system.faps.send(EndOfFaps(session=session)))
+            await until(lambda: system.closed == [session], 1.0)
+
+    asyncio.run(speak())
+    *chunks, last = system.audio_messages
+    assert [chunk.media_time for chunk in chunks] == [0, 320, 640, 960, 1280]
+    assert all(isinstance(chunk, AudioChunk) and len(chunk.pcm) == 1920 for chunk in chunks)
+    assert isinstance(last, EndOfAudio)
+
+
+def test_the_sample_sentence_is_streamed_once_for_whoever_asks(
+    system: ScriptedSystem, gateway: GatewayProcess
+) -> None:
+    async def ask() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer") as browser,
+            http.ws_connect(f"{gateway.page}viewer") as other,
+        ):
+            await browser.send_json({"play": "sample"})
+            await other.send_json({"play": "sample"})
+            names = set()
+            for viewer in (browser, other):
+                while (name := (await receive_json(viewer, "session"))["session"]) is None:
+                    pass
+                names.add(name)
+            await until(lambda: len(system.audio_messages) > 10)
+            assert names == set(system.started)
+
+    asyncio.run(ask())
+    assert gateway.stop() == 0
+    assert system.closed == system.started
+
+
+def test_bad_microphones_are_told_why(system: ScriptedSystem, gateway: GatewayProcess) -> None:
+    async def error_after(http: aiohttp.ClientSession, *messages: str | bytes) -> str:
+        async with http.ws_connect(f"{gateway.page}microphone") as browser:
+            for message in messages:
+                if isinstance(message, str):
+                    await browser.send_str(message)
+                else:
+                    await browser.send_bytes(message)
+            text: str = (await receive_json(browser, "error"))["text"]
+            return text
+
+    async def speak() -> None:
+        async with aiohttp.ClientSession() as http:
+            hello = json.dumps({"sample_rate_hz": 16000})
+            assert "sample_rate_hz" in await error_after(http, '{"sample_rate_hz": 4000}')
+            assert "describes the audio" in await error_after(http, b"\x00\x00")
+            assert "multiple of 2" in await error_after(http, hello, b"\x00\x00\x00")
+            async with http.ws_connect(f"{gateway.page}microphone") as browser:
+                await browser.send_str(hello)
+                await receive_json(browser, "opened")
+                await browser.send_bytes(bytes(300 * 1024))
+                assert (await browser.receive(5)).type is aiohttp.WSMsgType.CLOSE
+                assert browser.close_code == aiohttp.WSCloseCode.MESSAGE_TOO_BIG
+            system.refuse = True
+            assert await error_after(http, hello) == "start one"
+
+    asyncio.run(speak())
+
+
+def test_strange_pages_and_paths_are_refused(gateway: GatewayProcess) -> None:
+    async def status(http: aiohttp.ClientSession, path: str, **headers: str) -> int:
+        async with http.get(gateway.page + path, headers=headers) as answer:
+            return answer.status
+
+    async def knock() -> None:
+        upgrade = {
+            "Connection": "Upgrade",
+            "Upgrade": "websocket",
+            "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+        }
+        async with aiohttp.ClientSession() as http:
+            assert await status(http, "viewer", Origin="http://evil.example", **upgrade) == 403
+            assert await status(http, "microphone", Origin="null", **upgrade) == 403
+            assert await status(http, "", Host="evil.example") == 403
+            assert await status(http, "viewer?session=..%2F", **upgrade) == 400
+            for path in (
+                "..%2Fservice.py",
+                "package.json",
+                "modules/three/build/..%2Fpackage.json",
+            ):
+                assert await status(http, path) in (403, 404)
+            async with http.get(gateway.page) as answer:
+                assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+
+    asyncio.run(knock())
+
+
+def test_sigterm_closes_with_a_reason_and_exits_0(gateway: GatewayProcess) -> None:
+    async def look() -> int | None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer") as browser,
+        ):
+            await receive_json(browser, "status")
+            gateway.process.send_signal(signal.SIGTERM)
+            with pytest.raises(EOFError):
+                await receive_json(browser, "never")
+            return browser.close_code
+
+    assert asyncio.run(look()) == aiohttp.WSCloseCode.GOING_AWAY
+    assert gateway.process.wait(10) == 0
+
+
+def test_an_address_that_cannot_be_had_is_a_users_mistake() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = str(listener.getsockname()[1])
+        taken = spawn(KOUXING_GATEWAY_PORT=port)
+        strange = spawn(KOUXING_GATEWAY_HOST="192.0.2.1", KOUXING_GATEWAY_INSECURE="1")
+        for process, words in (
+            (taken, f"gateway.port: {port} is in use"),
+            (strange, "gateway.host"),
+        ):
+            _, text = process.communicate(timeout=20)
+            assert process.returncode == 2
+            assert words in text
+            assert "Traceback" not in text

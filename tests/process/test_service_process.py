@@ -1,0 +1,105 @@
+"""Each service as a process: ready, SIGTERM, exit 0; a wrong configuration, exit 2."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from shared.client import Client
+from tests.system import BINDS, ROOT, System, free_port
+
+pytestmark = pytest.mark.process
+
+
+def ended(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", *arguments],
+        env={**os.environ, **environment},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_every_service_stops_cleanly_on_sigterm(tmp_path: Path) -> None:
+    with System(("control", "recognizer", "synthesizer", "driver"), tmp_path) as system:
+        processes = dict(system.processes)
+        for process in processes.values():
+            process.send_signal(signal.SIGTERM)
+        statuses = {service: process.wait(15) for service, process in processes.items()}
+    assert statuses == dict.fromkeys(processes, 0)
+    for service in processes:
+        assert '"message": "stopped"' in system.log(service)
+        assert "traceback" not in system.log(service).lower()
+
+
+@pytest.mark.parametrize("service", ["control", "recognizer", "synthesizer"])
+def test_a_port_in_use_is_named(service: str) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        key = BINDS[service][0]
+        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        result = ended(f"services.{service}", **{f"KOUXING_{service.upper()}_{key}": endpoint})
+    assert result.returncode == 2
+    assert f"{service}.{key.lower()}" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("service", ["control", "recognizer", "synthesizer", "driver", "gateway"])
+def test_a_wrong_setting_is_named_before_anything_is_opened(service: str) -> None:
+    result = ended(f"services.{service}", "--set", "log_level=loud")
+    assert result.returncode == 2
+    assert f"{service}.log_level" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_hung_loop_is_seen_as_a_lost_service(tmp_path: Path) -> None:
+    with System(("control", "recognizer", "synthesizer"), tmp_path) as system:
+        system.processes["recognizer"].send_signal(signal.SIGSTOP)
+        with Client(system.control) as client:
+            end_s = time.monotonic() + 10
+            while "recognizer" in {service.service for service in client.status().services}:
+                assert time.monotonic() < end_s
+                time.sleep(0.1)
+            system.processes["recognizer"].send_signal(signal.SIGCONT)
+            while "recognizer" not in {service.service for service in client.status().services}:
+                assert time.monotonic() < end_s + 10
+                time.sleep(0.1)
+
+
+def test_a_service_ends_with_its_supervisor(tmp_path: Path) -> None:
+    starter = (
+        "import os, subprocess, sys\n"
+        "env = {**os.environ, 'KOUXING_SUPERVISOR': str(os.getpid())}\n"
+        "child = subprocess.Popen([sys.executable, '-m', 'services.synthesizer'], env=env)\n"
+        "print(child.pid, flush=True)\n"
+    )
+    environment = {
+        f"KOUXING_SYNTHESIZER_{key}": f"tcp://127.0.0.1:{free_port()}"
+        for key in BINDS["synthesizer"]
+    }
+    parent = subprocess.run(
+        [sys.executable, "-c", starter],
+        env={**os.environ, **environment},
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        timeout=30,
+        check=True,
+    )
+    process = int(parent.stdout)
+    end_s = time.monotonic() + 20
+    while Path(f"/proc/{process}").exists():
+        assert time.monotonic() < end_s, "the service outlived its supervisor"
+        time.sleep(0.1)

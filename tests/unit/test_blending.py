@@ -1,0 +1,213 @@
+"""Blending, the full model and its parameters: Li et al. 2011, eq. 8-11; Wang & Cai 2003, eq. 6."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.synthesizer.blending import around, blend, log_weights, softmax
+from services.synthesizer.full import synthesize
+from services.synthesizer.parameters import (
+    VisemeParameters,
+    load_parameters,
+    save_parameters,
+)
+from services.synthesizer.timeline import EDGE_S, build_timeline
+from services.synthesizer.visemes import MOUTH_FAPS, VISEME_INDEX, static_targets
+from shared.errors import UserError
+from shared.phones import Phone
+from training.visemes import starting_parameters
+
+pytestmark = pytest.mark.unit
+
+PARAMETERS = load_parameters()
+JAW = MOUTH_FAPS.index(3)
+LOWER_LIP = MOUTH_FAPS.index(5)
+
+
+def phones(text: str, start_s: float = 0.5) -> list[Phone]:
+    """Units as "b:0.08 a:0.2", one after the other."""
+    made: list[Phone] = []
+    for word in text.split():
+        unit, duration = word.split(":")
+        made.append(
+            Phone(
+                index=len(made),
+                unit=unit,
+                onset_s=start_s,
+                duration_s=float(duration),
+                confidence=1.0,
+                final=True,
+            )
+        )
+        start_s += float(duration)
+    return made
+
+
+def curve(text: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    return blend(PARAMETERS, build_timeline(phones(text)), time_s)
+
+
+def sharp(parameters: VisemeParameters) -> VisemeParameters:
+    """Parameters whose visemes have died away at each other's centres."""
+    return dataclasses.replace(
+        parameters,
+        theta_minus=parameters.theta_minus * 20.0,
+        theta_plus=parameters.theta_plus * 20.0,
+        offset_s=np.zeros_like(parameters.offset_s),
+    )
+
+
+def test_weights_sum_to_one_and_do_not_overflow() -> None:
+    weights = softmax(np.array([[1e9, -1e9], [1e9 + 1.0, -1e9]]))
+    np.testing.assert_allclose(weights.sum(axis=0), 1.0)
+    np.testing.assert_allclose(weights[:, 0], [0.26894142, 0.73105858])
+
+
+def test_pair_of_visemes_by_hand() -> None:
+    # Li 2011, eq. 11, written out as quotients
+    p = PARAMETERS
+    timeline = build_timeline(phones("e:0.1 i:0.12"))
+    first, second = (VISEME_INDEX[shape] for shape in "ei")
+    time_s = 0.6
+    d_first = p.alpha[first] * np.exp(
+        -p.theta_plus[first] * np.abs(0.55 + p.offset_s[first] - time_s) ** p.c
+    )
+    d_second = p.alpha[second] * np.exp(
+        -p.theta_minus[second] * np.abs(0.66 + p.offset_s[second] - time_s) ** p.c
+    )
+    # centres before the one and after the other viseme, so that plus and minus are these
+    assert (np.abs(p.offset_s[[first, second]]) < 0.05).all()
+    want = (d_second * p.target[second] + d_first * p.target[first]) / (d_second + d_first)
+    alone = dataclasses.replace(timeline, silence_start_s=np.zeros(0), silence_end_s=np.zeros(0))
+    np.testing.assert_allclose(blend(p, alone, np.array([time_s]))[0], want)
+
+
+def test_curve_is_at_its_target_at_centres_when_neighbours_have_died_away() -> None:
+    timeline = build_timeline(phones("d:0.2 a:0.3 j:0.2 i:0.3 g:0.2 u:0.3"))
+    got = blend(sharp(PARAMETERS), timeline, timeline.centre_start_s)
+    np.testing.assert_allclose(got, PARAMETERS.target[timeline.viseme], atol=3.0)
+
+
+def test_fast_speech_falls_short_of_its_targets() -> None:
+    slow = curve("d:0.12 a:0.24 d:0.12", np.array([0.74]))
+    fast = curve("d:0.04 a:0.08 d:0.04", np.array([0.58]))
+    assert fast[0, JAW] < 0.9 * slow[0, JAW]
+
+
+def test_curve_is_continuous_at_every_centre() -> None:
+    timeline = build_timeline(phones("n:0.07 i:0.12 h:0.08 ao:0.25 sil:0.1 b:0.08 iao:0.2 m:0.06"))
+    centres = np.concatenate([timeline.centre_start_s, timeline.centre_end_s])
+    beside = 1e-7
+    left, right = (blend(PARAMETERS, timeline, centres + sign * beside) for sign in (-1.0, 1.0))
+    # no faster than the fastest lips of the model
+    assert np.abs(right - left).max() < 2.0 * beside * 40_000.0
+
+
+def test_pause_relaxes_the_mouth_the_more_the_longer_it_is() -> None:
+    jaw = [
+        curve(f"a:0.2 sil:{pause} a:0.2", np.array([0.7 + pause / 2.0]))[0, JAW]
+        for pause in (0.04, 0.1, 0.2, 0.4)
+    ]
+    held = curve("a:0.2 a:0.2", np.array([0.7]))[0, JAW]
+    assert held == pytest.approx(PARAMETERS.target[VISEME_INDEX["a"], JAW], rel=0.02)
+    assert held > jaw[0] > jaw[1] > jaw[2] > jaw[3]
+    assert jaw[3] < 0.05 * held
+
+
+def test_no_silence_between_touching_units() -> None:
+    assert len(build_timeline(phones("a:0.2 i:0.2")).silence_start_s) == 2
+    assert len(build_timeline(phones("a:0.2 sil:0.2 i:0.2")).silence_start_s) == 3
+
+
+def test_long_vowel_is_held() -> None:
+    inside = np.linspace(0.5 + EDGE_S, 1.5 - EDGE_S, 20)
+    assert np.ptp(curve("d:0.08 a:1.0 d:0.08", inside + 0.08)[:, JAW]) < 60.0
+
+
+def test_mouth_is_at_rest_a_million_seconds_away() -> None:
+    got = curve("d:0.1 a:0.2 b:0.1", np.array([-1e6, 0.0, 3.0, 1e6]))
+    np.testing.assert_allclose(got, np.tile(PARAMETERS.neutral, (4, 1)), atol=1e-6)
+
+
+def test_speech_at_a_million_seconds_looks_the_same() -> None:
+    timeline = build_timeline(phones("d:0.1 a:0.2 b:0.1", start_s=1e6))
+    far = blend(PARAMETERS, timeline, 1e6 + np.arange(0.0, 0.5, 0.02))
+    near = curve("d:0.1 a:0.2 b:0.1", 0.5 + np.arange(0.0, 0.5, 0.02))
+    np.testing.assert_allclose(far, near, atol=0.1)
+
+
+def test_pair_and_reach() -> None:
+    timeline = build_timeline(phones("d:0.1 a:0.1 j:0.1 i:0.1 g:0.1"))  # centres 0.55, 0.65, ...
+    assert around(timeline, 0.62, 0.0).tolist() == [True, True, False, False, False]
+    assert around(timeline, 0.67, 0.0).tolist() == [False, True, True, False, False]
+    assert around(timeline, 0.67, 0.15).tolist() == [True, True, True, False, False]
+    assert around(timeline, 0.67, 0.3).all()
+    assert around(timeline, 0.0, 0.0).tolist() == [True, False, False, False, False]
+    assert around(timeline, 9.0, 0.0).tolist() == [False, False, False, False, True]
+
+
+def test_weights_have_one_row_for_each_viseme_and_silence() -> None:
+    timeline = build_timeline(phones("d:0.1 iao:0.2 sil:0.1 b:0.1"))
+    shape = log_weights(PARAMETERS, timeline, np.zeros(7)).shape
+    assert shape == (4 + 3, 7, len(MOUTH_FAPS))
+
+
+def test_full_model_does_not_depend_on_its_blocks() -> None:
+    spoken = phones("d:0.1 a:0.2 sil:0.3 b:0.1 iao:0.2 " * 8)
+    faps = synthesize(PARAMETERS, spoken, 500)
+    whole = blend(PARAMETERS, build_timeline(spoken), np.arange(500) / 50.0)
+    np.testing.assert_allclose(faps[:, np.array(MOUTH_FAPS) - 1], whole, atol=0.01)
+    assert synthesize(PARAMETERS, [], 3).shape == (3, 68)
+
+
+def test_parameters_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "parameters.json"
+    parameters = starting_parameters()
+    save_parameters(parameters, path, "a test")
+    again = load_parameters(path)
+    for field in dataclasses.fields(VisemeParameters):
+        np.testing.assert_allclose(
+            getattr(again, field.name), getattr(parameters, field.name), rtol=1e-6
+        )
+    np.testing.assert_array_equal(again.target, static_targets())
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("format", "something else"),
+        ("c", 7.0),
+        ("c", None),
+        ("closure_ratio", 5.0),
+        ("faps", [1, 2]),
+        ("silence", {}),
+        ("visemes", []),
+    ],
+)
+def test_bad_parameters_are_refused(tmp_path: Path, key: str, value: object) -> None:
+    path = tmp_path / "parameters.json"
+    save_parameters(starting_parameters(), path, "a test")
+    data = json.loads(path.read_text())
+    data[key] = value
+    path.write_text(json.dumps(data))
+    with pytest.raises(UserError, match=r"parameters\.json"):
+        load_parameters(path)
+
+
+def test_values_without_sense_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "parameters.json"
+    save_parameters(starting_parameters(), path, "a test")
+    data = json.loads(path.read_text())
+    data["visemes"]["a"]["alpha"][0] = float("nan")
+    path.write_text(json.dumps(data))
+    with pytest.raises(UserError, match="alpha"):
+        load_parameters(path)
+    path.write_text("no JSON")
+    with pytest.raises(UserError, match="cannot read"):
+        load_parameters(path)
+    with pytest.raises(UserError, match="cannot read"):
+        load_parameters(tmp_path / "absent.json")

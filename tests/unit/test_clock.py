@@ -1,0 +1,24 @@
+from __future__ import annotations
+
+import pytest
+
+from shared.clock import ClockOffset, to_samples, to_seconds
+
+pytestmark = pytest.mark.unit
+
+
+def test_media_time_is_samples_at_16_khz() -> None:
+    assert to_samples(1.5) == 24000
+    assert to_seconds(24000) == 1.5
+    assert to_samples(-0.1) == 0
+
+
+def test_the_exchange_with_the_least_round_trip_gives_the_offset() -> None:
+    clock = ClockOffset()
+    assert clock.offset_ms == 0.0
+    ahead_ns = 5_000_000
+    clock.update(0, 30_000_000 + ahead_ns, 30_000_000 + ahead_ns, 40_000_000)  # 30 out, 10 back
+    assert clock.offset_ms == pytest.approx(15.0)
+    clock.update(0, 1_000_000 + ahead_ns, 2_000_000 + ahead_ns, 3_000_000)  # 1 out, 1 back
+    clock.update(0, 9_000_000 + ahead_ns, 9_000_000 + ahead_ns, 10_000_000)
+    assert clock.offset_ms == pytest.approx(5.0)

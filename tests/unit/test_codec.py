@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import msgpack
+import pytest
+
+from shared.codec import BadMessage, decode, encode, topic
+from shared.messages import AudioChunk, Done, FapFrame, OpenSession, PhoneHeard
+
+pytestmark = pytest.mark.unit
+
+
+def parts_of(kind: str, session: str = "s", **fields: object) -> list[bytes]:
+    return [f"{kind}/{session}/".encode(), msgpack.packb({"session": session, **fields})]
+
+
+def test_the_topic_ends_in_a_slash() -> None:
+    assert topic(FapFrame, "demo") == b"fap/demo/"
+
+
+def test_fields_with_defaults_may_be_left_out() -> None:
+    message = decode(parts_of("open", request="r"))
+    assert message == OpenSession(session="s", request="r")
+
+
+def test_unknown_fields_are_ignored() -> None:
+    assert decode(parts_of("done", request="r", colour="red")) == Done(session="s", request="r")
+
+
+@pytest.mark.parametrize(
+    ("parts", "reason"),
+    [
+        ([b"done/s/"], "parts"),
+        ([b"done/s/", b"", b""], "parts"),
+        ([b"done", b"\x80"], "topic"),
+        ([b"\xff\xfe/s/", b"\x80"], "topic"),
+        ([b"dance/s/", b"\x80"], "kind"),
+        ([b"done/s/x", b"\x80"], "kind"),
+        ([b"done/s/", b"\xc1garbage"], "body"),
+        ([b"done/s/", b""], "body"),
+        ([b"done/s/", b"\x91" * 5000], "body"),
+        (parts_of("done"), "body"),
+        (parts_of("done", request=5), "body"),
+        (parts_of("done", request=""), "body"),
+        (parts_of("done", request="r", media_time=-1), "body"),
+        (parts_of("open", request="r", sample_rate_hz=192000), "body"),
+        (parts_of("open", request="r", encoding="mp3"), "body"),
+        (parts_of("open", session="a b", request="r"), "body"),
+        (parts_of("fap", values=b"short", mask=b"\0" * 9), "body"),
+        (parts_of("done", request="r", version=2), "version"),
+        (parts_of("done", version=2, other=1), "version"),
+        ([b"done/other/", msgpack.packb({"session": "s", "request": "r"})], "topic"),
+    ],
+)
+def test_what_is_no_message_is_refused_with_its_reason(parts: list[bytes], reason: str) -> None:
+    with pytest.raises(BadMessage) as caught:
+        decode(parts)
+    assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("confidence", [float("nan"), 1.5, -0.1, float("inf")])
+def test_a_confidence_outside_0_to_1_is_refused(confidence: float) -> None:
+    with pytest.raises(BadMessage):
+        decode(parts_of("phone", index=0, unit="a", duration=1, confidence=confidence, final=True))
+
+
+def test_binary_fields_are_binary_in_msgpack() -> None:
+    _, body = encode(AudioChunk(session="s", token="t", pcm=b"\x01\x02"))  # noqa: S106
+    assert msgpack.unpackb(body)["pcm"] == b"\x01\x02"
+
+
+def test_a_phone_survives_the_wire() -> None:
+    phone = PhoneHeard(
+        session="s", index=2, unit="zh", duration=800, confidence=0.25, final=True, media_time=5
+    )
+    assert decode(encode(phone)) == phone

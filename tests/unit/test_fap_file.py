@@ -1,0 +1,120 @@
+"""Reading and writing .fap files, with what differs in the wild."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from shared.errors import UserError
+from shared.fap_file import FapAnimation, read_fap, write_fap
+
+pytestmark = pytest.mark.unit
+
+
+def mask(*faps: int, digits: int = 68) -> str:
+    return " ".join("1" if number in faps else "0" for number in range(1, digits + 1))
+
+
+def write(tmp_path: Path, *lines: str, end: str = "\n") -> Path:
+    path = tmp_path / "some.fap"
+    path.write_bytes(end.join(lines).encode("utf-8"))
+    return path
+
+
+@pytest.mark.parametrize("style", ["xface", "greta"])
+def test_round_trip(tmp_path: Path, style: Literal["xface", "greta"]) -> None:
+    rng = np.random.default_rng(0)
+    faps = np.zeros((7, 68), dtype=np.float32)
+    faps[:, 2:] = rng.normal(0.0, 300.0, (7, 66))
+    if style == "greta":
+        faps = faps.round()
+    path = tmp_path / "some.fap"
+    write_fap(path, FapAnimation("a name", 29.97, faps), style)
+    again = read_fap(path)
+    assert (again.name, again.frame_rate_hz) == ("a name", 29.97)
+    np.testing.assert_array_equal(again.faps, faps)
+    assert len(path.read_text().splitlines()[1].split()) == (69 if style == "greta" else 68)
+
+
+def test_no_frames(tmp_path: Path) -> None:
+    path = tmp_path / "some.fap"
+    write_fap(path, FapAnimation("", 50.0, np.zeros((0, 68), dtype=np.float32)))
+    assert read_fap(path).faps.shape == (0, 68)
+
+
+def test_frame_of_xface(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        "# made by hand",
+        "2.1 C:\\some where\\file 25 2",
+        mask(1, 2, 3, 51),
+        "0 5 0 63 0 2 40 0 0 0 0 120 -7",
+        "",
+        mask(3),
+        "1 1.5e2  ",
+        end="\r\n",
+    )
+    got = read_fap(path)
+    assert got.name == "C:\\some where\\file"
+    assert got.frame_rate_hz == 25.0
+    assert got.faps[0, [0, 1, 2, 50]].tolist() == [5.0, 2.0, 120.0, -7.0]
+    assert got.faps[1, 2] == 150.0
+
+
+def test_frame_of_greta(tmp_path: Path) -> None:
+    path = write(
+        tmp_path, "2.1 AU Interpolation_1111.fap 25 1", mask(1, 3, 48, digits=69), "12 0 80 -900"
+    )
+    got = read_fap(path)
+    assert got.name == "AU Interpolation_1111.fap"
+    assert got.faps[0, [0, 2, 47]].tolist() == [0.0, 80.0, -900.0]
+
+
+def test_digits_without_blanks_and_values_without_bounds(tmp_path: Path) -> None:
+    path = write(tmp_path, "2.1 x 25 1", mask(3, 5, 6, 7).replace(" ", ""), "0 inf nan -inf 1e60")
+    assert not read_fap(path).faps.any()
+
+
+def test_outer_lips_follow_the_inner_ones_where_the_file_has_only_those(tmp_path: Path) -> None:
+    got = read_fap(write(tmp_path, "2.1 x 25 1", mask(4, 5, 57, 52), "0 -10 -20 -30 -40")).faps[0]
+    assert got[[3, 50, 4, 51, 56, 9]].tolist() == [-10.0, -10.0, -20.0, -30.0, -40.0, -40.0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        ([], "line 1: expected '2.1 NAME FPS NFRAMES', found nothing"),
+        (["2.0 x 25 1"], "line 1: .* found version '2.0'"),
+        (["2.1 25 1"], "line 1"),
+        (["2.1 x 25 many"], "line 1: 'many' is not a count"),
+        (["2.1 x fast 1"], "line 1: frame rate 'fast'"),
+        (["2.1 x nan 1"], "line 1: frame rate"),
+        (["2.1 x 25 -1"], "line 1: -1 frames"),
+        (["2.1 x 25 1"], "ends after 0 of 1 frames"),
+        (["2.1 x 25 2", mask(3), "0 1"], "line 3: the file ends after 1 of 2 frames"),
+        (["2.1 x 25 1", mask(3)], "ends after 0"),
+        (["2.1 x 25 1", "0 1 0", "0"], "line 2: expected a mask of 68"),
+        (["2.1 x 25 1", mask(69, digits=69), "0 1"], "line 2: the mask sets a 69th"),
+        (["2.1 x 25 1", mask(3, 4), "0 1"], "line 3: 1 values, the mask asks for 2"),
+        (["2.1 x 25 1", mask(3), "0 one"], "line 3: a value is not a number"),
+        (["2.1 x 25 1", mask(3), "x 1"], "line 3: 'x' is not a frame number"),
+        (["2.1 x 25 2", mask(3), "0 1", mask(3), "5 1"], "line 5: frame 5 where 1 must follow"),
+        (["2.1 x 25 1", mask(3), "0 1", mask(3)], "line 4: more than the 1 frames"),
+    ],
+)
+def test_bad_files_are_refused_with_line_and_reason(
+    tmp_path: Path, lines: list[str], complaint: str
+) -> None:
+    with pytest.raises(UserError, match=complaint):
+        read_fap(write(tmp_path, *lines))
+
+
+def test_places_that_do_not_exist_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="absent"):
+        read_fap(tmp_path / "absent.fap")
+    with pytest.raises(UserError, match="absent"):
+        write_fap(
+            tmp_path / "absent" / "x.fap",
+            FapAnimation("", 50.0, np.zeros((1, 68), dtype=np.float32)),
+        )

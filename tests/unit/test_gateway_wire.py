@@ -1,0 +1,52 @@
+"""What a browser sends is checked field by field."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import pytest
+
+from services.gateway import wire
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+
+def test_binary_messages_have_an_aligned_header() -> None:
+    message = wire.binary(wire.FAP_TYPE, 7, 2**40 + 1, b"payload!")
+
+    assert struct.unpack_from("<B3xId", message) == (1, 7, 2**40 + 1)
+    assert message[16:] == b"payload!"
+
+
+def test_a_hello_describes_the_audio() -> None:
+    hello = wire.parse_hello('{"sample_rate_hz": 44100, "num_channels": 2, "encoding": "f32le"}')
+
+    assert (hello.sample_rate_hz, hello.num_channels, hello.encoding) == (44100, 2, "f32le")
+    assert hello.frame_bytes == 8
+    assert wire.parse_hello('{"sample_rate_hz": 8000}').frame_bytes == 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({}, "sample_rate_hz"),
+        ({"sample_rate_hz": True}, "sample_rate_hz"),
+        ({"sample_rate_hz": 16000.0}, "sample_rate_hz"),
+        ({"sample_rate_hz": 96000}, "sample_rate_hz"),
+        ({"sample_rate_hz": 16000, "num_channels": 3}, "num_channels"),
+        ({"sample_rate_hz": 16000, "encoding": "opus"}, "encoding"),
+        ({"sample_rate_hz": 16000, "encoding": ["s16le"]}, "encoding"),
+        ([1], "object"),
+    ],
+)
+def test_a_wrong_hello_names_its_field(fields: object, named: str) -> None:
+    with pytest.raises(UserError, match=named):
+        wire.parse_hello(json.dumps(fields))
+
+
+@pytest.mark.parametrize("message", ["", "{", "[" * 100_000, "null", '"text"'])
+def test_what_is_no_object_is_refused(message: str) -> None:
+    with pytest.raises(UserError, match="JSON object"):
+        wire.parse_object(message)

@@ -1,0 +1,25 @@
+from __future__ import annotations
+
+import pytest
+
+from shared.metrics import WINDOW, Metrics
+
+pytestmark = pytest.mark.unit
+
+
+def test_counts_and_percentiles() -> None:
+    metrics = Metrics()
+    metrics.count("in_audio")
+    metrics.count("in_audio", 2)
+    for value in range(101):
+        metrics.observe("chunk_ms", float(value))
+    snapshot = metrics.snapshot()
+    assert snapshot["in_audio"] == 3
+    assert (snapshot["chunk_ms_p50"], snapshot["chunk_ms_p95"]) == (50.0, 95.0)
+
+
+def test_only_the_newest_values_count() -> None:
+    metrics = Metrics()
+    for value in [1e9] * 10 + [1.0] * WINDOW:
+        metrics.observe("chunk_ms", value)
+    assert metrics.snapshot()["chunk_ms_p99"] == 1.0

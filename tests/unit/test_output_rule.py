@@ -1,0 +1,48 @@
+import pytest
+
+from services.recognizer.output_rule import OutputRule
+
+pytestmark = pytest.mark.unit
+
+
+def put_out(frames: str, agreement: int, before: str = "-") -> list[tuple[int, str]]:
+    """Which letters of a string of last units are put out, and at which frame."""
+    rule = OutputRule(agreement, last_output=ord(before))
+    return [(t, unit) for t, unit in enumerate(frames) if rule.accept(ord(unit))]
+
+
+def test_put_out_at_the_third_agreeing_frame() -> None:
+    assert put_out("aaaaabbbbb", 3) == [(2, "a"), (7, "b")]
+
+
+def test_disagreement_starts_the_count_again() -> None:
+    assert put_out("aababbb", 3) == [(6, "b")]
+
+
+def test_short_units_are_dropped_by_a_large_agreement() -> None:
+    assert put_out("aaaabbcccc", 2) == [(1, "a"), (5, "b"), (7, "c")]
+    assert put_out("aaaabbcccc", 3) == [(2, "a"), (8, "c")]
+
+
+def test_the_unit_last_put_out_is_not_repeated() -> None:
+    assert put_out("aaabbaaa", 3) == [(2, "a")]  # the two frames of b did not agree long enough
+
+
+def test_one_frame_suffices_for_agreement_one() -> None:
+    assert put_out("abba", 1) == [(0, "a"), (1, "b"), (3, "a")]
+
+
+def test_silence_before_speech_is_not_put_out() -> None:
+    assert put_out("----aaa", 3) == [(6, "a")]
+
+
+def test_reset_forgets() -> None:
+    rule = OutputRule(2, last_output=0)
+    assert [rule.accept(1), rule.accept(1)] == [False, True]
+    rule.reset()
+    assert [rule.accept(1), rule.accept(1)] == [False, True]
+
+
+def test_agreement_must_be_positive() -> None:
+    with pytest.raises(ValueError, match="agreement is 0"):
+        OutputRule(0, last_output=0)

@@ -1,0 +1,140 @@
+import pytest
+
+from shared.errors import UserError
+from shared.phones import FINALS, INITIALS, UNITS
+from shared.pinyin import pinyin_of_text, units_of_pinyin, units_of_syllable
+
+pytestmark = pytest.mark.unit
+
+# The syllables of Mandarin by initial (Xinhua Zidian's table), ü written v after n and l.
+SYLLABLES = {
+    "": "a o e ai ei ao ou an en ang eng er",
+    "y": "yi ya yo ye yao you yan yin yang ying yong yu yue yuan yun",
+    "w": "wu wa wo wai wei wan wen wang weng",
+    "b": "ba bo bai bei bao ban ben bang beng bi bie biao bian bin bing bu",
+    "p": "pa po pai pei pao pou pan pen pang peng pi pie piao pian pin ping pu",
+    "m": "ma mo me mai mei mao mou man men mang meng mi mie miao miu mian min ming mu",
+    "f": "fa fo fei fou fan fen fang feng fu",
+    "d": "da de dai dei dao dou dan den dang deng di dia die diao diu dian ding du duo dui duan "
+    "dun dong",
+    "t": "ta te tai tao tou tan tang teng ti tie tiao tian ting tu tuo tui tuan tun tong",
+    "n": "na ne nai nei nao nou nan nen nang neng ni nie niao niu nian nin niang ning nu nuo nuan "
+    "nong nv nve",
+    "l": "la le lai lei lao lou lan lang leng li lia lie liao liu lian lin liang ling lu luo luan "
+    "lun long lv lve",
+    "g": "ga ge gai gei gao gou gan gen gang geng gu gua guo guai gui guan gun guang gong",
+    "k": "ka ke kai kei kao kou kan ken kang keng ku kua kuo kuai kui kuan kun kuang kong",
+    "h": "ha he hai hei hao hou han hen hang heng hu hua huo huai hui huan hun huang hong",
+    "j": "ji jia jie jiao jiu jian jin jiang jing jiong ju jue juan jun",
+    "q": "qi qia qie qiao qiu qian qin qiang qing qiong qu que quan qun",
+    "x": "xi xia xie xiao xiu xian xin xiang xing xiong xu xue xuan xun",
+    "zh": "zhi zha zhe zhai zhei zhao zhou zhan zhen zhang zheng zhu zhua zhuo zhuai zhui zhuan "
+    "zhun zhuang zhong",
+    "ch": "chi cha che chai chao chou chan chen chang cheng chu chua chuo chuai chui chuan chun "
+    "chuang chong",
+    "sh": "shi sha she shai shei shao shou shan shen shang sheng shu shua shuo shuai shui shuan "
+    "shun shuang",
+    "r": "ri re rao rou ran ren rang reng ru rua ruo rui ruan run rong",
+    "z": "zi za ze zai zei zao zou zan zen zang zeng zu zuo zui zuan zun zong",
+    "c": "ci ca ce cai cei cao cou can cen cang ceng cu cuo cui cuan cun cong",
+    "s": "si sa se sai sao sou san sen sang seng su suo sui suan sun song",
+}
+LEGAL = [syllable for row in SYLLABLES.values() for syllable in row.split()]
+
+
+def test_table_is_whole() -> None:
+    assert len(LEGAL) == len(set(LEGAL)) == 410
+
+
+@pytest.mark.parametrize("initial", list(SYLLABLES))
+def test_every_legal_syllable_has_initial_and_final(initial: str) -> None:
+    for syllable in SYLLABLES[initial].split():
+        units = units_of_syllable(syllable)
+        if initial in INITIALS:
+            assert units[0] == initial, syllable
+            assert len(units) == 2, syllable
+        assert units[-1] in FINALS, syllable
+        assert all(unit in UNITS for unit in units)
+
+
+def test_all_units_occur() -> None:
+    seen = {unit for syllable in LEGAL for unit in units_of_syllable(syllable)}
+    assert seen == set(UNITS) - {"sil"}
+
+
+def test_different_syllables_have_different_units() -> None:
+    same = {"you": "yo", "yo": "yo"}  # yo is said iou
+    units = [units_of_syllable(syllable) for syllable in LEGAL if syllable not in same]
+    assert len(units) == len(set(units))
+
+
+@pytest.mark.parametrize(
+    ("syllable", "units"),
+    [
+        ("zhuang1", "zh uang"),
+        ("yi1", "i"),
+        ("yin", "in"),
+        ("ying2", "ing"),
+        ("wu3", "u"),
+        ("wen4", "uen"),
+        ("weng", "ueng"),
+        ("yu2", "v"),
+        ("yue4", "ve"),
+        ("yuan2", "van"),
+        ("yun2", "vn"),
+        ("you3", "iou"),
+        ("nv3", "n v"),
+        ("nü3", "n v"),
+        ("nu:3", "n v"),
+        ("nǚ", "n v"),
+        ("lve4", "l ve"),
+        ("lüe4", "l ve"),
+        ("lüè", "l ve"),
+        ("ju2", "j v"),
+        ("jv2", "j v"),
+        ("xue2", "x ve"),
+        ("quan", "q van"),
+        ("jun1", "j vn"),
+        ("gui4", "g uei"),
+        ("niu2", "n iou"),
+        ("lun2", "l uen"),
+        ("zi4", "z ii"),
+        ("ci", "c ii"),
+        ("si", "s ii"),
+        ("zhi", "zh iii"),
+        ("chi", "ch iii"),
+        ("shi4", "sh iii"),
+        ("ri4", "r iii"),
+        ("er2", "er"),
+        ("hua1", "h ua"),
+        ("huar1", "h ua er"),
+        ("wanr2", "uan er"),
+        ("yuán", "van"),
+        ("LÜ4", "l v"),
+        ("ê4", "ei"),
+        ("eh", "ei"),
+        ("m2", "m"),
+        ("ng4", "n"),
+        ("hm", "h m"),
+        ("de5", "d e"),
+        ("de0", "d e"),
+    ],
+)
+def test_spellings(syllable: str, units: str) -> None:
+    assert units_of_syllable(syllable) == tuple(units.split())
+
+
+@pytest.mark.parametrize("wrong", ["", "1", "ja", "muo3", "luun2", "xyz", "zhuangg", "b", "ni3hao3"])
+def test_unknown_syllables_are_named(wrong: str) -> None:
+    with pytest.raises(UserError, match=f"'{wrong}'"):
+        units_of_syllable(wrong)
+
+
+def test_text() -> None:
+    assert pinyin_of_text("你好，世界！") == ("ni3", "hao3", "shi4", "jie4")
+    assert units_of_pinyin("ni3 hao3") == ("n", "i", "h", "ao")
+    assert pinyin_of_text("绿") == ("lv4",)
+    with pytest.raises(UserError, match="'abc'"):
+        pinyin_of_text("你abc")
+    with pytest.raises(UserError, match="'42'"):
+        pinyin_of_text("42度")

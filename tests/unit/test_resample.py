@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+
+from services.recognizer.resample import Resampler, to_16_khz
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+RATES = (8_000, 11_025, 16_000, 22_050, 24_000, 32_000, 44_100, 48_000)
+
+
+def tone(rate_hz: int, hz: float = 440.0, seconds: float = 1.0) -> np.ndarray:
+    return (0.5 * np.sin(2 * np.pi * hz * np.arange(int(rate_hz * seconds)) / rate_hz)).astype(
+        np.float32
+    )
+
+
+@pytest.mark.parametrize("rate_hz", RATES)
+def test_a_tone_stays_the_same_tone(rate_hz: int) -> None:
+    heard = to_16_khz(tone(rate_hz), rate_hz)
+    assert abs(len(heard) - 16_000) <= 1
+    inner = slice(1000, 15_000)
+    np.testing.assert_allclose(heard[inner], tone(16_000)[inner], atol=2e-3)
+
+
+def test_stereo_is_averaged() -> None:
+    left = tone(48_000)
+    heard = to_16_khz(np.stack([left, np.zeros_like(left)], axis=1), 48_000)
+    np.testing.assert_allclose(heard[1000:15_000], 0.5 * tone(16_000)[1000:15_000], atol=2e-3)
+
+
+def test_what_16_khz_cannot_hold_is_removed() -> None:
+    assert np.abs(to_16_khz(tone(48_000, hz=12_000.0), 48_000)[500:-500]).max() < 1e-3
+
+
+def test_16_khz_passes_through_and_is_clipped() -> None:
+    samples = np.array([0.0, 0.5, 3.0, -3.0], np.float32)
+    np.testing.assert_array_equal(Resampler(16_000).accept_waveform(samples), [0.0, 0.5, 1.0, -1.0])
+    column = Resampler(16_000).accept_waveform(samples[:, None])
+    np.testing.assert_array_equal(column, [0.0, 0.5, 1.0, -1.0])
+
+
+def test_reset_starts_a_new_stream() -> None:
+    resampler = Resampler(44_100)
+    first = resampler.accept_waveform(tone(44_100))
+    resampler.reset()
+    np.testing.assert_array_equal(resampler.accept_waveform(tone(44_100)), first)
+
+
+@pytest.mark.parametrize("rate_hz", [0, 7_999, 48_001, 192_000])
+def test_rates_out_of_range(rate_hz: int) -> None:
+    with pytest.raises(UserError, match=str(rate_hz)):
+        Resampler(rate_hz)
+
+
+def test_wrong_samples_are_refused() -> None:
+    with pytest.raises(UserError, match="9 channels"):
+        Resampler(16_000, 9)
+    with pytest.raises(UserError, match="shape"):
+        Resampler(16_000, 2).accept_waveform(np.zeros(10, np.float32))
+    with pytest.raises(UserError, match="shape"):
+        Resampler(16_000).accept_waveform(np.zeros((10, 2), np.float32))
+    with pytest.raises(UserError, match="no numbers"):
+        Resampler(16_000).accept_waveform(np.array([np.nan], np.float32))

@@ -1,0 +1,67 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector, VoiceState
+from shared.audio_file import read_audio
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+QUIET, STARTING, SPEAKING, STOPPING = VoiceState
+
+
+def states(samples: np.ndarray) -> list[VoiceState]:
+    detector = VoiceActivityDetector()
+    whole = len(samples) // BLOCK_SAMPLES * BLOCK_SAMPLES
+    return [detector.accept_block(block) for block in samples[:whole].reshape(-1, BLOCK_SAMPLES)]
+
+
+def test_silence_and_noise_are_quiet() -> None:
+    noise = np.random.default_rng(0).normal(0, 0.02, 48_000).astype(np.float32)
+    hum = (0.1 * np.sin(2 * np.pi * 50 * np.arange(48_000) / 16_000)).astype(np.float32)
+    for sound in (np.zeros(48_000, np.float32), noise, noise * 10, hum):
+        assert set(states(sound)) <= {QUIET, STARTING}
+
+
+def test_four_states() -> None:
+    detector = VoiceActivityDetector()
+    assert detector.state is QUIET
+    assert detector.accept_probability(0.9) is STARTING
+    assert detector.accept_probability(0.1) is QUIET  # a click
+    assert detector.accept_probability(0.9) is STARTING
+    assert detector.accept_probability(0.9) is SPEAKING
+    assert detector.accept_probability(0.4) is SPEAKING  # weaker, but not improbable
+    assert detector.accept_probability(0.1) is STOPPING
+    assert detector.accept_probability(0.9) is SPEAKING  # a stop's closure
+    ending = [detector.accept_probability(0.1) for _ in range(16)]
+    assert ending == [STOPPING] * 15 + [QUIET]
+    assert [state.is_speech for state in VoiceState] == [False, False, True, True]
+
+
+def test_quieten_ends_speech_at_once() -> None:
+    detector = VoiceActivityDetector()
+    detector.accept_probability(0.9)
+    detector.accept_probability(0.9)
+    detector.quieten()
+    assert detector.state is QUIET
+    assert detector.accept_probability(0.9) is STARTING
+
+
+def test_reset_gives_the_same_again() -> None:
+    samples = np.random.default_rng(0).normal(0, 0.1, BLOCK_SAMPLES).astype(np.float32)
+    detector = VoiceActivityDetector()
+    first = detector._network.process_samples(samples.tolist())
+    detector.reset()
+    assert detector._network.process_samples(samples.tolist()) == first
+
+
+def test_speech_is_speech() -> None:
+    samples, rate_hz = read_audio(DEMO / "hello-female.wav")
+    heard = states(samples.reshape(-1))
+    assert rate_hz == 16_000
+    assert heard[0] is QUIET
+    assert heard.count(SPEAKING) > 0.7 * len(heard)
+    # the speech begins at about 0.38 s; it is noticed within 100 ms
+    assert 0.38 < heard.index(SPEAKING) * BLOCK_SAMPLES / 16_000 < 0.48

@@ -1,0 +1,1 @@
+"""Training of models; never imported by a service."""

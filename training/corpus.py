@@ -1,0 +1,192 @@
+"""Speech corpora for training: rows with audio and units, in three layouts.
+
+Layouts, told apart by what the folder holds:
+
+- ``manifest.tsv``: columns ``utt_id path speaker source licence split seconds text pinyin``;
+- a Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``), Chinese text;
+- AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
+
+Bad rows are reported by row, skipped and counted, never fatal: a corpus of a thousand hours has
+always some.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shared.errors import UserError
+from shared.phones import UNIT_INDEX
+from shared.pinyin import pinyin_of_text, units_of_pinyin
+
+# Licences that allow a model trained on the data to be given away.
+_FREE_LICENCE = re.compile(
+    r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
+)
+_CLOSED_LICENCE = re.compile(r"\bnc\b|\bnd\b|non-?commercial|no-?deriv", re.I)
+_SHORTEST_UNIT_S = 0.03
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Utterance:
+    """One recording with what is said in it."""
+
+    utterance_id: str
+    path: Path
+    speaker: str
+    source: str
+    licence: str
+    split: str
+    seconds: float
+    units: tuple[int, ...]  # indices into shared.phones.UNITS
+    syllables: tuple[int, ...]  # number of units of each syllable
+
+
+@dataclass(slots=True)
+class RowErrors:
+    """What was wrong with which rows."""
+
+    messages: list[str] = field(default_factory=list)
+
+    def add(self, place: str, what: str) -> None:
+        """Note one bad row."""
+        self.messages.append(f"{place}: {what}; row skipped")
+
+
+def may_ship(licence: str) -> bool:
+    """Whether a model trained on rows under this licence may be given away."""
+    return bool(_FREE_LICENCE.search(licence)) and not _CLOSED_LICENCE.search(licence)
+
+
+def read_corpus(folder: Path, errors: RowErrors) -> list[Utterance]:
+    """Read a corpus folder in any of the three layouts.
+
+    Parameters
+    ----------
+    folder
+        The corpus.
+    errors
+        Receives a message for every row that cannot be used.
+
+    Raises
+    ------
+    UserError
+        If the folder holds none of the layouts.
+    """
+    if (folder / "manifest.tsv").is_file():
+        rows = _manifest_rows(folder)
+    elif (folder / "wav.scp").is_file():
+        rows = _kaldi_rows(folder)
+    elif (folder / "transcript").is_dir() and (folder / "wav").is_dir():
+        rows = _aishell_rows(folder)
+    else:
+        raise UserError(
+            f"{folder} holds no corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
+            "text, or with AISHELL's wav and transcript folders"
+        )
+    utterances = []
+    for place, row in rows:
+        utterance = _utterance(place, row, errors)
+        if utterance:
+            utterances.append(utterance)
+    return utterances
+
+
+def _utterance(place: str, row: dict[str, str], errors: RowErrors) -> Utterance | None:
+    path = Path(row["path"])
+    if not path.is_file():
+        errors.add(place, f"no audio file {path}")
+        return None
+    try:
+        pinyin = row.get("pinyin") or " ".join(pinyin_of_text(row["text"].replace(" ", "")))
+        syllables = [units_of_pinyin(syllable) for syllable in pinyin.split()]
+        seconds = float(row.get("seconds") or _duration_s(path))
+    except (UserError, ValueError) as error:
+        errors.add(place, str(error))
+        return None
+    units = tuple(UNIT_INDEX[unit] for syllable in syllables for unit in syllable)
+    if not units:
+        errors.add(place, "no text")
+        return None
+    if len(units) * _SHORTEST_UNIT_S > seconds:
+        errors.add(place, f"{len(units)} units cannot be said in {seconds:.2f} s")
+        return None
+    return Utterance(
+        utterance_id=row["utt_id"],
+        path=path,
+        speaker=row.get("speaker") or row["utt_id"],
+        source=row.get("source", ""),
+        licence=row.get("licence", ""),
+        split=row.get("split") or "train",
+        seconds=seconds,
+        units=units,
+        syllables=tuple(len(syllable) for syllable in syllables),
+    )
+
+
+def _duration_s(path: Path) -> float:
+    import soundfile  # noqa: PLC0415  (manifests state the length; only bare layouts need to ask)
+
+    try:
+        return float(soundfile.info(path).duration)
+    except soundfile.LibsndfileError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def _manifest_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    path = folder / "manifest.tsv"
+    needed = {"utt_id", "path", "pinyin"}
+    with path.open(encoding="utf-8", newline="") as lines:
+        reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
+        missing = needed - set(reader.fieldnames or ())
+        if missing:
+            raise UserError(f"{path} lacks the columns {', '.join(sorted(missing))}; add them")
+        for number, row in enumerate(reader, start=2):
+            place = f"{path.name} row {number} ({row['utt_id']})"
+            cells = {key: value or "" for key, value in row.items() if key}
+            yield place, {**cells, "path": str(folder / cells["path"])}
+
+
+def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    speakers = dict(_pairs(folder / "utt2spk")) if (folder / "utt2spk").is_file() else {}
+    texts = dict(_pairs(folder / "text"))
+    for number, (utterance_id, where) in enumerate(_pairs(folder / "wav.scp"), start=1):
+        path = Path(where) if Path(where).is_absolute() else folder / where
+        yield (
+            f"wav.scp line {number} ({utterance_id})",
+            {
+                "utt_id": utterance_id,
+                "path": str(path),
+                "speaker": speakers.get(utterance_id, ""),
+                "text": texts.get(utterance_id, ""),
+            },
+        )
+
+
+def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    audio = {path.stem: path for path in sorted((folder / "wav").rglob("*.wav"))}
+    for transcript in sorted((folder / "transcript").glob("*.txt")):
+        for number, (utterance_id, text) in enumerate(_pairs(transcript), start=1):
+            path = audio.get(utterance_id, folder / "wav" / f"{utterance_id}.wav")
+            yield (
+                f"{transcript.name} line {number} ({utterance_id})",
+                {
+                    "utt_id": utterance_id,
+                    "path": str(path),
+                    "speaker": path.parent.name,
+                    "source": "AISHELL-1",
+                    "licence": "Apache-2.0",
+                    "split": path.relative_to(folder / "wav").parts[0],
+                    "text": text,
+                },
+            )
+
+
+def _pairs(path: Path) -> Iterator[tuple[str, str]]:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        key, _, value = line.strip().partition(" ")
+        if key:
+            yield key, value.strip()

@@ -1,0 +1,317 @@
+"""From corpora to a model file with its card: the Gaussian mixture and the neural recognizer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.recognizer import ErrorCounts, count_errors
+from services.recognizer.acoustic_model import AcousticModel, Topology
+from services.recognizer.decoder import Decoder
+from services.recognizer.features import NUM_FEATURES, NUM_STATIC, cepstra_of_all
+from services.recognizer.gmm import GmmModel
+from services.recognizer.load import MODEL_PATH, load_model
+from services.recognizer.neural import NeuralModel
+from shared.errors import UserError
+from shared.phones import SILENCE, UNIT_INDEX, UNITS
+from training.augmentation import Augmentation
+from training.corpus import RowErrors
+from training.examples import SYNTHETIC_WEIGHT, Example, load_examples
+from training.gmm import (
+    FrameSet,
+    Hmm,
+    decorrelate,
+    estimate,
+    first_estimate,
+    split,
+    topology_of,
+    unit_bigram,
+)
+from training.neural import train_network
+
+Report = Callable[[str], None]
+
+_STATES_PER_UNIT = 5  # Li et al. 2011, section 3.1
+_HALF_WIDTH = 2  # of the differences: the textbook's
+_ROTATED_AT = 8  # mixtures per state when the features are decorrelated
+_BIGRAM_SCALES = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
+_UNIT_PENALTIES = (0.0, -2.0, -4.0, -7.0, -10.0, -15.0)
+_SIL = UNIT_INDEX[SILENCE]
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What was chosen on development data."""
+
+    bigram_scale: float
+    unit_penalty: float
+    error_rate: float
+
+
+def train_gmm(
+    corpora: Sequence[Path],
+    output: Path,
+    *,
+    seed: int = 0,
+    num_mixtures: int = 16,
+    synthetic_weight: float = SYNTHETIC_WEIGHT,
+    shipping: bool = True,
+    report: Report = print,
+) -> None:
+    """Train the Gaussian mixture recognizer and write the model and its card.
+
+    Parameters
+    ----------
+    corpora
+        Folders that :func:`training.corpus.read_corpus` reads; splits ``train`` and ``dev``.
+    output
+        The ``.npz`` file to write; the card is written beside it as ``.md``.
+    seed
+        Of the augmentation.
+    num_mixtures
+        Gaussians per state, a power of two.
+    synthetic_weight
+        Weight of synthetic speech against real speech.
+    shipping
+        Leave out rows whose licence forbids giving the model away.
+    report
+        Receives lines of progress.
+
+    Raises
+    ------
+    UserError
+        If there is nothing to train on, or the number of mixtures is no power of two.
+    """
+    if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
+        raise UserError(f"{num_mixtures} mixtures are no power of two; give 1, 2, 4, 8, 16...")
+    errors = RowErrors()
+    heard = load_examples(corpora, errors, shipping=shipping, synthetic_weight=synthetic_weight)
+    rng = np.random.default_rng(seed)
+    examples = [copy for example in heard for copy in _copies(example, rng)]
+    first_state = np.arange(len(UNITS) + 1) * _STATES_PER_UNIT
+    prior_mean = _mean_cepstra(heard)
+    report(f"{len(heard)} recordings, {len(examples)} with their changed copies")
+    frames = FrameSet.build(examples, first_state, prior_mean, _HALF_WIDTH)
+    rotation = np.eye(NUM_FEATURES, dtype=np.float32)
+    hmm = first_estimate(frames, first_state)
+    for _ in range(4):
+        report(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
+        hmm = estimate(frames, hmm)
+    size = 1
+    while size < num_mixtures:
+        size *= 2
+        hmm = _repeated(frames, split(hmm, frames, size), 6)
+        if size == min(_ROTATED_AT, num_mixtures):
+            hmm, rotation = decorrelate(frames, hmm)
+            hmm = _repeated(frames, hmm, 4)
+        if size > 2:
+            report(f"{size} mixtures: log likelihood {frames.realign(hmm):.3f} per frame")
+            hmm = _repeated(frames, hmm, 4)
+    log_bigram = unit_bigram([example.units for example in heard])
+    model = GmmModel(
+        topology=topology_of(hmm, log_bigram, frames),
+        mixtures=hmm.mixtures,
+        rotation=rotation,
+        prior_mean=prior_mean,
+        half_width=_HALF_WIDTH,
+    )
+    topology, choice = choose_search(model, corpora, shipping=shipping, report=report)
+    replace(model, topology=topology).save(output)
+    _write_card(
+        output,
+        title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
+        f"{len(UNITS)} x {_STATES_PER_UNIT} states",
+        details=f"seed {seed}, synthetic weight {synthetic_weight:.2f}",
+        examples=heard,
+        errors=errors,
+        choice=choice,
+    )
+    _report_rows(errors, report)
+
+
+def train_neural(
+    corpora: Sequence[Path],
+    output: Path,
+    *,
+    aligner: Path = MODEL_PATH,
+    seed: int = 0,
+    num_epochs: int = 8,
+    synthetic_weight: float = SYNTHETIC_WEIGHT,
+    shipping: bool = True,
+    report: Report = print,
+) -> None:
+    """Train the neural recognizer on frames that a Gaussian mixture model aligns.
+
+    Parameters
+    ----------
+    corpora, output, synthetic_weight, shipping, report
+        As for :func:`train_gmm`.
+    aligner
+        A model that :func:`train_gmm` wrote.
+    seed
+        Of weights, order and augmentation.
+    num_epochs
+        Passes over the data.
+
+    Raises
+    ------
+    UserError
+        If there is nothing to train on, or the aligner is no Gaussian mixture model.
+    """
+    gmm = load_model(aligner)
+    if not isinstance(gmm, GmmModel):
+        raise UserError(f"{aligner} is no Gaussian mixture model; give one that train-gmm wrote")
+    errors = RowErrors()
+    examples = load_examples(corpora, errors, shipping=shipping, synthetic_weight=synthetic_weight)
+    hmm = Hmm(
+        first_state=gmm.topology.first_state,
+        log_stay=gmm.topology.log_stay,
+        log_leave=gmm.topology.log_leave,
+        mixtures=gmm.mixtures,
+    )
+    frames = FrameSet.build(examples, hmm.first_state, gmm.prior_mean, gmm.half_width)
+    frames.features = frames.features @ gmm.rotation
+    report(f"{len(examples)} recordings, log likelihood {frames.realign(hmm):.3f} per frame")
+    states = [frames.states[a:b] for a, b in zip(frames.bounds, frames.bounds[1:], strict=False)]
+    aligned = [number for number, path in enumerate(states) if path[0] >= 0]
+    log_bigram = unit_bigram([example.units for example in examples])
+    model = train_network(
+        [examples[number] for number in aligned],
+        [states[number] for number in aligned],
+        topology_of(hmm, log_bigram, frames),
+        num_epochs=num_epochs,
+        seed=seed,
+        report=report,
+    )
+    topology, choice = choose_search(model, corpora, shipping=shipping, report=report)
+    replace(model, topology=topology).save(output)
+    widths = " x ".join(str(layer.shape[1]) for layer in model.weights)
+    _write_card(
+        output,
+        title=f"Neural recognizer, layers {widths}",
+        details=f"seed {seed}, {num_epochs} epochs, synthetic weight {synthetic_weight:.2f}, "
+        f"aligned by `{aligner.name}`",
+        examples=examples,
+        errors=errors,
+        choice=choice,
+    )
+    _report_rows(errors, report)
+
+
+def choose_search(
+    model: GmmModel | NeuralModel, corpora: Sequence[Path], *, shipping: bool, report: Report
+) -> tuple[Topology, Choice | None]:
+    """Choose bigram scale and unit penalty on the split ``dev``; keep the middle without one."""
+    topology = model.topology
+    try:
+        dev = load_examples(corpora, RowErrors(), split="dev", shipping=shipping)
+    except UserError:
+        report("no dev recordings: bigram scale and unit penalty are not chosen")
+        return _searching(topology, 4.0, -5.0), None
+    scores = [_all_scores(model, example) for example in dev]
+    best: Choice | None = None
+    for bigram_scale in _BIGRAM_SCALES:
+        for unit_penalty in _UNIT_PENALTIES:
+            decoder = Decoder(_searching(topology, bigram_scale, unit_penalty))
+            total = ErrorCounts()
+            for example, rows in zip(dev, scores, strict=True):
+                decoder.reset()
+                for row in rows:
+                    decoder.accept(row)
+                units = [segment.unit for segment in decoder.finish() if segment.unit != _SIL]
+                total += count_errors([UNITS[u] for u in example.units], [UNITS[u] for u in units])
+            if best is None or total.rate < best.error_rate:
+                best = Choice(bigram_scale, unit_penalty, total.rate)
+                report(
+                    f"dev phone error rate {100 * total.rate:.1f} % with bigram scale "
+                    f"{bigram_scale} and unit penalty {unit_penalty}"
+                )
+    assert best is not None  # noqa: S101 (the grid is not empty)
+    return _searching(topology, best.bigram_scale, best.unit_penalty), best
+
+
+def _searching(topology: Topology, bigram_scale: float, unit_penalty: float) -> Topology:
+    log_bigram = (bigram_scale * topology.log_bigram + unit_penalty).astype(np.float32)
+    return replace(topology, log_bigram=log_bigram)
+
+
+def _all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
+    stream = model.stream()
+    return np.concatenate([stream.accept(example.log_mel.astype(np.float32)), stream.finish()])
+
+
+def _copies(example: Example, rng: np.random.Generator) -> list[Example]:
+    """The recording and, the rarer its speaker, changed copies that share its weight."""
+    num_copies = max(1, math.ceil(example.weight))
+    copies = []
+    for number in range(num_copies):
+        changed = number > 0 or rng.random() < 0.5
+        augmentation = Augmentation.draw(rng) if changed else None
+        weight = example.weight / num_copies
+        copies.append(replace(example, weight=weight, augmentation=augmentation))
+    return copies
+
+
+def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
+    step = max(1, len(examples) // 500)
+    means = [
+        cepstra_of_all(example.log_mel.astype(np.float32)).mean(axis=0)
+        for example in examples[::step]
+    ]
+    return np.mean(means, axis=0).astype(np.float32).reshape(NUM_STATIC)
+
+
+def _repeated(frames: FrameSet, hmm: Hmm, times: int) -> Hmm:
+    for _ in range(times):
+        hmm = estimate(frames, hmm)
+    return hmm
+
+
+def _report_rows(errors: RowErrors, report: Report) -> None:
+    for message in errors.messages[:20]:
+        report(message)
+    if errors.messages:
+        report(f"{len(errors.messages)} rows skipped")
+
+
+def _write_card(
+    output: Path,
+    *,
+    title: str,
+    details: str,
+    examples: Sequence[Example],
+    errors: RowErrors,
+    choice: Choice | None,
+) -> None:
+    """Write what the model was made of, beside the model."""
+    licences: dict[str, list[Example]] = {}
+    for example in examples:
+        licences.setdefault(example.licence or "none given", []).append(example)
+    rows = [
+        f"| {licence} | {len(group)} | {len({example.speaker for example in group})} | "
+        f"{sum(len(example.log_mel) for example in group) / 6000:.1f} |"
+        for licence, group in sorted(licences.items())
+    ]
+    lines = [
+        f"# {title}",
+        "",
+        f"Made by `training.recipes`, {details}.",
+        "",
+        "| licence of the recordings | recordings | speakers | minutes without outer silence |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+        f"{len(errors.messages)} rows were skipped.",
+    ]
+    if choice is not None:
+        lines += [
+            "",
+            f"Chosen on dev: bigram scale {choice.bigram_scale}, unit penalty "
+            f"{choice.unit_penalty}; phone error rate there {100 * choice.error_rate:.1f} %.",
+        ]
+    output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
