@@ -318,7 +318,7 @@ def phones(
     found = recognize(load_model(), samples, MEDIA_RATE_HZ)
     if not found:
         CONSOLE.print(f"[yellow]{audio}: no speech was heard")
-    text = format_phones(found, form.value, duration_s=len(samples) / MEDIA_RATE_HZ)
+    text = format_phones(found, form.value, len(samples) / MEDIA_RATE_HZ)
     if output is None:
         sys.stdout.write(text)
     else:

@@ -111,6 +111,10 @@ class Supervisor:
                 del self._due_s[service]
                 self._spawn(service)
 
+    def process_number(self, service: str) -> int:
+        """Return the process number of a running service."""
+        return self._processes[service].pid
+
     def stop(self) -> None:
         """Ask every service to finish, and end those that do not."""
         for process in self._processes.values():

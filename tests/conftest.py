@@ -13,5 +13,5 @@ from tests.system import System
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     """Control, recognizer, synthesizer and driver on this host."""
     folder = tmp_path_factory.mktemp("system")
-    with System(("control", "recognizer", "synthesizer"), folder) as running:
+    with System(("control", "recognizer", "synthesizer", "driver"), folder) as running:
         yield running

@@ -194,7 +194,8 @@ def _batches(
         targets.append(path)
         size += len(padded)
         if size > _POOL_FRAMES or position == len(order) - 1:
-            pool, of_pool, at = (np.concatenate(part) for part in (frames, targets, centres))
+            pool, of_pool = np.concatenate(frames), np.concatenate(targets)
+            at = np.concatenate(centres)
             shuffled = rng.permutation(len(of_pool))
             for start in range(0, len(shuffled) - _BATCH + 1, _BATCH):
                 rows = shuffled[start : start + _BATCH]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from evaluation.recognizer import ErrorCounts, count_errors
 from services.recognizer.acoustic_model import AcousticModel, Topology
 from services.recognizer.decoder import Decoder
-from services.recognizer.features import NUM_FEATURES, NUM_STATIC, cepstra_of_all
+from services.recognizer.features import NUM_FEATURES, cepstra_of_all
 from services.recognizer.gmm import GmmModel
 from services.recognizer.load import MODEL_PATH, load_model
 from services.recognizer.neural import NeuralModel
@@ -246,7 +246,7 @@ def _all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
 
 
 def _copies(example: Example, rng: np.random.Generator) -> list[Example]:
-    """The recording and, the rarer its speaker, changed copies that share its weight."""
+    """Give a rare speaker's recording changed copies that share its weight."""
     num_copies = max(1, math.ceil(example.weight))
     copies = []
     for number in range(num_copies):
@@ -263,7 +263,8 @@ def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
         cepstra_of_all(example.log_mel.astype(np.float32)).mean(axis=0)
         for example in examples[::step]
     ]
-    return np.mean(means, axis=0).astype(np.float32).reshape(NUM_STATIC)
+    mean: NDArray[np.float32] = np.mean(means, axis=0, dtype=np.float32)
+    return mean
 
 
 def _repeated(frames: FrameSet, hmm: Hmm, times: int) -> Hmm:

@@ -346,6 +346,12 @@ class _FapFit:
             ]
         )
         self.visemes, self.silences = self._start.copy(), self._silence_start.copy()
+        # The start's shapes are another speaker's: as large as this one's, to begin with.
+        curve = self.curve()[0]
+        gain = max(float(curve @ self._measured) / max(float(curve @ curve), 1e-9), 0.0)
+        self._start[4] *= gain
+        self.visemes[4] *= gain
+        self.gain = gain
         self._fixed_target = start.closes[:, column] > 0.0
         self._fixed_target[VISEME_INDEX[REST]] = True
 

@@ -6,6 +6,7 @@ and keeps them in step. Audio, phones and FAPs never pass through it.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable
@@ -37,6 +38,7 @@ from shared.messages import (
 )
 from shared.service import Handler, Service
 
+STOPPED = "stopped"  # why a service is gone that said goodbye
 START_LIMIT_S = 5.0  # for the services to take a session
 Request = OpenSession | CloseSession | FlushSession | StatusRequest
 
@@ -194,7 +196,7 @@ class ControlService(Service):
             self._publish("service-ready", detail=f"{heartbeat.service} {heartbeat.instance}")
             self._take_over(heartbeat)
         if heartbeat.state == "draining":
-            self._service_gone(heartbeat.instance, "stopped")
+            self._service_gone(heartbeat.instance, STOPPED)
         for session, idle_s in heartbeat.idle_s.items():
             record = self._registry.sessions.get(session)
             if record is None:  # of an earlier run of control, or just closed
@@ -298,7 +300,9 @@ class ControlService(Service):
 
     def _service_gone(self, instance: str, reason: str) -> None:
         self._registry.services.pop(instance, None)
-        LOG.warning("lost %s: %s", instance, reason)
+        LOG.log(
+            logging.INFO if reason == STOPPED else logging.WARNING, "lost %s: %s", instance, reason
+        )
         self._publish("service-lost", detail=f"{instance}: {reason}")
         for record in list(self._registry.sessions.values()):
             record.waiting_for.discard(instance)

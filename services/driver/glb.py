@@ -9,7 +9,7 @@ the scene says how a FAP becomes a weight or an angle:
   node combine as yaw * pitch * roll.
 
 Nodes: ``kouxing`` > ``body`` (joint), ``garment``; ``body`` > ``head`` (joint) > ``eye_left``,
-``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``lashes``; and ``skin``, a
+``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``; and ``skin``, a
 mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face looks along z.
 """
 
@@ -240,7 +240,9 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
         },
     }
     if part.transparent:
-        material |= {"alphaMode": "BLEND", "doubleSided": True}
+        material["alphaMode"] = "BLEND"
+    if part.double_sided:
+        material["doubleSided"] = True
     return material
 
 

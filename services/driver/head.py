@@ -54,6 +54,7 @@ class Part:
     texture: str  # key of Head.textures
     roughness: float  # 0 to 1
     transparent: bool  # the texture's alpha counts
+    double_sided: bool  # its inside is seen, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +256,7 @@ def _assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail)
                 texture=str(arrays["part_textures"][row]),
                 roughness=float(arrays["part_roughness"].astype(float)[row]),
                 transparent=bool(arrays["part_transparent"][row]),
+                double_sided=bool(arrays["part_double_sided"][row]),
             )
         )
         num_triangles += len(own)

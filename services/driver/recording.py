@@ -31,7 +31,7 @@ class Recording:
         self._frames: deque[tuple[float, Faps]] = deque()
         self._num_samples = 0
         self._writer = VideoWriter(
-            path, renderer.width_px, renderer.height_px, frame_rate_hz, MEDIA_RATE_HZ
+            path, *renderer.size, frame_rate_hz=frame_rate_hz, sample_rate_hz=MEDIA_RATE_HZ
         )
 
     @property

@@ -150,6 +150,7 @@ _MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "teeth_lower": ((0.4, 0.36, 0.32), 60.0, 0.30),
     "tongue": ((0.5, 0.3, 0.3), 30.0, 0.20),
     "hair": ((0.3, 0.3, 0.3), 14.0, 0.12),
+    "hair_tips": ((0.3, 0.3, 0.3), 14.0, 0.12),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
 
@@ -324,9 +325,10 @@ class Renderer:
             program["eye"] = self._camera.position
         half_way = _KEY + eye / np.linalg.norm(eye)
         self._eye_program["half_way"] = tuple(half_way / np.linalg.norm(half_way))
-        context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         for part in self.head.parts:
             if not part.transparent:
+                culled = 0 if part.double_sided else moderngl.CULL_FACE
+                context.enable_only(moderngl.DEPTH_TEST | culled)
                 self._draw_part(part)
         if self._background is not None:  # behind all that hides it, before what lets it through
             middle, edge = self._background
@@ -350,7 +352,7 @@ class Renderer:
         wrap, gloss, shine = _MATERIALS[part.name]
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
-            ("two_sided", float(part.transparent)),
+            ("two_sided", float(part.double_sided)),
         ):  # fmt: skip
             if name in program:
                 program[name] = value

@@ -16,7 +16,7 @@ import numpy as np
 from services.driver.head import Head
 from services.driver.recording import Recording
 from services.driver.render import Renderer
-from services.driver.window import HeadWindow
+from services.driver.window import Window
 from shared.bus import Socket
 from shared.clock import to_seconds
 from shared.config import DriverConfig
@@ -66,6 +66,7 @@ class DriverService(Service):
         self._frame_s = time.monotonic()
         self._stalled = False
         self._window = self._open_window()
+        self._visible = self._window is not None
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""
@@ -97,12 +98,11 @@ class DriverService(Service):
 
     def on_tick(self, now_s: float) -> None:
         """Draw what is due."""
-        if self._window is not None:
-            if self._window.closed:
+        if self._window is not None and self._visible:
+            self._visible = self._window.draw(self._shown(now_s))
+            if not self._visible:
                 LOG.info("the window was closed")
-                self._window = None
-            else:
-                self._window.draw(self._shown(now_s))
+                self._window.hide()  # videos under way go on drawing in its context
         self._render_until(time.monotonic() + RENDER_BUDGET_S)
 
     def on_drain(self) -> bool:
@@ -139,11 +139,11 @@ class DriverService(Service):
 
     # --- the window ----------------------------------------------------------------------------
 
-    def _open_window(self) -> HeadWindow | None:
+    def _open_window(self) -> Window | None:
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if self._config.view == "none" or (self._config.view == "auto" and not has_display):
             return None
-        return HeadWindow(self._head, self._config.width_px, self._config.height_px)
+        return Window(self._head, self._config.width_px, self._config.height_px)
 
     def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
         """Return the newest frame, or while none comes one that fades to rest."""
@@ -160,10 +160,13 @@ class DriverService(Service):
         config = self._config
         try:
             if self._renderer is None:
-                self._renderer = Renderer(self._head, config.width_px, config.height_px)
+                context = None if self._window is None else self._window.context
+                size = (config.width_px, config.height_px)
+                self._renderer = Renderer(self._head, *size, context=context)
             path = Path(config.out) / f"{session}.mp4"
+            path.parent.mkdir(parents=True, exist_ok=True)
             return Recording(path, self._renderer, config.frame_rate_hz)
-        except UserError as error:
+        except (UserError, OSError) as error:
             self._report(session, "no-video", str(error))
             return None
 

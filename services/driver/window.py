@@ -62,7 +62,13 @@ class Window:
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
         size = glfw.get_framebuffer_size(self._window)
-        self._renderer = Renderer(head, *size, context=moderngl.create_context(require=330))
+        self._context = moderngl.create_context(require=330)
+        self._renderer = Renderer(head, *size, context=self._context)
+
+    @property
+    def context(self) -> moderngl.Context:
+        """The window's OpenGL context, for renderers that draw beside it."""
+        return self._context
 
     def draw(self, faps: Float32) -> bool:
         """Show one picture and handle what the user did to the window.
@@ -91,6 +97,10 @@ class Window:
         """Show what ``next_faps`` gives, at the display's rate, until the window is closed."""
         while self.draw(next_faps()):
             pass
+
+    def hide(self) -> None:
+        """Take the window off the screen; its context stays."""
+        glfw.hide_window(self._window)
 
     def close(self) -> None:
         """Close the window."""

@@ -155,7 +155,7 @@ def _frame_after(record: int) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _step(  # noqa: PLR0912, PLR0917 (one pass over the states; numba takes positions)
+def _step(  # noqa: PLR0912 (one pass over the states; numba takes positions)
     frame: int,
     observed: NDArray[np.float32],
     score: NDArray[np.float32],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,11 +55,13 @@ def read_archive(path: Path) -> Archive:
         If the file is missing or no model file.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return Archive({name: archive[name] for name in archive.files})
-    except FileNotFoundError as error:
+        content = io.BytesIO(path.read_bytes())
+    except OSError as error:
         raise UserError(f"no acoustic model at {path}; train one or reinstall") from error
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+    try:
+        with np.lib.npyio.NpzFile(content, allow_pickle=False) as archive:
+            return Archive({name: archive[name] for name in archive.files})
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is no acoustic model ({error}); train one or reinstall") from error
 
 

@@ -40,7 +40,8 @@ def brute_force(
 ) -> tuple[float, list[Segment]]:
     """Score every sequence of states that the loop allows."""
     states = [u * states_per_unit + k for u in units for k in range(states_per_unit)]
-    best, path = -np.inf, ()
+    best = -np.inf
+    path: tuple[int, ...] = ()
     for sequence in itertools.product(states, repeat=len(scores)):
         if sequence[0] % states_per_unit or sequence[-1] % states_per_unit != states_per_unit - 1:
             continue
@@ -64,9 +65,7 @@ def brute_force(
             best, path = total, sequence
     units_of_frames = [state // states_per_unit for state in path]
     starts = [0] + [
-        t
-        for t in range(1, len(path))
-        if path[t] % states_per_unit == 0 and path[t] != path[t - 1]
+        t for t in range(1, len(path)) if path[t] % states_per_unit == 0 and path[t] != path[t - 1]
     ]
     ends = [*starts[1:], len(path)]
     return best, [Segment(units_of_frames[s], s, e) for s, e in zip(starts, ends, strict=True)]
@@ -87,7 +86,9 @@ def test_same_as_trying_every_path(seed: int, states_per_unit: int, num_frames: 
     assert decoder.finish() == expected
 
 
-def clear_scores(sequence: list[int], model: Topology, frames_per_state: int) -> NDArray[np.float32]:
+def clear_scores(
+    sequence: list[int], model: Topology, frames_per_state: int
+) -> NDArray[np.float32]:
     """Scores that leave no doubt."""
     rows = []
     for unit in sequence:

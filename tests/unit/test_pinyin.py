@@ -124,7 +124,9 @@ def test_spellings(syllable: str, units: str) -> None:
     assert units_of_syllable(syllable) == tuple(units.split())
 
 
-@pytest.mark.parametrize("wrong", ["", "1", "ja", "muo3", "luun2", "xyz", "zhuangg", "b", "ni3hao3"])
+@pytest.mark.parametrize(
+    "wrong", ["", "1", "ja", "muo3", "luun2", "xyz", "zhuangg", "b", "ni3hao3"]
+)
 def test_unknown_syllables_are_named(wrong: str) -> None:
     with pytest.raises(UserError, match=f"'{wrong}'"):
         units_of_syllable(wrong)

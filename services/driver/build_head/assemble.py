@@ -288,19 +288,24 @@ def _tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
 
 
 def _hair() -> list[Piece]:
-    sheets = [
-        parts.hair_sheet(side, rise, 44, 30, seed)
-        for rise, seed in ((0.0, 1), (0.03, 2))
-        for side in (1.0, -1.0)
-    ]
-    offsets = np.cumsum([0] + [len(sheet.vertices) for sheet in sheets[:-1]])
-    part = parts.Part(
-        np.concatenate([sheet.vertices for sheet in sheets]),
-        np.concatenate([s.triangles + first for s, first in zip(sheets, offsets, strict=True)]),
-        np.concatenate([sheet.uv for sheet in sheets]),
-        np.concatenate([sheet.colors for sheet in sheets]),
-    )
-    return [Piece("hair", part, "hair", 0.5, np.ones(len(part.vertices)))]
+    """Make the opaque body of the hair, and its thin front edge and tips."""
+    pieces = []
+    for name, rise, tips in (("hair", 0.0, False), ("hair_tips", 0.014, True)):
+        sheets = [parts.hair_sheet(side, rise, 38, 28) for side in (1.0, -1.0)]
+        count = len(sheets[0].vertices)
+        triangles = np.concatenate([sheets[0].triangles, sheets[1].triangles + count])
+        uv = np.concatenate([sheet.uv for sheet in sheets])
+        u, v = uv[triangles, 0], uv[triangles, 1]
+        shown = (
+            (u.min(axis=1) < 0.16) | (v.max(axis=1) > 0.80)
+            if tips
+            else (u.min(axis=1) > 0.06) & (v.max(axis=1) < 0.90)
+        )
+        used, triangles = np.unique(triangles[shown], return_inverse=True)
+        vertices = np.concatenate([sheet.vertices for sheet in sheets])[used]
+        part = parts.Part(vertices, triangles.reshape(-1, 3), uv[used], np.ones_like(vertices))
+        pieces.append(Piece(name, part, "hair", 0.5, np.ones(len(vertices))))
+    return pieces
 
 
 def _lashes(skin: Skin, fields: Fields) -> Piece:
@@ -399,7 +404,7 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
             lit = np.clip(0.95 - 2.2 * (part.vertices[:, 1:2] - part.vertices[0, 1] - 0.005) / 0.1,
                           0.45, 1.0)
             part.colors = np.repeat(lit, 3, axis=1)
-        elif piece.name == "hair":
+        elif piece.name.startswith("hair"):
             part.colors = np.repeat(0.45 + 0.55 * own, 3, axis=1)
         elif piece.name.startswith("teeth"):
             part.colors = part.colors * (0.55 + 0.45 * np.clip(1.5 * own, 0, 1))
@@ -504,7 +509,8 @@ def _write(
         part_names=np.array([p.name for p in pieces]),
         part_textures=np.array([p.texture for p in pieces]),
         part_roughness=np.array([p.roughness for p in pieces]),
-        part_transparent=np.array([p.texture in ("hair", "lashes") for p in pieces]),
+        part_transparent=np.array([p.name in ("hair_tips", "lashes") for p in pieces]),
+        part_double_sided=np.array([p.texture in ("hair", "lashes") for p in pieces]),
         part_vertices=np.array(part_vertices),
         part_triangles=np.array(part_triangles),
         fapu_names=np.array(list(fapu)),

@@ -159,7 +159,7 @@ def _bezier(points: Float, t: Float) -> Float:
     return (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
 
 
-def hair_sheet(side: float, rise: float, strands: int, steps: int, seed: int) -> Part:
+def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     """Comb one side of a bob from the parting over the ear down to the jaw.
 
     Parameters
@@ -170,10 +170,8 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int, seed: int) ->
         Distance from the innermost layer, dm.
     strands, steps
         Size of the grid across and along the hair.
-    seed
-        Of the small irregularities.
     """
-    noise = np.random.default_rng(seed)
+    noise = np.random.default_rng(1)
     across = np.linspace(0.0, 1.0, strands)
     # in degrees about the skull's centre: azimuth from the front, elevation
     azimuth_end = np.interp(across, [0.0, 0.25, 1.0], [63.0, 84.0, 180.0])

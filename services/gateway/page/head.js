@@ -2,10 +2,15 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { MorphedMesh } from "./morph.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const RADIANS_PER_UNIT = 1e-5;
 const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
+const SLOW_MS = 45; // a display frame
+const JUDGE_EVERY_MS = 1500;
+const COARSER = 0.7;
+const LEAST_PIXEL_RATIO = 0.5;
 const PORTRAIT_ASPECT = 0.8; // narrower windows step back, so that the face still fits
 
 export class Head {
@@ -13,10 +18,14 @@ export class Head {
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
-  #morphs = []; // [influences, target, FAP index, weight per FAP unit]
+  #meshes = []; // that FAPs move
   #joints = []; // { node, rest, turns: [[FAP index, axis]] }
   #fovYDegrees = 22;
   #stale = true;
+  #pixelRatio = Math.min(2, devicePixelRatio);
+  #intervalMs = 0; // between display frames, smoothed
+  #drawnMs = 0;
+  #judgedMs = 0;
   #turn = new THREE.Quaternion();
 
   constructor(canvas) {
@@ -29,7 +38,10 @@ export class Head {
     this.#controls.maxPolarAngle = 1.9;
     this.#controls.addEventListener("change", () => (this.#stale = true));
     this.#light();
-    new ResizeObserver(() => this.#resize(canvas)).observe(canvas);
+    new ResizeObserver(() => {
+      this.#resize();
+      this.#renderer.render(this.#scene, this.#camera);
+    }).observe(canvas);
   }
 
   /** Load a head into a canvas. */
@@ -43,13 +55,8 @@ export class Head {
     const about = gltf.scene.userData.kouxing ?? gltf.scene.getObjectByName("kouxing").userData.kouxing;
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
-      node.frustumCulled = false; // bounds do not follow the morph targets
-      for (const { name, number, unitsPerWeight } of about.faps) {
-        const target = node.morphTargetDictionary?.[name];
-        if (target !== undefined) {
-          this.#morphs.push([node.morphTargetInfluences, target, number - 1, 1 / unitsPerWeight]);
-        }
-      }
+      node.frustumCulled = false; // bounds do not follow the face
+      if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
     });
     this.#findJoints(gltf.scene, about.faps);
     this.#scene.add(gltf.scene);
@@ -58,9 +65,7 @@ export class Head {
 
   /** Take on a face: 68 values in FAP units. */
   pose(faps) {
-    for (const [influences, target, index, scale] of this.#morphs) {
-      influences[target] = faps[index] * scale;
-    }
+    for (const mesh of this.#meshes) mesh.pose(faps);
     for (const { node, rest, turns } of this.#joints) {
       node.quaternion.copy(rest);
       for (const [index, axis] of turns) {
@@ -71,10 +76,19 @@ export class Head {
     this.#stale = true;
   }
 
-  /** Draw, if anything has changed. */
-  draw() {
+  /** Draw, if anything has changed since the last display frame. */
+  draw(nowMs) {
+    this.#intervalMs += 0.1 * (Math.min(500, nowMs - this.#drawnMs) - this.#intervalMs);
+    this.#drawnMs = nowMs;
     if (!this.#stale) return;
     this.#stale = false;
+    if (nowMs - this.#judgedMs > JUDGE_EVERY_MS) {
+      this.#judgedMs = nowMs;
+      if (this.#intervalMs > SLOW_MS && this.#pixelRatio > LEAST_PIXEL_RATIO) {
+        this.#pixelRatio *= COARSER; // the mouth must move in time rather than be sharp
+        this.#resize();
+      }
+    }
     this.#renderer.render(this.#scene, this.#camera);
   }
 
@@ -103,7 +117,7 @@ export class Head {
     this.#controls.minDistance = 0.5 * distance;
     this.#controls.maxDistance = 1.5 * distance;
     this.#controls.update();
-    this.#resize(this.#renderer.domElement);
+    this.#resize();
   }
 
   /** A key from the front upper left, a fill, a rim, and soft light from everywhere. */
@@ -120,8 +134,8 @@ export class Head {
     }
   }
 
-  #resize(canvas) {
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  #resize() {
+    const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
     if (width === 0 || height === 0) return;
     const aspect = width / height;
     const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
@@ -129,9 +143,8 @@ export class Head {
     this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
     this.#camera.aspect = aspect;
     this.#camera.updateProjectionMatrix();
-    this.#renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    this.#renderer.setPixelRatio(this.#pixelRatio);
     this.#renderer.setSize(width, height, false);
     this.#stale = true;
-    this.draw();
   }
 }

@@ -138,7 +138,7 @@ function draw(nowMs) {
   presence += ((isLive ? 1 : 0) - presence) * (1 - Math.exp(-elapsedMs / REST_MS));
   if (Math.abs(presence - isLive) < 0.001) presence = isLive ? 1 : 0;
   if (settle()) head?.pose(faps);
-  head?.draw();
+  head?.draw(nowMs);
 
   showLevel();
   if (mediaTime !== null) showPhones(mediaTime);
@@ -286,7 +286,7 @@ sound.turnOn();
 try {
   head = await Head.load(element("head"), "head.glb");
   head.pose(faps);
-  head.draw(); // the first time takes long, which says nothing about the stream
+  head.draw(performance.now()); // the first time takes long, which says nothing about the stream
   playout.reset();
 } catch (error) {
   showError(`no head: ${error.message}`);

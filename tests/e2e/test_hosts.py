@@ -1,0 +1,146 @@
+"""Each service on an address of its own; strangers that know PROTOCOL.md alone."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zmq
+
+from tests.e2e.following import samples_of_file
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+HOSTS = {
+    "control": "127.0.0.11",
+    "recognizer": "127.0.0.12",
+    "synthesizer": "127.0.0.13",
+    "driver": "127.0.0.14",
+}
+
+
+@pytest.fixture(scope="module")
+def spread(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    with System(HOSTS, tmp_path_factory.mktemp("spread"), hosts=HOSTS) as running:
+        yield running
+
+
+class Stranger:
+    """A program that speaks the protocol with nothing but pyzmq and msgpack."""
+
+    def __init__(self) -> None:
+        self.context = zmq.Context()
+
+    def socket(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+        made = self.context.socket(kind)
+        made.setsockopt(zmq.LINGER, 1000)
+        made.setsockopt(zmq.RCVTIMEO, 20000)
+        made.connect(endpoint)
+        return made
+
+    def close(self) -> None:
+        self.context.destroy()
+
+
+def send(socket: zmq.Socket[bytes], kind: str, session: str, **fields: object) -> None:
+    body = {"version": 1, "session": session, **fields}
+    socket.send_multipart([f"{kind}/{session}/".encode(), msgpack.packb(body)])
+
+
+def receive(socket: zmq.Socket[bytes]) -> tuple[str, dict[str, Any]]:
+    topic, body = socket.recv_multipart()
+    return topic.decode().split("/")[0], msgpack.unpackb(body)
+
+
+def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> None:
+    speaker, watcher = Stranger(), Stranger()
+    control = speaker.socket(zmq.DEALER, spread.control)
+    send(control, "open", "stranger", request="1", encoding="s16le", paced=False)
+    kind, opened = receive(control)
+    assert kind == "opened", opened
+    for key, service in (("audio", "recognizer"), ("faps", "synthesizer"), ("events", "control")):
+        assert opened[key].startswith(f"tcp://{HOSTS[service]}:")
+
+    faps = watcher.socket(zmq.SUB, opened["faps"])
+    for wanted in ("fap", "end", "joined"):
+        faps.setsockopt(zmq.SUBSCRIBE, f"{wanted}/stranger/".encode())
+    assert receive(faps)[0] == "joined"
+
+    samples = samples_of_file(DEMO / "vowels-male.wav")
+    pcm = (samples * 32767).astype("<i2").tobytes()
+    audio = speaker.socket(zmq.DEALER, opened["audio"])
+    for number, begin in enumerate(range(0, len(pcm), 1280), start=1):
+        send(
+            audio,
+            "audio",
+            "stranger",
+            token=opened["token"],
+            sequence=number,
+            media_time=begin // 2,
+            pcm=pcm[begin : begin + 1280],
+        )
+    send(audio, "finish", "stranger", token=opened["token"], sequence=10**6)
+
+    jaw: list[float] = []
+    while (frame := receive(faps))[0] != "end":
+        kind, body = frame
+        assert kind == "fap"
+        assert body["mask"] == bytes([252] + [255] * 7 + [15])
+        assert body["media_time"] == 320 * len(jaw)
+        jaw.append(struct.unpack("<68f", body["values"])[2])
+    assert len(jaw) / 50 >= len(samples) / 16000
+    assert max(jaw) > 200, "/a/ opens the jaw"
+    assert abs(jaw[-1]) < 1
+
+    send(control, "close", "stranger", request="2", token=opened["token"])
+    assert receive(control)[0] == "done"
+    speaker.close()
+    watcher.close()
+
+
+def test_the_same_request_twice_is_carried_out_once(spread: System) -> None:
+    stranger = Stranger()
+    control = stranger.socket(zmq.DEALER, spread.control)
+    for _ in range(2):
+        send(control, "open", "", request="again")
+    answers = [receive(control)[1]]
+    control.setsockopt(zmq.RCVTIMEO, 1000)
+    try:
+        answers.append(receive(control)[1])
+    except zmq.Again:
+        send(control, "open", "", request="again")
+        answers.append(receive(control)[1])
+    assert answers[0] == answers[1]
+    send(control, "status", "", request="status")
+    _, report = receive(control)
+    assert sum(s["session"] == answers[0]["session"] for s in report["sessions"]) == 1
+    send(
+        control,
+        "close",
+        answers[0]["session"],
+        request="done",
+        token=answers[0]["token"],
+    )
+    assert receive(control)[0] == "done"
+    stranger.close()
+
+
+def test_services_share_no_folder_and_say_what_they_are(spread: System, tmp_path: Path) -> None:
+    stranger = Stranger()
+    control = stranger.socket(zmq.DEALER, spread.control)
+    end_s = time.monotonic() + 10
+    while True:
+        send(control, "status", "", request=str(time.monotonic()))
+        _, report = receive(control)
+        offsets = {s["service"]: s["clock_offset_ms"] for s in report["services"]}
+        if set(offsets) == set(HOSTS) or time.monotonic() > end_s:
+            break
+    assert set(offsets) == set(HOSTS)
+    assert np.abs(list(offsets.values())).max() < 50, "one clock here, so the offsets are small"
+    stranger.close()

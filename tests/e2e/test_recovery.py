@@ -1,0 +1,122 @@
+"""A crashed service is started again and its sessions go on."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rich.console import Console
+
+from services.supervisor import Supervisor
+from shared.client import Client, Session
+from shared.errors import UserError
+from shared.messages import FapFrame
+from tests.e2e.following import samples_of_file
+from tests.system import BINDS, DEMO, ONE_THREAD, free_port
+
+pytestmark = pytest.mark.e2e
+
+
+class Watched:
+    """A supervisor on ports of its own, checked as ``kouxing run`` does."""
+
+    def __init__(self, folder: Path) -> None:
+        environment = {**ONE_THREAD, "KOUXING_DRIVER_VIEW": "none"}
+        for service, keys in BINDS.items():
+            for key in keys:
+                endpoint = f"tcp://127.0.0.1:{free_port()}"
+                environment[f"KOUXING_{service.upper()}_{key}"] = endpoint
+        environment["KOUXING_GATEWAY_PORT"] = str(free_port())
+        self.control = environment["KOUXING_CONTROL_COMMANDS"]
+        environment["KOUXING_CONTROL"] = self.control
+        self.shown = io.StringIO()
+        console = Console(file=self.shown, width=200)
+        self.supervisor = Supervisor([], folder, console, environment)
+
+    def instance(self, client: Client, service: str) -> str:
+        for state in client.status().services:
+            if state.service == service:
+                return state.instance
+        return ""
+
+    def kill(self, service: str) -> None:
+        os.kill(self.supervisor.process_number(service), signal.SIGKILL)
+
+    def check_until_replaced(self, client: Client, service: str, old: str) -> None:
+        end_s = time.monotonic() + 30
+        while self.instance(client, service) in ("", old):
+            assert time.monotonic() < end_s, f"{service} did not come back"
+            self.supervisor.check()
+            time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
+    made = Watched(tmp_path_factory.mktemp("logs"))
+    try:
+        made.supervisor.start()
+        made.supervisor.wait_ready(made.control)
+        yield made
+    finally:
+        made.supervisor.stop()
+
+
+def moves(session: Session, samples: NDArray[np.float32]) -> bool:
+    """Stream samples in real time; return whether the mouth opens and frames keep coming."""
+    output = session.subscribe(FapFrame)
+    opening = 0.0
+    for begin in range(0, len(samples), 320):
+        session.send(samples[begin : begin + 320])
+        output.wait(0.02)
+        for received in output.receive():
+            if isinstance(received.message, FapFrame):
+                values = np.frombuffer(received.message.values, "<f4")
+                opening = max(opening, float(np.abs(values[2:13]).max()))
+    return opening > 100
+
+
+@pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
+def test_a_session_goes_on_after_a_crash(watched: Watched, service: str) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")
+    with Client(watched.control) as client:
+        session = client.open_session(encoding="f32le", sample_rate_hz=16000)
+        assert moves(session, samples[:24000])
+        old = watched.instance(client, service)
+        watched.kill(service)
+        watched.check_until_replaced(client, service, old)
+        time.sleep(0.5)
+        assert moves(session, samples[24000:72000])
+        session.close()
+    assert f"{service} ended with status -9" in watched.shown.getvalue()
+
+
+def test_the_driver_and_the_gateway_come_back_too(watched: Watched) -> None:
+    with Client(watched.control) as client:
+        for service in ("driver", "gateway"):
+            old = watched.instance(client, service)
+            watched.kill(service)
+            watched.check_until_replaced(client, service, old)
+
+
+def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
+    with Client(watched.control) as client:
+        watched.kill("control")
+        time.sleep(0.1)
+        end_s = time.monotonic() + 30
+        while True:
+            watched.supervisor.check()
+            try:
+                session = client.open_session(encoding="f32le")
+                break
+            except UserError:
+                assert time.monotonic() < end_s
+                time.sleep(0.2)
+        assert moves(session, samples_of_file(DEMO / "hello-female.wav")[:32000])
+        session.close()

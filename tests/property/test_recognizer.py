@@ -1,0 +1,96 @@
+"""The recognizer hears the same whatever the chunks are, and its parts keep their promises."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.recognizer.decoder import NUM_UNITS, Decoder
+from services.recognizer.features import Differences, LogMel, cepstra, with_differences
+from services.recognizer.load import load_model
+from services.recognizer.output_rule import OutputRule
+from services.recognizer.pipeline import Recognizer
+from services.recognizer.resample import Resampler, to_16_khz
+from shared.audio_file import read_audio
+from shared.phones import Phone, SpeechChange
+
+pytestmark = pytest.mark.property
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+HELLO = read_audio(DEMO / "hello-male.wav")[0][:32_000, 0]
+NOISE = np.random.default_rng(0).normal(0, 0.1, 12_000).astype(np.float32)
+CUTS = st.lists(st.integers(0, 32_000), max_size=60)
+
+
+def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
+    return np.split(samples, sorted(cut for cut in cuts if cut <= len(samples)))
+
+
+def hear(chunks: list[np.ndarray], rate_hz: int) -> list[Phone | SpeechChange]:
+    recognizer = Recognizer(load_model(), sample_rate_hz=rate_hz)
+    events = [event for chunk in chunks for event in recognizer.accept_waveform(chunk)]
+    return events + recognizer.input_finished()
+
+
+@settings(deadline=None, max_examples=12)
+@given(cuts=CUTS, rate_hz=st.sampled_from([16_000, 44_100]))
+def test_any_chunking_is_heard_the_same(cuts: list[int], rate_hz: int) -> None:
+    assert hear(pieces(HELLO, cuts), rate_hz) == hear([HELLO], rate_hz)
+
+
+@settings(deadline=None, max_examples=30)
+@given(cuts=CUTS, rate_hz=st.integers(8_000, 48_000))
+def test_resampling_in_any_chunks(cuts: list[int], rate_hz: int) -> None:
+    resampler = Resampler(rate_hz)
+    parts = [resampler.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
+    whole = to_16_khz(NOISE, rate_hz)
+    np.testing.assert_array_equal(np.concatenate([*parts, resampler.finish()]), whole)
+
+
+@settings(deadline=None, max_examples=30)
+@given(cuts=CUTS, half_width=st.integers(1, 3))
+def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
+    log_mel, differences = LogMel(), Differences(half_width)
+    parts = [
+        differences.accept(cepstra(log_mel.accept_waveform(piece))) for piece in pieces(NOISE, cuts)
+    ]
+    whole = with_differences(cepstra(LogMel().accept_waveform(NOISE)), half_width)
+    np.testing.assert_array_equal(np.concatenate([*parts, differences.finish()]), whole)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    units=st.lists(st.integers(0, 3), max_size=60), agreement=st.integers(1, 6), before=st.just(9)
+)
+def test_the_output_rule_is_the_paper_s(units: list[int], agreement: int, before: int) -> None:
+    """Li 2011, eq. 4, word for word."""
+    rule = OutputRule(agreement, last_output=before)
+    last = before
+    for t, unit in enumerate(units):
+        recent = units[max(0, t - agreement + 1) : t + 1]
+        expected = len(recent) == agreement and set(recent) == {unit} and unit != last
+        assert rule.accept(unit) == expected
+        last = unit if expected else last
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=st.integers(0, 2**31), num_frames=st.integers(1, 400))
+def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
+    topology = load_model().topology
+    rng = np.random.default_rng(seed)
+    decoder = Decoder(topology)
+    for row in rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32):
+        unit, start, confidence = decoder.accept(row)
+        assert 0 <= unit < NUM_UNITS
+        assert start < num_frames
+        assert 0 < confidence <= 1
+    segments = decoder.finish()
+    assert segments[0].start == 0
+    assert segments[-1].end == num_frames
+    shortest = np.diff(topology.first_state)
+    for one, two in pairwise(segments):
+        assert one.end == two.start
+        assert one.end - one.start >= shortest[one.unit]

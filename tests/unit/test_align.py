@@ -1,0 +1,97 @@
+import csv
+import io
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.recognizer.load import load_model
+from shared.audio_file import read_audio
+from shared.errors import UserError
+from shared.phone_files import format_phones
+from shared.phones import Phone
+from training.align import align_text, spoken
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+
+
+@pytest.fixture(scope="module")
+def vowels() -> list[Phone]:
+    samples, rate_hz = read_audio(DEMO / "vowels-male.wav")
+    return align_text(load_model(), samples, rate_hz, "啊，喔，鹅，衣，乌，迂。")
+
+
+def test_all_units_in_order_without_gaps(vowels: list[Phone]) -> None:
+    assert [phone.unit for phone in spoken(vowels)] == ["a", "o", "e", "i", "u", "v"]
+    for one, two in pairwise(vowels):
+        assert one.onset_s + one.duration_s == pytest.approx(two.onset_s)
+    assert vowels[0].onset_s == pytest.approx(0.0075)
+
+
+def test_vowels_are_where_the_sound_is(vowels: list[Phone]) -> None:
+    samples, rate_hz = read_audio(DEMO / "vowels-male.wav")
+    loud = np.square(samples[:, 0]).mean()
+    for phone in spoken(vowels):
+        first = int(phone.onset_s * rate_hz)
+        part = samples[first : int((phone.onset_s + phone.duration_s) * rate_hz), 0]
+        assert np.square(part).mean() > 0.3 * loud
+
+
+def test_pinyin_and_characters_are_the_same() -> None:
+    samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
+    model = load_model()
+    by_text = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
+    pinyin = "ba4 ba ma1 ma pǎo bu4 mai3 ping2 guo3 bo2 bo pei2 po2 po man4 man pin3 cha2"
+    by_pinyin = align_text(model, samples, rate_hz, pinyin)
+    assert [p.unit for p in by_text] == [p.unit for p in by_pinyin]
+
+
+PHONES = [
+    Phone(index=0, unit="n", onset_s=0.25, duration_s=0.1, confidence=0.5, final=True),
+    Phone(index=1, unit="i", onset_s=0.35, duration_s=0.2, confidence=1.0, final=True),
+    Phone(index=2, unit="sil", onset_s=0.8, duration_s=0.3, confidence=0.25, final=True),
+]
+
+
+def test_csv_and_json_and_table() -> None:
+    rows = list(csv.DictReader(io.StringIO(format_phones(PHONES, "csv", 1.0))))
+    assert [row["unit"] for row in rows] == ["n", "i", "sil"]
+    assert rows[1]["onset_s"] == "0.35"
+    read = json.loads(format_phones(PHONES, "json", 1.0))
+    assert read["total_s"] == 1.0
+    assert read["phones"][2] == {
+        "index": 2,
+        "unit": "sil",
+        "onset_s": 0.8,
+        "duration_s": 0.3,
+        "confidence": 0.25,
+    }
+    table = format_phones(PHONES, "table", 1.0).splitlines()
+    assert len(table) == 4
+    assert table[1].split() == ["0.250", "0.100", "n", "0.50"]
+
+
+def test_textgrid_covers_the_whole_time() -> None:
+    lines = format_phones(PHONES, "textgrid", 1.0).splitlines()
+    assert lines[:2] == ['File type = "ooTextFile"', 'Object class = "TextGrid"']
+    texts = [line.split('"')[1] for line in lines if "text =" in line]
+    assert texts == ["", "n", "i", "", "sil"]
+    starts = [float(line.split("=")[1]) for line in lines if line.startswith("            xmin")]
+    ends = [float(line.split("=")[1]) for line in lines if line.startswith("            xmax")]
+    assert starts == [0.0, *ends[:-1]]
+    assert ends[-1] == 1.0
+    assert "        intervals: size = 5" in lines
+
+
+def test_nothing_said_is_one_empty_interval() -> None:
+    assert 'text = ""' in format_phones([], "textgrid", 1.0)
+    assert format_phones([], "csv", 1.0).count("\n") == 1
+
+
+def test_unknown_style() -> None:
+    with pytest.raises(UserError, match="'xml'"):
+        format_phones(PHONES, "xml", 1.0)

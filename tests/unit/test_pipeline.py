@@ -1,0 +1,166 @@
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.recognizer.load import load_model
+from services.recognizer.pipeline import Recognizer, recognize
+from shared.audio_file import read_audio
+from shared.errors import UserError
+from shared.phones import Phone, SpeechChange
+from shared.pinyin import pinyin_of_text, units_of_syllable
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+Event = Phone | SpeechChange
+
+
+@pytest.fixture(scope="module")
+def hello() -> np.ndarray:
+    return read_audio(DEMO / "hello-female.wav")[0][:, 0]
+
+
+def feed(recognizer: Recognizer, samples: np.ndarray, chunk: int = 320) -> list[Event]:
+    events: list[Event] = []
+    for start in range(0, len(samples), chunk):
+        events += recognizer.accept_waveform(samples[start : start + chunk])
+    return events
+
+
+def run(samples: np.ndarray, chunk: int = 320, agreement: int = 3) -> list[Event]:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000, agreement=agreement)
+    return [*feed(recognizer, samples, chunk), *recognizer.input_finished()]
+
+
+def finals(events: Sequence[Event]) -> list[Phone]:
+    return [event for event in events if isinstance(event, Phone) and event.final]
+
+
+def units_in(text: str) -> list[str]:
+    return [unit for syllable in pinyin_of_text(text) for unit in units_of_syllable(syllable)]
+
+
+def share_found(wanted: list[str], heard: list[str]) -> float:
+    """Longest common subsequence over what was wanted."""
+    table = np.zeros((len(wanted) + 1, len(heard) + 1), int)
+    for i, a in enumerate(wanted):
+        for j, b in enumerate(heard):
+            table[i + 1, j + 1] = max(table[i, j + 1], table[i + 1, j], table[i, j] + (a == b))
+    return float(table[-1, -1] / len(wanted))
+
+
+def test_most_of_a_clear_sentence_is_recognised(hello: np.ndarray) -> None:
+    wanted = units_in("你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。")
+    offline = [phone.unit for phone in recognize(load_model(), hello, 16_000)]
+    live = [phone.unit for phone in finals(run(hello))]
+    assert share_found(wanted, offline) > 0.6
+    assert share_found(wanted, live) > 0.6
+    assert len(offline) < 1.3 * len(wanted)
+
+
+def test_silence_and_noise_give_nothing() -> None:
+    assert run(np.zeros(32_000, np.float32)) == []
+    noise = np.random.default_rng(0).normal(0, 0.01, 32_000).astype(np.float32)
+    assert run(noise) == []
+    assert recognize(load_model(), noise, 16_000) == []
+
+
+def test_order_and_times_of_what_is_put_out(hello: np.ndarray) -> None:
+    events = run(hello)
+    assert isinstance(events[0], SpeechChange)
+    assert events[0].active
+    assert isinstance(events[-1], SpeechChange)
+    assert not events[-1].active
+    phones = [event for event in events if isinstance(event, Phone)]
+    closed: set[int] = set()
+    for phone in phones:
+        assert phone.index not in closed  # nothing is said of a unit once it is final
+        assert phone.index <= len(closed)  # one unit is open at a time
+        assert 0 <= phone.confidence <= 1
+        assert phone.duration_s > 0
+        if phone.final:
+            closed.add(phone.index)
+    assert closed == set(range(len(closed)))
+    done = finals(events)
+    for one, two in pairwise(done):
+        assert one.onset_s + one.duration_s <= two.onset_s + 1e-9
+    assert events[0].time_s <= done[0].onset_s
+    assert done[-1].onset_s + done[-1].duration_s <= events[-1].time_s + 1e-9
+
+
+def test_provisional_units_come_soon(hello: np.ndarray) -> None:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
+    num_early = 0
+    provisional = 0
+    for start in range(0, len(hello), 160):
+        for event in recognizer.accept_waveform(hello[start : start + 160]):
+            if isinstance(event, Phone) and not event.final:
+                provisional += 1
+                num_early += (start + 160) / 16_000 - event.onset_s < 0.25
+    assert provisional > 40
+    assert num_early > 0.8 * provisional
+
+
+def test_time_goes_on_and_never_back(hello: np.ndarray) -> None:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
+    before = 0.0
+    for start in range(0, len(hello), 800):
+        recognizer.accept_waveform(hello[start : start + 800])
+        heard_s = (start + 800) / 16_000
+        assert before <= recognizer.time_s <= heard_s
+        assert heard_s - recognizer.time_s < 0.12
+        before = recognizer.time_s
+
+
+def test_flush_ends_speech_and_the_clock_goes_on(hello: np.ndarray) -> None:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
+    events = feed(recognizer, hello[:32_000])
+    ended = recognizer.flush()
+    assert isinstance(ended[-1], SpeechChange)
+    assert not ended[-1].active
+    assert recognizer.flush() == []
+    later = [*feed(recognizer, hello[32_000:]), *recognizer.input_finished()]
+    assert isinstance(later[0], SpeechChange)
+    assert later[0].time_s >= ended[-1].time_s
+    indices = [phone.index for phone in finals([*events, *ended, *later])]
+    assert indices == list(range(len(indices)))
+
+
+def test_reset_gives_the_same_again(hello: np.ndarray) -> None:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
+    first = [*feed(recognizer, hello), *recognizer.input_finished()]
+    recognizer.reset()
+    assert [*feed(recognizer, hello), *recognizer.input_finished()] == first
+
+
+def test_stereo_at_48_khz(hello: np.ndarray) -> None:
+    recognizer = Recognizer(load_model(), sample_rate_hz=48_000, num_channels=2)
+    stereo = np.repeat(np.repeat(hello, 3)[:, None], 2, axis=1)
+    heard = finals([*feed(recognizer, stereo, 960), *recognizer.input_finished()])
+    same = [phone.unit for phone in finals(run(hello))]
+    assert share_found(same, [phone.unit for phone in heard]) > 0.8
+
+
+def test_two_stretches_of_speech(hello: np.ndarray) -> None:
+    pause = np.zeros(24_000, np.float32)
+    events = run(np.concatenate([hello, pause, hello]))
+    changes = [event.active for event in events if isinstance(event, SpeechChange)]
+    assert changes == [True, False] * (len(changes) // 2)
+    assert len(changes) >= 4
+    # the second time the voice is known, which may change a unit here and there
+    phones = finals(events)
+    middle_s = (len(hello) + 12_000) / 16_000
+    first = [phone.unit for phone in phones if phone.onset_s < middle_s]
+    second = [phone.unit for phone in phones if phone.onset_s > middle_s]
+    assert share_found(first, second) > 0.7
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(UserError, match="4000 Hz"):
+        Recognizer(load_model(), sample_rate_hz=4_000)
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
+    with pytest.raises(UserError, match="no numbers"):
+        recognizer.accept_waveform(np.array([np.inf], np.float32))

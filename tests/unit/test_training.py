@@ -1,0 +1,433 @@
+"""Corpora, augmentation, estimation and alignment on small made-up speech."""
+
+import itertools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from services.recognizer.features import NUM_BANDS
+from shared.errors import UserError
+from shared.phones import UNIT_INDEX, UNITS
+from training import feature_cache
+from training.align import align_text
+from training.augmentation import Augmentation
+from training.corpus import RowErrors, may_ship, read_corpus
+from training.examples import Example, load_examples, trim_silence
+from training.gmm import (
+    SIL,
+    FrameSet,
+    decorrelate,
+    estimate,
+    first_estimate,
+    flat_path,
+    split,
+    topology_of,
+    unit_bigram,
+    units_of_path,
+    utterance_graph,
+    viterbi_path,
+)
+from training.neural import FRAME_OFFSETS, gradients_of, train_network
+from training.recipes import train_gmm, train_neural
+
+pytestmark = pytest.mark.unit
+
+FIRST_STATE = np.arange(len(UNITS) + 1) * 3
+SYLLABLES = ("ma", "ti", "sou", "lan")
+
+
+def spectrum(unit: str) -> np.ndarray:
+    rng = np.random.default_rng(UNIT_INDEX[unit])
+    return np.concatenate([[14.0], rng.normal(12, 3, NUM_BANDS)])
+
+
+def made_up_speech(num: int, seed: int = 0) -> list[Example]:
+    """Each unit has a spectrum of its own; silence is weak."""
+    rng = np.random.default_rng(seed)
+    examples = []
+    for _ in range(num):
+        names = [str(name) for name in rng.choice(SYLLABLES, 3)]
+        units = [unit for name in names for unit in (name[0], name[1:])]
+        rows = [np.full((15, 41), 7.0)]
+        rows += [np.tile(spectrum(unit), (int(rng.integers(6, 14)), 1)) for unit in units]
+        rows.append(np.full((15, 41), 7.0))
+        log_mel = np.concatenate(rows)
+        examples.append(
+            Example(
+                log_mel=(log_mel + rng.normal(0, 0.7, log_mel.shape)).astype(np.float16),
+                units=tuple(UNIT_INDEX[unit] for unit in units),
+                syllables=(2, 2, 2),
+                weight=1.0,
+            )
+        )
+    return examples
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+# --- corpora
+
+
+def write_corpus(folder: Path, rows: list[str], num_audio: int = 3) -> None:
+    folder.mkdir(exist_ok=True)
+    rng = np.random.default_rng(0)
+    for number in range(num_audio):
+        sound = np.concatenate([np.zeros(4000), rng.normal(0, 0.1, 12_000), np.zeros(4000)])
+        soundfile.write(folder / f"{number}.wav", sound, 16_000)
+    header = "utt_id\tpath\tspeaker\tsource\tlicence\tsplit\tseconds\ttext\tpinyin"
+    (folder / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+
+
+def test_manifest_and_its_bad_rows(tmp_path: Path) -> None:
+    write_corpus(
+        tmp_path,
+        [
+            "a\t0.wav\tA\tx\tCC0-1.0\ttrain\t1.25\t你好\tni3 hao3",
+            "b\tnone.wav\tA\tx\tCC0-1.0\ttrain\t1.25\t你好\tni3 hao3",
+            "c\t1.wav\tA\tx\tCC0-1.0\ttrain\t1.25\t你好\tni3 haoo3",
+            "d\t1.wav\tA\tx\tCC0-1.0\ttrain\t0.1\t你好\tni3 hao3",
+            "e\t2.wav\tB\tx\tMIT\tdev\t1.25\t一个\t",
+            "f\t2.wav\tB\tx\tMIT\tdev\t1.25\t\t",
+        ],
+    )
+    errors = RowErrors()
+    good = read_corpus(tmp_path, errors)
+    assert [u.utterance_id for u in good] == ["a", "e"]
+    assert [UNITS[unit] for unit in good[0].units] == ["n", "i", "h", "ao"]
+    assert good[0].syllables == (2, 2)
+    assert [UNITS[unit] for unit in good[1].units] == ["i", "g", "e"]
+    for message, part in zip(
+        errors.messages, ("row 3 (b): no audio", "row 4 (c)", "row 5 (d): 4 units", "no text"),
+        strict=True,
+    ):  # fmt: skip
+        assert part in message
+
+
+def test_kaldi_folder(tmp_path: Path) -> None:
+    write_corpus(tmp_path, [])
+    (tmp_path / "manifest.tsv").unlink()
+    (tmp_path / "wav.scp").write_text(f"u1 0.wav\nu2 {tmp_path}/1.wav\n")
+    (tmp_path / "text").write_text("u1 你好\nu2 你 好 吗\n", encoding="utf-8")
+    (tmp_path / "utt2spk").write_text("u1 anna\nu2 bob\n")
+    rows = read_corpus(tmp_path, RowErrors())
+    assert [(u.utterance_id, u.speaker, len(u.units)) for u in rows] == [
+        ("u1", "anna", 4),
+        ("u2", "bob", 6),
+    ]
+    assert rows[0].seconds == pytest.approx(1.25)
+
+
+def test_aishell_folder(tmp_path: Path) -> None:
+    (tmp_path / "wav" / "train" / "S0002").mkdir(parents=True)
+    (tmp_path / "transcript").mkdir()
+    sound = np.zeros(16_000)
+    soundfile.write(tmp_path / "wav/train/S0002/BAC009S0002W0122.wav", sound, 16_000)
+    transcript = tmp_path / "transcript" / "aishell_transcript_v0.8.txt"
+    transcript.write_text("BAC009S0002W0122 而 对\nBAC009S0002W0123 无声\n", encoding="utf-8")
+    errors = RowErrors()
+    rows = read_corpus(tmp_path, errors)
+    assert [(u.speaker, u.split, u.licence) for u in rows] == [("S0002", "train", "Apache-2.0")]
+    assert "BAC009S0002W0123" in errors.messages[0]
+
+
+def test_no_corpus_and_no_columns(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no corpus"):
+        read_corpus(tmp_path, RowErrors())
+    (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
+    with pytest.raises(UserError, match="lacks the columns pinyin"):
+        read_corpus(tmp_path, RowErrors())
+
+
+@pytest.mark.parametrize(
+    ("licence", "free"),
+    [
+        ("Apache-2.0 (AISHELL-1/OpenSLR33)", True),
+        ("MIT", True),
+        ("CC0-1.0 (Common Voice)", True),
+        ("CC-BY-SA (shtooka)", True),
+        ("CC BY 4.0", True),
+        ("Unlicense (public domain)", True),
+        ("synthetic (Kokoro-82M, Apache-2.0)", True),
+        ("CC-BY-NC-ND-4.0", False),
+        ("CC BY-NC 4.0", False),
+        ("CC BY-SA-NC", False),
+        ("all rights reserved", False),
+        ("", False),
+    ],
+)
+def test_licences(licence: str, free: bool) -> None:
+    assert may_ship(licence) is free
+
+
+def test_weights_and_licence_filter(tmp_path: Path) -> None:
+    write_corpus(
+        tmp_path,
+        [
+            "a\t0.wav\tA\tx\tCC0\ttrain\t1.25\t你好\tni3 hao3",
+            "b\t1.wav\tB\tx\tCC BY-NC\ttrain\t1.25\t你好\tni3 hao3",
+            "c\t2.wav\tC\tx\tsynthetic\ttrain\t1.25\t你好\tni3 hao3",
+        ],
+    )
+    errors = RowErrors()
+    examples = load_examples([tmp_path], errors, synthetic_weight=0.5)
+    assert [example.weight for example in examples] == [3.0, 1.5]  # rare speakers count most
+    assert any("CC BY-NC" in message for message in errors.messages)
+    assert len(load_examples([tmp_path], RowErrors(), shipping=False)) == 3
+    with pytest.raises(UserError, match="no usable recordings"):
+        load_examples([tmp_path], RowErrors(), split="test")
+
+
+def test_cache_is_used_and_unreadable_audio_is_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_corpus(
+        tmp_path,
+        [f"{n}\t{n}.wav\tA\tx\tCC0\ttrain\t1.25\t你好\tni3 hao3" for n in range(3)],
+    )
+    (tmp_path / "1.wav").write_bytes(b"no sound")
+    rows = read_corpus(tmp_path, RowErrors())
+    errors = RowErrors()
+    first = feature_cache.log_mel_of(rows, errors)
+    assert [block is None for block in first] == [False, True, False]
+    assert len(errors.messages) == 1
+    monkeypatch.setattr(feature_cache, "read_audio", lambda _: pytest.fail("computed again"))
+    again = feature_cache.log_mel_of(rows, RowErrors())
+    assert first[0] is not None
+    assert again[0] is not None
+    np.testing.assert_array_equal(first[0], again[0])
+
+
+def test_long_silence_is_trimmed() -> None:
+    log_mel = np.full((400, 41), 7.0, np.float16)
+    log_mel[150:250] = 18.0
+    assert len(trim_silence(log_mel)) == 150
+
+
+# --- augmentation
+
+
+def test_augmentation_is_repeatable_and_finite() -> None:
+    log_mel = made_up_speech(1)[0].log_mel.astype(np.float32)
+    for seed in range(20):
+        change = Augmentation.draw(np.random.default_rng(seed))
+        heard = change.apply(log_mel)
+        assert heard.shape == (len(change.positions(len(log_mel))), 41)
+        assert np.isfinite(heard).all()
+        np.testing.assert_array_equal(heard, change.apply(log_mel))
+
+
+def test_no_change_changes_little() -> None:
+    log_mel = made_up_speech(1)[0].log_mel.astype(np.float32)
+    nothing = Augmentation(
+        speed=1.0, warp=1.0, level=0.0, noise_below=30.0, noise_tilt=0.0,
+        colour=(0.0,) * 6, decay=0.0, narrow=False, seed=0,
+    )  # fmt: skip
+    np.testing.assert_allclose(nothing.apply(log_mel), np.maximum(log_mel, 6), atol=0.02)
+
+
+# --- paths
+
+
+def every_path(num_frames: int, graph_length: int) -> Iterator[tuple[int, ...]]:
+    return itertools.product(range(graph_length), repeat=num_frames)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first_state = np.arange(len(UNITS) + 1)  # one state each: sil a sil b sil
+    graph = utterance_graph([22, 30], [1, 1], first_state)
+    num_frames = 6
+    scores = rng.normal(0, 2, (num_frames, len(graph.states))).astype(np.float32)
+    stay = rng.uniform(0.2, 0.8, len(UNITS))
+    log_stay, log_leave = np.log(stay), np.log(1 - stay)
+    allowed = {(0, 1), (1, 2), (1, 3), (2, 3), (3, 4)}
+    best = -np.inf
+    for sequence in every_path(num_frames, len(graph.states)):
+        if sequence[0] not in (0, 1) or sequence[-1] not in (3, 4):
+            continue
+        total = sum(scores[t, p] for t, p in enumerate(sequence))
+        for a, b in itertools.pairwise(sequence):
+            if a == b:
+                total += log_stay[graph.states[a]]
+            elif (a, b) in allowed:
+                total += log_leave[graph.states[a]]
+            else:
+                total = -np.inf
+        best = max(best, total + log_leave[graph.states[sequence[-1]]])
+    path, found = viterbi_path(
+        scores, graph, log_stay.astype(np.float32), log_leave.astype(np.float32)
+    )
+    assert found == pytest.approx(best, rel=1e-4)
+    assert len(path) == num_frames
+
+
+def test_pauses_are_optional_and_units_are_not() -> None:
+    graph = utterance_graph([0, 21], [2], FIRST_STATE)
+    wanted = np.repeat([0, 1, 2, 3, 4, 5], 2)  # the positions of b and a, no pause
+    scores = np.full((12, len(graph.states)), -20.0, np.float32)
+    scores[np.arange(12), wanted + 3] = 0.0
+    half = np.full(len(UNITS) * 3, np.log(0.5), np.float32)
+    path, _ = viterbi_path(scores, graph, half, half)
+    assert [(UNITS[u.unit], u.start, u.end) for u in units_of_path(path, graph)] == [
+        ("b", 0, 6),
+        ("a", 6, 12),
+    ]
+    path, likelihood = viterbi_path(scores[:5], graph, half, half)
+    assert len(path) == 0
+    assert likelihood == -np.inf
+
+
+def test_flat_path_goes_through_all_units() -> None:
+    example = made_up_speech(1)[0]
+    graph = utterance_graph(example.units, example.syllables, FIRST_STATE)
+    path = flat_path(graph, example.log_mel[:, 0].astype(np.float32))
+    found = [u.unit for u in units_of_path(path, graph)]
+    assert found == [SIL, *example.units, SIL]
+    assert (np.diff(path) >= 0).all()
+
+
+# --- estimation
+
+
+def prior_mean() -> np.ndarray:
+    return np.zeros(13, np.float32)
+
+
+def test_likelihood_never_falls() -> None:
+    frames = FrameSet.build(made_up_speech(30), FIRST_STATE, prior_mean(), 1)
+    hmm = first_estimate(frames, FIRST_STATE)
+    before = frames.realign(hmm)
+    for num_mixtures in (1, 2, 4):
+        if num_mixtures > 1:
+            hmm = split(hmm, frames, num_mixtures)
+            before = frames.realign(hmm)
+        for _ in range(6):
+            hmm = estimate(frames, hmm)
+            now = frames.realign(hmm)
+            assert now >= before - 1e-3
+            before = now
+
+
+def test_estimates_of_one_gaussian_are_mean_and_variance() -> None:
+    frames = FrameSet.build(made_up_speech(10), FIRST_STATE, prior_mean(), 1)
+    hmm = estimate(frames, first_estimate(frames, FIRST_STATE))
+    state = int(FIRST_STATE[SIL])
+    x = frames.features[frames.states == state]
+    floor = 0.05 * frames.features.var(axis=0)
+    np.testing.assert_allclose(hmm.mixtures.means[state, 0], x.mean(axis=0), atol=1e-3)
+    expected = np.maximum(x.var(axis=0), floor)
+    np.testing.assert_allclose(hmm.mixtures.covars[state, 0], expected, rtol=1e-2, atol=1e-3)
+
+
+def test_splitting_keeps_the_weights_whole() -> None:
+    frames = FrameSet.build(made_up_speech(20), FIRST_STATE, prior_mean(), 1)
+    hmm = split(first_estimate(frames, FIRST_STATE), frames, 4)
+    np.testing.assert_allclose(hmm.mixtures.weights.sum(axis=1), 1, rtol=1e-5)
+    assert (hmm.mixtures.weights[FIRST_STATE[SIL]] > 0).all()
+
+
+def test_decorrelating_raises_the_likelihood() -> None:
+    frames = FrameSet.build(made_up_speech(40), FIRST_STATE, prior_mean(), 1)
+    hmm = first_estimate(frames, FIRST_STATE)
+    for _ in range(3):
+        frames.realign(hmm)
+        hmm = estimate(frames, hmm)
+    before = frames.realign(hmm)
+    hmm, rotation = decorrelate(frames, hmm)
+    # densities of rotated features count volume in other units: add log |det|
+    volume = float(np.linalg.slogdet(rotation.astype(float))[1])
+    assert frames.realign(hmm) + volume > before - 0.05
+
+
+def test_bigram_rows_are_distributions() -> None:
+    examples = made_up_speech(20)
+    log_bigram = unit_bigram([example.units for example in examples])
+    np.testing.assert_allclose(np.exp(log_bigram).sum(axis=1), 1, atol=0.02)
+    t, i, a = (UNIT_INDEX[unit] for unit in ("t", "i", "a"))
+    assert log_bigram[t, i] > log_bigram[t, a]
+    assert log_bigram[i, SIL] > log_bigram[t, SIL]
+
+
+# --- the network
+
+
+def test_gradients_against_differences() -> None:
+    from tests.unit.test_gmm import random_neural  # noqa: PLC0415 (a small model is made there)
+
+    model = random_neural()
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(4, model.weights[0].shape[0])).astype(np.float32)
+    targets = rng.integers(0, model.topology.num_states, 4)
+    loss, _, gradients = gradients_of(model, inputs, targets)
+    parameters = [*model.weights, *model.biases]
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        at = np.unravel_index(np.abs(gradient).argmax(), gradient.shape)
+        step = 1e-2
+        parameter[at] += step
+        changed, _, _ = gradients_of(model, inputs, targets)
+        parameter[at] -= step
+        assert (changed - loss) / step == pytest.approx(gradient[at], rel=0.1)
+
+
+def test_a_network_learns_made_up_speech() -> None:
+    examples = made_up_speech(60)
+    frames = FrameSet.build(examples, FIRST_STATE, prior_mean(), 1)
+    hmm = first_estimate(frames, FIRST_STATE)
+    for _ in range(3):
+        frames.realign(hmm)
+        hmm = estimate(frames, hmm)
+    states = [frames.states[a:b] for a, b in itertools.pairwise(frames.bounds)]
+    lines: list[str] = []
+    model = train_network(
+        examples, states, topology_of(hmm, unit_bigram([(0,)]), frames), num_epochs=4, seed=0,
+        report=lines.append, hidden=(32,),
+    )  # fmt: skip
+    first, last = (float(line.split(": ")[1].split()[0]) for line in (lines[0], lines[-1]))
+    assert last < 0.7 * first
+    assert model.stream().look_ahead_frames == FRAME_OFFSETS[-1]
+
+
+# --- whole recipes
+
+
+def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
+    rows = [
+        f"{n}\t{n}.wav\tS{n}\tx\tCC0-1.0\t{'dev' if n == 5 else 'train'}\t1.25\t你好\tni3 hao3"
+        for n in range(6)
+    ]
+    write_corpus(tmp_path / "corpus", [*rows, "bad\tbad.wav\tS\tx\tCC0\ttrain\t1\t你\tni3"], 6)
+    lines: list[str] = []
+    gmm = tmp_path / "gmm.npz"
+    train_gmm([tmp_path / "corpus"], gmm, num_mixtures=2, report=lines.append)
+    assert "1 rows skipped" in lines[-1]
+    assert "CC0-1.0" in gmm.with_suffix(".md").read_text()
+    again = tmp_path / "again.npz"
+    train_gmm([tmp_path / "corpus"], again, num_mixtures=2, report=lines.append)
+    assert again.read_bytes() == gmm.read_bytes()  # the same seed, the same model
+    neural = tmp_path / "neural.npz"
+    train_neural([tmp_path / "corpus"], neural, aligner=gmm, num_epochs=1, report=lines.append)
+    assert "Neural" in neural.with_suffix(".md").read_text()
+    with pytest.raises(UserError, match="no Gaussian mixture model"):
+        train_neural([tmp_path / "corpus"], neural, aligner=neural)
+    with pytest.raises(UserError, match="power of two"):
+        train_gmm([tmp_path / "corpus"], gmm, num_mixtures=3)
+
+
+def test_alignment_refuses_what_cannot_be() -> None:
+    from services.recognizer.load import load_model  # noqa: PLC0415
+
+    model = load_model()
+    sound = np.zeros(4000, np.float32)
+    with pytest.raises(UserError, match="text is empty"):
+        align_text(model, sound, 16_000, "。")
+    with pytest.raises(UserError, match="too short"):
+        align_text(model, sound, 16_000, "你听到的每一个字都由我说出来")
+    assert json.dumps([phone.unit for phone in align_text(model, sound, 16_000, "a1")])
