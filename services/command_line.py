@@ -307,12 +307,11 @@ def phones(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")] = None,
 ) -> None:
     """Recognise an audio file: units with their times."""
-    from shared.phone_files import format_phones
-
     from services import offline
-    from services.recognizer.gmm import load_model
+    from services.recognizer.load import load_model
     from services.recognizer.pipeline import recognize
     from shared.messages import MEDIA_RATE_HZ
+    from shared.phone_files import format_phones
 
     samples = offline.mono_16k(audio)
     found = recognize(load_model(), samples, MEDIA_RATE_HZ)
@@ -323,6 +322,20 @@ def phones(
         sys.stdout.write(text)
     else:
         _write_text(output, text)
+
+
+@app.command()
+def bench(
+    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")],
+    repeats: Annotated[int, typer.Option(min=1, help="How often to stream it.")] = 3,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure latency, CPU and images per second of the whole chain on this machine."""
+    from evaluation.latency import measure, show
+
+    latency = measure(audio, repeats, CONSOLE)
+    show(latency, Console())
+    _write_json(json_file, asdict(latency))
 
 
 @head_app.command("export")

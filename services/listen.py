@@ -109,4 +109,4 @@ def _write_fap(path: Path, session: str, frames: list[tuple[float, NDArray[np.fl
     steps_s = np.diff(times_s)
     frame_rate_hz = float(1.0 / np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 50.0
     values = np.array([faps for _, faps in frames], np.float32).reshape(-1, NUM_FAPS)
-    write_fap(path, FapAnimation(name=session, frame_rate_hz=frame_rate_hz, values=values))
+    write_fap(path, FapAnimation(name=session, frame_rate_hz=frame_rate_hz, faps=values))

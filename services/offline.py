@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from services.driver.head import Head
 from services.driver.recording import Recording
 from services.driver.render import Renderer
-from services.recognizer.gmm import load_model
+from services.recognizer.load import load_model
 from services.recognizer.pcm import slices
 from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler

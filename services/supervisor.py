@@ -145,7 +145,7 @@ class Supervisor:
             follow.start()
 
     def _follow_log(self, service: str, stream: IO[bytes]) -> None:
-        with (self._log_folder / f"{service}.log").open("ab") as log:
+        with stream, (self._log_folder / f"{service}.log").open("ab") as log:
             for line in stream:
                 log.write(line)
                 log.flush()
@@ -158,10 +158,8 @@ def _as_warning(line: bytes) -> str:
     """Return what the console shows of a log line: warnings, errors, and what is no JSON."""
     try:
         entry = json.loads(line)
-        if entry["level"] in ("warning", "error", "critical"):
-            return (
-                str(entry["message"]) + "\n" * ("traceback" in entry) + entry.get("traceback", "")
-            )
+        if entry["level"] not in ("warning", "error", "critical"):
+            return ""
+        return "\n".join(str(entry[key]) for key in ("message", "traceback") if key in entry)
     except (ValueError, KeyError, TypeError):
         return line.decode("utf-8", "replace").rstrip()
-    return ""

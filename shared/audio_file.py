@@ -148,9 +148,11 @@ def _file_blocks(
                 raise UserError(
                     f"{path}: damaged at {num_read / file.samplerate:.2f} s: {error}"
                 ) from None
-            if not np.isfinite(block).all():
+            is_number = np.isfinite(block).all(axis=1)
+            if not is_number.all():
+                place_s = (num_read + int(is_number.argmin())) / file.samplerate
                 raise UserError(
-                    f"{path}: NaN or infinite samples near {num_read / file.samplerate:.2f} s; "
+                    f"{path}: NaN or infinite samples near {place_s:.2f} s; "
                     "export the file again, for example as 16-bit PCM"
                 )
             num_read += len(block)

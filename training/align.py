@@ -18,8 +18,6 @@ from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone
 from shared.pinyin import pinyin_of_text, units_of_syllable
 from training.gmm import units_of_path, utterance_graph, viterbi_path
 
-_CONFIDENCE_SCALE = 0.3  # frames are not independent: scores overstate the evidence
-
 
 def align_text(
     model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int, text: str
@@ -83,7 +81,7 @@ def align_units(
             "check that text and recording belong together"
         )
     best_of_units = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
-    share = np.exp(_CONFIDENCE_SCALE * (best_of_units - best_of_units.max(axis=1, keepdims=True)))
+    share = np.exp(best_of_units - best_of_units.max(axis=1, keepdims=True))
     share /= share.sum(axis=1, keepdims=True)
     phones: list[Phone] = []
     for aligned in units_of_path(path, graph):

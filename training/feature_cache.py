@@ -56,6 +56,8 @@ def log_mel_of(
     list
         Shape (frames, 41) each; None where the audio cannot be read (noted in ``errors``).
     """
+    if not utterances:
+        return []
     key = hashlib.sha256(_FORMAT.encode())
     for utterance in utterances:
         state = utterance.path.stat()
@@ -76,7 +78,7 @@ def log_mel_of(
 
 
 def _compute(utterances: Sequence[Utterance], rows: Path, bounds: Path) -> None:
-    blocks, lengths = [np.empty((0, 41), dtype=np.float16)], []
+    blocks, lengths = [], []
     for utterance in track(utterances, description="features"):
         try:
             block = LogMel().accept_waveform(read_audio(utterance.path)).astype(np.float16)

@@ -1,8 +1,9 @@
 """Train the neural acoustic model on frames aligned by the Gaussian mixture model.
 
 Source: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition":
-cross-entropy on the states of a forced alignment; Kingma and Ba 2015, "Adam". Plain numpy: the
-network is small, and nothing but the recognizer's own dependencies is needed.
+cross-entropy on the states of a forced alignment; Kingma and Ba 2015, "Adam"; Srivastava et al.
+2014, "Dropout". Plain numpy: the network is small, and nothing but what the recognizer itself
+depends on is needed.
 
 ======== ============================================================ ===================
 symbol   meaning                                                      shape
@@ -35,6 +36,8 @@ HIDDEN = (512, 512, 512)
 _BATCH = 512
 _POOL_FRAMES = 40_000  # shuffled together
 _LEARNING_RATE = 1e-3
+_DROPOUT = 0.15  # share of the hidden values left out of each step
+_HEARINGS = 2  # of an utterance of weight 1 in an epoch
 _AUGMENTED_SHARE = 0.75
 _KNOWN_SPEAKER_SHARE = 0.5  # of the recordings, heard as if the speaker had spoken before
 _ADAM_MEAN, _ADAM_SQUARE, _ADAM_SMALL = 0.9, 0.999, 1e-8
@@ -94,12 +97,12 @@ def train_network(
         kappa=1.0,
     )
     frames_of_epoch = sum(e.weight * len(path) for e, path in zip(examples, states, strict=True))
-    num_steps = max(1, int(num_epochs * frames_of_epoch / _BATCH))
+    num_steps = max(1, int(num_epochs * _HEARINGS * frames_of_epoch / _BATCH))
     adam = _Adam([*model.weights, *model.biases], num_steps)
     for epoch in range(num_epochs):
         losses, rights, seen = 0.0, 0, 0
         for inputs, targets in _batches(examples, states, model, rng):
-            loss, right, gradients = gradients_of(model, inputs, targets)
+            loss, right, gradients = gradients_of(model, inputs, targets, rng)
             adam.step(gradients)
             losses, rights, seen = losses + loss * len(inputs), rights + right, seen + len(inputs)
             if (seen // _BATCH) % 500 == 0:
@@ -111,7 +114,10 @@ def train_network(
 
 
 def gradients_of(
-    model: NeuralModel, inputs: NDArray[np.float32], targets: NDArray[np.int64]
+    model: NeuralModel,
+    inputs: NDArray[np.float32],
+    targets: NDArray[np.int64],
+    rng: np.random.Generator | None = None,
 ) -> tuple[float, int, list[NDArray[np.float32]]]:
     """Mean cross-entropy, number of right frames, and the gradients of all weights and biases.
 
@@ -123,12 +129,18 @@ def gradients_of(
         Shape (batch, inputs).
     targets
         States, shape (batch,).
+    rng
+        Draws the hidden values that are left out; None leaves out none.
     """
     outputs = [inputs]
+    kept_gain = np.float32(1 / (1 - _DROPOUT) if rng else 1)
     for weights, biases in zip(model.weights[:-1], model.biases[:-1], strict=True):
         hidden = outputs[-1] @ weights
         hidden += biases
-        outputs.append(np.maximum(hidden, 0, out=hidden))
+        np.maximum(hidden, 0, out=hidden)
+        if rng:
+            hidden *= (rng.random(hidden.shape, dtype=np.float32) >= _DROPOUT) * kept_gain
+        outputs.append(hidden)
     logits = outputs[-1] @ model.weights[-1] + model.biases[-1]
     right = int((logits.argmax(axis=1) == targets).sum())
     logits -= logits.max(axis=1, keepdims=True)
@@ -145,7 +157,7 @@ def gradients_of(
         of_biases.append(slope.sum(axis=0))
         if layer:
             slope = slope @ model.weights[layer].T
-            slope *= outputs[layer] > 0
+            slope *= (outputs[layer] > 0) * kept_gain
     return loss, right, [*of_weights[::-1], *of_biases[::-1]]
 
 
@@ -180,7 +192,7 @@ def _batches(
     rng: np.random.Generator,
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int64]]]:
     """One epoch in shuffled batches, every recording changed anew."""
-    times = np.array([example.weight for example in examples])
+    times = _HEARINGS * np.array([example.weight for example in examples])
     draws = np.floor(times + rng.random(len(times))).astype(int)  # 1.3 is heard once or twice
     order = rng.permutation(np.repeat(np.arange(len(examples)), draws))
     frames: list[NDArray[np.float32]] = []

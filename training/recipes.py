@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,8 @@ from services.recognizer.decoder import Decoder
 from services.recognizer.features import NUM_FEATURES, cepstra_of_all
 from services.recognizer.gmm import GmmModel
 from services.recognizer.load import MODEL_PATH, load_model
-from services.recognizer.neural import NeuralModel
 from shared.errors import UserError
-from shared.phones import SILENCE, UNIT_INDEX, UNITS
+from shared.phones import SILENCE, UNITS
 from training.augmentation import Augmentation
 from training.corpus import RowErrors
 from training.examples import SYNTHETIC_WEIGHT, Example, load_examples
@@ -39,18 +39,20 @@ Report = Callable[[str], None]
 _STATES_PER_UNIT = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # of the differences: the textbook's
 _ROTATED_AT = 8  # mixtures per state when the features are decorrelated
-_BIGRAM_SCALES = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
-_UNIT_PENALTIES = (0.0, -2.0, -4.0, -7.0, -10.0, -15.0)
-_SIL = UNIT_INDEX[SILENCE]
+_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
+_UNIT_PENALTIES = (0.5, 0.0, -0.5, -1.0, -1.5, -2.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
     """What was chosen on development data."""
 
-    bigram_scale: float
+    scales: tuple[float, ...]  # of each model's log scores
     unit_penalty: float
     error_rate: float
+
+
+_UNCHOSEN = Choice((0.2,), -1.0, 1.0)
 
 
 def train_gmm(
@@ -120,8 +122,9 @@ def train_gmm(
         prior_mean=prior_mean,
         half_width=_HALF_WIDTH,
     )
-    topology, choice = choose_search(model, corpora, shipping=shipping, report=report)
-    replace(model, topology=topology).save(output)
+    choice = choose_search([model], corpora, shipping=shipping, report=report) or _UNCHOSEN
+    topology = with_penalty(model.topology, choice.unit_penalty)
+    replace(model, topology=topology, kappa=choice.scales[0]).save(output)
     _write_card(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
@@ -188,8 +191,9 @@ def train_neural(
         seed=seed,
         report=report,
     )
-    topology, choice = choose_search(model, corpora, shipping=shipping, report=report)
-    replace(model, topology=topology).save(output)
+    choice = choose_search([model], corpora, shipping=shipping, report=report) or _UNCHOSEN
+    topology = with_penalty(model.topology, choice.unit_penalty)
+    replace(model, topology=topology, kappa=choice.scales[0]).save(output)
     widths = " x ".join(str(layer.shape[1]) for layer in model.weights)
     _write_card(
         output,
@@ -204,40 +208,60 @@ def train_neural(
 
 
 def choose_search(
-    model: GmmModel | NeuralModel, corpora: Sequence[Path], *, shipping: bool, report: Report
-) -> tuple[Topology, Choice | None]:
-    """Choose bigram scale and unit penalty on the split ``dev``; keep the middle without one."""
-    topology = model.topology
+    models: Sequence[AcousticModel],
+    corpora: Sequence[Path],
+    *,
+    shipping: bool = True,
+    report: Report = print,
+) -> Choice | None:
+    """Choose each model's scale and the unit penalty on the split ``dev``, if there is one.
+
+    Parameters
+    ----------
+    models
+        Models that listen together, each with scale 1 and an unchanged bigram.
+    corpora, shipping, report
+        As for :func:`train_gmm`.
+    """
     try:
         dev = load_examples(corpora, RowErrors(), split="dev", shipping=shipping)
     except UserError:
-        report("no dev recordings: bigram scale and unit penalty are not chosen")
-        return _searching(topology, 4.0, -5.0), None
-    scores = [_all_scores(model, example) for example in dev]
+        report("no dev recordings: scales and unit penalty are not chosen")
+        return None
+    scores = [[_all_scores(model, example) for example in dev] for model in models]
     best: Choice | None = None
-    for bigram_scale in _BIGRAM_SCALES:
+    for scales in product(_SCALES, repeat=len(models)):
         for unit_penalty in _UNIT_PENALTIES:
-            decoder = Decoder(_searching(topology, bigram_scale, unit_penalty))
+            decoder = Decoder(with_penalty(models[0].topology, unit_penalty))
             total = ErrorCounts()
-            for example, rows in zip(dev, scores, strict=True):
+            for number, example in enumerate(dev):
                 decoder.reset()
-                for row in rows:
+                for row in _weighted([rows[number] for rows in scores], scales):
                     decoder.accept(row)
-                units = [segment.unit for segment in decoder.finish() if segment.unit != _SIL]
-                total += count_errors([UNITS[u] for u in example.units], [UNITS[u] for u in units])
+                units = [UNITS[segment.unit] for segment in decoder.finish()]
+                heard = [unit for unit in units if unit != SILENCE]
+                total += count_errors([UNITS[unit] for unit in example.units], heard)
             if best is None or total.rate < best.error_rate:
-                best = Choice(bigram_scale, unit_penalty, total.rate)
+                best = Choice(scales, unit_penalty, total.rate)
                 report(
-                    f"dev phone error rate {100 * total.rate:.1f} % with bigram scale "
-                    f"{bigram_scale} and unit penalty {unit_penalty}"
+                    f"dev phone error rate {100 * total.rate:.1f} % with scales {scales} and unit "
+                    f"penalty {unit_penalty}"
                 )
-    assert best is not None  # noqa: S101 (the grid is not empty)
-    return _searching(topology, best.bigram_scale, best.unit_penalty), best
+    return best
 
 
-def _searching(topology: Topology, bigram_scale: float, unit_penalty: float) -> Topology:
-    log_bigram = (bigram_scale * topology.log_bigram + unit_penalty).astype(np.float32)
-    return replace(topology, log_bigram=log_bigram)
+def _weighted(
+    scores: Sequence[NDArray[np.float32]], scales: Sequence[float]
+) -> NDArray[np.float32]:
+    total = np.zeros_like(scores[0])
+    for rows, scale in zip(scores, scales, strict=True):
+        total += np.float32(scale) * rows
+    return total
+
+
+def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
+    """Add a penalty for every unit to the bigram."""
+    return replace(topology, log_bigram=topology.log_bigram + np.float32(unit_penalty))
 
 
 def _all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
@@ -247,7 +271,7 @@ def _all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
 
 def _copies(example: Example, rng: np.random.Generator) -> list[Example]:
     """Give a rare speaker's recording changed copies that share its weight."""
-    num_copies = max(1, math.ceil(example.weight))
+    num_copies = max(1, math.ceil(2 * example.weight))
     copies = []
     for number in range(num_copies):
         changed = number > 0 or rng.random() < 0.5
@@ -287,7 +311,7 @@ def _write_card(
     details: str,
     examples: Sequence[Example],
     errors: RowErrors,
-    choice: Choice | None,
+    choice: Choice,
 ) -> None:
     """Write what the model was made of, beside the model."""
     licences: dict[str, list[Example]] = {}
@@ -309,10 +333,10 @@ def _write_card(
         "",
         f"{len(errors.messages)} rows were skipped.",
     ]
-    if choice is not None:
+    if choice is not _UNCHOSEN:
         lines += [
             "",
-            f"Chosen on dev: bigram scale {choice.bigram_scale}, unit penalty "
+            f"Chosen on dev: scale of the log scores {choice.scales[0]}, unit penalty "
             f"{choice.unit_penalty}; phone error rate there {100 * choice.error_rate:.1f} %.",
         ]
     output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -22,6 +22,7 @@ nobody sees.
 A folder of lips holds for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame
 with ``t`` in seconds) and ``<clip>.json`` (licence, speaker, transcript). Columns are FAPs of a
 tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig (``mouth_stretch_c``).
+``held.txt`` names clips and speakers that are for scoring only.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from rich.progress import track
 from scipy.optimize import minimize
 
 from services.recognizer.acoustic_model import AcousticModel
-from services.recognizer.gmm import load_model
+from services.recognizer.load import load_model
 from services.recognizer.pipeline import recognize
 from services.synthesizer.blending import softmax
 from services.synthesizer.dominance import log_left_silence, log_pause, log_right_silence
@@ -139,10 +140,12 @@ def starting_parameters(c: float = _START_C) -> VisemeParameters:
 
 # What a weight of 1 of FACEGOOD's rig does to these FAPs, for the ARKit shape of the same name on
 # MakeHuman's face (CC0); left and right of a pair together. The rig's jaw goes further than a
-# speaker's: scaled so that its continuous clip opens as far as filmed speakers do. The jaw's swing
-# backwards is left to the head's own jaw.
+# speaker's: scaled so that its continuous clip opens as far as filmed speakers do; so do its
+# pursed lips: scaled to half a centimetre. The jaw's swing backwards is left to the head's own jaw.
 _RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 _JAW_SCALE = 0.6
+_DEPTH_SCALE = 0.6
+_DEPTH_FAPS = (16, 17)
 _RIG = {
     "mouth_stretch_c": [
         _JAW_SCALE * value
@@ -177,6 +180,7 @@ class LipClip:
     speaker: str
     licence: str
     is_rig: bool  # weights of an animator's rig, not measured points
+    is_held: bool  # kept for scoring
     transcript: str  # Chinese, empty where unknown
     time_s: Array  # (num_frames,)
     faps: Array  # (num_frames, num_mouth_faps), FAP units, nan where not measured
@@ -191,10 +195,13 @@ def read_clips(folder: Path) -> list[LipClip]:
     UserError
         The folder holds no clips, or one of them cannot be read.
     """
+    held = folder / "held.txt"
+    left_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
     clips = []
     for path in sorted(folder.glob("*.json")):
         try:
             about = json.loads(path.read_text(encoding="utf-8"))
+            is_held = path.stem in left_out or about["speaker"] in left_out
             if not str(about["language"]).startswith("zh"):
                 continue
             with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
@@ -209,6 +216,7 @@ def read_clips(folder: Path) -> list[LipClip]:
                     speaker=about["speaker"],
                     licence=about["licence"],
                     is_rig=is_rig,
+                    is_held=is_held,
                     transcript=about.get("transcript") or "",
                     time_s=columns["t"],
                     faps=_rig_faps(columns) if is_rig else _tracked_faps(columns),
@@ -244,6 +252,7 @@ def _rig_faps(columns: dict[str, Array]) -> Array:
         ]
         weight = np.mean(np.stack(sides), axis=0)
         faps[:, _columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
+    faps[:, _columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
     for right, left in _MIRROR.items():
         faps[:, MOUTH_FAPS.index(right)] = faps[:, MOUTH_FAPS.index(left)]
     return faps
@@ -263,6 +272,7 @@ _RIDGE = 30.0  # frames' worth of belief in the start: neighbouring frames tell 
 _SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.02, "target": 1.0}
 # how far from the start, in spreads
 _ALPHA_RANGE, _THETA_RANGE, _OFFSET_RANGE = 4.0, 2.0, 2.5
+_LARGEST_GAIN = 2.0
 _EXPONENTS = (1.3, 1.5, 1.8)  # below, the corners at centres begin to show
 _ROUNDS = 2
 _SILENCE_STEP = 1e-4  # of the finite differences, in units of the spread
@@ -475,6 +485,9 @@ def estimate(frames: Frames) -> VisemeParameters:
             fit.descend(_FINAL_ROWS, with_silences=True)
             fit.descend(_INITIAL_ROWS, with_silences=False)
         visemes, silences = fit.visemes.copy(), fit.silences.copy()
+        # Least squares flattens what it cannot foresee: give the motion its measured extent.
+        modelled, seen = fit.curve()
+        visemes[4] *= min(max(float(np.std(seen) / np.std(modelled)), 1.0), _LARGEST_GAIN)
         visemes[:3], silences[:2] = np.exp(visemes[:3]), np.exp(silences[:2])
         columns = [column] + [
             MOUTH_FAPS.index(right) for right, left in _MIRROR.items() if left == MOUTH_FAPS[column]
@@ -487,20 +500,27 @@ def estimate(frames: Frames) -> VisemeParameters:
 
 
 def train(folder: Path, output: Path) -> None:
-    """Learn viseme parameters from the clips of ``folder`` that may be used for a program.
+    """Learn viseme parameters from the rig's clips of ``folder`` that may be used for a program.
+
+    Filmed clips are left out: whose lips are measured at the points of another face, they are for
+    scoring (``evaluation/lips.py``).
 
     Raises
     ------
     UserError
         No clip can be used.
     """
-    clips = [clip for clip in read_clips(folder) if clip.is_rig and may_ship(clip.licence)]
+    clips = [
+        clip
+        for clip in read_clips(folder)
+        if clip.is_rig and not clip.is_held and may_ship(clip.licence)
+    ]
     if not clips:
         raise UserError(f"no clip in {folder} may be used; give clips with a free licence")
     model = load_model()
     parameters = estimate(frames_of(clips, [label_clip(model, clip) for clip in clips]))
     names = ", ".join(clip.name for clip in clips)
-    save_parameters(parameters, output, f"{_SOURCE}; learned from {names} (MIT)")
+    save_parameters(parameters, output, f"{_SOURCE}; learned from {names} (FACEGOOD, MIT)")
 
 
 if __name__ == "__main__":

@@ -133,8 +133,8 @@ class ControlService(Service):
         self._commands.send(reply, to=sender)
 
     def _open(self, message: OpenSession, sender: bytes) -> None:
-        pending = self._registry.sessions.get(message.session)
-        if pending is not None and (pending.client, pending.opening) == (sender, message):
+        pending = self._registry.sessions.values()
+        if any((record.client, record.opening) == (sender, message) for record in pending):
             return  # the same request again while its services start
         record = self._registry.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})

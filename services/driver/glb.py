@@ -9,8 +9,9 @@ the scene says how a FAP becomes a weight or an angle:
   node combine as yaw * pitch * roll.
 
 Nodes: ``kouxing`` > ``body`` (joint), ``garment``; ``body`` > ``head`` (joint) > ``eye_left``,
-``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``; and ``skin``, a
-mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face looks along z.
+``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``;
+and ``skin``, a mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face
+looks along z.
 """
 
 from __future__ import annotations
@@ -97,9 +98,11 @@ class _Document:
             item["min"], item["max"] = array.min(axis=0).tolist(), array.max(axis=0).tolist()
         return self.add("accessors", item)
 
-    def sparse_vectors(self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int) -> int:
+    def sparse_vectors(
+        self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int
+    ) -> int:
         """Store displacements (N, 3) that are zero but in ``rows``."""
-        padded = np.concatenate([values, np.zeros((1, 3), np.float32)]) if len(rows) < count else values
+        padded = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])
         return self.add(
             "accessors",
             {
@@ -133,7 +136,9 @@ class _Document:
                 file.write(struct.pack("<I4s", len(text), b"JSON") + text)
                 file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
         except OSError as error:
-            raise UserError(f"{path} cannot be written ({error.strerror}); give another path") from error
+            raise UserError(
+                f"{path} cannot be written ({error.strerror}); give another path"
+            ) from error
 
 
 def export_glb(head: Head, path: str | Path) -> None:
@@ -246,9 +251,7 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
     return material
 
 
-def _targets(
-    document: _Document, head: Head, part: Part
-) -> tuple[list[dict[str, int]], list[str]]:
+def _targets(document: _Document, head: Head, part: Part) -> tuple[list[dict[str, int]], list[str]]:
     """Morph targets of a part, and their names."""
     rows = head.basis[3 * part.vertices.start : 3 * part.vertices.stop].tocsc()
     count = part.vertices.stop - part.vertices.start
@@ -269,7 +272,7 @@ def _units_per_weight(fapu: str) -> float:
 
 
 def _description(head: Head) -> dict[str, Any]:
-    """What a viewer needs to turn FAPs into weights and angles."""
+    """Say what a viewer needs to turn FAPs into weights and angles."""
     faps: list[dict[str, Any]] = []
     for fap in FAPS[2:]:
         entry: dict[str, Any] = {"number": fap.number, "name": fap.name, "fapu": fap.fapu}

@@ -166,7 +166,10 @@ class Head:
         a, b, c = vertices[self._soft_triangles.T]
         soft = self._soft_incidence @ _cross(b - a, c - a)
         length = np.sqrt(np.einsum("ij,ij->i", soft, soft))[:, None]
-        normals[self._soft_vertices] = soft / np.maximum(length, 1e-20)
+        # where triangles have no area the neutral normal stays
+        normals[self._soft_vertices] = np.where(
+            length > 1e-14, soft / np.maximum(length, 1e-14), normals[self._soft_vertices]
+        )
         return self._turn(vertices, faps, points=True), self._turn(normals, faps, points=False)
 
     def _bend(self, faps: Float32) -> Float32:

@@ -164,7 +164,8 @@ def standalone_context() -> moderngl.Context:
         If the GL libraries are missing or give no context.
     """
     try:
-        return moderngl.create_standalone_context(require=330, backend="egl")
+        settings: dict[str, Any] = {"backend": "egl"}
+        return moderngl.create_standalone_context(require=330, **settings)
     except Exception as error:  # moderngl raises bare Exception
         missing = [name for name in ("EGL", "GL") if ctypes.util.find_library(name) is None]
         found = f"lib{' and lib'.join(missing)} not found" if missing else str(error)
@@ -176,10 +177,9 @@ def standalone_context() -> moderngl.Context:
 
 def decode_image(encoded: bytes) -> UInt8:
     """Decode a JPEG or PNG into (H, W, 4)."""
-    with av.open(io.BytesIO(encoded)) as container:
+    with av.open(io.BytesIO(encoded), "r") as container:
         frame = next(container.decode(video=0))
-        pixels: UInt8 = frame.to_ndarray(format="rgba")
-    return pixels
+        return np.asarray(frame.to_ndarray(format="rgba"), dtype=np.uint8)
 
 
 class Renderer:
@@ -321,7 +321,7 @@ class Renderer:
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         eye = np.array(self._camera.position)
         for program in (self._program, self._eye_program):
-            program["view_projection"].write(self._view_projection().T.tobytes())
+            program["view_projection"] = tuple(self._view_projection().T.ravel())
             program["eye"] = self._camera.position
         half_way = _KEY + eye / np.linalg.norm(eye)
         self._eye_program["half_way"] = tuple(half_way / np.linalg.norm(half_way))
@@ -337,12 +337,13 @@ class Renderer:
             self._backdrop.render()
         context.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
         # the second pair keeps the alpha of transparent pictures right
-        context.blend_func = (
+        factors: Any = (
             moderngl.SRC_ALPHA,
             moderngl.ONE_MINUS_SRC_ALPHA,
             moderngl.ONE,
             moderngl.ONE_MINUS_SRC_ALPHA,
         )
+        context.blend_func = factors
         for part in self.head.parts:
             if part.transparent:
                 self._draw_part(part)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import av
 import numpy as np
@@ -56,7 +57,9 @@ class VideoWriter:
         sample_rate_hz: int,
     ) -> None:
         if width_px < 2 or height_px < 2 or width_px % 2 or height_px % 2:
-            raise UserError(f"a video of {width_px} x {height_px} pixels; give even, positive sizes")
+            raise UserError(
+                f"a video of {width_px} x {height_px} pixels; give even, positive sizes"
+            )
         if not frame_rate_hz > 0:
             raise UserError(f"a frame rate of {frame_rate_hz} Hz; give a positive one")
         if sample_rate_hz not in SAMPLE_RATES_HZ:
@@ -119,7 +122,7 @@ class VideoWriter:
         self._num_samples += len(samples)
         self._mux(self._sound.encode(frame))
 
-    def _mux(self, packets: list[av.Packet]) -> None:
+    def _mux(self, packets: list[Any]) -> None:
         try:
             self._container.mux(packets)
         except OSError as error:

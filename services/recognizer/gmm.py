@@ -108,6 +108,7 @@ class GmmModel:
     rotation: NDArray[np.float32]  # (39, 39)
     prior_mean: NDArray[np.float32]  # (13,) cepstral mean of the training corpus
     half_width: int  # of the differences
+    kappa: float = 1.0  # scale of the log scores: neighbouring frames say nearly the same
 
     def stream(self) -> GmmStream:
         """Start a stream of scores for one speaker."""
@@ -124,6 +125,7 @@ class GmmModel:
             "rotation": self.rotation,
             "prior_mean": self.prior_mean,
             "half_width": np.array(self.half_width),
+            "kappa": np.array(self.kappa, np.float32),
         }
         write_archive(path, arrays)
 
@@ -160,7 +162,7 @@ class GmmStream:
         for row in range(len(features)):  # row by row: a product's rounding depends on its height
             frame = normalised[row : row + 1] @ self._model.rotation
             scores[row] = mixture_scores(frame, self._matrix, num_mixtures)[0]
-        return scores
+        return scores * np.float32(self._model.kappa)
 
 
 def gmm_from(archive: Archive) -> GmmModel:
@@ -186,6 +188,7 @@ def gmm_from(archive: Archive) -> GmmModel:
         rotation=archive.floats("rotation", NUM_FEATURES, NUM_FEATURES),
         prior_mean=archive.floats("prior_mean", NUM_STATIC),
         half_width=half_width,
+        kappa=float(archive.floats("kappa")),
     )
 
 

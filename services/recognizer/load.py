@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from services.recognizer import gmm, neural
+from services.recognizer import combined, gmm, neural
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.model_file import read_archive
 from shared.errors import UserError
 
-_FOLDER = Path(__file__).parent / "models"
-MODEL_PATH = _FOLDER / "gmm.npz"
+MODEL_PATH = Path(__file__).parent / "models" / "gmm.npz"
 
 
 def load_model(path: Path = MODEL_PATH) -> AcousticModel:
@@ -19,7 +18,7 @@ def load_model(path: Path = MODEL_PATH) -> AcousticModel:
     Parameters
     ----------
     path
-        A file that ``GmmModel.save`` or ``NeuralModel.save`` wrote.
+        A file that ``GmmModel.save``, ``NeuralModel.save`` or ``save_combined`` wrote.
 
     Raises
     ------
@@ -33,9 +32,16 @@ def load_model(path: Path = MODEL_PATH) -> AcousticModel:
             return gmm.gmm_from(archive)
         if found == neural.FORMAT:
             return neural.neural_from(archive)
+        if found == combined.FORMAT:
+            names = combined.part_files_of(archive)
+            if path.name in names:
+                raise ValueError("it is a part of itself")
+            return combined.combined_from(
+                archive, [load_model(path.with_name(name)) for name in names]
+            )
     except ValueError as error:
         raise UserError(f"acoustic model {path}: {error}; train it again") from error
+    known = ", ".join((gmm.FORMAT, neural.FORMAT, combined.FORMAT))
     raise UserError(
-        f"acoustic model {path} has the format {found!r}; this program reads {gmm.FORMAT!r} and "
-        f"{neural.FORMAT!r}: train it again"
+        f"acoustic model {path} has the format {found!r}; this program reads {known}: train again"
     )

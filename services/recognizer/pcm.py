@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-WIRE_TYPES = {"s16le": np.dtype("<i2"), "f32le": np.dtype("<f4")}
+SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 FULL_SCALE = 32768.0
 SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
 
@@ -25,19 +25,19 @@ def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
     BadAudio
         If the length fits no whole number of sample frames, or a sample is NaN or infinite.
     """
-    wire_type = WIRE_TYPES[encoding]
-    frame_bytes = wire_type.itemsize * num_channels
+    frame_bytes = SAMPLE_BYTES[encoding] * num_channels
     if len(pcm) % frame_bytes:
         raise BadAudio(
             f"{len(pcm)} bytes are no whole number of {encoding} frames of {num_channels} channels "
             f"({frame_bytes} bytes each); was another encoding or channel count opened?"
         )
-    samples = np.frombuffer(pcm, wire_type).reshape(-1, num_channels)
     if encoding == "s16le":
-        return samples.astype(np.float32) / np.float32(FULL_SCALE)
+        scaled = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(FULL_SCALE)
+        return scaled.reshape(-1, num_channels)
+    samples = np.frombuffer(pcm, "<f4").astype(np.float32)
     if not np.isfinite(samples).all():
         raise BadAudio("the chunk holds NaN or infinite samples; it was dropped")
-    return np.clip(samples, -1.0, 1.0).astype(np.float32)
+    return np.clip(samples, -1.0, 1.0).reshape(-1, num_channels)
 
 
 def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
@@ -55,7 +55,7 @@ def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np
 def pcm16_of(samples: NDArray[np.float32]) -> bytes:
     """Return mono samples in [-1, 1] as little-endian int16 bytes."""
     scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
-    return scaled.astype("<i2").tobytes()
+    return bytes(scaled.astype("<i2").tobytes())
 
 
 def level_db(samples: NDArray[np.float32]) -> float:

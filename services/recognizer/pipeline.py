@@ -173,6 +173,8 @@ class Recognizer:
         Channels of the input; they are averaged.
     agreement
         N of the output rule.
+    least_confidence
+        Confidence that a frame needs to count for the output rule; 0 is the paper's rule.
 
     Raises
     ------
@@ -193,11 +195,12 @@ class Recognizer:
         sample_rate_hz: int,
         num_channels: int = 1,
         agreement: int = 3,
+        least_confidence: float = 0.0,
     ) -> None:
         self._durations_s = model.topology.duration_mean_s
         self._scores = SpeechScores(model, sample_rate_hz, num_channels)
         self._decoder = Decoder(model.topology)
-        self._rule = OutputRule(agreement, last_output=_SIL)
+        self._rule = OutputRule(agreement, least_confidence, last_output=_SIL)
         self._num_phones = 0
         self._begin(0)
 
@@ -266,7 +269,7 @@ class Recognizer:
 
     def _frame(self, scores: NDArray[np.float32]) -> list[Phone | SpeechChange]:
         unit, start, confidence = self._decoder.accept(scores)
-        if not self._rule.accept(unit):
+        if not self._rule.accept(unit, confidence):
             return []
         settled = self._settle(self._decoder.path_since(self._done))
         self._open = Phone(

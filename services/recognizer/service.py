@@ -11,8 +11,11 @@ import dataclasses
 import secrets
 import time
 
+import numpy as np
+
 from services.recognizer.acoustic_model import AcousticModel
-from services.recognizer.gmm import load_model
+from services.recognizer.decoder import Decoder
+from services.recognizer.load import load_model
 from services.recognizer.pcm import BadAudio, level_db, pcm16_of, samples_of, slices
 from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler
@@ -39,6 +42,7 @@ from shared.reliable import ReliableSender
 from shared.service import Service
 
 GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, less is jitter
+WARM_UP_FRAMES = 200
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 
 
@@ -140,6 +144,7 @@ class RecognizerService(Service):
             "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
         }
         self._model = load_model()
+        _warm_up(self._model)
         self.listen(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_finish})
         self.listen(self._phones, {})
 
@@ -278,6 +283,14 @@ class RecognizerService(Service):
         stream = self._streams.get(ack.session)
         if stream is not None and stream.link is not None and ack.epoch == stream.start.epoch:
             stream.link.acknowledge(ack.sequence, time.monotonic())
+
+
+def _warm_up(model: AcousticModel) -> None:
+    """Run the search once: its compiled code is loaded now and not in the first sentence."""
+    decoder = Decoder(model.topology)
+    for _ in range(WARM_UP_FRAMES):
+        decoder.accept(np.zeros(model.topology.num_states, np.float32))
+    decoder.finish()
 
 
 def _addressed(message: Message, stream: _Stream) -> Message:

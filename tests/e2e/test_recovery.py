@@ -106,7 +106,7 @@ def test_the_driver_and_the_gateway_come_back_too(watched: Watched) -> None:
 
 
 def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
-    with Client(watched.control) as client:
+    with Client(watched.control, deadline_s=2.0) as client:
         watched.kill("control")
         time.sleep(0.1)
         end_s = time.monotonic() + 30

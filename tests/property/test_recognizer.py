@@ -67,12 +67,12 @@ def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
 )
 def test_the_output_rule_is_the_paper_s(units: list[int], agreement: int, before: int) -> None:
     """Li 2011, eq. 4, word for word."""
-    rule = OutputRule(agreement, last_output=before)
+    rule = OutputRule(agreement, 0.0, last_output=before)
     last = before
     for t, unit in enumerate(units):
         recent = units[max(0, t - agreement + 1) : t + 1]
         expected = len(recent) == agreement and set(recent) == {unit} and unit != last
-        assert rule.accept(unit) == expected
+        assert rule.accept(unit, 0.1) == expected
         last = unit if expected else last
 
 

@@ -130,7 +130,7 @@ def test_value_and_slope_are_continuous_where_the_plan_changes() -> None:
     live.accept_phone(phone(1, "i", 0.4, 0.2))
     faps = values(frames[-3:] + live.advance(0.6))[:, JAW]
     steps = np.diff(faps)
-    assert abs(steps[1]) > 2.0
+    assert abs(steps[1]) > 0.5
     # a jump to the new plan would be fifty times as large, a corner ten times
     assert abs(steps[2] - steps[1]) < 5.0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,18 +35,26 @@ SHAPE = (
     ("nose/nose-scale-horiz-decr", 0.25),
     ("mouth/mouth-upperlip-height-decr", 0.35),
     ("mouth/mouth-lowerlip-height-decr", 0.40),
-    ("eyes/l-eye-height2-incr", 0.35),
-    ("eyes/r-eye-height2-incr", 0.35),
+    ("eyes/l-eye-height2-incr", 0.55),
+    ("eyes/r-eye-height2-incr", 0.55),
     ("eyes/l-eye-scale-incr", 0.20),
     ("eyes/r-eye-scale-incr", 0.20),
 )
 # closes the lips, which the plain target leaves apart
-FACE_SHAPE = (("mouthPressLeft", 0.12), ("mouthPressRight", 0.12), ("mouthRollLower", 0.10),
-              ("mouthSmileLeft", 0.06), ("mouthSmileRight", 0.06))
+FACE_SHAPE = (
+    ("mouthPressLeft", 0.12),
+    ("mouthPressRight", 0.12),
+    ("mouthRollLower", 0.10),
+    ("mouthSmileLeft", 0.06),
+    ("mouthSmileRight", 0.06),
+)
 PIVOT = np.array([0.0, 5.472, 0.417])  # MakeHuman's joint-head: the top of the spine
 LOWEST = 3.4  # dm, where the bust ends
 # the front edge of the left upper eyelid, from the nose outwards
 LEFT_LID = (6886, 6844, 6841, 6838, 6785, 6784, 6790, 6793, 6796, 6799)
+LEFT_LOWER_LID = (
+    6886, 6850, 6853, 6856, 6837, 11695, 6834, 6831, 6828, 6825, 6820, 6817, 6814, 6808
+)  # fmt: skip
 # the left half of the lips' outline, from 8.1 over 8.3 to 8.2
 LIP_OUTLINE = (
     455, 7214, 7210, 7215, 7169, 11956, 7170, 7171, 7168, 7167, 10405, 7162, 7163, 10370, 7164,
@@ -86,7 +95,8 @@ def build(source: MakeHuman, output: Path) -> None:
     tongue = subdivided(vertices, mesh.quads[mesh.group("helper-tongue")])
 
     cavity = _cavity(mesh, skin)
-    close_lips(skin, cavity)
+    _make_room(skin, cavity)
+    close_lips(skin)
     fapu = _fapu(skin, vertices, mesh)
     weight = _head_weight(source)
     face = _face_fields(source, skin, cavity, fapu)
@@ -124,7 +134,8 @@ def _fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float]:
     """Measure the face in the units of the standard, in dm."""
 
     def at(name: str) -> Float:
-        return skin.vertices[skin.point(name)]
+        place: Float = skin.vertices[skin.point(name)]
+        return place
 
     left, right = _eye_centres(vertices, mesh)
     return {
@@ -144,6 +155,15 @@ def _cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
     is_lining[mesh.quads[lining]] = 1.0
     cavity: NDArray[np.bool_] = skin.matrix @ is_lining[skin.base] > 0.5
     return cavity
+
+
+def _make_room(skin: Skin, cavity: NDArray[np.bool_]) -> None:
+    """Move the scalp away from the hair, and the mouth's lining away from its corners."""
+    x, y, z = skin.vertices.T
+    top = np.clip((y - 6.48) / 0.15, 0, 1)
+    normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
+    corner = np.clip((np.abs(x) - 0.13) / 0.05, 0, 1) * (z > 1.0) * cavity
+    skin.vertices[:] -= 0.05 * top[:, None] * normals + 0.012 * corner[:, None] * [0, 0, 1]
 
 
 def _face_fields(
@@ -177,7 +197,8 @@ def _head_weight(source: MakeHuman) -> Float:
     for bone in source.bones():
         if bone.startswith(_TORSO):
             weight -= source.bone_weights(bone)
-    return np.clip(weight, 0, 1)
+    np.clip(weight, 0, 1, out=weight)
+    return weight
 
 
 def _skin_piece(skin: Skin, weight: Float, fields: Fields) -> Piece:
@@ -201,46 +222,38 @@ def _skin_piece(skin: Skin, weight: Float, fields: Fields) -> Piece:
 
 def _garment(mesh: BaseMesh, vertices: Float, kept: NDArray[np.bool_]) -> Piece:
     """Make a round-necked top: the torso, a little larger, cut off round the neck."""
-    below = vertices[:, 1] < _neckline(vertices[:, 2])
-    quads = mesh.quads[kept]
-    quads = quads[below[quads].any(axis=1)]
-    moved = vertices.copy()
-    triangles = surface.triangles_of(quads)
-    normals = surface.vertex_normals(vertices, triangles)
-    moved[:, 1] = np.minimum(moved[:, 1], _neckline(moved[:, 2]))
-    moved += 0.035 * normals
-    cloth = subdivided(moved, quads)
-    inward = surface.vertex_normals(cloth.vertices, surface.triangles_of(cloth.quads))
-    rim = _borders(cloth.quads)
-    rim = rim[(cloth.vertices[rim][..., 1] > _neckline(cloth.vertices[rim][..., 2]) - 0.1).all(1)]
+    torso = subdivided(vertices, mesh.quads[kept])
+    triangles = surface.triangles_of(torso.quads)
+    normals = surface.vertex_normals(torso.vertices, triangles)
+    height = torso.vertices[:, 1] - _neckline(torso.vertices[:, 2])
+    cut, triangles, rim = surface.clip(height, triangles, np.hstack([torso.vertices, normals]))
+    points, normals = cut[:, :3], cut[:, 3:]
+    # the edge is folded in towards the neck
     ring, local = np.unique(rim, return_inverse=True)
     local = local.reshape(rim.shape)
-    inner = cloth.vertices[ring] - 0.045 * inward[ring] - [0, 0.03, 0]
-    count = len(cloth.vertices)
-    strip = np.concatenate(
-        [
-            np.stack([rim[:, 1], rim[:, 0], local[:, 0] + count], axis=1),
-            np.stack([rim[:, 1], local[:, 0] + count, local[:, 1] + count], axis=1),
+    folds = [
+        points[ring] + out * normals[ring] + [0, up, 0]
+        for out, up in ((0.034, 0.012), (0.020, 0.014), (0.002, -0.03))
+    ]
+    strips = []
+    before = rim
+    for step in range(len(folds)):
+        after = local + len(points) + step * len(ring)
+        strips += [
+            np.stack([before[:, 1], before[:, 0], after[:, 0]], axis=1),
+            np.stack([before[:, 1], after[:, 0], after[:, 1]], axis=1),
         ]
-    )
-    points = np.concatenate([cloth.vertices, inner])
-    uv = points[:, [0, 1]] * 0.18 + [0.5, -0.3]
+        before = after
+    everything = np.concatenate([points + 0.034 * normals, *folds])
+    used, compact = np.unique(np.concatenate([triangles, *strips]), return_inverse=True)
+    everything = everything[used]
     part = parts.Part(
-        points,
-        np.concatenate([surface.triangles_of(cloth.quads), strip]),
-        np.clip(uv, 0, 1),
-        np.ones_like(points),
+        everything,
+        compact.reshape(-1, 3),
+        np.full((len(everything), 2), 0.5),
+        np.ones_like(everything),
     )
-    return Piece("garment", part, "cloth", 0.9, np.zeros(len(points)))
-
-
-def _borders(quads: Index) -> Index:
-    """Edges (E, 2) with a quad on one side only, in the direction of that quad."""
-    pairs = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
-    _, which, count = np.unique(
-        np.sort(pairs, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return pairs[count[which.ravel()] == 1]
+    return Piece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
 
 
 def _eyes(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[Piece]:
@@ -271,7 +284,7 @@ def _teeth(fapu: dict[str, float]) -> list[Piece]:
 
 
 def _tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
-    points = tongue.vertices + [0.0, -0.045, -0.03]
+    points = tongue.vertices + np.array([0.0, -0.045, -0.03])
     uv = np.clip(points[:, [0, 2]] * [1.2, 0.8] + [0.5, -0.3], 0, 1)
     tint = np.clip((points[:, 2] - 0.55) / 0.6, 0.15, 1.0)[:, None] * [0.85, 0.7, 0.7]
     part = parts.Part(points, surface.triangles_of(tongue.quads), uv, tint)
@@ -290,7 +303,7 @@ def _tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
 def _hair() -> list[Piece]:
     """Make the opaque body of the hair, and its thin front edge and tips."""
     pieces = []
-    for name, rise, tips in (("hair", 0.0, False), ("hair_tips", 0.014, True)):
+    for name, rise, tips in (("hair", 0.0, False), ("hair_tips", 0.005, True)):
         sheets = [parts.hair_sheet(side, rise, 38, 28) for side in (1.0, -1.0)]
         count = len(sheets[0].vertices)
         triangles = np.concatenate([sheets[0].triangles, sheets[1].triangles + count])
@@ -321,9 +334,7 @@ def _lashes(skin: Skin, fields: Fields) -> Piece:
                 [np.argmin(((skin.vertices[: len(skin.base)] - p) ** 2).sum(1)) for p in mirror]
             )
         edge = skin.vertices[lid]
-        walked = np.concatenate(
-            [[0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))]
-        )
+        walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))])
         at = np.linspace(0.06, 1.0, columns) * walked[-1]
         root = interpolate.make_interp_spline(walked, edge, 3)(at)
         sideways = (np.linspace(-0.55, 1.0, columns) * side)[:, None] * [1.0, 0, 0]
@@ -361,7 +372,8 @@ def _lashes(skin: Skin, fields: Fields) -> Piece:
     both: Fields = {}
     for half, own in enumerate(moved):
         for fap, shift in own.items():
-            both.setdefault(fap, np.zeros((2 * count, 3)))[half * count : (half + 1) * count] = shift
+            whole = both.setdefault(fap, np.zeros((2 * count, 3)))
+            whole[half * count : (half + 1) * count] = shift
     return Piece("lashes", part, "lashes", 0.9, np.ones(2 * count), both)
 
 
@@ -386,9 +398,7 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
     triangles = np.concatenate(
         [p.part.triangles + first for p, first in zip(solid, offsets, strict=False)]
     )
-    normals = np.concatenate(
-        [surface.vertex_normals(_opened(p), p.part.triangles) for p in solid]
-    )
+    normals = np.concatenate([surface.vertex_normals(_opened(p), p.part.triangles) for p in solid])
     seen = openness(vertices, normals, triangles)
     for piece, first in zip(solid, offsets, strict=False):
         part = piece.part
@@ -399,10 +409,11 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
             lining = np.array([0.60, 0.19, 0.18]) * (0.06 + 0.94 * depth**1.5)
             part.colors = np.where(cavity[:, None], lining * (0.7 + 0.3 * shade), shade)
         elif piece.name == "garment":
-            part.colors = np.repeat(0.3 + 0.7 * own, 3, axis=1)
+            part.colors = np.repeat(0.6 + 0.4 * own, 3, axis=1)
         elif piece.name.startswith("eye"):
-            lit = np.clip(0.95 - 2.2 * (part.vertices[:, 1:2] - part.vertices[0, 1] - 0.005) / 0.1,
-                          0.45, 1.0)
+            lit = np.clip(
+                0.95 - 2.2 * (part.vertices[:, 1:2] - part.vertices[0, 1] - 0.005) / 0.1, 0.45, 1.0
+            )
             part.colors = np.repeat(lit, 3, axis=1)
         elif piece.name.startswith("hair"):
             part.colors = np.repeat(0.45 + 0.55 * own, 3, axis=1)
@@ -410,9 +421,7 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
             part.colors = part.colors * (0.55 + 0.45 * np.clip(1.5 * own, 0, 1))
 
 
-def _textures(
-    skin: Skin, vertices: Float, cavity: NDArray[np.bool_]
-) -> dict[str, bytes]:
+def _textures(skin: Skin, vertices: Float, cavity: NDArray[np.bool_]) -> dict[str, bytes]:
     uv = paint.skin_uv(skin.vertices)
     normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
     outward = skin.vertices - [0, 0, paint.AXIS_Z]
@@ -420,7 +429,9 @@ def _textures(
     outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6) & ~cavity
     face = paint.face_map(skin.vertices[outer], uv[outer])
     brow = vertices[[FEATURE_POINTS[name] for name in ("4.1", "4.3", "4.5")]][:, :2]
-    lid = vertices[np.array(LEFT_LID)][:, :2]
+    upper, lower = (vertices[np.array(edge)] for edge in (LEFT_LID, LEFT_LOWER_LID))
+    low = np.interp(upper[:, 0], lower[:, 0], lower[:, 1])
+    lid = np.stack([upper[:, 0], upper[:, 1], low], axis=1)
     return {
         "skin": paint.encode(paint.skin(face, brow, lid, _lip_outline(skin))),
         "eye": paint.encode(paint.eye()),
@@ -446,11 +457,15 @@ def _lip_outline(skin: Skin) -> Float:
 
 
 def _write(
-    output: Path, pieces: list[Piece], textures: dict[str, bytes], skin: Skin, tongue: Skin,
+    output: Path,
+    pieces: list[Piece],
+    textures: dict[str, bytes],
+    skin: Skin,
+    tongue: Skin,
     fapu: dict[str, float],
 ) -> None:
     def metres(points: Float) -> NDArray[np.float32]:
-        return ((points - PIVOT) * METRES_PER_UNIT).astype(np.float32)
+        return np.asarray((points - PIVOT) * METRES_PER_UNIT, dtype=np.float32)
 
     first = np.cumsum([0] + [len(p.part.vertices) for p in pieces])
     start = {p.name: int(at) for p, at in zip(pieces, first, strict=False)}
@@ -496,32 +511,35 @@ def _write(
         units.append(1e5 if fap == 47 else 1024.0)
         bounds.append(sum(len(rows) for rows in moved))
     centres = metres(np.stack([(e.vertices.max(0) + e.vertices.min(0)) / 2 for e in eyes]))
-    np.savez_compressed(
-        output,
-        format=np.array(FORMAT),
-        vertices=metres(vertices),
-        uv=np.round(np.concatenate([p.part.uv for p in pieces]) * 65535).astype(np.uint16),
-        colors=np.round(
+    arrays: dict[str, Any] = {
+        "format": np.array(FORMAT),
+        "vertices": metres(vertices),
+        "uv": np.round(np.concatenate([p.part.uv for p in pieces]) * 65535).astype(np.uint16),
+        "colors": np.round(
             np.sqrt(np.clip(np.concatenate([p.part.colors for p in pieces]), 0, 1)) * 255
         ).astype(np.uint8),
-        head_weight=np.round(np.concatenate([p.head_weight for p in pieces]) * 255).astype(np.uint8),
-        triangles=np.concatenate(triangles).astype(np.uint16),
-        part_names=np.array([p.name for p in pieces]),
-        part_textures=np.array([p.texture for p in pieces]),
-        part_roughness=np.array([p.roughness for p in pieces]),
-        part_transparent=np.array([p.name in ("hair_tips", "lashes") for p in pieces]),
-        part_double_sided=np.array([p.texture in ("hair", "lashes") for p in pieces]),
-        part_vertices=np.array(part_vertices),
-        part_triangles=np.array(part_triangles),
-        fapu_names=np.array(list(fapu)),
-        fapu=np.array(list(fapu.values())),
-        feature_point_names=np.array(list(points)),
-        feature_points=np.array(list(points.values())),
-        eye_centres=centres,
-        field_faps=np.array(faps, dtype=np.int64),
-        field_units=np.array(units),
-        field_bounds=np.array(bounds),
-        field_vertices=np.concatenate([*moved, np.zeros(0, int)]).astype(np.uint16),
-        field_shifts=np.concatenate([*shifts, np.zeros((0, 3))]).astype(np.float16),
-        **{f"texture_{name}": np.frombuffer(data, np.uint8) for name, data in textures.items()},
-    )
+        "head_weight": np.round(np.concatenate([p.head_weight for p in pieces]) * 255).astype(
+            np.uint8
+        ),
+        "triangles": np.concatenate(triangles).astype(np.uint16),
+        "part_names": np.array([p.name for p in pieces]),
+        "part_textures": np.array([p.texture for p in pieces]),
+        "part_roughness": np.array([p.roughness for p in pieces]),
+        "part_transparent": np.array([p.name in ("hair_tips", "lashes") for p in pieces]),
+        "part_double_sided": np.array([p.texture in ("hair", "lashes") for p in pieces]),
+        "part_vertices": np.array(part_vertices),
+        "part_triangles": np.array(part_triangles),
+        "fapu_names": np.array(list(fapu)),
+        "fapu": np.array(list(fapu.values())),
+        "feature_point_names": np.array(list(points)),
+        "feature_points": np.array(list(points.values())),
+        "eye_centres": centres,
+        "field_faps": np.array(faps, dtype=np.int64),
+        "field_units": np.array(units),
+        "field_bounds": np.array(bounds),
+        "field_vertices": np.concatenate([*moved, np.zeros(0, int)]).astype(np.uint16),
+        "field_shifts": np.concatenate([*shifts, np.zeros((0, 3))]).astype(np.float16),
+    }
+    for name, data in textures.items():
+        arrays[f"texture_{name}"] = np.frombuffer(data, np.uint8)
+    np.savez_compressed(output, allow_pickle=False, **arrays)

@@ -70,7 +70,7 @@ def openness(
         axes = np.stack([right, np.cross(way, right), -way]) / reach
         view = np.eye(4)
         view[:3, :3], view[:3, 3] = axes, -axes @ middle
-        program["view"].write(view.T.astype("f4").tobytes())
+        program["view"] = tuple(view.T.ravel())
         target.use()
         target.clear(red=1.0, depth=1.0)
         array.render()

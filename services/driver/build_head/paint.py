@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, ndimage
 
+from services.driver.build_head.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
+
 Float = NDArray[np.float64]
 
 AXIS_Z = 0.35  # dm, of the vertical axis the angle is counted about
@@ -30,7 +32,8 @@ def skin_uv(vertices: Float) -> Float:
     angle = np.abs(np.arctan2(np.abs(vertices[:, 0]), vertices[:, 2] - AXIS_Z))
     u = np.interp(angle, _ANGLES, _COLUMNS)
     v = (TOP_Y - vertices[:, 1]) / (TOP_Y - BOTTOM_Y)
-    return np.clip(np.stack([u, v], axis=1), 0.0, 1.0)
+    uv: Float = np.clip(np.stack([u, v], axis=1), 0.0, 1.0)
+    return uv
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +71,14 @@ def _noise(shape: tuple[int, int], sigma: float | tuple[float, float], seed: int
     """Smooth noise of unit variance."""
     white = np.random.default_rng(seed).standard_normal(shape)
     smooth: Float = ndimage.gaussian_filter(white, sigma, mode="wrap")
-    return smooth / smooth.std()
+    smooth /= smooth.std()
+    return smooth
 
 
 def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
     """Soft spot (H, W) of height 1 at a place of the face."""
-    return np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
+    spot: Float = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
+    return spot
 
 
 def _mix(image: Float, color: tuple[float, float, float], amount: Float) -> Float:
@@ -95,7 +100,8 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
     brow
         Middle line of a brow from the nose outwards (3, 2), x and y in dm.
     lid
-        Edge of an upper eyelid from the nose outwards (N, 2), x and y in dm.
+        Edges of the eyelids from the nose outwards (N, 3): x, height of the upper and of the lower
+        one in dm.
     lips
         From the middle outwards (N, 3): x, height of the upper and of the lower outline in dm.
 
@@ -106,8 +112,11 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
     shape = face.x.shape
     image = np.broadcast_to(np.array(SKIN), (*shape, 3)).copy()
     blotch = _noise(shape, 26, 1)
-    image *= 1 + 0.010 * blotch[..., None] * np.array([0.6, 1.0, 1.2])
-    image *= 1 + 0.010 * _noise(shape, 1.1, 2)[..., None] + 0.006 * _noise(shape, 3.5, 3)[..., None]
+    # the neck is thin: there the texture is squeezed, and grain would turn into streaks
+    grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1)
+    image *= 1 + 0.010 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
+    fine = 0.010 * _noise(shape, 1.1, 2) + 0.006 * _noise(shape, 3.5, 3)
+    image *= 1 + (grain * fine)[..., None]
     rosy = (0.90, 0.56, 0.50)
     image = _mix(image, rosy, 0.34 * _spot(face, 0.42, 5.42, 0.20, 0.17))
     image = _mix(image, rosy, 0.16 * _spot(face, 0.0, 5.46, 0.10, 0.10))
@@ -117,7 +126,7 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
     image = _mix(image, (0.74, 0.53, 0.47), 0.30 * _spot(face, 0.27, 5.885, 0.14, 0.05))
     image = _mix(image, (0.95, 0.80, 0.70), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
     image = _paint_lips(image, face, lips)
-    image = _paint_eye_lines(image, face, lid)
+    image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2])
     image = _paint_brow(image, face, brow)
     return np.clip(_paint_hairline(image, face), 0, 1)
 
@@ -125,10 +134,11 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
 def _paint_lips(image: Float, face: FaceMap, lips: Float) -> Float:
     """Tint what lies between the two lip outlines."""
     upper, lower = (np.interp(face.x, lips[:, 0], lips[:, column]) for column in (1, 2))
-    edge = 0.008
+    upper = upper - 0.012 * np.exp(-((face.x / 0.024) ** 2))  # Cupid's bow
+    edge = 0.0065
     inside = 1 / (1 + np.exp((face.y - upper + 0.010) / edge))
     inside *= 1 / (1 + np.exp((lower + 0.012 - face.y) / edge))
-    inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.012) / 0.006))
+    inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.030) / 0.007))
     lines = _noise(face.x.shape, (14, 1.8), 4)
     color = np.array(LIP) * (1 + 0.022 * lines[..., None])
     image = image + (color - image) * (0.80 * inside)[..., None]
@@ -136,14 +146,17 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float) -> Float:
     return _mix(image, (0.70, 0.48, 0.42), 0.30 * below)
 
 
-def _paint_eye_lines(image: Float, face: FaceMap, lid: Float) -> Float:
-    """Darken the edge of the upper lid, where the lashes grow, and its fold."""
+def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> Float:
+    """Darken the edges of the lids, where the lashes grow, and the upper lid's fold."""
     edge = np.interp(face.x, lid[:, 0], lid[:, 1])
     inside = 1 / (1 + np.exp(-(face.x - lid[0, 0] - 0.01) / 0.008))
     inside *= 1 / (1 + np.exp((face.x - lid[-1, 0] - 0.02) / 0.012))
     height = face.y - edge
     line = np.exp(-((height / 0.011) ** 2)) * inside
     fold = np.exp(-(((height - 0.052) / 0.010) ** 2)) * inside
+    below = np.interp(face.x, lid[:, 0], lower)
+    rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
+    image = _mix(image, (0.52, 0.31, 0.28), 0.45 * rim)
     image = _mix(image, (0.16, 0.10, 0.09), 0.80 * line)
     return _mix(image, (0.55, 0.36, 0.31), 0.50 * fold)
 
@@ -176,7 +189,8 @@ def _directed(white: Float, slope: float, length: int) -> Float:
         scale = 1.0 / np.hypot(1.0, slope)
         total += ndimage.shift(white, (-slope * scale * step, scale * step), order=1, mode="wrap")
     smooth: Float = ndimage.gaussian_filter(total, 0.7)
-    return smooth / smooth.std()
+    smooth /= smooth.std()
+    return smooth
 
 
 def hairline_height(x: Float) -> Float:
@@ -199,11 +213,9 @@ def _paint_hairline(image: Float, face: FaceMap) -> Float:
 
 def eye(size: int = 256) -> Float:
     """Paint an eyeball; the distance from the middle counts the angle from the pupil."""
-    from services.driver.build_head.parts import _EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
-
     place = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(place, place)
-    angle = np.hypot(x, y) * _EYE_RINGS[-1]
+    angle = np.hypot(x, y) * EYE_RINGS[-1]
     turn = np.arctan2(y, x)
     rng = np.random.default_rng(8)
     spokes = np.zeros((size, size))
@@ -272,10 +284,11 @@ def hair(size: tuple[int, int] = (512, 512)) -> Float:
     shine = np.exp(-(((v - 0.20 + 0.012 * strands) / 0.07) ** 2))
     value = 1 + 0.22 * strands + 0.55 * shine
     image = np.array(HAIR) * value[..., None] + np.array([0.045, 0.03, 0.02]) * shine[..., None]
-    tips = (0.985 - v) / 0.07 + 0.55 * _noise(size, (40, 2.0), 13)
-    front = u / 0.05 + 0.45 * _noise(size, (60, 1.5), 14) + 0.2
-    alpha = np.clip(tips, 0, 1) * np.clip(front, 0, 1)
-    return np.clip(np.concatenate([image, alpha[..., None]], axis=2), 0, 1)
+    tips = (0.99 - v) / 0.045 + 0.35 * _noise(size, (40, 1.2), 13) + 0.35 * _noise(size, (40, 5), 14)
+    front = np.clip(u / 0.055, 0, 1)
+    alpha = np.clip(tips, 0, 1) * front * front * (3 - 2 * front)
+    painted: Float = np.clip(np.concatenate([image, alpha[..., None]], axis=2), 0, 1)
+    return painted
 
 
 def lashes(size: tuple[int, int] = (64, 256)) -> Float:
@@ -315,7 +328,8 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
     # filter 2 (difference from the row above) suits strands that run down
     above = np.concatenate([np.zeros_like(pixels[:1]), pixels[:-1]])
     lines = np.concatenate(
-        [np.full((rows, 1), 2, np.uint8), (pixels - above).reshape(rows, columns * channels)], axis=1
+        [np.full((rows, 1), 2, np.uint8), (pixels - above).reshape(rows, columns * channels)],
+        axis=1,
     )
 
     def chunk(kind: bytes, data: bytes) -> bytes:

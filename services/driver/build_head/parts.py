@@ -6,6 +6,7 @@ All lengths are MakeHuman decimetres, y up, z towards the viewer, x to the subje
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,20 +40,20 @@ def grid_triangles(rows: int, columns: int) -> Index:
 IRIS_ANGLE = np.radians(25.0)  # half the angle the iris spans, seen from the eye's centre
 PUPIL_ANGLE = np.radians(9.5)
 # rings of vertices from the front pole backwards; ring 2 is the pupil's edge, ring 6 the iris's
-_EYE_RINGS = np.radians([0.0, 5.0, 9.5, 13.0, 17.0, 21.0, 25.0, 30.0, 38.0, 48.0, 60.0, 75.0, 95.0])
+EYE_RINGS = np.radians([0.0, 5.0, 9.5, 13.0, 17.0, 21.0, 25.0, 30.0, 38.0, 48.0, 60.0, 75.0, 95.0])
 _EYE_SEGMENTS = 32
 
 
 def eyeball(centre: Float, radius: float) -> Part:
     """Make a sphere, open at the back, whose texture is a view from the front."""
     turn = np.linspace(0.0, 2 * np.pi, _EYE_SEGMENTS + 1)
-    angle, turn = np.meshgrid(_EYE_RINGS, turn, indexing="ij")
+    angle, turn = np.meshgrid(EYE_RINGS, turn, indexing="ij")
     bulge = 1.0 + 0.035 * np.clip(1 - angle / np.radians(32.0), 0, 1) ** 1.0  # the cornea
     direction = np.stack(
         [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=2
     )
     vertices = centre + radius * (bulge[..., None] * direction).reshape(-1, 3)
-    reach = (angle / _EYE_RINGS[-1]).ravel()  # the texture's radius counts angle, not projection
+    reach = (angle / EYE_RINGS[-1]).ravel()  # the texture's radius counts angle, not projection
     uv = 0.5 + 0.5 * np.stack([reach * np.cos(turn).ravel(), -reach * np.sin(turn).ravel()], axis=1)
     triangles = grid_triangles(*angle.shape)
     return Part(vertices, triangles, uv, np.ones((len(vertices), 3)))
@@ -60,11 +61,12 @@ def eyeball(centre: Float, radius: float) -> Part:
 
 def pupil_growth(part: Part, centre: Float) -> Float:
     """Radial directions (V, 3) of unit length at the pupil's edge, for the FAPs 29 and 30."""
-    angle = np.repeat(_EYE_RINGS, _EYE_SEGMENTS + 1)
+    angle = np.repeat(EYE_RINGS, _EYE_SEGMENTS + 1)
     weight = np.interp(angle, [0.0, PUPIL_ANGLE, IRIS_ANGLE], [0.0, 1.0, 0.0])
     outward = (part.vertices - centre) * [1.0, 1.0, 0.0]
     length = np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
-    return weight[:, None] * outward / length
+    growth: Float = weight[:, None] * outward / length
+    return growth
 
 
 # ---- teeth ------------------------------------------------------------------------------------
@@ -105,10 +107,7 @@ def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: floa
     half = np.concatenate([[0.0], np.cumsum(widths)]) / 100.0
     bounds = np.concatenate([-half[:0:-1], half])
     place = np.concatenate(
-        [
-            np.linspace(a, b, _TOOTH_COLUMNS, endpoint=False)
-            for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-        ]
+        [np.linspace(a, b, _TOOTH_COLUMNS, endpoint=False) for a, b in pairwise(bounds)]
         + [bounds[-1:]]
     )
     phase = np.concatenate([np.tile(np.arange(_TOOTH_COLUMNS), 2 * len(widths)), [0]])
@@ -143,7 +142,8 @@ def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: floa
     if up > 0:
         triangles = triangles[:, ::-1]
     shade = np.clip(1.0 - 0.75 * np.tile(back, len(rows)) ** 1.3, 0.12, 1.0)
-    shade *= np.repeat(np.interp(_PROFILE[:, 2], [0.0, 0.3, 0.7, 1.0], [0.45, 0.9, 1, 0.4]), columns)
+    by_row = np.interp(_PROFILE[:, 2], [0.0, 0.3, 0.7, 1.0], [0.45, 0.9, 1.0, 0.4])
+    shade *= np.repeat(by_row, columns)
     return Part(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))
 
 
@@ -156,7 +156,8 @@ def _bezier(points: Float, t: Float) -> Float:
     """Evaluate quadratic curves with control points (3, A, 2) at (T,) as (A, T, 2)."""
     first, middle, last = points[:, :, None, :]
     s = t[None, :, None]
-    return (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
+    curve: Float = (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
+    return curve
 
 
 def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
@@ -204,10 +205,11 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     # below the ears the hair hangs and turns inwards at the tips
     drop = np.linspace(0.0, 1.0, steps - steps // 2)[1:]
     length = np.interp(across, [0.0, 0.15, 0.5, 1.0], [1.02, 1.08, 1.10, 1.06])
-    length = length + 0.02 * noise.standard_normal(strands)
+    length = length + 0.025 * noise.standard_normal(strands)
     last, before = skull[:, -1], skull[:, -2]
     lean = (last - before) / np.maximum(np.linalg.norm(last - before, axis=1, keepdims=True), 1e-9)
-    out = np.stack([side * np.sin(azimuth[:, -1]), np.zeros(strands), np.cos(azimuth[:, -1])], axis=1)
+    facing = azimuth[:, -1]
+    out = np.stack([side * np.sin(facing), np.zeros(strands), np.cos(facing)], axis=1)
     sway = 0.05 * np.sin(np.pi * np.minimum(drop * 0.9, 1))[None, :] - 0.17 * drop[None, :] ** 3
     hang = (
         last[:, None]
@@ -234,6 +236,4 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     triangles = grid_triangles(strands, rows)[::-1]
     if side < 0:
         triangles = triangles[:, ::-1]
-    return Part(
-        points.reshape(-1, 3), triangles, uv.reshape(-1, 2), np.ones((strands * rows, 3))
-    )
+    return Part(points.reshape(-1, 3), triangles, uv.reshape(-1, 2), np.ones((strands * rows, 3)))

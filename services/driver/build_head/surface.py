@@ -83,9 +83,7 @@ def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, In
 
     before = np.roll(edge_of_corner, 1, axis=1) + num_vertices
     after = edge_of_corner + num_vertices
-    middle = np.broadcast_to(
-        np.arange(num_faces)[:, None] + num_vertices + num_edges, quads.shape
-    )
+    middle = np.broadcast_to(np.arange(num_faces)[:, None] + num_vertices + num_edges, quads.shape)
     fine = np.stack([quads, after, middle, before], axis=2).reshape(-1, 4)
     matrix = sparse.csr_array(sparse.vstack([vertex_points, edge_points, faces]))
     return matrix, fine
@@ -107,7 +105,57 @@ def vertex_normals(vertices: Float, triangles: Index) -> Float:
     normals = np.zeros_like(vertices)
     for corner in range(3):
         np.add.at(normals, triangles[:, corner], area)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
+
+
+def clip(
+    height: Float, triangles: Index, values: Float
+) -> tuple[Float, Index, Index]:
+    """Cut away what lies above height 0.
+
+    Parameters
+    ----------
+    height
+        Of every vertex (V,).
+    triangles
+        Vertex numbers (F, 3).
+    values
+        What to interpolate at the cut (V, D).
+
+    Returns
+    -------
+    Values (W, D) of the old and the new vertices, triangles (G, 3), and the edges (E, 2) along the
+    cut, in the direction of their triangles.
+    """
+    above = height[triangles] > 0
+    kept = triangles[~above.any(axis=1)].tolist()
+    rows = list(values)
+    made: dict[tuple[int, int], int] = {}
+    rim = []
+
+    def cut(i: int, j: int) -> int:
+        key = (min(i, j), max(i, j))
+        if key not in made:
+            share = height[i] / (height[i] - height[j])
+            made[key] = len(rows)
+            rows.append(values[i] + share * (values[j] - values[i]))
+        return made[key]
+
+    for corners, high in zip(triangles, above, strict=True):
+        if not high.any() or high.all():
+            continue
+        # turn the triangle so that the corner that is alone on its side comes first
+        alone = int(np.argmax(high)) if high.sum() == 1 else int(np.argmin(high))
+        a, b, c = (int(vertex) for vertex in np.roll(corners, -alone))
+        p, q = cut(a, b), cut(a, c)
+        if high.sum() == 1:
+            kept += [[p, b, c], [p, c, q]]
+            rim.append([q, p])
+        else:
+            kept.append([a, p, q])
+            rim.append([p, q])
+    return np.array(rows), np.array(kept), np.array(rim)
 
 
 class Geodesics:
@@ -123,9 +171,7 @@ class Geodesics:
 
     def distance(self, sources: Index) -> Float:
         """Distance (V,) of every vertex from the nearest source; inf where none is reached."""
-        found: Float = csgraph.dijkstra(
-            self._graph, directed=False, indices=sources, min_only=True
-        )
+        found: Float = csgraph.dijkstra(self._graph, directed=False, indices=sources, min_only=True)
         return found
 
     def zone(self, moving: Index, fixed: Index) -> Float:
@@ -141,4 +187,5 @@ class Geodesics:
         both = reached & (share > 0)
         share = np.where(reached, 1.0, 0.0)
         share[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
-        return 0.5 - 0.5 * np.cos(np.pi * share)
+        weight: Float = 0.5 - 0.5 * np.cos(np.pi * share)
+        return weight

@@ -44,6 +44,7 @@ LIP_RING = (
     7206, 7266, 7265, 7264, 523, 517, 518, 519, 446, 445, 3708, 435, 434, 3731, 436, 420, 421, 516,
     5360, 515, 514, 522, 521,
 )  # fmt: skip
+_CORNER_SLOPE = 0.37  # of the lips' curve seen from above, near the corners
 _HINGE_Z = 0.35  # dm; the jaw turns about an axis here
 
 
@@ -82,7 +83,7 @@ def subdivided(vertices: Float, quads: Index) -> Skin:
     return Skin(number, coarse, fine, matrix, matrix @ vertices[base], base)
 
 
-def close_lips(skin: Skin, cavity: NDArray[np.bool_], overlap: float = 0.002) -> None:
+def close_lips(skin: Skin, overlap: float = 0.002) -> None:
     """Move both lips so that they meet along the whole ring, ``overlap`` dm pressed together.
 
     Subdivision rounds the lips off and would leave a slit.
@@ -231,12 +232,19 @@ class FaceFields:
             (57, "8.7"), (58, "8.8"), (59, "8.3"), (60, "8.4"),
         ):  # fmt: skip
             self._add(fap, self.lip_y[name])
+        # halfway points follow their corner by half, so that a narrowed mouth keeps its shape
         corners = ("2.4", "2.5", "8.3", "8.4")
+        halfway = (("2.6", "2.8"), ("2.7", "2.9"), ("8.5", "8.7"), ("8.6", "8.8"))
         middles = ("2.2", "2.3", "8.1", "8.2")
-        sideways = smoothest(skin, skin.points(*corners, *middles), fixed)[:, :4]
-        self.lip_x = dict(zip(corners, sideways.T, strict=True))
-        for fap, name in ((6, "2.4"), (7, "2.5"), (53, "8.3"), (54, "8.4")):
+        names = (*corners, *(name for pair in halfway for name in pair), *middles)
+        single = smoothest(skin, skin.points(*names), fixed)
+        self.lip_x = {}
+        for row, (fap, name) in enumerate(((6, "2.4"), (7, "2.5"), (53, "8.3"), (54, "8.4"))):
+            half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
+            self.lip_x[name] = single[:, row] + 0.45 * half
             self._add(fap, self.lip_x[name])
+            # a corner slides along the curve of the lips: outwards is backwards
+            self.fields[fap][:, 2] = -_CORNER_SLOPE * self.lip_x[name] * self.fapu["MW"]
         pushed = smoothest(skin, skin.points("2.3", "2.2", *corners), fixed)[:, :2]
         self.lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
         self._add(16, self.lip_z["2.3"])
@@ -244,7 +252,7 @@ class FaceFields:
 
     def _jaw(self) -> None:
         skin = self.skin
-        x, y, z = skin.vertices.T
+        _, y, z = skin.vertices.T
         outside = ~self.cavity
         upper = ~self._far(("2.2", "2.6", "2.7", "8.1", "8.5", "8.6"), 0.03)
         lower = ~self._far(("2.3", "2.8", "2.9", "8.2", "8.7", "8.8"), 0.03)
@@ -260,10 +268,10 @@ class FaceFields:
             (14, self.jaw, self.lip_z),
             (15, self.jaw * lever, self.lip_x),
         ):
-            weight = weight / weight[skin.point("2.1")]
+            left = weight / weight[skin.point("2.1")]
             for name, field in taken_out.items():
-                weight = weight - weight[skin.point(name)] * field
-            self._add(fap, weight)
+                left = left - left[skin.point(name)] * field
+            self._add(fap, left)
 
     def _eyes(self, blink: tuple[Float, Float], squint: tuple[Float, Float]) -> None:
         for units, pairs in (
@@ -276,7 +284,7 @@ class FaceFields:
                 self.fields[fap] = unit / travel * self.fapu["IRISD"]
 
     def _brows(self) -> None:
-        x, y, z = self.skin.vertices.T
+        _, y, z = self.skin.vertices.T
         names = ("4.1", "4.3", "4.5", "4.2", "4.4", "4.6")
         points = self.skin.points(*names)
         fixed = np.flatnonzero((y < 5.885) | (y > 6.42) | (z < 0.75) | self.cavity)
@@ -311,7 +319,9 @@ class FaceFields:
             names = ("3.1", "3.3", "3.7", "3.11") if side == "l" else ("3.2", "3.4", "3.8", "3.12")
             self._zone(fap, names, 0.05, 0.22, nose)
 
-    def _zone(self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index) -> None:
+    def _zone(
+        self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index
+    ) -> None:
         """Move what lies within ``core`` of the points, hold what lies beyond ``reach``."""
         points = self.skin.points(*([names] if isinstance(names, str) else names))
         near = self._geodesics.distance(points)
@@ -338,11 +348,13 @@ def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
     reach = np.clip((z - z.min()) / (0.5 * length), 0, 1)
     roll[:, 1] = reach * np.abs(x) * (np.abs(x) / half)  # lever times angle, growing outwards
     fields[47] = roll
-    forward = np.clip((z - z.min()) / (0.45 * length), 0, 1) ** 2 * (3 - 2 * np.clip((z - z.min()) / (0.45 * length), 0, 1))
-    return fields | jaw_fields(tongue.vertices, forward, fapu)
+    forward = np.clip((z - z.min()) / (0.45 * length), 0, 1)
+    return fields | jaw_fields(tongue.vertices, forward**2 * (3 - 2 * forward), fapu)
 
 
-def jaw_fields(vertices: Float, share: Float, fapu: dict[str, float], chin_z: float = 1.104) -> Fields:
+def jaw_fields(
+    vertices: Float, share: Float, fapu: dict[str, float], chin_z: float = 1.104
+) -> Fields:
     """Fields (V, 3) of what moves with the jaw: lower teeth, tongue."""
     lever = share * np.maximum(vertices[:, 2] - _HINGE_Z, 0) / (chin_z - _HINGE_Z)
     return {

@@ -10,11 +10,13 @@ const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
 const SLOW_MS = 45; // a display frame
 const JUDGE_EVERY_MS = 1500;
 const COARSER = 0.7;
-const LEAST_PIXEL_RATIO = 0.5;
-const PORTRAIT_ASPECT = 0.8; // narrower windows step back, so that the face still fits
+const LEAST_PIXEL_RATIO = 0.6;
+const OVERLAY_SHARE = 0.7;
+const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
 export class Head {
   #renderer;
+  #overlay;
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
@@ -22,14 +24,17 @@ export class Head {
   #joints = []; // { node, rest, turns: [[FAP index, axis]] }
   #fovYDegrees = 22;
   #stale = true;
-  #pixelRatio = Math.min(2, devicePixelRatio);
+  #pixelRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
   #intervalMs = 0; // between display frames, smoothed
   #drawnMs = 0;
   #judgedMs = 0;
   #turn = new THREE.Quaternion();
 
-  constructor(canvas) {
-    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+  constructor(canvas, overlay) {
+    this.#overlay = overlay;
+    // Smooth edges come from more pixels than the screen has: multisampling speckles a mesh whose
+    // triangles are as small as pixels.
+    this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
     this.#controls = new OrbitControls(this.#camera, canvas);
     this.#controls.enablePan = false;
     this.#controls.minAzimuthAngle = -1.2;
@@ -44,9 +49,9 @@ export class Head {
     }).observe(canvas);
   }
 
-  /** Load a head into a canvas. */
-  static async load(canvas, url) {
-    const head = new Head(canvas);
+  /** Load a head into a canvas whose lower edge is covered by another element. */
+  static async load(canvas, overlay, url) {
+    const head = new Head(canvas, overlay);
     head.#add(await new GLTFLoader().loadAsync(url));
     return head;
   }
@@ -56,6 +61,7 @@ export class Head {
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
       node.frustumCulled = false; // bounds do not follow the face
+      if (node.name === "tongue") node.material.roughness = 0.9; // no lamp shines into the mouth
       if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
     });
     this.#findJoints(gltf.scene, about.faps);
@@ -122,9 +128,9 @@ export class Head {
 
   /** A key from the front upper left, a fill, a rim, and soft light from everywhere. */
   #light() {
-    this.#scene.add(new THREE.HemisphereLight(0xffffff, 0xb9a79c, 1.9));
+    this.#scene.add(new THREE.HemisphereLight(0xffffff, 0xc4ab9c, 2.1));
     for (const [color, intensity, x, y, z] of [
-      [0xfff4e8, 1.7, -0.6, 0.8, 1.2],
+      [0xfff2e4, 2.1, -0.5, 0.6, 1],
       [0xe6eeff, 0.7, 1, 0.1, 0.9],
       [0xffffff, 0.6, 0.4, 0.9, -1],
     ]) {
@@ -137,12 +143,14 @@ export class Head {
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
     if (width === 0 || height === 0) return;
-    const aspect = width / height;
+    // The head is fitted into what the controls leave free, a little behind them at most.
+    const hidden = this.#overlay.offsetHeight * OVERLAY_SHARE;
+    const free = Math.max(0.5 * height, height - hidden);
     const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
-    const widened = half * Math.max(1, PORTRAIT_ASPECT / aspect);
+    const widened = half * Math.max(height / free, PORTRAIT_ASPECT * (height / width));
     this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
-    this.#camera.aspect = aspect;
-    this.#camera.updateProjectionMatrix();
+    this.#camera.aspect = width / height;
+    this.#camera.setViewOffset(width, height, 0, (height - free) / 2, width, height);
     this.#renderer.setPixelRatio(this.#pixelRatio);
     this.#renderer.setSize(width, height, false);
     this.#stale = true;

@@ -284,7 +284,7 @@ element("microphone").onclick = () => {
 requestAnimationFrame(draw);
 sound.turnOn();
 try {
-  head = await Head.load(element("head"), "head.glb");
+  head = await Head.load(element("head"), document.querySelector("footer"), "head.glb");
   head.pose(faps);
   head.draw(performance.now()); // the first time takes long, which says nothing about the stream
   playout.reset();

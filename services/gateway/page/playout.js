@@ -8,6 +8,7 @@ const ADJUST_EVERY_MS = 500;
 const WINDOW_MS = 10000; // that the percentiles are taken over: a single hiccup must not count
 const ENOUGH = 20; // frames before the percentile is believed
 const JUMP_MS = 300; // a stream that is later, or earlier, by this: begin anew
+const SURE_MS = 100; // for which it must be late; less than the delay, so that no sound is lost
 const MAX_BEHIND_MS = 3000; // media time that leaps ahead by this: begin anew at once
 const MAX_FRAMES = 1000;
 
@@ -53,7 +54,9 @@ export class Playout {
   displayFrameMs = 1000 / 60;
   outputLatencyMs = 0; // of the loudspeaker; sound must leave that much earlier
   #offsetMs = null;
+  #begunMs = 0; // when the first offset was set
   #adjustedMs = 0;
+  #lateSinceMs = null; // when what arrives began to be too late
 
   constructor() {
     this.reset();
@@ -62,6 +65,7 @@ export class Playout {
   /** Forget everything: another session, or the stream paused. */
   reset() {
     this.#offsetMs = null;
+    this.#lateSinceMs = null;
     this.frames = new Lateness();
     this.soundStarts = new Lateness();
     this.soundEnds = new Lateness();
@@ -85,19 +89,19 @@ export class Playout {
   /** Take the arrival of a frame whose media time advances. */
   frameArrived(nowMs, mediaTime) {
     const latenessMs = nowMs - mediaTime / SAMPLES_PER_MS;
-    this.#resyncIfFar(latenessMs);
+    this.#resyncIfFar(nowMs, latenessMs);
     this.frames.add(nowMs, latenessMs);
-    this.#offsetMs ??= latenessMs + FIRST_DELAY_MS / 2;
+    this.#begin(nowMs, latenessMs + FIRST_DELAY_MS / 2);
   }
 
   /** Take the arrival of a chunk of sound. */
   soundArrived(nowMs, mediaTime, numSamples) {
     const startMs = nowMs - mediaTime / SAMPLES_PER_MS;
     const endMs = startMs - numSamples / SAMPLES_PER_MS;
-    this.#resyncIfFar(endMs);
+    this.#resyncIfFar(nowMs, endMs);
     this.soundStarts.add(nowMs, startMs);
     this.soundEnds.add(nowMs, endMs);
-    this.#offsetMs ??= endMs + FIRST_DELAY_MS;
+    this.#begin(nowMs, endMs + FIRST_DELAY_MS);
   }
 
   /** Correct the offset if it is time to; return whether it changed. */
@@ -123,10 +127,23 @@ export class Playout {
     if (this.#offsetMs !== null) this.#offsetMs += 0.05 * (measuredOffsetMs - this.#offsetMs);
   }
 
-  #resyncIfFar(latenessMs) {
+  /** Set the first offset: what had piled up before comes at once, and its end is the truest. */
+  #begin(nowMs, offsetMs) {
+    if (this.#offsetMs === null) this.#begunMs = nowMs;
+    if (nowMs - this.#begunMs < SURE_MS) this.#offsetMs = Math.min(this.#offsetMs ?? Infinity, offsetMs);
+  }
+
+  /**
+   * Begin anew if the sender paused, or media time leapt ahead. What was held up on the way, or by
+   * this page being busy, comes in one burst whose end is on time again: that is no pause.
+   */
+  #resyncIfFar(nowMs, latenessMs) {
     if (this.#offsetMs === null) return;
     const lateMs = latenessMs - this.#offsetMs;
-    if (lateMs > JUMP_MS || lateMs < -MAX_BEHIND_MS) this.reset();
+    if (lateMs <= JUMP_MS) this.#lateSinceMs = null;
+    else this.#lateSinceMs ??= nowMs;
+    const hasPaused = this.#lateSinceMs !== null && nowMs - this.#lateSinceMs > SURE_MS;
+    if (hasPaused || lateMs < -MAX_BEHIND_MS) this.reset();
   }
 }
 

@@ -1,0 +1,244 @@
+"""The command line with good and bad files, with and without running services."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import soundfile
+
+from shared.fap_file import read_fap
+from tests.e2e.following import samples_of_file
+from tests.system import DEMO, ONE_THREAD, ROOT, System, free_port
+
+pytestmark = pytest.mark.e2e
+SENTENCE = DEMO / "vowels-male.wav"
+
+
+def kouxing(
+    *arguments: object, control: str = "", stdin: bytes | None = None
+) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, **ONE_THREAD, "COLUMNS": "200"}
+    if control:
+        environment["KOUXING_CONTROL"] = control
+    result = subprocess.run(
+        [sys.executable, "-m", "services", *map(str, arguments)],
+        env=environment,
+        cwd=ROOT,
+        capture_output=True,
+        input=stdin,
+        timeout=100,
+        check=False,
+    )
+    texts = (result.stdout.decode(), result.stderr.decode())
+    assert "Traceback" not in texts[1], texts[1]
+    return subprocess.CompletedProcess(result.args, result.returncode, *texts)
+
+
+def empty(path: Path) -> None:
+    path.touch()
+
+
+def text(path: Path) -> None:
+    path.write_text("this is no sound", encoding="utf-8")
+
+
+def header_only(path: Path) -> None:
+    path.write_bytes(SENTENCE.read_bytes()[:44])
+
+
+def half_a_header(path: Path) -> None:
+    path.write_bytes(SENTENCE.read_bytes()[:20])
+
+
+def not_a_number(path: Path) -> None:
+    samples = samples_of_file(SENTENCE)
+    samples[20000] = np.nan
+    soundfile.write(path, samples, 16000, subtype="FLOAT")
+
+
+def too_low(path: Path) -> None:
+    soundfile.write(path, np.zeros(4000, np.float32), 4000)
+
+
+REFUSED = [
+    (empty, "empty"),
+    (text, "no audio"),
+    (header_only, "no samples"),
+    (half_a_header, "no audio"),
+    (not_a_number, "NaN"),
+    (too_low, "too low"),
+]
+
+
+@pytest.mark.parametrize(
+    ("make", "word"), REFUSED, ids=lambda value: getattr(value, "__name__", "")
+)
+@pytest.mark.parametrize("command", ["phones", "speak"])
+def test_bad_files_are_refused_in_one_line(
+    system: System, tmp_path: Path, command: str, make: Callable[[Path], None], word: str
+) -> None:
+    path = tmp_path / "bad.wav"
+    make(path)
+    result = kouxing(command, path, *(["--fast"] * (command == "speak")), control=system.control)
+    assert result.returncode == 2
+    assert word in result.stderr
+    assert "bad.wav" in result.stderr
+    system.assert_all_alive()
+
+
+def test_a_missing_file_and_a_missing_system_are_named(tmp_path: Path) -> None:
+    assert "no such file" in kouxing("phones", tmp_path / "nowhere.wav").stderr
+    nobody = f"tcp://127.0.0.1:{free_port()}"
+    result = kouxing("status", control=nobody)
+    assert result.returncode == 2
+    assert "kouxing run" in result.stderr
+
+
+def as_8_bit(path: Path) -> None:
+    soundfile.write(path, samples_of_file(SENTENCE), 16000, subtype="PCM_U8")
+
+
+def as_192_khz(path: Path) -> None:
+    samples = samples_of_file(SENTENCE)
+    positions = np.arange(len(samples) * 12) / 12
+    fine = np.interp(positions, np.arange(len(samples)), samples)
+    soundfile.write(path, fine, 192000, subtype="PCM_24")
+
+
+def as_six_channels(path: Path) -> None:
+    samples = samples_of_file(SENTENCE)
+    soundfile.write(path, np.repeat(samples[:, None], 6, axis=1), 16000)
+
+
+def truncated(path: Path) -> None:
+    data = SENTENCE.read_bytes()
+    path.write_bytes(data[: len(data) * 3 // 4 + 1])
+
+
+@pytest.mark.parametrize("make", [as_8_bit, as_192_khz, as_six_channels, truncated])
+def test_odd_files_are_spoken(system: System, tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "odd.wav"
+    make(path)
+    result = kouxing("speak", path, "--fast", control=system.control)
+    assert result.returncode == 0, result.stderr
+    assert "no speech" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("scale", "word"), [(0.0, "it is silent"), (30.0, "clipped")], ids=["silent", "clipped"]
+)
+def test_silence_and_clipping_are_spoken_with_a_remark(
+    system: System, tmp_path: Path, scale: float, word: str
+) -> None:
+    path = tmp_path / "sound.wav"
+    samples = np.clip(samples_of_file(SENTENCE) * scale, -1, 1)
+    soundfile.write(path, samples, 16000)
+    result = kouxing("speak", path, "--fast", control=system.control)
+    assert result.returncode == 0, result.stderr
+    assert word in result.stderr
+
+
+def test_raw_sound_from_standard_input(system: System) -> None:
+    pcm = (samples_of_file(SENTENCE) * 32767).astype("<i2").tobytes()
+    result = kouxing("speak", "-", "--fast", control=system.control, stdin=pcm)
+    assert result.returncode == 0, result.stderr
+    assert "phones in 2.3 s" in result.stderr
+
+
+def test_minutes_of_silence_do_not_stop_the_voice_after_them(
+    system: System, tmp_path: Path
+) -> None:
+    path = tmp_path / "long.flac"
+    with soundfile.SoundFile(path, "w", 16000, 1) as file:
+        file.write(np.zeros(180 * 16000, np.float32))
+        file.write(samples_of_file(SENTENCE))
+    result = kouxing("speak", path, "--fast", control=system.control)
+    assert result.returncode == 0, result.stderr
+    assert "no speech" not in result.stderr
+    assert "182.3 s" in result.stderr
+
+
+@pytest.mark.parametrize("form", ["table", "csv", "json", "textgrid"])
+def test_phones_in_every_form(form: str) -> None:
+    result = kouxing("phones", SENTENCE, "--format", form)
+    assert result.returncode == 0, result.stderr
+    if form == "csv":
+        rows = list(csv.DictReader(io.StringIO(result.stdout)))
+        assert {"unit", "onset_s", "duration_s"} <= set(rows[0])
+    elif form == "json":
+        assert json.loads(result.stdout)
+    elif form == "textgrid":
+        assert result.stdout.startswith('File type = "ooTextFile"')
+    else:
+        assert "onset_s" in result.stdout
+
+
+def test_render_writes_a_video_without_services(tmp_path: Path) -> None:
+    video = tmp_path / "face.mp4"
+    result = kouxing("render", SENTENCE, video, "--size", "320x240")
+    assert result.returncode == 0, result.stderr
+    with av.open(str(video)) as film:
+        stream = film.streams.video[0]
+        assert (stream.width, stream.height) == (320, 240)
+        assert sum(1 for _ in film.decode(video=0)) >= 2.2 * 25
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--size", "huge"], "--size"),
+        (["--size", "321x240"], "even"),
+        (["--size", "99999x2"], "7680"),
+    ],
+)
+def test_render_names_what_is_wrong(tmp_path: Path, arguments: list[str], word: str) -> None:
+    result = kouxing("render", SENTENCE, tmp_path / "face.mp4", *arguments)
+    assert result.returncode == 2
+    assert word in result.stderr
+
+
+def test_render_into_a_missing_folder_is_named(tmp_path: Path) -> None:
+    result = kouxing("render", SENTENCE, tmp_path / "nowhere" / "face.mp4", "--size", "320x240")
+    assert result.returncode == 2
+    assert "nowhere" in result.stderr
+
+
+def test_listen_records_what_speak_sends(system: System, tmp_path: Path) -> None:
+    recorded = tmp_path / "face.fap"
+    listener = subprocess.Popen(
+        [sys.executable, "-m", "services", "listen", "heard", "--output", recorded],
+        env={**os.environ, "KOUXING_CONTROL": system.control},
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+    )
+    spoken = kouxing("speak", SENTENCE, "--session", "heard", control=system.control)
+    assert spoken.returncode == 0, spoken.stderr
+    _, log = listener.communicate(timeout=30)
+    assert listener.returncode == 0, log.decode()
+    animation = read_fap(recorded)
+    assert animation.frame_rate_hz == 50
+    assert len(animation.faps) > 50, log.decode()
+
+
+def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -> None:
+    figures = tmp_path / "status.json"
+    result = kouxing("status", "--json", figures, control=system.control)
+    assert result.returncode == 0, result.stderr
+    assert "recognizer" in result.stdout
+    services = json.loads(figures.read_text(encoding="utf-8"))["services"]
+    assert {service["service"] for service in services} == {
+        "control",
+        "recognizer",
+        "synthesizer",
+        "driver",
+    }

@@ -1,0 +1,42 @@
+"""Software GL draws the stored pictures, up to a tolerance.
+
+A change of looks that is meant: run with ``KOUXING_WRITE_GOLDEN=1`` and look at the pictures.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from services.driver.head import Head, neutral_faps
+from services.driver.render import Renderer
+
+pytestmark = pytest.mark.golden
+
+SHAPES = {
+    "rest": neutral_faps(),
+    "a": neutral_faps(
+        open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
+        lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, lower_t_midlip_o=-260,
+        raise_b_midlip_o=-510, raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
+    ),
+    "turned": neutral_faps(head_yaw=40_000, yaw_l_eyeball=-20_000, yaw_r_eyeball=-20_000),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_picture(shape: str) -> None:
+    renderer = Renderer(Head.load(detail="coarse"), 192, 144, samples=0)
+    image = renderer.draw(SHAPES[shape])
+    renderer.close()
+    stored = Path(__file__).with_name(f"render_{shape}.png")
+    if os.environ.get("KOUXING_WRITE_GOLDEN"):
+        Image.fromarray(image).save(stored)
+    golden = np.asarray(Image.open(stored).convert("RGB"), dtype=float)
+    difference = np.abs(image.astype(float) - golden)
+    assert difference.mean() < 1.5
+    assert (difference.max(axis=2) > 24).mean() < 0.02

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import io
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from shared.audio_file import open_audio, raw_audio, read_audio
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+
+def test_blocks_add_up_to_the_file(tmp_path: Path) -> None:
+    samples = np.random.default_rng(1).uniform(-0.5, 0.5, (5000, 2)).astype(np.float32)
+    soundfile.write(tmp_path / "a.wav", samples, 22050, subtype="FLOAT")
+    source = open_audio(tmp_path / "a.wav")
+    assert (source.sample_rate_hz, source.num_channels) == (22050, 2)
+    np.testing.assert_array_equal(np.concatenate(list(source.blocks)), samples)
+
+
+@pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"])
+def test_every_sample_format_is_scaled_to_one(tmp_path: Path, subtype: str) -> None:
+    sine = 0.5 * np.sin(np.arange(4000) * 0.1)
+    soundfile.write(tmp_path / "a.wav", sine, 16000, subtype=subtype)
+    read, _ = read_audio(tmp_path / "a.wav")
+    np.testing.assert_allclose(read[:, 0], sine, atol=0.01)
+
+
+def test_rates_above_48_khz_are_resampled(tmp_path: Path) -> None:
+    sine = 0.5 * np.sin(2 * np.pi * 440 * np.arange(192000) / 192000)
+    soundfile.write(tmp_path / "a.wav", sine, 192000)
+    read, rate_hz = read_audio(tmp_path / "a.wav")
+    assert rate_hz == 48000
+    expected = 0.5 * np.sin(2 * np.pi * 440 * np.arange(48000) / 48000)
+    np.testing.assert_allclose(read[1000:-1000, 0], expected[1000:-1000], atol=1e-3)
+
+
+def test_an_hour_is_read_without_holding_it(tmp_path: Path) -> None:
+    with soundfile.SoundFile(tmp_path / "hour.flac", "w", 8000, 1) as file:
+        for _ in range(60):
+            file.write(np.zeros(60 * 8000, np.float32))
+    tracemalloc.start()
+    source = open_audio(tmp_path / "hour.flac", block_s=1.0)
+    num_samples = sum(len(block) for block in source.blocks)
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert num_samples == 3600 * 8000
+    assert source.duration_s == 3600
+    assert peak_bytes < 5e6
+
+
+def test_nan_is_named_with_its_place(tmp_path: Path) -> None:
+    samples = np.zeros(32000, np.float32)
+    samples[24000] = np.inf
+    soundfile.write(tmp_path / "a.wav", samples, 16000, subtype="FLOAT")
+    with pytest.raises(UserError, match=r"near 1\.50 s"):
+        read_audio(tmp_path / "a.wav")
+
+
+def test_raw_sound_may_come_in_odd_pieces() -> None:
+    values = np.arange(-1000, 1000, dtype="<i2")
+    source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), 16000, 2)
+    read = np.concatenate(list(source.blocks))
+    np.testing.assert_allclose(read.ravel() * 32768, values)

@@ -1,0 +1,86 @@
+"""Rendering without a display."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import moderngl
+import numpy as np
+import pytest
+
+from services.driver import render
+from services.driver.head import Head, neutral_faps
+from services.driver.render import Renderer
+from services.driver.window import Window
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+OPEN = neutral_faps(
+    open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
+    lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,
+    raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def head() -> Head:
+    return Head.load(detail="coarse")
+
+
+def test_the_picture_shows_a_face(head: Head) -> None:
+    renderer = Renderer(head, 160, 120, samples=0)
+    image = renderer.draw(neutral_faps())
+    renderer.close()
+    assert image.shape == (120, 160, 3)
+    assert image.dtype == np.uint8
+    red, green, blue = image[62, 80].astype(int)  # skin
+    assert red > green > blue
+    assert image[28, 80].mean() < 80  # dark hair above
+    assert image[60, 5, 2] > image[60, 5, 0]  # bluish background
+
+
+def test_a_differs_from_b_in_the_mouth(head: Head) -> None:
+    renderer = Renderer(head, 160, 120, samples=0)
+    closed, opened = (renderer.draw(f).astype(int) for f in (neutral_faps(), OPEN))
+    renderer.close()
+    change = np.abs(opened - closed).mean(axis=2)
+    assert change[74:92, 70:90].mean() > 8
+    assert change[:50].max() <= 2  # nothing above the eyes
+
+
+def test_transparent_background(head: Head) -> None:
+    renderer = Renderer(head, 160, 120, samples=0, background=None)
+    image = renderer.draw(neutral_faps())
+    renderer.close()
+    assert image.shape == (120, 160, 4)
+    assert image[5, 5, 3] == 0
+    assert image[62, 80, 3] == 255
+
+
+def test_resize(head: Head) -> None:
+    renderer = Renderer(head, 80, 60, samples=4)
+    renderer.resize(96, 72)
+    assert renderer.draw(neutral_faps()).shape == (72, 96, 3)
+    renderer.close()
+
+
+def test_no_size(head: Head) -> None:
+    with pytest.raises(UserError, match="positive size"):
+        Renderer(head, 0, 60)
+
+
+def test_missing_libraries_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**_: Any) -> None:
+        raise Exception("libEGL.so not loaded")
+
+    monkeypatch.setattr(moderngl, "create_standalone_context", fail)
+    with pytest.raises(UserError, match="libegl1 libgl1 libgl1-mesa-dri"):
+        render.standalone_context()
+
+
+def test_a_window_needs_a_display(head: Head, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(UserError, match="display"):
+        Window(head)

@@ -1,0 +1,116 @@
+"""The exported GLB is consistent, small and complete."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from services.driver.glb import export_glb
+from services.driver.head import Head
+from shared.errors import UserError
+from shared.faps import FAPS
+
+pytestmark = pytest.mark.unit
+
+SIZES = {5121: 1, 5123: 2, 5125: 4, 5126: 4}
+COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+@pytest.fixture(scope="module")
+def glb(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("glb") / "head.glb"
+    export_glb(Head.load(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def document(glb: Path) -> dict[str, Any]:
+    data = glb.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    read: dict[str, Any] = json.loads(data[20 : 20 + size])
+    binary, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0"
+    read["binary"] = data[28 + size :]
+    assert read["buffers"][0]["byteLength"] <= binary == len(read["binary"])
+    return read
+
+
+def test_size(glb: Path) -> None:
+    assert glb.stat().st_size < 4_000_000
+
+
+def test_trimesh_reads_it(glb: Path) -> None:
+    scene = trimesh.load_scene(glb)
+    assert {"skin", "eye_left", "teeth_lower", "tongue", "hair"} <= set(scene.geometry)
+
+
+def test_accessors_fit_their_views(document: dict[str, Any]) -> None:
+    views = document["bufferViews"]
+    for view in views:
+        assert view["byteOffset"] + view["byteLength"] <= len(document["binary"])
+        assert view["byteOffset"] % 4 == 0
+    for accessor in document["accessors"]:
+        item = SIZES[accessor["componentType"]] * COMPONENTS[accessor["type"]]
+        if "bufferView" in accessor:
+            assert accessor["count"] * item == views[accessor["bufferView"]]["byteLength"]
+        if "sparse" in accessor:
+            sparse = accessor["sparse"]
+            values = views[sparse["values"]["bufferView"]]
+            assert sparse["count"] * item == values["byteLength"]
+            at = views[sparse["indices"]["bufferView"]]
+            rows = np.frombuffer(
+                document["binary"], np.uint16, sparse["count"], at["byteOffset"]
+            ).astype(int)
+            assert (np.diff(rows) > 0).all()
+            assert rows[-1] < accessor["count"]
+
+
+def test_every_fap_is_a_target_or_a_rotation(document: dict[str, Any]) -> None:
+    described = {fap["name"]: fap for fap in document["scenes"][0]["extras"]["kouxing"]["faps"]}
+    assert list(described) == [fap.name for fap in FAPS[2:]]
+    targets = {
+        name
+        for mesh in document["meshes"]
+        for name in mesh.get("extras", {}).get("targetNames", [])
+    }
+    turned = {name for name, fap in described.items() if "rotation" in fap}
+    assert targets | turned == set(described)
+    names = {node["name"] for node in document["nodes"]}
+    assert {described[name]["rotation"]["node"] for name in turned} <= names
+
+
+def test_a_target_moves_as_the_head_does(document: dict[str, Any]) -> None:
+    head = Head.load()
+    mesh = next(mesh for mesh in document["meshes"] if mesh["name"] == "skin")
+    row = mesh["extras"]["targetNames"].index("raise_b_midlip")
+    accessor = document["accessors"][mesh["primitives"][0]["targets"][row]["POSITION"]]
+    sparse = accessor["sparse"]
+    views = document["bufferViews"]
+    rows = np.frombuffer(
+        document["binary"],
+        np.uint16,
+        sparse["count"],
+        views[sparse["indices"]["bufferView"]]["byteOffset"],
+    )
+    values = np.frombuffer(
+        document["binary"],
+        np.float32,
+        3 * sparse["count"],
+        views[sparse["values"]["bufferView"]]["byteOffset"],
+    ).reshape(-1, 3)
+    at = list(rows).index(head.feature_points["2.3"])  # the skin is the first part
+    assert values[at, 1] == pytest.approx(head.fapu["MNS"], rel=0.01)
+
+
+def test_unwritable_path(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be written"):
+        export_glb(Head.load(detail="coarse"), tmp_path / "no" / "head.glb")

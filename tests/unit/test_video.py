@@ -1,0 +1,122 @@
+"""Videos have all their pictures, and sound as long."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from services.driver.head import Head, neutral_faps
+from services.driver.video import VideoWriter, render_video
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+
+def read(path: Path) -> tuple[int, float, float]:
+    """Count the pictures; durations of picture and sound in seconds."""
+    with av.open(str(path)) as container:
+        video, sound = container.streams.video[0], container.streams.audio[0]
+        assert video.codec_context.name == "h264"
+        assert video.codec_context.pix_fmt == "yuv420p"
+        assert sound.codec_context.name == "aac"
+        durations = [
+            float((stream.duration or 0) * (stream.time_base or 0)) for stream in (video, sound)
+        ]
+        images = sum(1 for _ in container.decode(video=0))
+    return images, durations[0], durations[1]
+
+
+def test_pictures_and_sound_agree(tmp_path: Path) -> None:
+    path = tmp_path / "out.mp4"
+    with VideoWriter(path, 64, 48, 25.0, 16000) as writer:
+        for number in range(30):
+            writer.write_image(np.full((48, 64, 3), number * 8, np.uint8))
+            writer.write_sound(np.zeros(640, np.float32))
+        assert not path.exists()  # not under its name before it is complete
+    images, picture_s, sound_s = read(path)
+    assert images == 30
+    assert picture_s == pytest.approx(1.2, abs=0.001)
+    assert sound_s == pytest.approx(1.2, abs=0.065)  # whole AAC blocks
+    assert [file.name for file in tmp_path.iterdir()] == ["out.mp4"]
+
+
+def test_sound_starts_with_the_picture(tmp_path: Path) -> None:
+    path = tmp_path / "click.mp4"
+    sound = np.zeros(16000, np.float32)
+    sound[8000:8400] = 0.9 * np.sin(np.arange(400) * 0.6)
+    with VideoWriter(path, 64, 48, 25.0, 16000) as writer:
+        for number in range(25):
+            writer.write_image(np.full((48, 64, 3), 255 * (number >= 12), np.uint8))
+        writer.write_sound(sound)
+    with av.open(str(path)) as container:
+        heard = []
+        for frame in container.decode(audio=0):
+            start = float((frame.pts or 0) * (frame.time_base or 0))
+            loud = np.flatnonzero(np.abs(frame.to_ndarray().ravel()) > 0.3)
+            heard += [start + float(index) / 16000 for index in loud]
+    assert min(heard) == pytest.approx(0.5, abs=0.01)
+
+
+def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
+    def fail() -> None:
+        with VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer:
+            writer.write_image(np.zeros((48, 64, 3), np.uint8))
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
+def test_unwritable_path(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be written"):
+        VideoWriter(tmp_path / "no" / "out.mp4", 64, 48, 25.0, 16000)
+
+
+@pytest.mark.parametrize(
+    ("size", "frame_rate_hz", "sample_rate_hz", "said"),
+    [
+        ((63, 48), 25.0, 16000, "even"),
+        ((64, 48), 0.0, 16000, "frame rate"),
+        ((64, 48), 25.0, 17000, "sample rate"),
+    ],
+)
+def test_bad_values(
+    tmp_path: Path, size: tuple[int, int], frame_rate_hz: float, sample_rate_hz: int, said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        VideoWriter(tmp_path / "out.mp4", *size, frame_rate_hz, sample_rate_hz)
+
+
+def test_a_picture_of_a_wrong_size(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ValueError, match="shape"),
+        VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer,
+    ):
+        writer.write_image(np.zeros((64, 48, 3), np.uint8))
+
+
+def test_a_head_speaks(tmp_path: Path) -> None:
+    frames = [neutral_faps(raise_b_midlip=-60.0 * number) for number in range(8)]
+    done: list[tuple[int, int]] = []
+    render_video(
+        Head.load(detail="coarse"),
+        frames,
+        len(frames),
+        np.zeros(1000, np.float32),
+        tmp_path / "speaks.mp4",
+        frame_rate_hz=25.0,
+        sample_rate_hz=16000,
+        width_px=96,
+        height_px=72,
+        samples=0,
+        progress=lambda number, total: done.append((number, total)),
+    )
+    images, picture_s, sound_s = read(tmp_path / "speaks.mp4")
+    assert images == 8
+    assert picture_s == pytest.approx(0.32, abs=0.001)
+    assert sound_s == pytest.approx(0.32, abs=0.065)
+    assert done[-1] == (8, 8)
