@@ -116,6 +116,8 @@ class Socket:
         ``joined`` message, so that subscribers know from when on they miss nothing.
         """
         for _ in range(MAX_BATCH):
+            if self._raw.closed:  # by what was done about the last message
+                return
             try:
                 parts = self._raw.recv_multipart(flags=zmq.DONTWAIT)
             except zmq.Again:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from evaluation.recognizer import ErrorCounts, count_errors
 from services.recognizer.acoustic_model import AcousticModel, Topology
+from services.recognizer.combined import save_combined
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import NUM_FEATURES, cepstra_of_all
 from services.recognizer.gmm import GmmModel
@@ -207,6 +208,42 @@ def train_neural(
     _report_rows(errors, report)
 
 
+def combine(
+    parts: Sequence[Path],
+    output: Path,
+    corpora: Sequence[Path],
+    *,
+    shipping: bool = True,
+    report: Report = print,
+) -> None:
+    """Let two models listen together: choose their weights on ``dev`` and write the model.
+
+    Parameters
+    ----------
+    parts
+        Model files in the folder of ``output``.
+    output
+        The ``.npz`` file to write; it names the parts.
+    corpora, shipping, report
+        As for :func:`train_gmm`.
+
+    Raises
+    ------
+    UserError
+        If a part cannot be read or lies in another folder, or there is no split ``dev``.
+    """
+    models = []
+    for part in parts:
+        if part.parent.resolve() != output.parent.resolve():
+            raise UserError(f"{part} is not in the folder of {output}; copy it there")
+        models.append(load_model(part))
+    choice = choose_search(models, corpora, shipping=shipping, report=report)
+    if choice is None:
+        raise UserError("the weights are chosen on recordings of split 'dev'; add some")
+    topology = with_penalty(models[0].topology, choice.unit_penalty)
+    save_combined(output, topology, [part.name for part in parts], choice.scales)
+
+
 def choose_search(
     models: Sequence[AcousticModel],
     corpora: Sequence[Path],
@@ -219,7 +256,7 @@ def choose_search(
     Parameters
     ----------
     models
-        Models that listen together, each with scale 1 and an unchanged bigram.
+        Models that listen together; the first one's bigram is used.
     corpora, shipping, report
         As for :func:`train_gmm`.
     """

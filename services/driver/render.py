@@ -31,9 +31,9 @@ DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
 class Camera:
     """Where a head is seen from; lengths in m, in the head's axes."""
 
-    position: tuple[float, float, float] = (0.0, 0.034, 1.05)
-    target: tuple[float, float, float] = (0.0, 0.014, 0.0)
-    field_of_view_deg: float = 17.5  # vertical
+    position: tuple[float, float, float] = (0.0, 0.030, 1.05)
+    target: tuple[float, float, float] = (0.0, 0.018, 0.0)
+    field_of_view_deg: float = 15.0  # vertical
 
 
 BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))  # sRGB, middle and edge
@@ -60,11 +60,11 @@ out vec3 normal;
 const vec3 KEY = normalize(vec3(-0.42, 0.50, 0.80));
 const vec3 FILL = normalize(vec3(0.75, 0.10, 0.60));
 const vec3 RIM = normalize(vec3(0.55, 0.45, -0.70));
-const vec3 KEY_COLOR = vec3(1.22, 1.12, 1.02);
+const vec3 KEY_COLOR = vec3(1.16, 1.06, 0.96);
 const vec3 FILL_COLOR = vec3(0.34, 0.38, 0.44);
 const vec3 RIM_COLOR = vec3(0.45, 0.47, 0.50);
-const vec3 SKY = vec3(0.46, 0.48, 0.52);
-const vec3 GROUND = vec3(0.30, 0.25, 0.22);
+const vec3 SKY = vec3(0.42, 0.44, 0.48);
+const vec3 GROUND = vec3(0.25, 0.21, 0.19);
 
 void main() {
     vec3 n = in_normal;

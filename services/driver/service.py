@@ -36,6 +36,7 @@ from shared.service import Service
 
 RENDER_BUDGET_S = 0.2  # of recording in one turn of the loop, so that heartbeats go on
 NUM_PUBLISHERS = 2  # recognizer and synthesizer
+LAST_FRAME_LIMIT_S = 10.0  # for a closed session's last frames to arrive
 STALL_S = 1.0  # without frames the window says so
 
 
@@ -48,6 +49,7 @@ class _Follower:
     publishers: set[str] = field(default_factory=set)  # that confirmed the subscriptions
     sequence: int = 0
     recording: Recording | None = None
+    leave_by_s: float | None = None  # the session is closed; the last frames are on their way
 
 
 class DriverService(Service):
@@ -70,7 +72,8 @@ class DriverService(Service):
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""
-        self.stop_session(start.session)
+        if start.session in self._followers:
+            self._leave(self._followers[start.session])
         socket = self.bus.connect_subscriber(start.phones, start.faps)
         follower = _Follower(start=start, socket=socket)
         self.listen(
@@ -90,14 +93,20 @@ class DriverService(Service):
         return False
 
     def stop_session(self, session: str) -> None:
-        """Follow a session no longer; finish its video with what has come."""
-        follower = self._followers.pop(session, None)
-        if follower is not None:
-            self.unlisten(follower.socket)
-            self._end_recording(follower)
+        """Follow a session no longer; one that is recorded only after its last frame."""
+        follower = self._followers.get(session)
+        if follower is None:
+            return
+        if follower.recording is None:
+            self._leave(follower)
+        elif follower.leave_by_s is None:
+            follower.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
 
     def on_tick(self, now_s: float) -> None:
         """Draw what is due."""
+        for follower in list(self._followers.values()):
+            if follower.leave_by_s is not None and now_s > follower.leave_by_s:
+                self._leave(follower)
         if self._window is not None and self._visible:
             self._visible = self._window.draw(self._shown(now_s))
             if not self._visible:
@@ -107,8 +116,8 @@ class DriverService(Service):
 
     def on_drain(self) -> bool:
         """Finish the videos that are under way."""
-        for session in list(self._followers):
-            self.stop_session(session)
+        for follower in list(self._followers.values()):
+            self._leave(follower)
         self._render_until(time.monotonic() + RENDER_BUDGET_S)
         return not self._unfinished
 
@@ -135,6 +144,14 @@ class DriverService(Service):
             follower.recording.accept_sound(sound.media_time, samples)
 
     def _on_end(self, follower: _Follower) -> None:
+        self._end_recording(follower)
+        if follower.leave_by_s is not None:
+            self._leave(follower)
+
+    def _leave(self, follower: _Follower) -> None:
+        """Close a session's subscriptions and finish its video with what has come."""
+        del self._followers[follower.start.session]
+        self.unlisten(follower.socket)
         self._end_recording(follower)
 
     # --- the window ----------------------------------------------------------------------------

@@ -59,8 +59,8 @@ def build_timeline(
     speech_ends_s : sequence of float
         Further times at which speech is known to have ended, seconds.
     hold_s : float
-        How long the last unit goes on past its duration when nothing says that it has ended: live,
-        a duration is an estimate. Seconds.
+        How long a unit goes on past its duration when nothing says what follows: live, a duration
+        may be an estimate and the next unit not known yet. Seconds.
     """
     in_order = sorted(phones, key=lambda phone: (phone.onset_s, phone.index))
     quiet_s = sorted(
@@ -81,7 +81,8 @@ def build_timeline(
         end_s = min(phone.onset_s + max(phone.duration_s, _SHORTEST_UNIT_S), bound_s)
         if bound_s - end_s < (_TOUCHING_S if phone.final else max(hold_s, _TOUCHING_S)):
             end_s = bound_s
-        held_s = hold_s if not phone.final and end_s < bound_s else 0.0
+        unknown = not phone.final or bound_s == np.inf  # whether the unit has really ended
+        held_s = hold_s if unknown and end_s < bound_s else 0.0
         touching = end_s == next_onset_s
         if end_s + held_s < next_onset_s:
             silences.append((end_s + held_s, next_onset_s))

@@ -377,9 +377,11 @@ def _lashes(skin: Skin, fields: Fields) -> Piece:
     return Piece("lashes", part, "lashes", 0.9, np.ones(2 * count), both)
 
 
-# an open mouth, in which the occlusion of lips and teeth is judged
-_OPEN = {3: 300.0, 4: -200.0, 8: -180.0, 9: -180.0, 5: -400.0, 10: -360.0, 11: -360.0, 51: -180.0,
-         55: -160.0, 56: -160.0, 52: -360.0, 57: -320.0, 58: -320.0}  # fmt: skip
+# an open mouth and drooping lids, with which the occlusion of lips, teeth and lids is judged
+_OPEN = {
+    3: 300, 4: -200, 8: -180, 9: -180, 5: -400, 10: -360, 11: -360, 51: -180, 55: -160, 56: -160,
+    52: -360, 57: -320, 58: -320, 19: 650, 20: 650,
+}  # fmt: skip
 
 
 def _opened(piece: Piece) -> Float:
@@ -406,7 +408,7 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
         if piece.name == "skin":
             shade = np.clip(0.10 + 1.0 * own, 0, 1) ** np.array([0.75, 1.0, 1.1])
             depth = np.clip((part.vertices[:, 2:] - 0.85) / 0.42, 0, 1)
-            lining = np.array([0.60, 0.19, 0.18]) * (0.06 + 0.94 * depth**1.5)
+            lining = np.array([0.62, 0.20, 0.19]) * (0.10 + 0.90 * depth)
             part.colors = np.where(cavity[:, None], lining * (0.7 + 0.3 * shade), shade)
         elif piece.name == "garment":
             part.colors = np.repeat(0.6 + 0.4 * own, 3, axis=1)

@@ -85,7 +85,7 @@ def _mix(image: Float, color: tuple[float, float, float], amount: Float) -> Floa
     return image + (np.array(color) - image) * np.clip(amount, 0, 1)[..., None]
 
 
-SKIN = (0.900, 0.745, 0.650)
+SKIN = (0.890, 0.725, 0.625)
 LIP = (0.720, 0.405, 0.385)
 HAIR = (0.135, 0.105, 0.095)
 
@@ -123,7 +123,7 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
     image = _mix(image, rosy, 0.10 * _spot(face, 0.0, 4.92, 0.16, 0.10))
     image = _mix(image, rosy, 0.28 * _spot(face, 0.74, 5.60, 0.10, 0.25) * (face.angle > 1.3))
     image = _mix(image, (0.80, 0.60, 0.53), 0.22 * _spot(face, 0.28, 5.70, 0.13, 0.035))
-    image = _mix(image, (0.74, 0.53, 0.47), 0.30 * _spot(face, 0.27, 5.885, 0.14, 0.05))
+    image = _mix(image, (0.78, 0.57, 0.51), 0.18 * _spot(face, 0.27, 5.885, 0.14, 0.05))
     image = _mix(image, (0.95, 0.80, 0.70), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
     image = _paint_lips(image, face, lips)
     image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2])
@@ -158,7 +158,7 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> F
     rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
     image = _mix(image, (0.52, 0.31, 0.28), 0.45 * rim)
     image = _mix(image, (0.16, 0.10, 0.09), 0.80 * line)
-    return _mix(image, (0.55, 0.36, 0.31), 0.50 * fold)
+    return _mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
 
 
 def _paint_brow(image: Float, face: FaceMap, brow: Float) -> Float:
@@ -252,7 +252,7 @@ def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Floa
     tooth = np.clip(np.searchsorted(bounds, place) - 1, 0, len(widths) - 1)
     within = (place - bounds[tooth]) / np.array(widths)[tooth]
     gap = np.minimum(within, 1 - within) * np.array(widths)[tooth]  # mm to the next tooth
-    ivory = np.array([0.93, 0.90, 0.84])
+    ivory = np.array([0.965, 0.94, 0.885])
     image = np.broadcast_to(ivory, (rows, columns, 3)).copy()
     image *= 1 - 0.10 * (np.clip(0.45 - v, 0, 1) / 0.45)[..., None] * np.array([0.3, 0.6, 1.0])
     image *= 1 + 0.03 * np.clip((v - 0.5) / 0.2, 0, 1)[..., None]
@@ -284,7 +284,9 @@ def hair(size: tuple[int, int] = (512, 512)) -> Float:
     shine = np.exp(-(((v - 0.20 + 0.012 * strands) / 0.07) ** 2))
     value = 1 + 0.22 * strands + 0.55 * shine
     image = np.array(HAIR) * value[..., None] + np.array([0.045, 0.03, 0.02]) * shine[..., None]
-    tips = (0.99 - v) / 0.045 + 0.35 * _noise(size, (40, 1.2), 13) + 0.35 * _noise(size, (40, 5), 14)
+    tips = (
+        (0.99 - v) / 0.045 + 0.35 * _noise(size, (40, 1.2), 13) + 0.35 * _noise(size, (40, 5), 14)
+    )
     front = np.clip(u / 0.055, 0, 1)
     alpha = np.clip(tips, 0, 1) * front * front * (3 - 2 * front)
     painted: Float = np.clip(np.concatenate([image, alpha[..., None]], axis=2), 0, 1)

@@ -109,9 +109,7 @@ def vertex_normals(vertices: Float, triangles: Index) -> Float:
     return normals
 
 
-def clip(
-    height: Float, triangles: Index, values: Float
-) -> tuple[Float, Index, Index]:
+def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, Index]:
     """Cut away what lies above height 0.
 
     Parameters

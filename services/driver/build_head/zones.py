@@ -236,8 +236,8 @@ class FaceFields:
         corners = ("2.4", "2.5", "8.3", "8.4")
         halfway = (("2.6", "2.8"), ("2.7", "2.9"), ("8.5", "8.7"), ("8.6", "8.8"))
         middles = ("2.2", "2.3", "8.1", "8.2")
-        names = (*corners, *(name for pair in halfway for name in pair), *middles)
-        single = smoothest(skin, skin.points(*names), fixed)
+        between = tuple(name for pair in halfway for name in pair)
+        single = smoothest(skin, skin.points(*corners, *between, *middles), fixed)
         self.lip_x = {}
         for row, (fap, name) in enumerate(((6, "2.4"), (7, "2.5"), (53, "8.3"), (54, "8.4"))):
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)

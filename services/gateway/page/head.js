@@ -9,9 +9,9 @@ const RADIANS_PER_UNIT = 1e-5;
 const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
 const SLOW_MS = 45; // a display frame
 const JUDGE_EVERY_MS = 1500;
-const COARSER = 0.7;
+const COARSER = 0.5;
 const LEAST_PIXEL_RATIO = 0.6;
-const OVERLAY_SHARE = 0.7;
+const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
 export class Head {
@@ -91,7 +91,7 @@ export class Head {
     if (nowMs - this.#judgedMs > JUDGE_EVERY_MS) {
       this.#judgedMs = nowMs;
       if (this.#intervalMs > SLOW_MS && this.#pixelRatio > LEAST_PIXEL_RATIO) {
-        this.#pixelRatio *= COARSER; // the mouth must move in time rather than be sharp
+        this.#pixelRatio = Math.max(LEAST_PIXEL_RATIO, COARSER * this.#pixelRatio); // the mouth must move in time rather than be sharp
         this.#resize();
       }
     }

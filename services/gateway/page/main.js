@@ -126,6 +126,8 @@ function draw(nowMs) {
   requestAnimationFrame(draw);
   const elapsedMs = nowMs - drawnMs;
   drawnMs = nowMs;
+  // While this page was busy nothing could arrive, which is no stall of the stream.
+  if (elapsedMs > STALL_MS / 2) arrivedMs = Math.min(nowMs, arrivedMs + elapsedMs);
   playout.displayFrameMs += 0.02 * (Math.min(100, elapsedMs) - playout.displayFrameMs);
   playout.outputLatencyMs = sound.outputLatencyMs;
   const heardMs = sound.offsetMs(nowMs);
