@@ -34,7 +34,7 @@ from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import SAMPLE_RATE_HZ, LogMel
 from services.recognizer.load import MODEL_PATH, load_model
-from services.recognizer.pipeline import Recognizer, recognize
+from services.recognizer.pipeline import DEFAULT_RULE, Recognizer, recognize
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from services.synthesizer.visemes import SHAPES
@@ -44,7 +44,8 @@ from training.align import align_units, spoken
 from training.corpus import RowErrors, Utterance, read_corpus
 from training.feature_cache import read_audio
 
-AGREEMENTS = (1, 2, 3, 4, 5, 6)
+# N of the output rule and the confidence a frame needs: the paper's rule, then the recognizer's own
+RULES = (*((agreement, 0.0) for agreement in (1, 2, 3, 4, 5, 6)), DEFAULT_RULE)
 _CHUNK_SAMPLES = 160  # sound is fed as it would arrive, 10 ms at a time
 _NUM_RESAMPLES = 2000
 
@@ -79,14 +80,16 @@ class Score:
     name: str
     phones: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
     visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
+    corrected: dict[str, ErrorCounts] = field(default_factory=dict)  # units once final, by speaker
     delays_s: list[float] = field(default_factory=list)
-    num_put_out: int = 0
-    num_heard_right: int = 0
 
     def summary(self, rng: np.random.Generator) -> dict[str, object]:
         """Rates, intervals and delay percentiles."""
         out: dict[str, object] = {"output": self.name}
-        for measure, by_speaker in (("phone", self.phones), ("viseme", self.visemes)):
+        measures = (("phone", self.phones), ("viseme", self.visemes), ("final", self.corrected))
+        for measure, by_speaker in measures:
+            if not by_speaker:
+                continue
             total = sum(by_speaker.values(), ErrorCounts())
             out[f"{measure}_error_rate"] = total.rate
             out[f"{measure}_interval_95"] = bootstrap_interval(list(by_speaker.values()), rng)
@@ -175,7 +178,7 @@ def evaluate_recognizer(
     corpus: Path,
     split: str,
     *,
-    agreements: Sequence[int] = AGREEMENTS,
+    rules: Sequence[tuple[int, float]] = RULES,
     confusion_picture: Path | None = None,
 ) -> dict[str, object]:
     """Measure a model on one split of a corpus.
@@ -188,8 +191,8 @@ def evaluate_recognizer(
         A corpus folder that :func:`training.corpus.read_corpus` reads.
     split
         Its split, such as ``dev`` or ``test``.
-    agreements
-        Values of N to try.
+    rules
+        Output rules to try: N, and the confidence that a frame needs.
     confusion_picture
         Where to write a picture of the confusions, if anywhere.
 
@@ -203,7 +206,10 @@ def evaluate_recognizer(
     if not utterances:
         raise UserError(f"{corpus} has no recordings in the split {split!r}; name another split")
     full = Score(name="full traceback")
-    live = [Score(name=f"N = {agreement}") for agreement in agreements]
+    live = [
+        Score(name=f"N = {agreement}" + (f", sure by {confidence}" if confidence else ""))
+        for agreement, confidence in rules
+    ]
     confusion = np.zeros((len(UNITS), len(UNITS)), dtype=np.int64)
     seconds = 0.0
     for utterance in track(utterances, description=f"recognising {split}"):
@@ -211,13 +217,16 @@ def evaluate_recognizer(
         seconds += len(samples) / SAMPLE_RATE_HZ
         truth = _truth(model, utterance, samples)
         heard = spoken(recognize(model, samples, SAMPLE_RATE_HZ))
-        _score(full, utterance.speaker, truth, heard)
+        _count(full.phones, utterance.speaker, _units(truth), _units(heard))
+        _count(full.visemes, utterance.speaker, _shapes(truth), _shapes(heard))
         # The full traceback says everything when the recording ends.
         full.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
         _confuse(confusion, truth, heard)
-        for score, agreement in zip(live, agreements, strict=True):
-            phones, put_out_s = _live(model, samples, agreement)
-            _score(score, utterance.speaker, truth, phones)
+        for score, rule in zip(live, rules, strict=True):
+            phones, put_out_s, finals = _live(model, samples, rule)
+            _count(score.phones, utterance.speaker, _units(truth), _units(phones))
+            _count(score.visemes, utterance.speaker, _shapes(truth), _shapes(phones))
+            _count(score.corrected, utterance.speaker, _units(truth), _units(finals))
             score.delays_s += _delays(truth, phones, put_out_s)
     if confusion_picture is not None:
         draw_confusions(confusion, confusion_picture)
@@ -244,6 +253,7 @@ def print_scores(results: dict[str, object], console: Console) -> None:
         "ins / del / sub %",
         "viseme error %",
         "95 %",
+        "phone error % once final",
     ):
         table.add_column(column, justify="right")
     table.add_column("delay p50 / p95 ms", justify="right")
@@ -263,6 +273,7 @@ def print_scores(results: dict[str, object], console: Console) -> None:
             split,
             f"{100 * score['viseme_error_rate']:.1f}",
             _interval(score["viseme_interval_95"]),
+            f"{100 * score['final_error_rate']:.1f}" if "final_error_rate" in score else "",
             f"{delay['p50']:.0f} / {delay['p95']:.0f}" if delay else "",
         )
     console.print(table)
@@ -280,31 +291,45 @@ def _truth(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float
 
 
 def _live(
-    model: AcousticModel, samples: NDArray[np.float32], agreement: int
-) -> tuple[list[Phone], list[float]]:
-    """Units in the order they were put out, and the media time that had been heard by then."""
-    recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ, agreement=agreement)
-    phones, put_out_s = [], []
-    for start in range(0, len(samples), _CHUNK_SAMPLES):
-        chunk = samples[start : start + _CHUNK_SAMPLES]
-        for event in recognizer.accept_waveform(chunk):
-            if isinstance(event, Phone) and not event.final and event.unit != SILENCE:
-                phones.append(event)
-                put_out_s.append((start + len(chunk)) / SAMPLE_RATE_HZ)
-    for event in recognizer.input_finished():
-        if isinstance(event, Phone) and not event.final and event.unit != SILENCE:
-            phones.append(event)
-            put_out_s.append(len(samples) / SAMPLE_RATE_HZ)
-    return phones, put_out_s
+    model: AcousticModel, samples: NDArray[np.float32], rule: tuple[int, float]
+) -> tuple[list[Phone], list[float], list[Phone]]:
+    """Units as they were put out, the media time heard by then, and the units once final."""
+    agreement, confidence = rule
+    recognizer = Recognizer(
+        model, sample_rate_hz=SAMPLE_RATE_HZ, agreement=agreement, least_confidence=confidence
+    )
+    put_out: list[Phone] = []
+    put_out_s: list[float] = []
+    finals: list[Phone] = []
+    starts = range(0, len(samples), _CHUNK_SAMPLES)
+    chunks = [samples[start : start + _CHUNK_SAMPLES] for start in starts]
+    for number in range(len(chunks) + 1):
+        done = number == len(chunks)
+        events = recognizer.input_finished() if done else recognizer.accept_waveform(chunks[number])
+        for event in events:
+            if not isinstance(event, Phone) or event.unit == SILENCE:
+                continue
+            if event.final:
+                finals.append(event)
+            else:
+                put_out.append(event)
+                put_out_s.append(min((number + 1) * _CHUNK_SAMPLES, len(samples)) / SAMPLE_RATE_HZ)
+    return put_out, put_out_s, finals
 
 
-def _score(score: Score, speaker: str, truth: Sequence[Phone], heard: Sequence[Phone]) -> None:
-    said, got = [phone.unit for phone in truth], [phone.unit for phone in heard]
-    for by_speaker, counts in (
-        (score.phones, count_errors(said, got)),
-        (score.visemes, count_errors(mouth_shapes(said), mouth_shapes(got))),
-    ):
-        by_speaker[speaker] = by_speaker.get(speaker, ErrorCounts()) + counts
+def _units(phones: Iterable[Phone]) -> list[str]:
+    return [phone.unit for phone in phones]
+
+
+def _shapes(phones: Iterable[Phone]) -> list[str]:
+    return mouth_shapes(_units(phones))
+
+
+def _count(
+    by_speaker: dict[str, ErrorCounts], speaker: str, said: Sequence[str], heard: Sequence[str]
+) -> None:
+    before = by_speaker.get(speaker, ErrorCounts())
+    by_speaker[speaker] = before + count_errors(said, heard)
 
 
 def _delays(

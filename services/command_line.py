@@ -37,6 +37,8 @@ SERVICE_CLASSES = {
     "gateway": "GatewayService",
 }
 
+SHOWN_FIGURES = {"in_audio_per_s", "out_fap_per_s", "frames_missed", "cpu_s"}
+
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML file with a table a service.")
 ]
@@ -239,7 +241,7 @@ def status(control: Control = "", json_file: JsonFile = None) -> None:
         figures = ", ".join(
             f"{name} {value:.4g}"
             for name, value in sorted(service.metrics.items())
-            if name.endswith(("_p50", "_p95")) or name.startswith(("dropped_", "in_audio"))
+            if name.endswith(("_p50", "_p95")) or name in SHOWN_FIGURES or _is_drop(name)
         )
         table.add_row(
             service.service,
@@ -361,6 +363,10 @@ def _overrides(settings: list[str] | None) -> dict[str, str]:
             raise UserError(f"--set {setting}: write --set KEY=VALUE")
         overrides[key] = value
     return overrides
+
+
+def _is_drop(name: str) -> bool:
+    return name.startswith("dropped_") and not name.endswith("_per_s")
 
 
 def _control(given: str) -> str:

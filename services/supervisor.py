@@ -63,7 +63,7 @@ class Supervisor:
         for service in SERVICES:
             self._spawn(service)
 
-    def wait_ready(self, control: str, deadline_s: float = 60.0) -> None:
+    def wait_ready(self, control: str, deadline_s: float = 120.0) -> None:
         """Wait until control has heard all services.
 
         Raises

@@ -236,7 +236,7 @@ class Service:
                 sent_ns=now_ns(),
                 endpoints=self.endpoints,
                 metrics={
-                    **self.metrics.snapshot(),
+                    **self.metrics.snapshot(time.monotonic()),
                     "cpu_s": time.process_time(),
                     "clock_offset_ms": -self.clock_offset.offset_ms,
                 },

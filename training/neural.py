@@ -32,7 +32,7 @@ from training.examples import Example
 
 # Dense around the present, sparse in the past, which costs no delay; 4 frames of look-ahead.
 FRAME_OFFSETS = np.array([-15, -12, -9, -7, -5, -4, -3, -2, -1, 0, 1, 2, 3, 4])
-HIDDEN = (512, 512, 512)
+HIDDEN = (512, 384, 384)
 _BATCH = 512
 _POOL_FRAMES = 40_000  # shuffled together
 _LEARNING_RATE = 1e-3

@@ -141,11 +141,14 @@ def starting_parameters(c: float = _START_C) -> VisemeParameters:
 # What a weight of 1 of FACEGOOD's rig does to these FAPs, for the ARKit shape of the same name on
 # MakeHuman's face (CC0); left and right of a pair together. The rig's jaw goes further than a
 # speaker's: scaled so that its continuous clip opens as far as filmed speakers do; so do its
-# pursed lips: scaled to half a centimetre. The jaw's swing backwards is left to the head's own jaw.
+# pursed lips: scaled to half a centimetre. Pursing draws real lips nearly together, which those
+# shapes do not: their lip heights are set by the filmed speakers' u. The jaw's swing backwards is
+# left to the head's own jaw.
 _RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _DEPTH_FAPS = (16, 17)
+_RIG_DELAY_S = 0.03  # of its lips against the sound, beside filmed speakers'
 _RIG = {
     "mouth_stretch_c": [
         _JAW_SCALE * value
@@ -157,10 +160,10 @@ _RIG = {
     "mouth_press": [24, -46, 188, 146, -141, 158, 270, 0, 24, 24, 246, 135, -35, 258, 288],
     "mouth_suck_d": [-65, 0, 188, 2, 0, 59, -41, -270, 0, 0, 317, -2, 0, 153, 0],
     "mouth_suck_u": [0, 70, 0, 9, 29, 0, 35, 0, -563, 434, 0, 2, 311, 0, 6],
-    "mouth_pucker": [0, 117, 23, -130, 59, 35, 6, 511, 481, -106, 47, -125, -94, 23, -18],
-    "mouth_funnel": [0, -270, -499, -70, 82, -182, -18, 293, 581, -235, -194, -86, -12, 47, 0],
-    "mouth_oo_c": [0, 117, 23, -140, 59, 35, 6, 511, 481, -106, 47, -135, -94, 23, -18],
-    "mouth_oh_c": [0, 0, -130, -130, 70, -30, 0, 450, 500, -150, -20, -120, -70, 30, -14],
+    "mouth_pucker": [0, 60, 250, -130, 40, 190, 6, 511, 481, -106, 200, -125, -94, 140, -18],
+    "mouth_funnel": [0, -100, -250, -70, 40, -100, -18, 293, 581, -150, -100, -86, -12, 20, 0],
+    "mouth_oo_c": [0, 60, 250, -140, 40, 190, 6, 511, 481, -106, 200, -135, -94, 140, -18],
+    "mouth_oh_c": [0, 60, 250, -130, 40, 190, 0, 450, 500, -100, 200, -120, -70, 140, -14],
     "mouth_lipStretch": [0, 12, -46, 121, 65, -77, -147, 0, 36, 46, -24, 121, 94, -41, -158],
     "mouth_lipCornerPull": [0, -188, 352, 169, -311, 393, 739, 24, 24, -130, 410, 168, -229, 511,
                             768],
@@ -218,7 +221,7 @@ def read_clips(folder: Path) -> list[LipClip]:
                     is_rig=is_rig,
                     is_held=is_held,
                     transcript=about.get("transcript") or "",
-                    time_s=columns["t"],
+                    time_s=columns["t"] - (_RIG_DELAY_S if is_rig else 0.0),
                     faps=_rig_faps(columns) if is_rig else _tracked_faps(columns),
                     samples=read_audio(path.with_suffix(".flac")),
                 )
@@ -253,6 +256,11 @@ def _rig_faps(columns: dict[str, Array]) -> Array:
         weight = np.mean(np.stack(sides), axis=0)
         faps[:, _columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
     faps[:, _columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
+    for upper, lower in _columns((4, 5)), _columns((8, 10)):
+        # inner lips that meet stop
+        crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)
+        faps[:, upper] -= 0.5 * crossed
+        faps[:, lower] -= 0.5 * crossed
     for right, left in _MIRROR.items():
         faps[:, MOUTH_FAPS.index(right)] = faps[:, MOUTH_FAPS.index(left)]
     return faps

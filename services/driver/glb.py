@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.driver.head import ROTATIONS, Head, Part
+from services.driver.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
 from services.driver.render import BACKGROUND, Camera
 from shared.errors import UserError
 from shared.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
@@ -297,5 +298,15 @@ def _description(head: Head) -> dict[str, Any]:
             "fovYDegrees": camera.field_of_view_deg,
         },
         "background": BACKGROUND[0],
+        "visemes": _shapes(VISEME_NAMES, VISEMES),
+        "expressions": _shapes(EXPRESSION_NAMES, EXPRESSIONS),
         "licence": "CC0-1.0",
     }
+
+
+def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:
+    """List what FAP 1 and FAP 2 select, as low-level FAPs."""
+    return [
+        {"name": name, "faps": {FAPS[i].name: round(float(row[i]), 1) for i in np.flatnonzero(row)}}
+        for name, row in zip(names, values, strict=True)
+    ]

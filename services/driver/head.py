@@ -132,7 +132,7 @@ class Head:
             known = ", ".join(sorted(asset.stem for asset in ASSETS.glob("*.npz")))
             raise UserError(f"there is no head {str(path)!r}; give the path of an .npz or: {known}")
         try:
-            with np.load(file, allow_pickle=False) as asset:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as asset:
                 arrays = {key: asset[key] for key in asset.files}
             return _assemble(file.stem, arrays, detail)
         except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:

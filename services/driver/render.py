@@ -198,7 +198,9 @@ class Renderer:
     camera
         Where from.
     context
-        OpenGL context of a window to draw into; by default one without a display.
+        OpenGL context of a window; by default one without a display.
+    on_screen
+        Draw into that window (``draw_on_screen``) and not beside it (``draw``).
 
     Raises
     ------
@@ -216,6 +218,7 @@ class Renderer:
         samples: int = 4,
         camera: Camera | None = None,
         context: moderngl.Context | None = None,
+        on_screen: bool = False,
     ) -> None:
         if width_px < 1 or height_px < 1:
             raise UserError(f"a picture of {width_px} x {height_px} pixels; give a positive size")
@@ -224,6 +227,7 @@ class Renderer:
         self._camera = camera or Camera()
         self._context = context or standalone_context()
         self._own_context = context is None
+        self._on_screen = on_screen
         self._samples = min(samples, self._context.max_samples)
         self._program = self._context.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         self._eye_program = self._context.program(
@@ -273,7 +277,7 @@ class Renderer:
         for target in self._targets:
             target.release()
         self._targets = []
-        if self._own_context:
+        if not self._on_screen:
             color = self._context.renderbuffer(self.size, 4)
             self._result = self._context.framebuffer(
                 [color], self._context.depth_renderbuffer(self.size)
@@ -309,7 +313,7 @@ class Renderer:
 
     def draw_on_screen(self, faps: Float32) -> None:
         """Draw into the window the context came from."""
-        screen = self._context.detect_framebuffer()
+        screen = self._context.screen
         screen.viewport = (0, 0, *self.size)
         self._paint(faps, screen)
 

@@ -49,6 +49,7 @@ class _Follower:
     publishers: set[str] = field(default_factory=set)  # that confirmed the subscriptions
     sequence: int = 0
     recording: Recording | None = None
+    ended: bool = False  # its last frame has come
     leave_by_s: float | None = None  # the session is closed; the last frames are on their way
 
 
@@ -144,6 +145,7 @@ class DriverService(Service):
             follower.recording.accept_sound(sound.media_time, samples)
 
     def _on_end(self, follower: _Follower) -> None:
+        follower.ended = True
         self._end_recording(follower)
         if follower.leave_by_s is not None:
             self._leave(follower)
@@ -165,7 +167,8 @@ class DriverService(Service):
     def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
         """Return the newest frame, or while none comes one that fades to rest."""
         silent_s = now_s - self._frame_s
-        if silent_s > STALL_S and not self._stalled and self._followers:
+        live = any(not follower.ended for follower in self._followers.values())
+        if silent_s > STALL_S and not self._stalled and live:
             LOG.warning("no FAP frames for %g s: the face goes to rest", STALL_S)
         self._stalled = silent_s > STALL_S
         fade = np.float32(np.clip(1.0 - (silent_s - STALL_S) / 0.3, 0.0, 1.0))

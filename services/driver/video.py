@@ -7,6 +7,7 @@ Picture ``n`` is shown at ``n / frame_rate_hz``, sound sample ``n`` is heard at
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
@@ -71,6 +72,9 @@ class VideoWriter:
         self._unfinished = self._path.with_name(f".{self._path.name}.part")
         self._num_images = self._num_samples = 0
         try:
+            if self._path.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "it is a folder")
+            self._unfinished.touch()  # FFmpeg would open it only at the first packet
             self._container = av.open(
                 str(self._unfinished), "w", format="mp4", options={"movflags": "faststart"}
             )

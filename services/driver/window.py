@@ -63,7 +63,7 @@ class Window:
         glfw.swap_interval(1)
         size = glfw.get_framebuffer_size(self._window)
         self._context = moderngl.create_context(require=330)
-        self._renderer = Renderer(head, *size, context=self._context)
+        self._renderer = Renderer(head, *size, context=self._context, on_screen=True)
 
     @property
     def context(self) -> moderngl.Context:

@@ -229,6 +229,10 @@ class GatewayService(Service):
             if name == session:
                 self._begin(_close(browser, "the session was closed"))
 
+    def idle_s(self) -> dict[str, float]:
+        """Name the sessions followed, so that control can say which of them are no more."""
+        return dict.fromkeys(self._followed, 0.0)
+
     def on_tick(self, now_s: float) -> None:
         """Ask control which services run."""
         answered = self._report_s >= self._request_s
@@ -356,7 +360,7 @@ class GatewayService(Service):
         path = PAGE / name
         if path.parent != PAGE or path.suffix not in SUFFIXES or not path.is_file():
             if name == "head.glb":
-                text = "the head is missing; make it with 'kouxing head export' (see the README)\n"
+                text = f"the head is missing; make it with 'kouxing head export {path}'\n"
                 raise web.HTTPNotFound(text=text)
             raise web.HTTPNotFound
         if not MODULES.is_dir():

@@ -22,6 +22,7 @@ written as a product of [x^2, x, 1] with a matrix made once. The rotation is Gal
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +100,7 @@ def mixture_scores(
     return log_density
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class GmmModel:
     """A Gaussian mixture HMM with its front end; implements ``AcousticModel``."""
 
@@ -109,6 +110,11 @@ class GmmModel:
     prior_mean: NDArray[np.float32]  # (13,) cepstral mean of the training corpus
     half_width: int  # of the differences
     kappa: float = 1.0  # scale of the log scores: neighbouring frames say nearly the same
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float32]:
+        """Matrix of the component densities, made once for all streams."""
+        return self.mixtures.score_matrix()
 
     def stream(self) -> GmmStream:
         """Start a stream of scores for one speaker."""
@@ -135,7 +141,6 @@ class GmmStream:
 
     def __init__(self, model: GmmModel) -> None:
         self._model = model
-        self._matrix = model.mixtures.score_matrix()
         self._mean = LiveMean(model.prior_mean)
         self._differences = Differences(model.half_width)
         self.look_ahead_frames = self._differences.look_ahead_frames
@@ -161,7 +166,7 @@ class GmmStream:
         num_mixtures = self._model.mixtures.weights.shape[1]
         for row in range(len(features)):  # row by row: a product's rounding depends on its height
             frame = normalised[row : row + 1] @ self._model.rotation
-            scores[row] = mixture_scores(frame, self._matrix, num_mixtures)[0]
+            scores[row] = mixture_scores(frame, self._model.matrix, num_mixtures)[0]
         return scores * np.float32(self._model.kappa)
 
 

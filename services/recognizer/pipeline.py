@@ -31,6 +31,7 @@ from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
+DEFAULT_RULE = (1, 0.85)  # frames that must agree, confidence that each needs
 _SIL = UNIT_INDEX[SILENCE]
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
 
@@ -194,8 +195,8 @@ class Recognizer:
         *,
         sample_rate_hz: int,
         num_channels: int = 1,
-        agreement: int = 3,
-        least_confidence: float = 0.0,
+        agreement: int = DEFAULT_RULE[0],
+        least_confidence: float = DEFAULT_RULE[1],
     ) -> None:
         self._durations_s = model.topology.duration_mean_s
         self._scores = SpeechScores(model, sample_rate_hz, num_channels)
@@ -310,6 +311,16 @@ class Recognizer:
             return self._open.index
         self._num_phones += 1
         return self._num_phones - 1
+
+
+def warm_up(model: AcousticModel) -> None:
+    """Run everything once, so that the first chunk of a session waits for no compiler."""
+    stream, decoder = model.stream(), Decoder(model.topology)
+    log_mel = LogMel().accept_waveform(np.zeros(SAMPLE_RATE_HZ // 2, dtype=np.float32))
+    for row in (*stream.accept(log_mel), *stream.finish()):
+        decoder.accept(row)
+    decoder.finish()
+    VoiceActivityDetector().accept_block(np.zeros(BLOCK_SAMPLES, dtype=np.float32))
 
 
 def recognize(

@@ -42,7 +42,7 @@ from shared.reliable import ReliableSender
 from shared.service import Service
 
 GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, less is jitter
-WARM_UP_FRAMES = 200
+WARM_UP_FRAMES = 600  # enough for every part of the search, also that which forgets the past
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 
 

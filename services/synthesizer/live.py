@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 FapFrame = tuple[float, NDArray[np.float32]]
 
 LONGEST_LOOK_AHEAD_S = 0.3
-_TRANSITION_S = 0.08  # from one plan to the next
+_TRANSITION_S = 0.06  # from one plan to the next
 _FLUSH_S = 0.14  # to rest after an interruption
 _RELAX_S = 0.3  # to rest when no sound comes
 _HOLD_S = 0.3  # a unit of unknown end is held this long past its estimated one

@@ -191,6 +191,7 @@ class SynthesizerService(Service):
     def _publish(
         self, session: str, face: _Face, frames: Sequence[tuple[float, NDArray[np.float32]]]
     ) -> None:
+        self.metrics.count("out_fap", len(frames))
         for time_s, faps in frames:
             face.sequence_out += 1
             face.media_time = to_samples(time_s)

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.synthesizer.visemes import VISEME_INDEX, shapes_of
-from shared.phones import SILENCE, Phone
+from shared.phones import INITIALS, SILENCE, Phone
 
 EDGE_S = 0.08  # a viseme's centre is at most this far from its beginning and its end
 _SHORTEST_UNIT_S = 0.01
 # A hole this short between two units is a rounding of their times, no pause.
 _TOUCHING_S = 0.03
+_EXPECTED_FINAL = "e"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +97,12 @@ def build_timeline(
                 (VISEME_INDEX[shape], start_s + edge_s, start_s + length_s - edge_s, phone.index)
             )
             start_s += length_s
-        if held_s:
+        if held_s and phone.unit in INITIALS:
+            # a final follows every initial: not knowing which, the mouth sets out for a middle one
+            visemes.append(
+                (VISEME_INDEX[_EXPECTED_FINAL], end_s + EDGE_S, end_s + held_s, phone.index)
+            )
+        elif held_s:
             shape_row, first_s, last_s, index = visemes.pop()
             visemes.append((shape_row, first_s, last_s + held_s, index))
     visemes.sort(key=lambda row: row[1:])

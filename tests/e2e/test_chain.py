@@ -14,7 +14,7 @@ from shared.bus import Socket
 from shared.client import Client
 from shared.messages import FapFrame
 from shared.phones import UNITS
-from tests.e2e.following import Heard, samples_of_file, stream
+from tests.e2e.following import Heard, samples_of_file, stream, stream_into
 from tests.system import DEMO, System
 
 pytestmark = pytest.mark.e2e
@@ -86,6 +86,16 @@ def test_any_rate_is_heard(system: System, rate_hz: int) -> None:
     result = stream(system.control, resampled, sample_rate_hz=rate_hz, chunk=rate_hz // 50)
     assert len(result.units) > 15
     assert abs(result.frames[-1].media_time - len(samples)) < 16000
+
+
+def test_int16_stereo_is_heard_as_float_mono(system: System, heard: Heard) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")
+    stereo = np.rint(np.stack([samples, samples], axis=1) * 32768).clip(-32768, 32767)
+    with Client(system.control) as client:
+        session = client.open_session(encoding="s16le", num_channels=2, paced=False)
+        result = stream_into(session, stereo, chunk=320)
+        session.close()
+    assert result.units == heard.units
 
 
 def test_a_stalled_stream_leads_to_rest_and_then_goes_on(system: System) -> None:

@@ -63,13 +63,12 @@ class ScriptedSystem:
         self.audio = self.bus.bind_router(LOCAL, "audio")
         self.phones = self.bus.bind_publisher(LOCAL, "phones")
         self.faps = self.bus.bind_publisher(LOCAL, "faps")
-        self.running = ["recognizer", "synthesizer"]
-        self.refuse = False
         self.page = ""
         self.gateway = b""
         self.started: list[str] = []  # sessions that the gateway has confirmed
         self.closed: list[str] = []
         self.audio_messages: list[Message] = []
+        self.forget()
         self._openings: dict[str, tuple[OpenSession, bytes]] = {}
         self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stop = False
@@ -80,6 +79,12 @@ class ScriptedSystem:
         self._stop = True
         self._thread.join()
         self.bus.close()
+
+    def forget(self) -> None:
+        self.running = ["recognizer", "synthesizer"]
+        self.refuse = False
+        for heard in (self.started, self.closed, self.audio_messages):
+            heard.clear()
 
     def do(self, job: Callable[[], object]) -> None:
         """Run something on the thread that owns the sockets, and wait for it."""
@@ -206,6 +211,8 @@ class GatewayProcess:
             return self.process.wait(10)
         finally:
             self.process.kill()
+            if self.process.stderr is not None:
+                self.process.stderr.close()
 
 
 def spawn(**environment: str) -> subprocess.Popen[str]:
@@ -241,20 +248,44 @@ async def receive_json(browser: aiohttp.ClientWebSocketResponse, kind: str) -> d
             raise EOFError(kind)
 
 
+@pytest.fixture(scope="module")
+def one_system() -> Iterator[ScriptedSystem]:
+    system = ScriptedSystem()
+    yield system
+    system.close()
+
+
+@pytest.fixture(scope="module")
+def one_gateway(one_system: ScriptedSystem) -> Iterator[GatewayProcess]:
+    gateway = GatewayProcess(one_system)
+    yield gateway
+    assert gateway.stop() == 0
+
+
 @pytest.fixture
-def system() -> Iterator[ScriptedSystem]:
+def system(one_system: ScriptedSystem) -> ScriptedSystem:
+    """The system that all tests share, with nothing remembered of the one before."""
+    one_system.forget()
+    return one_system
+
+
+@pytest.fixture
+def gateway(one_gateway: GatewayProcess) -> GatewayProcess:
+    return one_gateway
+
+
+@pytest.fixture
+def own_system() -> Iterator[ScriptedSystem]:
     system = ScriptedSystem()
     yield system
     system.close()
 
 
 @pytest.fixture
-def gateway(system: ScriptedSystem) -> Iterator[GatewayProcess]:
-    gateway = GatewayProcess(system)
+def own_gateway(own_system: ScriptedSystem) -> Iterator[GatewayProcess]:
+    gateway = GatewayProcess(own_system)
     yield gateway
     gateway.stop()
-    assert gateway.process.stderr is not None
-    gateway.process.stderr.close()
 
 
 def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayProcess) -> None:
@@ -326,8 +357,10 @@ def test_a_microphone_streams_and_says_its_last(
 
 
 def test_the_sample_sentence_is_streamed_once_for_whoever_asks(
-    system: ScriptedSystem, gateway: GatewayProcess
+    own_system: ScriptedSystem, own_gateway: GatewayProcess
 ) -> None:
+    system, gateway = own_system, own_gateway
+
     async def ask() -> None:
         async with (
             aiohttp.ClientSession() as http,
@@ -407,7 +440,9 @@ def test_strange_pages_and_paths_are_refused(gateway: GatewayProcess) -> None:
     asyncio.run(knock())
 
 
-def test_sigterm_closes_with_a_reason_and_exits_0(gateway: GatewayProcess) -> None:
+def test_sigterm_closes_with_a_reason_and_exits_0(own_gateway: GatewayProcess) -> None:
+    gateway = own_gateway
+
     async def look() -> int | None:
         async with (
             aiohttp.ClientSession() as http,

@@ -71,8 +71,8 @@ def brute_force(
     return best, [Segment(units_of_frames[s], s, e) for s, e in zip(starts, ends, strict=True)]
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize(("states_per_unit", "num_frames"), [(2, 6), (3, 5)])
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("states_per_unit", "num_frames"), [(2, 5), (3, 5)])
 def test_same_as_trying_every_path(seed: int, states_per_unit: int, num_frames: int) -> None:
     rng = np.random.default_rng(seed)
     units = [0, 7, SIL] if states_per_unit == 2 else [3, 40]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from services.recognizer.load import load_model
-from services.recognizer.pipeline import Recognizer, recognize
+from services.recognizer.pipeline import Recognizer, recognize, warm_up
 from shared.audio_file import read_audio
 from shared.errors import UserError
 from shared.phones import Phone, SpeechChange
@@ -30,8 +30,8 @@ def feed(recognizer: Recognizer, samples: np.ndarray, chunk: int = 320) -> list[
     return events
 
 
-def run(samples: np.ndarray, chunk: int = 320, agreement: int = 3) -> list[Event]:
-    recognizer = Recognizer(load_model(), sample_rate_hz=16_000, agreement=agreement)
+def run(samples: np.ndarray, chunk: int = 320) -> list[Event]:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
     return [*feed(recognizer, samples, chunk), *recognizer.input_finished()]
 
 
@@ -164,3 +164,11 @@ def test_bad_input_is_refused() -> None:
     recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
     with pytest.raises(UserError, match="no numbers"):
         recognizer.accept_waveform(np.array([np.inf], np.float32))
+
+
+def test_warm_up_leaves_nothing_behind(hello: np.ndarray) -> None:
+    model = load_model()
+    before = [*feed(first := Recognizer(model, sample_rate_hz=16_000), hello)]
+    warm_up(model)
+    first.reset()
+    assert feed(first, hello) == before

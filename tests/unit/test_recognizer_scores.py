@@ -93,7 +93,7 @@ def test_a_whole_evaluation(tmp_path: Path) -> None:
     )
     picture = tmp_path / "confusions.png"
     results = evaluate_recognizer(
-        load_model(), tmp_path, "test", agreements=(3,), confusion_picture=picture
+        load_model(), tmp_path, "test", rules=[(3, 0.0)], confusion_picture=picture
     )
     assert picture.stat().st_size > 10_000
     console = Console(width=160, record=True, file=(tmp_path / "out.txt").open("w"))

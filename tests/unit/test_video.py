@@ -71,9 +71,11 @@ def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_unwritable_path(tmp_path: Path) -> None:
+@pytest.mark.parametrize("path", ["no/out.mp4", "."])
+def test_unwritable_path(tmp_path: Path, path: str) -> None:
     with pytest.raises(UserError, match="cannot be written"):
-        VideoWriter(tmp_path / "no" / "out.mp4", 64, 48, 25.0, 16000)
+        VideoWriter(tmp_path / path, 64, 48, 25.0, 16000)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

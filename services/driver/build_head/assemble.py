@@ -274,7 +274,7 @@ def _teeth(fapu: dict[str, float]) -> list[Piece]:
     pieces = []
     for name, widths, edge, front, up in (
         ("teeth_upper", parts.UPPER_TEETH, 5.158, 1.222, 1.0),
-        ("teeth_lower", parts.LOWER_TEETH, 5.150, 1.190, -1.0),
+        ("teeth_lower", parts.LOWER_TEETH, 5.162, 1.188, -1.0),
     ):
         part = parts.tooth_row(widths, edge, front, up)
         still = np.ones(len(part.vertices))
@@ -284,7 +284,7 @@ def _teeth(fapu: dict[str, float]) -> list[Piece]:
 
 
 def _tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
-    points = tongue.vertices + np.array([0.0, -0.045, -0.03])
+    points = tongue.vertices * [1.2, 1.0, 1.0] + [0.0, -0.045, -0.03]
     uv = np.clip(points[:, [0, 2]] * [1.2, 0.8] + [0.5, -0.3], 0, 1)
     tint = np.clip((points[:, 2] - 0.55) / 0.6, 0.15, 1.0)[:, None] * [0.85, 0.7, 0.7]
     part = parts.Part(points, surface.triangles_of(tongue.quads), uv, tint)

@@ -168,7 +168,7 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     side
         1 for the subject's left, -1 for the right.
     rise
-        Distance from the innermost layer, dm.
+        How far the front edge and the tips stand off, dm.
     strands, steps
         Size of the grid across and along the hair.
     """
@@ -190,7 +190,7 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     on_skull = np.linspace(0.0, 1.0, steps // 2 + 1)
     angles = np.radians(_bezier(np.stack([start, middle, end]), on_skull))
     azimuth, elevation = angles[..., 0], angles[..., 1]
-    radii = np.array([0.745, 0.925, 0.90]) + rise
+    radii = np.array([0.745, 0.925, 0.90])
     swell = 1.0 + 0.03 * np.sin(np.pi * on_skull)[None, :]
     skull = np.stack(
         [
@@ -225,6 +225,13 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     points += (0.10 * low * aside)[..., None] * out[:, None]
     rows = points.shape[1]
     walked = np.linspace(0.0, 1.0, rows)
+    lift = np.maximum(
+        np.clip((walked[None, :] - 0.80) / 0.08, 0, 1),
+        np.clip((0.16 - across[:, None]) / 0.06, 0, 1),
+    )
+    outward = points - np.where(points[..., 1:2] > _SKULL[1], _SKULL, points * [0, 1, 0])
+    outward /= np.linalg.norm(outward, axis=2, keepdims=True)
+    points += rise * lift[..., None] * outward
     uv = np.stack(
         [
             np.broadcast_to(across[:, None], (strands, rows)),

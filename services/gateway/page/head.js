@@ -7,7 +7,8 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const RADIANS_PER_UNIT = 1e-5;
 const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
-const SLOW_MS = 45; // a display frame
+const SLOW_MS = 45; // for a picture
+const PAUSE_MS = 1000; // without a change, which is no slowness
 const JUDGE_EVERY_MS = 1500;
 const COARSER = 0.5;
 const LEAST_PIXEL_RATIO = 0.6;
@@ -15,6 +16,7 @@ const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
 export class Head {
+  frameMs = 1000 / 60; // between two pictures of the moving face, smoothed
   #renderer;
   #overlay;
   #scene = new THREE.Scene();
@@ -25,7 +27,7 @@ export class Head {
   #fovYDegrees = 22;
   #stale = true;
   #pixelRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
-  #intervalMs = 0; // between display frames, smoothed
+  #fence = null; // passed when the picture before is done
   #drawnMs = 0;
   #judgedMs = 0;
   #turn = new THREE.Quaternion();
@@ -45,7 +47,7 @@ export class Head {
     this.#light();
     new ResizeObserver(() => {
       this.#resize();
-      this.#renderer.render(this.#scene, this.#camera);
+      this.#render();
     }).observe(canvas);
   }
 
@@ -57,7 +59,7 @@ export class Head {
   }
 
   #add(gltf) {
-    const about = gltf.scene.userData.kouxing ?? gltf.scene.getObjectByName("kouxing").userData.kouxing;
+    const about = gltf.scene.getObjectByName("kouxing").userData.kouxing;
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
       node.frustumCulled = false; // bounds do not follow the face
@@ -82,20 +84,41 @@ export class Head {
     this.#stale = true;
   }
 
-  /** Draw, if anything has changed since the last display frame. */
+  /**
+   * Draw, if anything has changed, and if the picture before is done: a slow machine is to have
+   * fewer pictures rather than a queue of late ones that block the page.
+   */
   draw(nowMs) {
-    this.#intervalMs += 0.1 * (Math.min(500, nowMs - this.#drawnMs) - this.#intervalMs);
-    this.#drawnMs = nowMs;
-    if (!this.#stale) return;
+    if (!this.#stale || !this.#isDone()) return;
     this.#stale = false;
+    const intervalMs = nowMs - this.#drawnMs;
+    this.#drawnMs = nowMs;
+    if (intervalMs < PAUSE_MS) this.frameMs += 0.1 * (intervalMs - this.frameMs);
     if (nowMs - this.#judgedMs > JUDGE_EVERY_MS) {
       this.#judgedMs = nowMs;
-      if (this.#intervalMs > SLOW_MS && this.#pixelRatio > LEAST_PIXEL_RATIO) {
-        this.#pixelRatio = Math.max(LEAST_PIXEL_RATIO, COARSER * this.#pixelRatio); // the mouth must move in time rather than be sharp
+      if (this.frameMs > SLOW_MS && this.#pixelRatio > LEAST_PIXEL_RATIO) {
+        this.#pixelRatio = Math.max(LEAST_PIXEL_RATIO, COARSER * this.#pixelRatio);
         this.#resize();
       }
     }
+    this.#render();
+  }
+
+  #isDone() {
+    const gl = this.#renderer.getContext();
+    if (this.#fence !== null) {
+      if (gl.clientWaitSync(this.#fence, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
+      gl.deleteSync(this.#fence);
+      this.#fence = null;
+    }
+    return true;
+  }
+
+  #render() {
     this.#renderer.render(this.#scene, this.#camera);
+    const gl = this.#renderer.getContext();
+    this.#fence ??= gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
   }
 
   #findJoints(scene, faps) {

@@ -19,7 +19,8 @@ export class Link {
 
   /**
    * @param {string} chosen session to look at; "" for the newest
-   * @param handlers { state(connected), fap(mediaTime, values), sound(mediaTime, samples), text(object) }
+   * @param handlers { state(connected), fap(mediaTime, values), sound(mediaTime, samples),
+   *   text(object) }
    */
   constructor(chosen, handlers) {
     this.#chosen = chosen;

@@ -8,7 +8,9 @@ import { Sound } from "./sound.js";
 
 const STALL_MS = 500; // without frames the face goes to rest
 const REST_MS = 80; // time constant of going there and coming back
-const NUM_PAST = 8;
+const NUM_PAST = 8; // phones shown beside the current one
+const MAX_PHONES = 100;
+const STALE = 8 * 16000; // samples after which the last phone is no longer shown
 const SILENCE = "sil";
 const LABEL_EVERY_MS = 250;
 const ERROR_MS = 8000; // for which an error stays to be read
@@ -34,6 +36,7 @@ const faps = new Float32Array(NUM_FAPS);
 window.kouxing = {
   get state() {
     const nowMs = performance.now();
+    const heardMs = sound.offsetMs(nowMs);
     return {
       connected,
       session,
@@ -44,7 +47,7 @@ window.kouxing = {
       playoutDelayMs: playout.delayMs,
       sound: sound.state,
       soundSamplesPlayed: sound.numPlayed,
-      soundMinusPictureMs: sound.offsetMs(nowMs) === null ? null : sound.offsetMs(nowMs) - playout.offsetMs,
+      soundMinusPictureMs: heardMs === null ? null : heardMs - playout.offsetMs,
       microphone: element("microphone").getAttribute("aria-pressed") === "true",
       phone: element("phone").value,
     };
@@ -104,10 +107,11 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
 });
 
 function hear({ index, unit, media_time: mediaTime, duration }) {
-  const known = phones.findIndex((phone) => phone.index === index);
-  if (known >= 0) phones.length = known; // a revision; what came after it comes again
-  phones.push({ index, unit, mediaTime, end: mediaTime + duration });
-  if (phones.length > 100) phones.shift();
+  const phone = { index, unit, mediaTime, end: mediaTime + duration };
+  const known = phones.findIndex((other) => other.index === index);
+  if (known >= 0) phones[known] = phone;
+  else phones.push(phone);
+  if (phones.length > MAX_PHONES) phones.shift();
 }
 
 function rms(samples) {
@@ -128,7 +132,7 @@ function draw(nowMs) {
   drawnMs = nowMs;
   // While this page was busy nothing could arrive, which is no stall of the stream.
   if (elapsedMs > STALL_MS / 2) arrivedMs = Math.min(nowMs, arrivedMs + elapsedMs);
-  playout.displayFrameMs += 0.02 * (Math.min(100, elapsedMs) - playout.displayFrameMs);
+  playout.displayFrameMs = Math.min(100, head?.frameMs ?? playout.displayFrameMs);
   playout.outputLatencyMs = sound.outputLatencyMs;
   const heardMs = sound.offsetMs(nowMs);
   if (heardMs !== null) playout.follow(heardMs);
@@ -167,8 +171,10 @@ function showState() {
   const nowMs = performance.now();
   const isLive = connected && nowMs - arrivedMs < STALL_MS;
   element("status").dataset.state = !connected ? "lost" : isLive ? "live" : "waiting";
-  let text = "connecting … 连接中";
-  if (connected) text = session === null ? "waiting for speech 等待语音" : isLive ? `live 直播` : "paused 暂停";
+  let text = "live 直播";
+  if (!connected) text = "connecting … 连接中";
+  else if (session === null) text = "waiting for speech 等待语音";
+  else if (!isLive) text = "paused 暂停";
   if (isLive) {
     const ageMs = microphone.ageMs(nowMs, playout.mediaAt(nowMs));
     const delayMs = ageMs ?? playout.delayMs;
@@ -206,7 +212,7 @@ function showPhones(mediaTime) {
   let current = phones.length - 1;
   while (current >= 0 && phones[current].mediaTime > mediaTime) current--;
   const phone = phones[current];
-  const isOver = phone === undefined || phone.unit === SILENCE || mediaTime > phone.end + 8000;
+  const isOver = phone === undefined || phone.unit === SILENCE || mediaTime > phone.end + STALE;
   setText(element("phone"), isOver ? "" : phone.unit);
   const past = phones
     .slice(Math.max(0, current - NUM_PAST), isOver ? current + 1 : Math.max(0, current))
@@ -214,8 +220,14 @@ function showPhones(mediaTime) {
   const key = past.join(" ");
   if (element("past").dataset.key !== key) {
     element("past").dataset.key = key;
-    element("past").replaceChildren(...past.map((unit) => Object.assign(document.createElement("li"), { textContent: unit })));
+    element("past").replaceChildren(...past.map(listItem));
   }
+}
+
+function listItem(text) {
+  const item = document.createElement("li");
+  item.textContent = text;
+  return item;
 }
 
 function showLevel() {
@@ -291,6 +303,6 @@ try {
   head.draw(performance.now()); // the first time takes long, which says nothing about the stream
   playout.reset();
 } catch (error) {
-  showError(`no head: ${error.message}`);
+  showError(`no head (is there a head.glb? see 'kouxing head export'): ${error.message}`);
 }
 element("loading").hidden = true;

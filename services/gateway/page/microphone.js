@@ -12,7 +12,10 @@ export class Microphone {
   #context = null;
   #firstMs = null; // page's clock at media time 0
 
-  /** @param handlers { state("off" | "starting" | "on"), level(rms), session(name), error(object) } */
+  /**
+   * @param handlers { state("off" | "starting" | "on"), level(rms), session(name),
+   *   error({ text }) }
+   */
   constructor(handlers) {
     this.#handlers = handlers;
   }
@@ -44,7 +47,8 @@ export class Microphone {
       await this.#context.audioWorklet.addModule("microphone-worklet.js");
     } catch (error) {
       const isDenied = error.name === "NotAllowedError";
-      this.#fail(isDenied ? "the microphone was not allowed 未允许使用麦克风" : `no microphone: ${error.message}`);
+      const denied = "the microphone was not allowed 未允许使用麦克风";
+      this.#fail(isDenied ? denied : `no microphone: ${error.message}`);
       return;
     }
     this.#connect();

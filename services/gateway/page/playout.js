@@ -114,9 +114,13 @@ export class Playout {
       return false;
     }
     const frameMs = this.frames.percentile(0.95);
-    // A long chunk of sound is as late as its first sample.
-    const soundMs = this.soundStarts.count ? this.soundStarts.percentile(0.95) + this.outputLatencyMs : -Infinity;
-    const errorMs = Math.max(frameMs, soundMs) + this.displayFrameMs - this.#offsetMs;
+    let latestMs = frameMs;
+    if (this.soundStarts.count) {
+      // A long chunk of sound is as late as its first sample.
+      const soundMs = this.soundStarts.percentile(0.95) + this.outputLatencyMs;
+      latestMs = Math.max(frameMs, soundMs);
+    }
+    const errorMs = latestMs + this.displayFrameMs - this.#offsetMs;
     if (Math.abs(errorMs) <= DEAD_ZONE_MS) return false;
     this.#offsetMs += errorMs / 2;
     return true;
@@ -130,7 +134,9 @@ export class Playout {
   /** Set the first offset: what had piled up before comes at once, and its end is the truest. */
   #begin(nowMs, offsetMs) {
     if (this.#offsetMs === null) this.#begunMs = nowMs;
-    if (nowMs - this.#begunMs < SURE_MS) this.#offsetMs = Math.min(this.#offsetMs ?? Infinity, offsetMs);
+    if (nowMs - this.#begunMs < SURE_MS) {
+      this.#offsetMs = Math.min(this.#offsetMs ?? Infinity, offsetMs);
+    }
   }
 
   /**

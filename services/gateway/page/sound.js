@@ -56,7 +56,8 @@ export class Sound {
   }
 
   get outputLatencyMs() {
-    return this.state === "on" ? 1000 * (this.#context.outputLatency || this.#context.baseLatency || 0) : 0;
+    if (this.state !== "on") return 0;
+    return 1000 * (this.#context.outputLatency || this.#context.baseLatency || 0);
   }
 
   /** Play such that media time m is heard at m + offset on the page's clock. */

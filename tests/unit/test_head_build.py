@@ -1,0 +1,110 @@
+"""The geometry that builds the head: subdivision, zones, interpolation, clipping."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.driver.build_head import paint, parts, surface, zones
+from services.driver.render import decode_image
+
+pytestmark = pytest.mark.unit
+
+CUBE = np.array(
+    [[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1],
+     [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], float
+)  # fmt: skip
+CUBE_QUADS = np.array(
+    [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
+)
+
+
+def sheet(rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Make a flat grid of unit squares."""
+    y, x = np.mgrid[:rows, :columns]
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    quads = np.stack([corner, corner + 1, corner + columns + 1, corner + columns], axis=1)
+    return np.stack([x, y, 0 * x], axis=2).reshape(-1, 3).astype(float), quads
+
+
+def test_catmull_clark_of_a_cube() -> None:
+    matrix, quads = surface.catmull_clark(CUBE_QUADS, 8)
+    fine = matrix @ CUBE
+    assert len(quads) == 24
+    assert len(fine) == 8 + 12 + 6
+    np.testing.assert_allclose(matrix.sum(axis=1), 1)
+    # textbook: a corner of the cube moves to 5/9, an edge point lies at 3/4, a face point stays
+    np.testing.assert_allclose(np.abs(fine[:8]), 5 / 9)
+    np.testing.assert_allclose(sorted(np.abs(fine[8])), [0, 0.75, 0.75])
+    np.testing.assert_allclose(sorted(np.abs(fine[-1])), [0, 0, 1])
+
+
+def test_subdivision_keeps_a_flat_sheet_and_its_border() -> None:
+    vertices, quads = sheet(4, 5)
+    matrix, fine = surface.catmull_clark(quads, len(vertices))
+    moved = matrix @ vertices
+    inner = [6, 7, 8, 11, 12, 13]
+    np.testing.assert_allclose(moved[inner], vertices[inner])
+    assert np.abs(moved[:, 2]).max() == 0
+    assert surface.edges_of(fine)[0].shape[1] == 2
+
+
+def test_zone_is_a_raised_cosine() -> None:
+    vertices, quads = sheet(3, 9)
+    row = np.arange(9)
+    zone = surface.Geodesics(vertices, quads).zone(row[:1] + 9, row[-1:] + 9)
+    np.testing.assert_allclose(zone[9:18], 0.5 + 0.5 * np.cos(np.pi * row / 8), atol=1e-12)
+
+
+def test_a_zone_does_not_jump_a_gap() -> None:
+    """Two strips that are near in space but not joined: the distance runs along the surface."""
+    vertices, quads = sheet(2, 5)
+    both = np.concatenate([vertices, vertices + np.array([0, 0, 0.01])])
+    geodesics = surface.Geodesics(both, np.concatenate([quads, quads + len(vertices)]))
+    zone = geodesics.zone(np.array([0]), np.array([4]))
+    assert zone[:5].max() == 1
+    assert zone[len(vertices) :].max() == 0
+
+
+def test_smoothest_field_meets_its_points() -> None:
+    vertices, quads = sheet(9, 9)
+    skin = zones.subdivided(vertices, quads)
+    points = skin.number[[30, 33, 50]]
+    border = np.flatnonzero(
+        (skin.vertices[:, :2] < 0.3).any(axis=1) | (skin.vertices[:, :2] > 7.7).any(axis=1)
+    )
+    fields = zones.smoothest(skin, points, border)
+    np.testing.assert_allclose(fields[points], np.eye(3), atol=1e-9)
+    assert np.abs(fields[border]).max() == 0
+    assert np.abs(fields).max() < 1.5
+
+
+def test_clip_cuts_at_height_zero() -> None:
+    vertices, quads = sheet(3, 3)
+    triangles = surface.triangles_of(quads)
+    cut, kept, rim = surface.clip(vertices[:, 1] - 1.25, triangles, vertices)
+    a, b, c = (cut[kept[:, corner]] for corner in range(3))
+    doubled = np.cross(b - a, c - a)[:, 2]
+    assert (doubled > 0).all()  # no triangle is turned over
+    assert doubled.sum() / 2 == pytest.approx(2 * 1.25)
+    np.testing.assert_allclose(cut[rim][..., 1], 1.25)
+    assert np.abs(np.diff(cut[rim][..., 0], axis=1)).sum() == pytest.approx(2)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_images_survive_encoding(channels: int) -> None:
+    image = np.zeros((16, 24, channels))
+    image[..., 0] = np.linspace(0.2, 0.8, 24)
+    image[..., -1] = np.linspace(0.3, 0.9, 16)[:, None]
+    pixels = decode_image(paint.encode(image))
+    tolerance = 6 if channels == 3 else 1  # JPEG loses a little
+    np.testing.assert_allclose(pixels[..., :channels], image * 255, atol=tolerance)
+
+
+def test_eyeball_is_round() -> None:
+    centre = np.array([0.3, 5.8, 1.1])
+    eye = parts.eyeball(centre, 0.135)
+    reach = np.linalg.norm(eye.vertices - centre, axis=1)
+    assert reach.min() == pytest.approx(0.135)
+    assert reach.max() < 0.135 * 1.04
