@@ -195,10 +195,3 @@ def gmm_from(archive: Archive) -> GmmModel:
         half_width=half_width,
         kappa=float(archive.floats("kappa")),
     )
-
-
-def load_model() -> GmmModel:  # until every caller imports services.recognizer.load
-    """Load the model that ships."""
-    from services.recognizer.load import load_model as load  # noqa: PLC0415
-
-    return load()  # type: ignore[return-value]

@@ -15,6 +15,7 @@ import numpy as np
 
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.decoder import Decoder
+from services.recognizer.features import LogMel
 from services.recognizer.load import load_model
 from services.recognizer.pcm import BadAudio, level_db, pcm16_of, samples_of, slices
 from services.recognizer.pipeline import Recognizer
@@ -42,7 +43,7 @@ from shared.reliable import ReliableSender
 from shared.service import Service
 
 GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, less is jitter
-WARM_UP_FRAMES = 600  # enough for every part of the search, also that which forgets the past
+WARM_UP_SAMPLES = 6 * MEDIA_RATE_HZ  # enough to reach the part of the search that forgets
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 
 
@@ -286,10 +287,13 @@ class RecognizerService(Service):
 
 
 def _warm_up(model: AcousticModel) -> None:
-    """Run the search once: its compiled code is loaded now and not in the first sentence."""
+    """Hear noise once: code is compiled or loaded now and not in the first sentence."""
+    noise = np.random.default_rng(0).normal(0, 0.1, WARM_UP_SAMPLES).astype(np.float32)
+    stream = model.stream()
     decoder = Decoder(model.topology)
-    for _ in range(WARM_UP_FRAMES):
-        decoder.accept(np.zeros(model.topology.num_states, np.float32))
+    for scores in stream.accept(LogMel().accept_waveform(noise)):
+        decoder.accept(scores)
+    stream.finish()
     decoder.finish()
 
 
