@@ -126,7 +126,7 @@ def test_no_jump_when_a_guess_is_replaced() -> None:
 def test_value_and_slope_are_continuous_where_the_plan_changes() -> None:
     # at 240 frames a second differences are close to derivatives
     live = LiveSynthesizer(PARAMETERS, frame_rate_hz=240.0)
-    frames = speak(live, 0.52)  # the jaw is moving
+    frames = speak(live, 0.49)  # the jaw is moving
     live.accept_phone(phone(1, "i", 0.4, 0.2))
     faps = values(frames[-3:] + live.advance(0.6))[:, JAW]
     steps = np.diff(faps)
@@ -146,7 +146,7 @@ def test_every_unit_moves_the_face_or_is_silence(unit: str) -> None:
         live.accept_phone(phone(2, "a", 0.5, 0.2))
     faps = values(live.advance(1.0))[20]  # at 0.4 s
     if unit == "sil":
-        assert np.abs(faps).max() < 60.0
+        assert np.abs(faps).max() < 120.0
     elif unit in FINALS:
         assert np.abs(faps).max() > 90.0
     else:

@@ -202,9 +202,16 @@ def _head_weight(source: MakeHuman) -> Float:
 
 
 def _skin_piece(skin: Skin, weight: Float, fields: Fields) -> Piece:
+    _, y, z = skin.vertices.T
+    covered = (y > 6.56) | ((z < 0.0) & (y > 5.25)) | (y < _neckline(z) - 0.15)
+
+    def seen(quads: Index) -> Index:
+        triangles = surface.triangles_of(quads)
+        return triangles[~covered[triangles].all(axis=1)]
+
     part = parts.Part(
         skin.vertices,
-        surface.triangles_of(skin.quads),
+        seen(skin.quads),
         paint.skin_uv(skin.vertices),
         np.ones_like(skin.vertices),
     )
@@ -216,7 +223,7 @@ def _skin_piece(skin: Skin, weight: Float, fields: Fields) -> Piece:
         skin.matrix @ weight[skin.base],
         fields,
         coarse_vertices=len(skin.base),
-        coarse_triangles=surface.triangles_of(skin.coarse_quads),
+        coarse_triangles=seen(skin.coarse_quads),
     )
 
 

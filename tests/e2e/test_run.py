@@ -1,0 +1,111 @@
+"""``kouxing run``: everything at once, as ``make demo`` and ``make run`` do it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import av
+import pytest
+
+from tests.system import BINDS, DEMO, ONE_THREAD, ROOT, free_port
+
+pytestmark = pytest.mark.e2e
+
+
+def own_environment(folder: Path) -> dict[str, str]:
+    environment = {**os.environ, **ONE_THREAD, "KOUXING_DRIVER_VIEW": "none"}
+    for service, keys in BINDS.items():
+        for key in keys:
+            endpoint = f"tcp://127.0.0.1:{free_port()}"
+            environment[f"KOUXING_{service.upper()}_{key}"] = endpoint
+    environment |= {
+        "KOUXING_CONTROL": environment["KOUXING_CONTROL_COMMANDS"],
+        "KOUXING_GATEWAY_PORT": str(free_port()),
+        "KOUXING_DRIVER_OUT": str(folder),
+        "KOUXING_DRIVER_WIDTH_PX": "320",
+        "KOUXING_DRIVER_HEIGHT_PX": "240",
+    }
+    return environment
+
+
+def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "services",
+            "run",
+            "--play",
+            DEMO / "vowels-male.wav",
+            "--stop-after",
+        ],
+        env=own_environment(tmp_path),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "demo.mp4" in result.stderr
+    with av.open(str(tmp_path / "demo.mp4")) as film:
+        assert len(film.streams.audio) == 1
+        assert sum(1 for _ in film.decode(video=0)) >= 2.2 * 25
+
+
+def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
+    environment = own_environment(tmp_path)
+    running = subprocess.Popen(
+        [sys.executable, "-m", "services", "run", "--no-browser"],
+        env=environment,
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        begun = ""
+        while "listening" not in begun:
+            line = running.stderr.readline() if running.stderr else ""
+            assert line, f"it ended: {begun}"
+            begun += line
+        page = f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/"
+        assert page.rstrip("/") in begun
+        with urllib.request.urlopen(page) as answer:
+            assert "kouxing" in answer.read().decode()
+        spoken = subprocess.run(
+            [sys.executable, "-m", "services", "speak", DEMO / "vowels-male.wav"],
+            env=environment,
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert spoken.returncode == 0, spoken.stderr
+    finally:
+        running.send_signal(signal.SIGINT)
+        _, log = running.communicate(timeout=30)
+    assert running.returncode == 0, log
+    assert "Traceback" not in log
+
+
+def test_a_wrong_configuration_ends_it_with_the_key(tmp_path: Path) -> None:
+    config = tmp_path / "kouxing.toml"
+    config.write_text("[synthesizer]\nlook_ahead_ms = 5000\n", encoding="utf-8")
+    result = subprocess.run(
+        [sys.executable, "-m", "services", "run", "--config", config],
+        env=own_environment(tmp_path),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert "synthesizer.look_ahead_ms" in result.stderr
+    assert "Traceback" not in result.stderr
