@@ -16,13 +16,14 @@ from services.driver.head import Head
 from services.driver.recording import Recording
 from services.driver.render import Renderer
 from services.recognizer.load import load_model
-from services.recognizer.pcm import slices
+from services.recognizer.pcm import level_db, slices
 from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler
 from services.synthesizer.live import LiveSynthesizer
 from services.synthesizer.parameters import load_parameters
 from services.synthesizer.service import REST_S
 from shared.audio_file import open_audio
+from shared.config import RecognizerConfig, SynthesizerConfig
 from shared.messages import MEDIA_RATE_HZ
 from shared.phones import Phone, SpeechChange
 
@@ -47,14 +48,30 @@ def mono_16k(path: Path) -> NDArray[np.float32]:
 def live_frames(
     samples: NDArray[np.float32],
     *,
-    frame_rate_hz: float = 50.0,
-    look_ahead_s: float = 0.06,
     on_progress: ProgressCallback = lambda _share: None,
 ) -> tuple[list[Phone], list[Frame]]:
-    """Return the phones and FAP frames that the live system makes of 16 kHz mono samples."""
-    recognizer = Recognizer(load_model(), sample_rate_hz=MEDIA_RATE_HZ)
+    """Return the phones and FAP frames that the live system, by its defaults, makes of a sound.
+
+    Parameters
+    ----------
+    samples
+        16 kHz mono, shape ``(n,)``.
+    on_progress
+        Told the share that is done.
+    """
+    rule, timing = RecognizerConfig(), SynthesizerConfig()
+    look_ahead_s = timing.look_ahead_ms / 1e3
+    recognizer = Recognizer(
+        load_model(),
+        sample_rate_hz=MEDIA_RATE_HZ,
+        agreement=rule.agreement,
+        least_confidence=rule.least_confidence,
+    )
     synthesizer = LiveSynthesizer(
-        load_parameters(), frame_rate_hz=frame_rate_hz, look_ahead_s=look_ahead_s
+        load_parameters(),
+        frame_rate_hz=timing.frame_rate_hz,
+        look_ahead_s=look_ahead_s,
+        gesture_seed=timing.gesture_seed,
     )
     phones: list[Phone] = []
     frames: list[Frame] = []
@@ -71,6 +88,7 @@ def live_frames(
     for part in slices(samples, 0):
         num_heard += len(part)
         take(recognizer.accept_waveform(part))
+        synthesizer.accept_level(num_heard / MEDIA_RATE_HZ, level_db(part))
         frames += synthesizer.advance(num_heard / MEDIA_RATE_HZ)
         on_progress(num_heard / len(samples))
     take(recognizer.input_finished())

@@ -52,6 +52,7 @@ class RecognizerConfig(Config):
     audio: str = "tcp://127.0.0.1:5560"
     phones: str = "tcp://127.0.0.1:5561"
     agreement: int = 3  # frames that must agree before a unit is put out (N of Li 2011)
+    least_confidence: float = 0.0  # of the frames that agree; 0 is the paper's rule
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +62,8 @@ class SynthesizerConfig(Config):
     phones: str = "tcp://127.0.0.1:5570"
     faps: str = "tcp://127.0.0.1:5571"
     frame_rate_hz: float = 50.0
-    look_ahead_ms: float = 60.0  # how much later than its sound a frame is made
+    look_ahead_ms: float = 150.0  # how much later than its sound a frame is made
+    gesture_seed: int = 3  # of blinks, gaze and head motion; 0: the mouth alone moves
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,6 +199,7 @@ def _check(section: str, config: Config) -> None:
         _require_secure(host, name, config)
     ranges: dict[str, tuple[float, float]] = {
         "agreement": (1, 20),
+        "least_confidence": (0, 1),
         "frame_rate_hz": (1, 240),
         "look_ahead_ms": (0, 300),
         "width_px": (16, 7680),

@@ -16,8 +16,9 @@ tau     centre minus time                              s          (num_frames, n
 Deviations: the speech is words and sentences, not single finals and syllables, so that a stage
 moves only its own visemes while the others take part as they are; each FAP is fitted on its own; a
 ridge holds what few frames tell about near the hand-set start. The closure rule stays out of the
-fit, and so do the targets of closing lips, which are closed by definition, and the tongue, which
-nobody sees.
+fit, and so do the lips of labials, whose targets are closed by definition, and the tongue, which
+nobody sees. Least squares flattens what it cannot foresee, so the targets are scaled to the
+measured extent in the end.
 
 A folder of lips holds for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame
 with ``t`` in seconds) and ``<clip>.json`` (licence, speaker, transcript). Columns are FAPs of a
@@ -48,6 +49,7 @@ from services.synthesizer.parameters import NUM_MOUTH_FAPS, VisemeParameters, sa
 from services.synthesizer.timeline import build_timeline
 from services.synthesizer.visemes import (
     CLOSURE_FAPS,
+    LIP_HEIGHT_FAPS,
     MOUTH_FAPS,
     REST,
     ROUNDED_SHAPES,
@@ -364,14 +366,15 @@ class _FapFit:
             ]
         )
         self.visemes, self.silences = self._start.copy(), self._silence_start.copy()
+        # Closed lips, and lip to teeth, are what they are.
+        self.fixed_target = np.zeros(len(VISEMES), dtype=bool)
+        labials = [*CLOSURE_FAPS] if MOUTH_FAPS[column] in LIP_HEIGHT_FAPS else []
+        self.fixed_target[[VISEME_INDEX[viseme] for viseme in [REST, *labials]]] = True
         # The start's shapes are another speaker's: as large as this one's, to begin with.
         curve = self.curve()[0]
         gain = max(float(curve @ self._measured) / max(float(curve @ curve), 1e-9), 0.0)
-        self._start[4] *= gain
-        self.visemes[4] *= gain
-        self.gain = gain
-        self._fixed_target = start.closes[:, column] > 0.0
-        self._fixed_target[VISEME_INDEX[REST]] = True
+        self._start[4, ~self.fixed_target] *= gain
+        self.visemes[4, ~self.fixed_target] *= gain
 
     def curve(self) -> tuple[Array, Array]:
         """Modelled and measured values of all frames."""
@@ -417,7 +420,7 @@ class _FapFit:
             *[(-_ALPHA_RANGE, _ALPHA_RANGE)] * len(rows),
             *[(-_THETA_RANGE, _THETA_RANGE)] * (2 * len(rows)),
             *[(-_OFFSET_RANGE, _OFFSET_RANGE)] * len(rows),
-            *[(0.0, 0.0) if fixed else (None, None) for fixed in self._fixed_target[rows]],
+            *[(0.0, 0.0) if fixed else (None, None) for fixed in self.fixed_target[rows]],
         ]
         if with_silences:
             z = np.append(z, (self.silences - self._silence_start) / self._silence_spread)
@@ -495,7 +498,8 @@ def estimate(frames: Frames) -> VisemeParameters:
         visemes, silences = fit.visemes.copy(), fit.silences.copy()
         # Least squares flattens what it cannot foresee: give the motion its measured extent.
         modelled, seen = fit.curve()
-        visemes[4] *= min(max(float(np.std(seen) / np.std(modelled)), 1.0), _LARGEST_GAIN)
+        gain = min(max(float(np.std(seen) / np.std(modelled)), 1.0), _LARGEST_GAIN)
+        visemes[4, ~fit.fixed_target] *= gain
         visemes[:3], silences[:2] = np.exp(visemes[:3]), np.exp(silences[:2])
         columns = [column] + [
             MOUTH_FAPS.index(right) for right, left in _MIRROR.items() if left == MOUTH_FAPS[column]

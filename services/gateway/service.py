@@ -127,6 +127,7 @@ class GatewayService(Service):
 
     def run(self) -> None:
         """Run until a signal asks for the end, then close every connection."""
+        signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # browsers come and go
         asyncio.run(self._run())
 
     def listen(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:

@@ -34,6 +34,7 @@ PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
 DEFAULT_RULE = (1, 0.85)  # frames that must agree, confidence that each needs
 _SIL = UNIT_INDEX[SILENCE]
+_WARM_UP_S = 6  # long enough that the search also forgets once, which is code of its own
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
 
 
@@ -315,7 +316,8 @@ class Recognizer:
 def warm_up(model: AcousticModel) -> None:
     """Run everything once, so that the first chunk of a session waits for no compiler."""
     stream, decoder = model.stream(), Decoder(model.topology)
-    log_mel = LogMel().accept_waveform(np.zeros(SAMPLE_RATE_HZ // 2, dtype=np.float32))
+    num_samples = _WARM_UP_S * SAMPLE_RATE_HZ
+    log_mel = LogMel().accept_waveform(np.zeros(num_samples, dtype=np.float32))
     for row in (*stream.accept(log_mel), *stream.finish()):
         decoder.accept(row)
     decoder.finish()

@@ -153,7 +153,7 @@ def _filter_table(rate_hz: int) -> NDArray[np.float32]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _interpolate(  # noqa: PLR0917 (numba takes positions)
+def _interpolate(
     known: NDArray[np.float32],
     first: int,
     table: NDArray[np.float32],

@@ -12,13 +12,12 @@ import secrets
 import time
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import AcousticModel
-from services.recognizer.decoder import Decoder
-from services.recognizer.features import LogMel
 from services.recognizer.load import load_model
-from services.recognizer.pcm import BadAudio, level_db, pcm16_of, samples_of, slices
-from services.recognizer.pipeline import Recognizer
+from services.recognizer.pcm import SLICE, BadAudio, level_db, pcm16_of, samples_of, slices
+from services.recognizer.pipeline import Recognizer, warm_up
 from services.recognizer.resample import Resampler
 from shared.bus import Socket
 from shared.clock import to_samples
@@ -43,14 +42,13 @@ from shared.reliable import ReliableSender
 from shared.service import Service
 
 GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, less is jitter
-WARM_UP_SAMPLES = 6 * MEDIA_RATE_HZ  # enough to reach the part of the search that forgets
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 
 
 class _Stream:
     """One session's audio on its way to phones."""
 
-    def __init__(self, start: StartSession, model: AcousticModel, agreement: int) -> None:
+    def __init__(self, start: StartSession, model: AcousticModel, rule: tuple[int, float]) -> None:
         self.start = start
         self.link: ReliableSender | None = None
         self.sequence_in = 0
@@ -60,7 +58,7 @@ class _Stream:
         self.speaking = False
         self.media_time_in: int | None = None  # of the next chunk, if nothing is lost
         self._model = model
-        self._agreement = agreement
+        self._rule = rule
         self._next_index = 0
         self.restart(0)
 
@@ -68,10 +66,15 @@ class _Stream:
         """Begin anew at a media time: after a pause in the stream or an interruption."""
         self.origin = media_time
         self.num_samples = 0
+        self._slice: list[NDArray[np.float32]] = []  # what came of the 20 ms under way
         self._index_base = self._next_index
         self._resampler = Resampler(self.start.sample_rate_hz, self.start.num_channels)
+        agreement, least_confidence = self._rule
         self._recognizer = Recognizer(
-            self._model, sample_rate_hz=MEDIA_RATE_HZ, agreement=self._agreement
+            self._model,
+            sample_rate_hz=MEDIA_RATE_HZ,
+            agreement=agreement,
+            least_confidence=least_confidence,
         )
 
     @property
@@ -89,8 +92,12 @@ class _Stream:
         messages: list[Message] = [Sound(media_time=self.media_time, pcm=pcm16_of(mono))]
         for part in slices(mono, self.num_samples):
             self.num_samples += len(part)
+            self._slice.append(part)
             messages += self._as_messages(self._recognizer.accept_waveform(part))
-            messages.append(Progress(media_time=self.media_time, level_db=level_db(part)))
+            if self.num_samples % SLICE == 0:
+                level = level_db(np.concatenate(self._slice))
+                messages.append(Progress(media_time=self.media_time, level_db=level))
+                self._slice.clear()
         return messages
 
     def finish(self) -> list[Message]:
@@ -135,7 +142,7 @@ class RecognizerService(Service):
 
     def __init__(self, config: RecognizerConfig) -> None:
         super().__init__(config)
-        self._agreement = config.agreement
+        self._rule = (config.agreement, config.least_confidence)
         self._streams: dict[str, _Stream] = {}
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
@@ -145,7 +152,7 @@ class RecognizerService(Service):
             "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
         }
         self._model = load_model()
-        _warm_up(self._model)
+        warm_up(self._model)
         self.listen(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_finish})
         self.listen(self._phones, {})
 
@@ -153,7 +160,7 @@ class RecognizerService(Service):
         """Make a stream, or after a crash of the synthesizer give the old one a new link."""
         stream = self._streams.get(start.session)
         if stream is None or stream.start.token != start.token:
-            stream = _Stream(start, self._model, self._agreement)
+            stream = _Stream(start, self._model, self._rule)
             self._streams[start.session] = stream
         if stream.link is None or stream.start.epoch != start.epoch:
             stream.start = start
@@ -284,17 +291,6 @@ class RecognizerService(Service):
         stream = self._streams.get(ack.session)
         if stream is not None and stream.link is not None and ack.epoch == stream.start.epoch:
             stream.link.acknowledge(ack.sequence, time.monotonic())
-
-
-def _warm_up(model: AcousticModel) -> None:
-    """Hear noise once: code is compiled or loaded now and not in the first sentence."""
-    noise = np.random.default_rng(0).normal(0, 0.1, WARM_UP_SAMPLES).astype(np.float32)
-    stream = model.stream()
-    decoder = Decoder(model.topology)
-    for scores in stream.accept(LogMel().accept_waveform(noise)):
-        decoder.accept(scores)
-    stream.finish()
-    decoder.finish()
 
 
 def _addressed(message: Message, stream: _Stream) -> Message:

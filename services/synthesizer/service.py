@@ -64,6 +64,7 @@ class SynthesizerService(Service):
     def __init__(self, config: SynthesizerConfig) -> None:
         super().__init__(config)
         self._frame_rate_hz = config.frame_rate_hz
+        self._gesture_seed = config.gesture_seed or None
         self._look_ahead_s = config.look_ahead_ms / 1e3
         self._faces: dict[str, _Face] = {}
         self._input = self.bus.bind_router(config.phones, "synthesizer.phones")
@@ -92,6 +93,7 @@ class SynthesizerService(Service):
                 self._parameters,
                 frame_rate_hz=self._frame_rate_hz,
                 look_ahead_s=self._look_ahead_s,
+                gesture_seed=self._gesture_seed,
             )
             face = _Face(start, live)
             face.receiver = ReliableReceiver(self._input, start.session)
@@ -149,6 +151,8 @@ class SynthesizerService(Service):
         if isinstance(message, PhoneHeard) and message.unit not in UNIT_INDEX:
             self.warn("unknown-unit", f"{message.unit!r} is none of the 60 units", message.session)
             return
+        if face.sequence_out == 0 and message.epoch > 1:  # a session that moved here in mid-stream
+            face.live.reset(to_seconds(message.media_time))
         started_s = time.perf_counter()
         face.heard_s = time.monotonic()
         time_s = to_seconds(message.media_time)
@@ -166,6 +170,7 @@ class SynthesizerService(Service):
         elif isinstance(message, Speech):
             face.live.accept_speech(SpeechChange(active=message.active, time_s=time_s))
         elif isinstance(message, Progress):
+            face.live.accept_level(time_s, message.level_db)
             self._publish(message.session, face, face.live.advance(time_s))
             self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
         elif isinstance(message, EndOfPhones):

@@ -23,7 +23,7 @@ EDGE_S = 0.08  # a viseme's centre is at most this far from its beginning and it
 _SHORTEST_UNIT_S = 0.01
 # A hole this short between two units is a rounding of their times, no pause.
 _TOUCHING_S = 0.03
-_EXPECTED_FINAL = "e"
+_EXPECTED_FINAL = "ei"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

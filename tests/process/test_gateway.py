@@ -233,6 +233,11 @@ def wait_until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
         time.sleep(0.01)
 
 
+def can_connect(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
 async def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
     await asyncio.to_thread(wait_until, condition, limit_s)
 
@@ -317,6 +322,13 @@ def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayP
             assert (await receive_json(other, "error"))["code"] == "refused"
 
     asyncio.run(look())
+
+
+def test_writing_to_a_browser_that_is_gone_is_no_end(gateway: GatewayProcess) -> None:
+    gateway.process.send_signal(signal.SIGPIPE)  # what such a write raises
+
+    with pytest.raises(subprocess.TimeoutExpired):
+        gateway.process.wait(0.3)
 
 
 def test_viewers_hear_what_is_missing(system: ScriptedSystem, gateway: GatewayProcess) -> None:
@@ -409,6 +421,31 @@ def test_bad_microphones_are_told_why(system: ScriptedSystem, gateway: GatewayPr
             assert await error_after(http, hello) == "start one"
 
     asyncio.run(speak())
+
+
+def test_without_control_browsers_are_told_to_start_it() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = str(listener.getsockname()[1])
+    process = spawn(KOUXING_GATEWAY_PORT=port, KOUXING_CONTROL="tcp://127.0.0.1:9")
+
+    async def ask() -> tuple[list[str], str]:
+        page = f"http://127.0.0.1:{port}/"
+        async with aiohttp.ClientSession() as http:
+            async with http.ws_connect(f"{page}viewer") as viewer:
+                status = await receive_json(viewer, "status")
+            async with http.ws_connect(f"{page}microphone") as browser:
+                await browser.send_json({"sample_rate_hz": 16000})
+                return status["missing"], (await receive_json(browser, "error"))["text"]
+
+    try:
+        wait_until(lambda: can_connect(int(port)))
+        missing, text = asyncio.run(ask())
+    finally:
+        process.terminate()
+        process.communicate(timeout=10)
+    assert missing == ["control"]
+    assert "does not answer; is 'kouxing run' running" in text
+    assert process.returncode == 0
 
 
 def test_strange_pages_and_paths_are_refused(gateway: GatewayProcess) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.recognizer import decoder
 from services.recognizer.load import load_model
 from services.recognizer.pipeline import Recognizer, recognize, warm_up
 from shared.audio_file import read_audio
@@ -172,3 +173,9 @@ def test_warm_up_leaves_nothing_behind(hello: np.ndarray) -> None:
     warm_up(model)
     first.reset()
     assert feed(first, hello) == before
+
+
+def test_warming_up_leaves_nothing_to_compile() -> None:
+    warm_up(load_model())
+    assert decoder._step.signatures
+    assert decoder._common_record.signatures

@@ -207,7 +207,8 @@ def _skin_piece(skin: Skin, weight: Float, fields: Fields) -> Piece:
 
     def seen(quads: Index) -> Index:
         triangles = surface.triangles_of(quads)
-        return triangles[~covered[triangles].all(axis=1)]
+        shown: Index = triangles[~covered[triangles].all(axis=1)]
+        return shown
 
     part = parts.Part(
         skin.vertices,
@@ -311,7 +312,7 @@ def _hair() -> list[Piece]:
     """Make the opaque body of the hair, and its thin front edge and tips."""
     pieces = []
     for name, rise, tips in (("hair", 0.0, False), ("hair_tips", 0.005, True)):
-        sheets = [parts.hair_sheet(side, rise, 38, 28) for side in (1.0, -1.0)]
+        sheets = [parts.hair_sheet(side, rise, 38, 34) for side in (1.0, -1.0)]
         count = len(sheets[0].vertices)
         triangles = np.concatenate([sheets[0].triangles, sheets[1].triangles + count])
         uv = np.concatenate([sheet.uv for sheet in sheets])
@@ -404,14 +405,26 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
     solid = [p for p in pieces if p.name != "lashes"]
     offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
     vertices = np.concatenate([_opened(p) for p in solid])
-    triangles = np.concatenate(
-        [p.part.triangles + first for p, first in zip(solid, offsets, strict=False)]
-    )
     normals = np.concatenate([surface.vertex_normals(_opened(p), p.part.triangles) for p in solid])
-    seen = openness(vertices, normals, triangles)
+
+    def unhidden(with_hair: bool) -> Float:
+        triangles = [
+            p.part.triangles + first
+            for p, first in zip(solid, offsets, strict=False)
+            if with_hair or not p.name.startswith("hair")
+        ]
+        return openness(vertices, normals, np.concatenate(triangles))
+
+    # the hair is thin where it meets the face: there it would cast jagged shadows
+    seen, seen_with_hair = unhidden(False), unhidden(True)
     for piece, first in zip(solid, offsets, strict=False):
         part = piece.part
-        own = np.clip(seen[first : first + len(part.vertices)], 0, 1)[:, None]
+        rows = slice(first, first + len(part.vertices))
+        under_hair = np.clip((0.66 - part.vertices[:, 2]) / 0.12, 0, 1)  # ears, sides of the neck
+        if piece.name.startswith("hair"):
+            under_hair[:] = 1
+        own = (1 - under_hair) * seen[rows] + under_hair * seen_with_hair[rows]
+        own = np.clip(own, 0, 1)[:, None]
         if piece.name == "skin":
             shade = np.clip(0.10 + 1.0 * own, 0, 1) ** np.array([0.75, 1.0, 1.1])
             depth = np.clip((part.vertices[:, 2:] - 0.85) / 0.42, 0, 1)

@@ -175,7 +175,7 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     noise = np.random.default_rng(1)
     across = np.linspace(0.0, 1.0, strands)
     # in degrees about the skull's centre: azimuth from the front, elevation
-    azimuth_end = np.interp(across, [0.0, 0.25, 1.0], [63.0, 84.0, 180.0])
+    azimuth_end = np.interp(across, [0.0, 0.25, 1.0], [58.0, 82.0, 180.0])
     start = np.stack(
         [np.zeros(strands), np.interp(across, [0, 0.35, 1], [38.0, 66.0, 112.0])], axis=1
     )
@@ -191,7 +191,7 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     angles = np.radians(_bezier(np.stack([start, middle, end]), on_skull))
     azimuth, elevation = angles[..., 0], angles[..., 1]
     radii = np.array([0.745, 0.925, 0.90])
-    swell = 1.0 + 0.03 * np.sin(np.pi * on_skull)[None, :]
+    swell = 1.0 + 0.05 * np.sin(np.pi * on_skull)[None, :]
     skull = np.stack(
         [
             side * np.cos(elevation) * np.sin(azimuth),

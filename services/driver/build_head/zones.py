@@ -304,7 +304,9 @@ class FaceFields:
         nose = self.skin.points("9.1", "9.2", "9.3", "9.4", "9.5", "9.15")
         self._zone(18, "2.10", 0.02, 0.26, chin)
         for fap, name in ((39, "5.1"), (40, "5.2")):
-            self._zone(fap, name, 0.06, 0.36, np.concatenate([lips, nose]))
+            self._zone(fap, name, 0.10, 0.40, np.concatenate([lips, nose]))
+            # a puffed cheek comes forward, too
+            self.fields[fap][:, 2] = 0.5 * np.abs(self.fields[fap][:, 0])
         for fap, name in ((41, "5.3"), (42, "5.4")):
             self._zone(fap, name, 0.05, 0.30, np.concatenate([lips, lids, nose]))
         for fap, name in ((61, "9.1"), (62, "9.2")):
