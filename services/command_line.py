@@ -62,7 +62,7 @@ class PhoneFormat(StrEnum):
 
 def main() -> None:
     """Run the command line; a user's mistake is one line on standard error and status 2."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     try:
         app()
     except UserError as error:
@@ -76,6 +76,8 @@ def main() -> None:
 def _serve(section: str, file: Path | None, settings: list[str] | None) -> None:
     config = load(section, file=file, overrides=_overrides(settings))
     from shared.service import run_service
+
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # peers come and go
 
     def make() -> Any:
         module = importlib.import_module(f"services.{section}.service")
@@ -203,7 +205,7 @@ def speak(
     elif source == "-":
         audio = raw_audio(sys.stdin.buffer, rate, channels)
     else:
-        audio = open_audio(Path(source))
+        audio = open_audio(Path(source), block_s=0.1 if fast else 0.02)
     spoken = stream(
         audio, _control(control), CONSOLE, session=session, record=record, paced=not fast
     )

@@ -20,6 +20,7 @@ from shared.errors import UserError
 from shared.messages import MAX_MESSAGE_BYTES, Joined, Message
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
+AUDIO_QUEUE_LENGTH = 500  # chunks; a sender that is faster than the recognizer soon feels it
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 1000)
@@ -171,21 +172,21 @@ class Bus:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def bind_router(self, endpoint: str, key: str) -> Socket:
+    def bind_router(self, endpoint: str, key: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
         """Bind a socket that many peers send commands or data to."""
-        return self._bind(zmq.ROUTER, endpoint, key)
+        return self._bind(zmq.ROUTER, endpoint, key, queue_length)
 
     def bind_publisher(self, endpoint: str, key: str) -> Socket:
         """Bind a socket that many peers subscribe to."""
-        return self._bind(zmq.XPUB, endpoint, key)
+        return self._bind(zmq.XPUB, endpoint, key, QUEUE_LENGTH)
 
-    def connect_dealer(self, endpoint: str) -> Socket:
+    def connect_dealer(self, endpoint: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
         """Connect to a router; messages queue until it is there."""
-        return self._connect(zmq.DEALER, endpoint)
+        return self._connect(zmq.DEALER, endpoint, queue_length=queue_length)
 
     def connect_subscriber(self, *endpoints: str) -> Socket:
         """Connect to publishers; nothing arrives before ``subscribe``."""
-        return self._connect(zmq.SUB, *endpoints)
+        return self._connect(zmq.SUB, *endpoints, queue_length=QUEUE_LENGTH)
 
     def poller(self) -> Poller:
         """Return a poller for sockets of this bus."""
@@ -203,20 +204,20 @@ class Bus:
         self._sockets.clear()
         self._context.term()
 
-    def _open(self, kind: int) -> zmq.Socket[bytes]:
+    def _open(self, kind: int, queue_length: int) -> zmq.Socket[bytes]:
         raw = self._context.socket(kind)
         raw.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        raw.setsockopt(zmq.SNDHWM, QUEUE_LENGTH)
-        raw.setsockopt(zmq.RCVHWM, QUEUE_LENGTH)
+        raw.setsockopt(zmq.SNDHWM, queue_length)
+        raw.setsockopt(zmq.RCVHWM, queue_length)
         raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
         raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
         raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         raw.setsockopt(zmq.LINGER, 0)
         return raw
 
-    def _bind(self, kind: int, endpoint: str, key: str) -> Socket:
+    def _bind(self, kind: int, endpoint: str, key: str, queue_length: int) -> Socket:
         split_endpoint(endpoint, key)
-        raw = self._open(kind)
+        raw = self._open(kind, queue_length)
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
         if kind == zmq.XPUB:
             raw.setsockopt(zmq.XPUB_VERBOSE, 1)
@@ -232,8 +233,8 @@ class Bus:
         self._sockets.append(socket)
         return socket
 
-    def _connect(self, kind: int, *endpoints: str) -> Socket:
-        raw = self._open(kind)
+    def _connect(self, kind: int, *endpoints: str, queue_length: int) -> Socket:
+        raw = self._open(kind, queue_length)
         for endpoint in endpoints:
             split_endpoint(endpoint, "endpoint")
             raw.setsockopt(zmq.IPV6, "[" in endpoint)

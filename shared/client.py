@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.bus import Bus, Socket
+from shared.bus import AUDIO_QUEUE_LENGTH, Bus, Socket
 from shared.errors import UserError
 from shared.messages import (
     MAX_AUDIO_BYTES,
@@ -115,7 +115,7 @@ class Session:
         self._opening = opening
         self.opened = opened
         self.name = opened.session
-        self._audio = client.bus.connect_dealer(opened.audio)
+        self._audio = client.bus.connect_dealer(opened.audio, queue_length=AUDIO_QUEUE_LENGTH)
         self._sequence = 0
         self._num_frames_sent = 0
 

@@ -40,7 +40,8 @@ Report = Callable[[str], None]
 _STATES_PER_UNIT = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # of the differences: the textbook's
 _ROTATED_AT = 8  # mixtures per state when the features are decorrelated
-_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
+_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the log scores of a model alone
+_SHARES = (0.25, 0.4, 0.55, 0.7, 1.0)  # of models together, on top of each one's own scale
 _UNIT_PENALTIES = (0.5, 0.0, -0.5, -1.0, -1.5, -2.0)
 
 
@@ -237,7 +238,7 @@ def combine(
         if part.parent.resolve() != output.parent.resolve():
             raise UserError(f"{part} is not in the folder of {output}; copy it there")
         models.append(load_model(part))
-    choice = choose_search(models, corpora, shipping=shipping, report=report)
+    choice = choose_search(models, corpora, scales=_SHARES, shipping=shipping, report=report)
     if choice is None:
         raise UserError("the weights are chosen on recordings of split 'dev'; add some")
     topology = with_penalty(models[0].topology, choice.unit_penalty)
@@ -248,6 +249,7 @@ def choose_search(
     models: Sequence[AcousticModel],
     corpora: Sequence[Path],
     *,
+    scales: Sequence[float] = _SCALES,
     shipping: bool = True,
     report: Report = print,
 ) -> Choice | None:
@@ -257,6 +259,8 @@ def choose_search(
     ----------
     models
         Models that listen together; the first one's bigram is used.
+    scales
+        Scales to try for each model.
     corpora, shipping, report
         As for :func:`train_gmm`.
     """
@@ -267,21 +271,21 @@ def choose_search(
         return None
     scores = [[_all_scores(model, example) for example in dev] for model in models]
     best: Choice | None = None
-    for scales in product(_SCALES, repeat=len(models)):
+    for weights in product(scales, repeat=len(models)):
         for unit_penalty in _UNIT_PENALTIES:
             decoder = Decoder(with_penalty(models[0].topology, unit_penalty))
             total = ErrorCounts()
             for number, example in enumerate(dev):
                 decoder.reset()
-                for row in _weighted([rows[number] for rows in scores], scales):
+                for row in _weighted([rows[number] for rows in scores], weights):
                     decoder.accept(row)
                 units = [UNITS[segment.unit] for segment in decoder.finish()]
                 heard = [unit for unit in units if unit != SILENCE]
                 total += count_errors([UNITS[unit] for unit in example.units], heard)
             if best is None or total.rate < best.error_rate:
-                best = Choice(scales, unit_penalty, total.rate)
+                best = Choice(weights, unit_penalty, total.rate)
                 report(
-                    f"dev phone error rate {100 * total.rate:.1f} % with scales {scales} and unit "
+                    f"dev phone error rate {100 * total.rate:.1f} % with scales {weights} and unit "
                     f"penalty {unit_penalty}"
                 )
     return best

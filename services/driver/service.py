@@ -122,6 +122,10 @@ class DriverService(Service):
         self._render_until(time.monotonic() + RENDER_BUDGET_S)
         return not self._unfinished
 
+    def idle_s(self) -> dict[str, float]:
+        """Name the sessions followed, so that control can say which of them are no more."""
+        return dict.fromkeys(self._followers, 0.0)
+
     # --- from the publishers -------------------------------------------------------------------
 
     def _on_joined(self, follower: _Follower, joined: Joined) -> None:

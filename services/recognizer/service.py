@@ -19,7 +19,7 @@ from services.recognizer.load import load_model
 from services.recognizer.pcm import SLICE, BadAudio, level_db, pcm16_of, samples_of, slices
 from services.recognizer.pipeline import Recognizer, warm_up
 from services.recognizer.resample import Resampler
-from shared.bus import Socket
+from shared.bus import AUDIO_QUEUE_LENGTH, Socket
 from shared.clock import to_samples
 from shared.config import RecognizerConfig, reachable
 from shared.logs import LOG
@@ -145,7 +145,9 @@ class RecognizerService(Service):
         self._rule = (config.agreement, config.least_confidence)
         self._streams: dict[str, _Stream] = {}
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
-        self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
+        self._audio = self.bus.bind_router(
+            config.audio, "recognizer.audio", queue_length=AUDIO_QUEUE_LENGTH
+        )
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
         self.endpoints = {
             "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),

@@ -121,6 +121,10 @@ class SynthesizerService(Service):
             if face.start.paced and not face.finished and now_s - face.heard_s > STALL_S:
                 self._relax(session, face, now_s)
 
+    def idle_s(self) -> dict[str, float]:
+        """Name the sessions served, so that control can say which of them are no more."""
+        return dict.fromkeys(self._faces, 0.0)
+
     def on_drain(self) -> bool:
         """Lead every face to rest and end its stream."""
         for session, face in self._faces.items():

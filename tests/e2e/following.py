@@ -100,7 +100,9 @@ def stream_into(
     heard = Heard()
     begin_s = time.monotonic()
     for begin in range(0, len(samples), chunk):
-        assert opened.send(samples[begin : begin + chunk])
+        while not opened.send(samples[begin : begin + chunk]):
+            output.wait(0.02)
+            collect(output.receive(), heard)
         if paced:
             due_s = begin_s + (begin + chunk) / rate_hz
             while time.monotonic() < due_s:

@@ -364,8 +364,8 @@ def system() -> Iterator[System]:
 @pytest.fixture(scope="module")
 def gateway(system: System) -> Iterator[Gateway]:
     if not HEAD.is_file():
-        export = [sys.executable, "-m", "services.command_line", "head", "export", str(HEAD)]
-        subprocess.run(export, cwd=ROOT, check=True)
+        kouxing = Path(sys.executable).with_name("kouxing")
+        subprocess.run([kouxing, "head", "export", HEAD], cwd=ROOT, check=True)
     gateway = Gateway(system.address, free_port())
     yield gateway
     assert gateway.stop() == 0

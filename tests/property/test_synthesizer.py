@@ -154,7 +154,7 @@ def run(
             live.accept_phone(item)
         elif isinstance(item, SpeechChange):
             live.accept_speech(item)
-    frames += live.advance(stops[-1][0] + 2.0)
+    frames += live.advance(stops[-1][0] + 3.0)
     return np.array([faps for _, faps in frames])
 
 

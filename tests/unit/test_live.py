@@ -93,6 +93,32 @@ def test_flush_works_while_media_time_stands_still() -> None:
     assert not live.relax(8)[7][1].round(3).any()
 
 
+def test_flush_then_stall_is_at_rest_in_time_too() -> None:
+    live = LiveSynthesizer(PARAMETERS)
+    now_s = speak(live)[-1][0] + 0.06
+    live.flush()
+    live.advance(now_s + 0.041)
+    assert not live.relax(7)[6][1].round(3).any()
+
+
+def test_a_long_vowel_stays_open_while_no_news_comes() -> None:
+    live = LiveSynthesizer(PARAMETERS, look_ahead_s=0.15)
+    live.accept_speech(SpeechChange(active=True, time_s=0.3))
+    live.accept_phone(phone(0, "a", 0.3, 0.15, final=False))
+    jaw = values(live.advance(1.2))[:, JAW]
+    assert jaw[25:].min() > 0.55 * jaw.max() > 120.0
+    assert jaw[35:].min() > 0.8 * jaw.max()
+
+
+def test_the_mouth_sets_out_before_the_next_unit_is_known() -> None:
+    jaws = []
+    for duration_s in (0.06, 0.3):
+        live = LiveSynthesizer(PARAMETERS)
+        live.accept_phone(phone(0, "j", 0.3, duration_s, final=False))
+        jaws.append(values(live.advance(0.46))[-1, JAW])
+    assert jaws[0] > jaws[1] + 20.0  # a final is due after the short one
+
+
 def test_a_unit_after_a_flush_is_spoken() -> None:
     live = LiveSynthesizer(PARAMETERS)
     speak(live)

@@ -40,7 +40,7 @@ SHAPE = (
     ("eyes/l-eye-scale-incr", 0.20),
     ("eyes/r-eye-scale-incr", 0.20),
 )
-# closes the lips, which the plain target leaves apart
+# the lips closed, which the plain target leaves apart, and a friendly look
 FACE_SHAPE = (
     ("mouthPressLeft", 0.12),
     ("mouthPressRight", 0.12),
@@ -88,7 +88,7 @@ def build(source: MakeHuman, output: Path) -> None:
 
     body = mesh.group("body")
     middle = vertices[mesh.quads].mean(axis=1)
-    is_socket = np.isin(mesh.quads, _socket(mesh, vertices)).all(axis=1)
+    is_socket = np.isin(mesh.quads, _socket(mesh)).all(axis=1)
     neckline = middle[:, 1] - _neckline(middle[:, 2])
     kept = body & (neckline > -0.3) & (middle[:, 1] > 4.0) & ~(is_socket & (middle[:, 2] < 1.1))
     skin = subdivided(vertices, mesh.quads[kept])
@@ -177,7 +177,7 @@ def _face_fields(
     return FaceFields(skin, cavity, blink, squint, fapu).fields
 
 
-def _socket(mesh: BaseMesh, vertices: Float) -> Index:
+def _socket(mesh: BaseMesh) -> Index:
     """Vertices of the two bags behind the eyelids, which have texture islands of their own."""
     islands = mesh.uv_quads[mesh.group("body")]
     inside = (mesh.uv[islands].max(axis=(1, 2)) < 0.64) & (mesh.uv[islands][..., 0].max(1) < 0.152)
@@ -427,6 +427,8 @@ def _shade(pieces: list[Piece], cavity: NDArray[np.bool_]) -> None:
         own = np.clip(own, 0, 1)[:, None]
         if piece.name == "skin":
             shade = np.clip(0.10 + 1.0 * own, 0, 1) ** np.array([0.75, 1.0, 1.1])
+            # the ears lie in the hair's shadow, deeper than the sparse vertices tell
+            shade *= 1 - 0.6 * np.clip((np.abs(part.vertices[:, :1]) - 0.645) / 0.04, 0, 1)
             depth = np.clip((part.vertices[:, 2:] - 0.85) / 0.42, 0, 1)
             lining = np.array([0.62, 0.20, 0.19]) * (0.10 + 0.90 * depth)
             part.colors = np.where(cavity[:, None], lining * (0.7 + 0.3 * shade), shade)
@@ -518,6 +520,9 @@ def _write(
         if tongue.number[vertex] >= 0
     }
     points |= {"3.5": start["eye_left"], "3.6": start["eye_right"]}
+    for piece, edge, root in ((pieces[4], "9.10", "9.8"), (pieces[5], "9.11", "9.9")):
+        at_edge, at_root = parts.middle_of_teeth(piece.part)
+        points |= {edge: start[piece.name] + at_edge, root: start[piece.name] + at_root}
     vertices = np.concatenate([p.part.vertices for p in pieces])
     fapu = {name: value * METRES_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
 

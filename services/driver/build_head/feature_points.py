@@ -1,7 +1,7 @@
 """The MPEG-4 feature points as vertices of MakeHuman's base mesh hm08.
 
 ISO/IEC 14496-2, annex C, figure C-1. Those on the eyeballs (3.5, 3.6) and the teeth (9.8 to 9.11)
-lie on parts that are made anew and are found by position.
+lie on parts that are made anew, which know their own.
 """
 
 FEATURE_POINTS = {

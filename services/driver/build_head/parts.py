@@ -147,6 +147,13 @@ def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: floa
     return Part(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))
 
 
+def middle_of_teeth(row: Part) -> tuple[int, int]:
+    """Find the vertices between the two middle teeth: at the cutting edge, and at the gum."""
+    columns = len(row.vertices) // len(_PROFILE)
+    edge = int(np.argmin(np.abs(_PROFILE[:, 1])))
+    return edge * columns + columns // 2, columns // 2
+
+
 # ---- hair -------------------------------------------------------------------------------------
 
 _SKULL = np.array([0.0, 5.93, 0.42])
@@ -223,6 +230,9 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     low = low * low * (3 - 2 * low)
     aside = np.exp(-(((azimuth[:, -1:] - np.radians(97)) / np.radians(30)) ** 2))
     points += (0.10 * low * aside)[..., None] * out[:, None]
+    # the front edge keeps to the cheek and hides the ear from in front
+    hug = np.exp(-((across / 0.10) ** 2))[:, None] * np.clip((6.15 - points[..., 1]) / 0.45, 0, 1)
+    points[..., 0] -= side * 0.07 * hug
     rows = points.shape[1]
     walked = np.linspace(0.0, 1.0, rows)
     lift = np.maximum(

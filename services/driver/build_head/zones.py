@@ -1,7 +1,9 @@
 """Displacement fields of the FAPs over the skin, the tongue, the teeth and the eyes.
 
 A field holds what its FAP does at one FAPU (1024 FAP units; 1 rad for the roll of the tongue), in
-dm. On its own axis every feature point moves by its own FAPs only:
+dm. Along its FAP's axis every feature point lands where the FAP says. Across it the standard is
+silent: corners of the mouth slide along the curve of the lips, eyelids go round the eyeball, puffed
+cheeks come forward.
 
 - most FAPs move a zone whose weight falls as a raised cosine of the distances along the surface to
   the moving and to the fixed vertices (Li 2011, section 2.1; ``surface.Geodesics.zone``);

@@ -24,6 +24,7 @@ export class Head {
   #controls;
   #meshes = []; // that FAPs move
   #joints = []; // { node, rest, turns: [[FAP index, axis]] }
+  #faps = null; // to be taken on
   #fovYDegrees = 22;
   #stale = true;
   #pixelRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
@@ -71,8 +72,13 @@ export class Head {
     this.#frame(about.camera);
   }
 
-  /** Take on a face: 68 values in FAP units. */
+  /** Take on a face with the next picture: 68 values in FAP units. */
   pose(faps) {
+    this.#faps = faps;
+    this.#stale = true;
+  }
+
+  #apply(faps) {
     for (const mesh of this.#meshes) mesh.pose(faps);
     for (const { node, rest, turns } of this.#joints) {
       node.quaternion.copy(rest);
@@ -81,7 +87,6 @@ export class Head {
         node.quaternion.multiply(this.#turn);
       }
     }
-    this.#stale = true;
   }
 
   /**
@@ -101,6 +106,8 @@ export class Head {
         this.#resize();
       }
     }
+    if (this.#faps !== null) this.#apply(this.#faps);
+    this.#faps = null;
     this.#render();
   }
 

@@ -10,6 +10,7 @@ const STALL_MS = 500; // without frames the face goes to rest
 const REST_MS = 80; // time constant of going there and coming back
 const NUM_PAST = 8; // phones shown beside the current one
 const MAX_PHONES = 100;
+const MAX_LOUDNESS = 500; // chunks
 const STALE = 8 * 16000; // samples after which the last phone is no longer shown
 const SILENCE = "sil";
 const LABEL_EVERY_MS = 250;
@@ -29,7 +30,8 @@ let phones = []; // { index, unit, mediaTime }, by index
 let arrivedMs = -Infinity; // when the newest frame came
 let numFrames = 0;
 let presence = 0; // 1: the face is the stream's, 0: at rest
-let level = 0;
+let loudness = []; // { mediaTime, level } of the sound that is still to be heard
+let level = 0; // as the meter shows it
 const faps = new Float32Array(NUM_FAPS);
 
 /** What the page knows, for whoever embeds or tests it: see proto/GATEWAY.md. */
@@ -60,6 +62,7 @@ function forget() {
   playout.reset();
   track.reset();
   phones = [];
+  loudness = [];
 }
 
 const link = new Link(new URLSearchParams(location.search).get("session") ?? "", {
@@ -82,7 +85,8 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     playout.soundArrived(nowMs, mediaTime, samples.length);
     if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
     sound.push(mediaTime, samples);
-    if (ownSession === null) level = rms(samples);
+    loudness.push({ mediaTime, level: rms(samples) });
+    if (loudness.length > MAX_LOUDNESS) loudness.shift();
   },
   text(message) {
     switch (message.type) {
@@ -146,7 +150,7 @@ function draw(nowMs) {
   if (settle()) head?.pose(faps);
   head?.draw(nowMs);
 
-  showLevel();
+  showLevel(mediaTime);
   if (mediaTime !== null) showPhones(mediaTime);
   if (nowMs - labelledMs > LABEL_EVERY_MS) {
     labelledMs = nowMs;
@@ -175,7 +179,7 @@ function showState() {
   if (!connected) text = "connecting … 连接中";
   else if (session === null) text = "waiting for speech 等待语音";
   else if (!isLive) text = "paused 暂停";
-  if (isLive) {
+  if (isLive && session !== null) {
     const ageMs = microphone.ageMs(nowMs, playout.mediaAt(nowMs));
     const delayMs = ageMs ?? playout.delayMs;
     if (delayMs !== null) text += ` · ${Math.round(delayMs / 5) * 5} ms`;
@@ -230,11 +234,15 @@ function listItem(text) {
   return item;
 }
 
-function showLevel() {
+function showLevel(mediaTime) {
+  while (mediaTime !== null && loudness[0]?.mediaTime <= mediaTime) {
+    const heard = loudness.shift();
+    if (ownSession === null) level = Math.max(level, heard.level);
+  }
   const db = Math.max(-60, 20 * Math.log10(level + 1e-6));
   element("meter").firstElementChild.style.transform = `scaleX(${(1 + db / 60).toFixed(3)})`;
   element("meter").setAttribute("aria-valuenow", Math.round(db));
-  level *= 0.95;
+  level *= 0.9;
 }
 
 function setText(target, text) {

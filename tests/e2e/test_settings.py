@@ -1,0 +1,68 @@
+"""Settings that change what a running system does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from shared.client import Client
+from shared.messages import Error, Event
+from tests.e2e.following import samples_of_file, stream
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+SETTINGS = {
+    "KOUXING_SYNTHESIZER_FRAME_RATE_HZ": "30",
+    "KOUXING_SYNTHESIZER_LOOK_AHEAD_MS": "0",
+    "KOUXING_SYNTHESIZER_GESTURE_SEED": "0",
+    "KOUXING_CONTROL_IDLE_LIMIT_S": "1",
+    "KOUXING_CONTROL_MAX_SESSIONS": "3",
+}
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    services = ("control", "recognizer", "synthesizer")
+    with System(services, tmp_path_factory.mktemp("tuned"), settings=SETTINGS) as running:
+        yield running
+
+
+def test_the_frame_rate_is_the_one_that_was_set(tuned: System) -> None:
+    heard = stream(tuned.control, samples_of_file(DEMO / "vowels-male.wav"))
+    times_s = np.array([frame.media_time for frame in heard.frames]) / 16000
+    np.testing.assert_allclose(np.diff(times_s), 1 / 30, atol=1e-4)
+
+
+def test_without_gestures_the_mouth_alone_moves(tuned: System) -> None:
+    heard = stream(tuned.control, samples_of_file(DEMO / "vowels-male.wav"))
+    assert np.abs(heard.faps[:, 2]).max() > 100
+    assert np.abs(heard.faps[:, 18:42]).max() == 0
+    assert np.abs(heard.faps[:, 47:50]).max() == 0
+
+
+def test_a_session_without_audio_is_closed_and_its_client_told(tuned: System) -> None:
+    with Client(tuned.control) as client:
+        session = client.open_session(encoding="f32le")
+        events = client.bus.connect_subscriber(session.opened.events)
+        events.subscribe(Event, session.name)
+        told: list[Event] = []
+        end_s = time.monotonic() + 10
+        while not told:
+            assert time.monotonic() < end_s
+            events.wait(0.1)
+            told += [
+                received.message
+                for received in events.receive()
+                if isinstance(received.message, Event) and received.message.name == "session-closed"
+            ]
+        assert "no audio" in told[0].detail
+        session.send(np.zeros(320, np.float32))
+        errors: list[Error] = []
+        while not errors:
+            assert time.monotonic() < end_s
+            errors = list(session.errors())
+            time.sleep(0.02)
+        assert errors[0].code == "unknown-session"

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from services.driver.head import Head
+from services.driver.recording import Recording
+from services.driver.render import Renderer
+from shared.faps import NUM_FAPS
+
+pytestmark = pytest.mark.unit
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(Head.load(), 64, 48, samples=0)
+
+
+def frame(value: float) -> np.ndarray:
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[2] = value
+    return faps
+
+
+def test_images_follow_media_time_whatever_the_frame_rates(
+    renderer: Renderer, tmp_path: Path
+) -> None:
+    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
+    recording.accept_sound(0, np.zeros(16000, np.float32))
+    for number in range(31):
+        recording.accept_frame(number / 30, frame(number))
+    while recording.step():
+        pass
+    recording.close()
+    assert recording.num_images == 26, "0 to 1 s, both included"
+    assert recording.duration_s == pytest.approx(26 / 25)
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 26
+
+
+def test_no_image_is_made_before_its_frames_have_come(renderer: Renderer, tmp_path: Path) -> None:
+    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
+    assert not recording.step()
+    recording.accept_frame(0.0, frame(0))
+    assert recording.step()
+    assert not recording.step()
+    recording.accept_frame(0.05, frame(1))
+    assert recording.step()
+    assert not recording.step()
+    recording.close()
+
+
+def test_missing_sound_becomes_silence_and_repeated_sound_is_left_out(
+    renderer: Renderer, tmp_path: Path
+) -> None:
+    recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
+    loud = np.full(8000, 0.5, np.float32)
+    recording.accept_sound(8000, loud)
+    recording.accept_sound(12000, loud)
+    recording.accept_frame(0.0, frame(0))
+    recording.step()
+    recording.close()
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        heard = np.concatenate([f.to_ndarray()[0] for f in film.decode(audio=0)])
+    assert len(heard) == pytest.approx(20000, abs=2100)
+    assert np.abs(heard[:6000]).max() < 0.1
+    assert np.abs(heard[10000:18000]).mean() > 0.3
