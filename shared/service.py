@@ -36,6 +36,7 @@ from shared.metrics import Metrics
 
 HEARTBEAT_S = 0.5
 TICK_S = 0.01
+TURN_S = 0.05  # for one socket's messages, before others, ticks and heartbeats get theirs
 DRAIN_LIMIT_S = 5.0
 PARENT_VARIABLE = "KOUXING_SUPERVISOR"  # process number of the supervisor that started this one
 
@@ -152,8 +153,11 @@ class Service:
             handlers = self._handlers.get(socket)
             if handlers is None:  # closed by a handler in this round
                 continue
+            turn_ends_s = time.monotonic() + TURN_S
             for received in socket.receive():
                 self._dispatch(socket, handlers, received)
+                if time.monotonic() > turn_ends_s:
+                    break
         now_s = time.monotonic()
         if now_s >= self._tick_due_s:
             self._tick_due_s = now_s + TICK_S

@@ -64,7 +64,7 @@ def test_a_confidence_outside_0_to_1_is_refused(confidence: float) -> None:
 
 
 def test_binary_fields_are_binary_in_msgpack() -> None:
-    _, body = encode(AudioChunk(session="s", token="t", pcm=b"\x01\x02"))  # noqa: S106
+    _, body = encode(AudioChunk(session="s", token="t", pcm=b"\x01\x02"))
     assert msgpack.unpackb(body)["pcm"] == b"\x01\x02"
 
 

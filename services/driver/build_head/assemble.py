@@ -39,6 +39,12 @@ SHAPE = (
     ("eyes/r-eye-height2-incr", 0.55),
     ("eyes/l-eye-scale-incr", 0.20),
     ("eyes/r-eye-scale-incr", 0.20),
+    ("ears/l-ear-wing-decr", 0.80),
+    ("ears/r-ear-wing-decr", 0.80),
+    ("ears/l-ear-scale-decr", 0.40),
+    ("ears/r-ear-scale-decr", 0.40),
+    ("ears/l-ear-lobe-decr", 0.60),
+    ("ears/r-ear-lobe-decr", 0.60),
 )
 # the lips closed, which the plain target leaves apart, and a friendly look
 FACE_SHAPE = (

@@ -230,9 +230,9 @@ def hair_sheet(side: float, rise: float, strands: int, steps: int) -> Part:
     low = low * low * (3 - 2 * low)
     aside = np.exp(-(((azimuth[:, -1:] - np.radians(97)) / np.radians(30)) ** 2))
     points += (0.10 * low * aside)[..., None] * out[:, None]
-    # the front edge keeps to the cheek and hides the ear from in front
-    hug = np.exp(-((across / 0.10) ** 2))[:, None] * np.clip((6.15 - points[..., 1]) / 0.45, 0, 1)
-    points[..., 0] -= side * 0.07 * hug
+    # below the cheekbone the front edge keeps to the face
+    hug = np.exp(-((across / 0.10) ** 2))[:, None] * np.clip((5.62 - points[..., 1]) / 0.25, 0, 1)
+    points[..., 0] -= side * 0.05 * hug
     rows = points.shape[1]
     walked = np.linspace(0.0, 1.0, rows)
     lift = np.maximum(

@@ -1,0 +1,37 @@
+"""The bench command measures something and writes it; how fast is for its reader to judge."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.system import DEMO, ONE_THREAD, ROOT
+
+pytestmark = pytest.mark.bench
+
+
+def test_it_prints_a_table_and_writes_the_same_figures(tmp_path: Path) -> None:
+    figures = tmp_path / "latency.json"
+    arguments = ["bench", DEMO / "vowels-male.wav", "--repeats", "1", "--json", figures]
+    result = subprocess.run(
+        [sys.executable, "-m", "services", *arguments],
+        env={**os.environ, **ONE_THREAD},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    latency = json.loads(figures.read_text(encoding="utf-8"))
+    assert latency["num_frames"] > 50
+    assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
+    assert latency["sound_to_frame_ms"]["p50"] > latency["look_ahead_ms"]
+    assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
+    assert all(rate > 0 for rate in latency["images_per_s"].values())
+    assert f"{latency['chunk_to_frame_ms']['p50']:.1f}" in result.stdout
