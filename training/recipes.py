@@ -42,7 +42,7 @@ _HALF_WIDTH = 2  # of the differences: the textbook's
 _ROTATED_AT = 8  # mixtures per state when the features are decorrelated
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the log scores of a model alone
 _SHARES = (0.25, 0.4, 0.55, 0.7, 1.0)  # of models together, on top of each one's own scale
-_UNIT_PENALTIES = (0.5, 0.0, -0.5, -1.0, -1.5, -2.0)
+_UNIT_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -279,13 +279,12 @@ def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
 
 _NEAR = 8  # visemes around a frame that can weigh anything
 _RIDGE = 30.0  # frames' worth of belief in the start: neighbouring frames tell the same
-_SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.02, "target": 1.0}
+_SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.04, "target": 1.0}
 # how far from the start, in spreads
-_ALPHA_RANGE, _THETA_RANGE, _OFFSET_RANGE = 4.0, 2.0, 2.5
+_ALPHA_RANGE, _THETA_RANGE, _OFFSET_RANGE = 4.0, 2.0, 2.0
 _LARGEST_GAIN = 2.0
 _EXPONENTS = (1.3, 1.5, 1.8)  # below, the corners at centres begin to show
-_ROUNDS = 3
-_DOUBT = 1.0  # an error of so many standard deviations counts half
+_ROUNDS = 2
 _SILENCE_STEP = 1e-4  # of the finite differences, in units of the spread
 
 
@@ -367,7 +366,6 @@ class _FapFit:
             ]
         )
         self.visemes, self.silences = self._start.copy(), self._silence_start.copy()
-        self._trust = np.ones(len(self._measured))
         # Closed lips, and lip to teeth, are what they are.
         self.fixed_target = np.zeros(len(VISEMES), dtype=bool)
         labials = [*CLOSURE_FAPS] if MOUTH_FAPS[column] in LIP_HEIGHT_FAPS else []
@@ -382,11 +380,6 @@ class _FapFit:
         """Modelled and measured values of all frames."""
         silent = self._log_silences(self.silences)
         return self._blend(self.visemes, silent)[0], self._measured
-
-    def doubt(self) -> None:
-        """Trust frames less that fit badly: most of them have the wrong unit recognised."""
-        error = self.curve()[0] - self._measured
-        self._trust = 1.0 / np.sqrt(1.0 + (error / (_DOUBT * np.std(error))) ** 2)
 
     def descend(self, rows: NDArray[np.intp], with_silences: bool) -> float:
         """Move the unknowns of some visemes, and of the silences; return the loss."""
@@ -403,10 +396,10 @@ class _FapFit:
             visemes, silences = place(z)
             silent = self._log_silences(silences)
             curve, slopes = self._blend(visemes, silent)
-            error = self._trust * (curve - self._measured) / self._scale
+            error = (curve - self._measured) / self._scale
             gradient = np.zeros_like(z)
             for unknown, slope in enumerate(slopes):
-                share = 2.0 * (error * self._trust)[:, None] / self._scale * slope
+                share = 2.0 * error[:, None] / self._scale * slope
                 summed = np.bincount(
                     self._viseme.ravel(), weights=share.ravel(), minlength=len(VISEMES)
                 )
@@ -417,9 +410,7 @@ class _FapFit:
                 moved[unknown] += _SILENCE_STEP * self._silence_spread[unknown]
                 beside = self._blend(visemes, self._log_silences(moved))[0]
                 gradient[num + unknown] = (
-                    np.sum(2.0 * error * self._trust * (beside - curve))
-                    / self._scale
-                    / _SILENCE_STEP
+                    np.sum(2.0 * error * (beside - curve)) / self._scale / _SILENCE_STEP
                 )
             gradient += 2.0 * _RIDGE * z
             return float(error @ error + _RIDGE * (z @ z)), gradient
@@ -504,7 +495,6 @@ def estimate(frames: Frames) -> VisemeParameters:
         for _ in range(_ROUNDS):
             fit.descend(_FINAL_ROWS, with_silences=True)
             fit.descend(_INITIAL_ROWS, with_silences=False)
-            fit.doubt()
         visemes, silences = fit.visemes.copy(), fit.silences.copy()
         # Least squares flattens what it cannot foresee: give the motion its measured extent.
         modelled, seen = fit.curve()

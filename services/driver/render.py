@@ -278,18 +278,19 @@ class Renderer:
             target.release()
         self._targets = []
         if not self._on_screen:
-            color = self._context.renderbuffer(self.size, 4)
-            self._result = self._context.framebuffer(
-                [color], self._context.depth_renderbuffer(self.size)
-            )
-            self._canvas = self._result
-            if self._samples > 1:
-                self._canvas = self._context.framebuffer(
-                    [self._context.renderbuffer(self.size, 4, samples=self._samples)],
-                    self._context.depth_renderbuffer(self.size, samples=self._samples),
-                )
-                self._targets.append(self._canvas)
-            self._targets.append(self._result)
+            self._result = self._framebuffer(0)
+            multi = self._samples > 1
+            self._canvas = self._framebuffer(self._samples) if multi else self._result
+            # copying an empty picture takes less time than clearing and painting the background
+            self._blank = self._framebuffer(self._samples if multi else 0)
+            self._clear(self._blank)
+
+    def _framebuffer(self, samples: int) -> Any:
+        color = self._context.renderbuffer(self.size, 4, samples=samples)
+        depth = self._context.depth_renderbuffer(self.size, samples=samples)
+        target = self._context.framebuffer([color], depth)
+        self._targets += [target, color, depth]
+        return target
 
     def draw(self, faps: Float32) -> UInt8:
         """Draw one picture.
@@ -303,6 +304,7 @@ class Renderer:
         -------
         Pixels (H, W, 3), top row first; (H, W, 4) with alpha if the background is transparent.
         """
+        self._context.copy_framebuffer(self._canvas, self._blank)
         self._paint(faps, self._canvas)
         if self._canvas is not self._result:
             self._context.copy_framebuffer(self._result, self._canvas)
@@ -315,14 +317,25 @@ class Renderer:
         """Draw into the window the context came from."""
         screen = self._context.screen
         screen.viewport = (0, 0, *self.size)
+        self._clear(screen)
         self._paint(faps, screen)
+
+    def _clear(self, target: Any) -> None:
+        """Leave nothing but the background."""
+        target.use()
+        target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        self._context.enable_only(moderngl.NOTHING)
+        if self._background is not None:
+            middle, edge = self._background
+            self._backdrop_program["middle"] = middle
+            self._backdrop_program["edge"] = edge
+            self._backdrop.render()
 
     def _paint(self, faps: Float32, target: Any) -> None:
         context = self._context
         self._stage[:, :3], self._stage[:, 3:] = self.head.pose(faps)
         self._moving.write(self._stage)
         target.use()
-        target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         eye = np.array(self._camera.position)
         for program in (self._program, self._eye_program):
             program["view_projection"] = tuple(self._view_projection().T.ravel())
@@ -334,11 +347,6 @@ class Renderer:
                 culled = 0 if part.double_sided else moderngl.CULL_FACE
                 context.enable_only(moderngl.DEPTH_TEST | culled)
                 self._draw_part(part)
-        if self._background is not None:  # behind all that hides it, before what lets it through
-            middle, edge = self._background
-            self._backdrop_program["middle"] = middle
-            self._backdrop_program["edge"] = edge
-            self._backdrop.render()
         context.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
         # the second pair keeps the alpha of transparent pictures right
         factors: Any = (
