@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Callable, Iterable
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -18,8 +17,6 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head import Head
-from services.driver.render import BACKGROUND, Renderer
 from shared.errors import UserError
 
 Float32 = NDArray[np.float32]
@@ -156,61 +153,3 @@ class VideoWriter:
             f"{self._path} cannot be written ({error.strerror or error}); give a path in a folder"
             " that exists and may be written"
         )
-
-
-def render_video(
-    head: Head,
-    frames: Iterable[Float32],
-    num_frames: int,
-    sound: Float32,
-    path: str | Path,
-    *,
-    frame_rate_hz: float,
-    sample_rate_hz: int,
-    width_px: int = 1280,
-    height_px: int = 720,
-    background: tuple[tuple[float, ...], tuple[float, ...]] = BACKGROUND,
-    samples: int = 4,
-    progress: Callable[[int, int], None] | None = None,
-) -> None:
-    """Draw a sequence of FAP frames and write it with its sound.
-
-    Parameters
-    ----------
-    head
-        Whom to draw.
-    frames
-        FAPs (68,) at ``frame_rate_hz``.
-    num_frames
-        How many of them there are.
-    sound
-        Mono sound (N,) at ``sample_rate_hz``, -1 to 1; it is padded with silence to the pictures'
-        length.
-    path
-        MP4 file to write.
-    frame_rate_hz, sample_rate_hz, width_px, height_px
-        Of the file.
-    background, samples
-        As for ``Renderer``.
-    progress
-        Called with the number of pictures done and ``num_frames``.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be written or OpenGL does not start.
-    """
-    padding = round(num_frames / frame_rate_hz * sample_rate_hz) - len(sound)
-    sound = np.pad(sound, (0, max(padding, 0)))
-    per_image = sample_rate_hz / frame_rate_hz
-    renderer = Renderer(head, width_px, height_px, background=background, samples=samples)
-    try:
-        with VideoWriter(path, width_px, height_px, frame_rate_hz, sample_rate_hz) as writer:
-            for done, faps in enumerate(frames, start=1):
-                writer.write_image(renderer.draw(faps))
-                writer.write_sound(sound[round((done - 1) * per_image) : round(done * per_image)])
-                if progress is not None:
-                    progress(done, num_frames)
-            writer.write_sound(sound[round(num_frames * per_image) :])
-    finally:
-        renderer.close()

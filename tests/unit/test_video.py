@@ -8,8 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from services.driver.head import Head, neutral_faps
-from services.driver.video import VideoWriter, render_video
+from services.driver.video import VideoWriter
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
@@ -99,26 +98,3 @@ def test_a_picture_of_a_wrong_size(tmp_path: Path) -> None:
         VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000) as writer,
     ):
         writer.write_image(np.zeros((64, 48, 3), np.uint8))
-
-
-def test_a_head_speaks(tmp_path: Path) -> None:
-    frames = [neutral_faps(raise_b_midlip=-60.0 * number) for number in range(8)]
-    done: list[tuple[int, int]] = []
-    render_video(
-        Head.load(detail="coarse"),
-        frames,
-        len(frames),
-        np.zeros(1000, np.float32),
-        tmp_path / "speaks.mp4",
-        frame_rate_hz=25.0,
-        sample_rate_hz=16000,
-        width_px=96,
-        height_px=72,
-        samples=0,
-        progress=lambda number, total: done.append((number, total)),
-    )
-    images, picture_s, sound_s = read(tmp_path / "speaks.mp4")
-    assert images == 8
-    assert picture_s == pytest.approx(0.32, abs=0.001)
-    assert sound_s == pytest.approx(0.32, abs=0.065)
-    assert done[-1] == (8, 8)
