@@ -268,7 +268,6 @@ def run_service(make: Callable[[], Service], section: str, log_level: str) -> in
     try:
         service = make()
     except UserError as error:
-        LOG.error("%s", error)
         print(f"{section}: {error}", file=sys.stderr)
         return 2
     service.run()

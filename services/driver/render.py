@@ -175,14 +175,6 @@ def standalone_context() -> moderngl.Context:
         ) from error
 
 
-def draws_in_software() -> bool:
-    """Whether Mesa draws on the processor, for want of a graphics card."""
-    context = standalone_context()
-    renderer = str(context.info["GL_RENDERER"])
-    context.release()
-    return "llvmpipe" in renderer or "softpipe" in renderer
-
-
 def decode_image(encoded: bytes) -> UInt8:
     """Decode a JPEG or PNG into (H, W, 4)."""
     with av.open(io.BytesIO(encoded), "r") as container:

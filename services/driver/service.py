@@ -15,7 +15,7 @@ import numpy as np
 
 from services.driver.head import Head
 from services.driver.recording import Recording
-from services.driver.render import Renderer, draws_in_software
+from services.driver.render import Renderer
 from services.driver.window import Window
 from shared.bus import Socket
 from shared.clock import to_seconds
@@ -166,10 +166,8 @@ class DriverService(Service):
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if self._config.view == "none" or (self._config.view == "auto" and not has_display):
             return None
-        # Without a graphics card smooth motion is worth more than smooth edges.
-        samples = 0 if draws_in_software() else 4
-        size = (self._config.width_px, self._config.height_px)
-        return Window(Head.load(detail="coarse"), *size, samples=samples)
+        head = Head.load(detail="coarse")  # live, smooth motion is worth more than smooth outlines
+        return Window(head, self._config.width_px, self._config.height_px)
 
     def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
         """Return the newest frame, or while none comes one that fades to rest."""

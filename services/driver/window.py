@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import glfw
 import moderngl
 import numpy as np
@@ -17,7 +15,7 @@ Float32 = NDArray[np.float32]
 
 
 class Window:
-    """A resizable window with a head in it.
+    """A resizable window with a head in it; edges are smoothed where a graphics card draws.
 
     Parameters
     ----------
@@ -25,10 +23,6 @@ class Window:
         Whom to show.
     width_px, height_px
         Size at first.
-    title
-        Of the window.
-    samples
-        Anti-aliasing samples a pixel.
 
     Raises
     ------
@@ -36,34 +30,32 @@ class Window:
         If there is no display, or no OpenGL 3.3 on it.
     """
 
-    def __init__(
-        self,
-        head: Head,
-        width_px: int = 640,
-        height_px: int = 480,
-        *,
-        title: str = "kouxing",
-        samples: int = 4,
-    ) -> None:
+    def __init__(self, head: Head, width_px: int, height_px: int) -> None:
         glfw.ERROR_REPORTING = "ignore"  # the results are checked here
         if not glfw.init():
             raise UserError(
                 "there is no display to open a window on; set DISPLAY, or write a video instead"
             )
+        self._open(width_px, height_px, num_samples=0)
+        if not _draws_in_software(self._context):
+            glfw.destroy_window(self._window)
+            self._open(width_px, height_px, num_samples=4)
+        size = glfw.get_framebuffer_size(self._window)
+        self._renderer = Renderer(head, *size, context=self._context, on_screen=True)
+
+    def _open(self, width_px: int, height_px: int, num_samples: int) -> None:
         glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
         glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
         glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
         glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
-        glfw.window_hint(glfw.SAMPLES, samples)
-        self._window = glfw.create_window(width_px, height_px, title, None, None)
+        glfw.window_hint(glfw.SAMPLES, num_samples)
+        self._window = glfw.create_window(width_px, height_px, "kouxing", None, None)
         if not self._window:
             glfw.terminate()
             raise UserError("the display offers no OpenGL 3.3; update its driver or install Mesa")
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
-        size = glfw.get_framebuffer_size(self._window)
         self._context = moderngl.create_context(require=330)
-        self._renderer = Renderer(head, *size, context=self._context, on_screen=True)
 
     @property
     def context(self) -> moderngl.Context:
@@ -93,11 +85,6 @@ class Window:
         glfw.swap_buffers(self._window)
         return True
 
-    def follow(self, next_faps: Callable[[], Float32]) -> None:
-        """Show what ``next_faps`` gives, at the display's rate, until the window is closed."""
-        while self.draw(next_faps()):
-            pass
-
     def hide(self) -> None:
         """Take the window off the screen; its context stays."""
         glfw.hide_window(self._window)
@@ -106,3 +93,8 @@ class Window:
         """Close the window."""
         glfw.destroy_window(self._window)
         glfw.terminate()
+
+
+def _draws_in_software(context: moderngl.Context) -> bool:
+    renderer = str(context.info["GL_RENDERER"])
+    return "llvmpipe" in renderer or "softpipe" in renderer

@@ -97,4 +97,4 @@ def test_a_window_needs_a_display(head: Head, monkeypatch: pytest.MonkeyPatch) -
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(UserError, match="display"):
-        Window(head)
+        Window(head, 160, 120)
