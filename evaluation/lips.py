@@ -6,7 +6,7 @@ lips:
 1. forced alignment of the transcript, full model (clips with a transcript only);
 2. recognised units with their times, full model;
 3. the live system at several look-aheads;
-4. live, but a unit counts only once the next one begins.
+4. live, but a unit counts only once the next one begins (look-ahead 50 ms).
 
 Two baselines need no units: the mouth opens with the loudness, and the mouth stands still at its
 mean. Measured for lip opening (inner lips), mouth width and jaw: correlation, the lag at which it
@@ -50,6 +50,7 @@ _LONGEST_LAG_S = 0.3
 _CHUNK_SAMPLES = 160  # sound comes 10 ms at a time
 _CLOSED_SHARE = 0.1
 _CLOSURE_WINDOW_S = 0.06
+_MEAN_OPENING = 250.0  # FAP units; only closures see it, means are removed
 
 MEASURES: dict[str, Callable[[Array], Array]] = {
     "opening": lambda faps: -faps[:, 3] - faps[:, 4],
@@ -127,19 +128,16 @@ def frames_of_schemes(
 
     schemes = {}
     if clip.transcript:
-        schemes["1 aligned, full model"] = full(
-            align_text(model, clip.samples, 16_000, clip.transcript)
-        )
-    schemes["2 recognised, full model"] = full(recognize(model, clip.samples, 16_000))
+        schemes["1 aligned"] = full(align_text(model, clip.samples, 16_000, clip.transcript))
+    schemes["2 recognised"] = full(recognize(model, clip.samples, 16_000))
     for look_ahead_s in LOOK_AHEADS_S:
-        schemes[f"3 live, look-ahead {1e3 * look_ahead_s:.0f} ms"] = live_frames(
+        schemes[f"3 live {1e3 * look_ahead_s:.0f} ms"] = live_frames(
             model, parameters, clip.samples, look_ahead_s, wait_for_next=False
         )
-    schemes["4 live, waits for the next unit (50 ms)"] = live_frames(
-        model, parameters, clip.samples, 0.05, wait_for_next=True
-    )
+    schemes["4 next unit"] = live_frames(model, parameters, clip.samples, 0.05, wait_for_next=True)
     schemes["loudness"] = loudness_frames(clip.samples)
     schemes["mean mouth"] = np.zeros((num_frames, NUM_FAPS))
+    schemes["mean mouth"][:, 4] = -_MEAN_OPENING
     return schemes
 
 

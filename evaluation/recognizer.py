@@ -15,16 +15,13 @@ Every recording is a session of its own, so the live mean starts from the prior 
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -33,7 +30,6 @@ from rich.table import Table
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import SAMPLE_RATE_HZ, LogMel
-from services.recognizer.load import MODEL_PATH, load_model
 from services.recognizer.pipeline import DEFAULT_RULE, Recognizer, recognize
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
@@ -188,7 +184,7 @@ def evaluate_recognizer(
     model
         The acoustic model.
     corpus
-        A corpus folder that :func:`training.corpus.read_corpus` reads.
+        A corpus folder, or a manifest, that :func:`training.corpus.read_corpus` reads.
     split
         Its split, such as ``dev`` or ``test``.
     rules
@@ -236,7 +232,7 @@ def evaluate_recognizer(
         "recordings": len(utterances),
         "speakers": len({utterance.speaker for utterance in utterances}),
         "seconds": seconds,
-        "bad_rows": len(errors.messages),
+        "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (full, *live)],
         "most_confused": most_confused(confusion),
         "cpu_per_audio_second": cpu_by_stage(model, read_audio(utterances[0].path)),
@@ -414,28 +410,3 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         "acoustic_model": run(stream.accept, (log_mel[t : t + 1] for t in range(len(log_mel)))),
         "decoder": run(decoder.accept, scores),
     }
-
-
-def main(
-    corpus: Annotated[Path, typer.Argument(help="corpus folder")],
-    split: Annotated[str, typer.Option(help="its split")] = "dev",
-    model: Annotated[Path, typer.Option(help="model file")] = MODEL_PATH,
-    confusions: Annotated[Path | None, typer.Option(help="picture to write (.png)")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="print JSON, not tables")] = False,
-) -> None:
-    """Print how well a model recognises one split of a corpus."""
-    try:
-        results = evaluate_recognizer(
-            load_model(model), corpus, split, confusion_picture=confusions
-        )
-    except UserError as error:
-        sys.stderr.write(f"{error}\n")
-        raise typer.Exit(2) from error
-    if as_json:
-        sys.stdout.write(json.dumps(results, indent=1) + "\n")
-    else:
-        print_scores(results, Console())
-
-
-if __name__ == "__main__":
-    typer.run(main)

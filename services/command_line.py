@@ -20,14 +20,18 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from evaluation.commands import app as evaluation_app
 from shared.config import ControlConfig, GatewayConfig, load
 from shared.errors import UserError
+from training.commands import app as training_app
 
 app = typer.Typer(
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__
 )
 head_app = typer.Typer(no_args_is_help=True, help="The 3-D head.")
 app.add_typer(head_app, name="head")
+app.add_typer(training_app, name="train")
+app.add_typer(evaluation_app, name="evaluate")
 CONSOLE = Console(stderr=True)
 SERVICE_CLASSES = {
     "control": "ControlService",
@@ -46,6 +50,7 @@ Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one key.")
 ]
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the figures here.")]
+Acoustic = Annotated[str, typer.Option(help="Model: combined, gmm, neural, or a file.")]
 Control = Annotated[
     str, typer.Option(help="Where control takes commands; else $KOUXING_CONTROL, else this host.")
 ]
@@ -307,25 +312,42 @@ def render(
 @app.command()
 def phones(
     audio: Annotated[Path, typer.Argument(help="Audio file.")],
+    acoustic: Acoustic = "combined",
     form: Annotated[PhoneFormat, typer.Option("--format", help="Form.")] = PhoneFormat.TABLE,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")] = None,
 ) -> None:
     """Recognise an audio file: units with their times."""
     from services import offline
-    from services.recognizer.load import load_model
+    from services.recognizer.load import load_model, model_path
     from services.recognizer.pipeline import recognize
     from shared.messages import MEDIA_RATE_HZ
     from shared.phone_files import format_phones
 
     samples = offline.mono_16k(audio)
-    found = recognize(load_model(), samples, MEDIA_RATE_HZ)
+    found = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
     if not found:
         CONSOLE.print(f"[yellow]{audio}: no speech was heard")
-    text = format_phones(found, form.value, len(samples) / MEDIA_RATE_HZ)
-    if output is None:
-        sys.stdout.write(text)
-    else:
-        _write_text(output, text)
+    _show(format_phones(found, form.value, len(samples) / MEDIA_RATE_HZ), output)
+
+
+@app.command()
+def align(
+    audio: Annotated[Path, typer.Argument(help="Audio file.")],
+    text: Annotated[str, typer.Argument(help="What is said: Chinese characters, or pinyin.")],
+    acoustic: Acoustic = "combined",
+    form: Annotated[PhoneFormat, typer.Option("--format", help="Form.")] = PhoneFormat.TABLE,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")] = None,
+) -> None:
+    """Find when each unit of a known text is said."""
+    from services import offline
+    from services.recognizer.load import load_model, model_path
+    from shared.messages import MEDIA_RATE_HZ
+    from shared.phone_files import format_phones
+    from training.align import align_text
+
+    samples = offline.mono_16k(audio)
+    said = align_text(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ, text)
+    _show(format_phones(said, form.value, len(samples) / MEDIA_RATE_HZ), output)
 
 
 @app.command()
@@ -396,6 +418,13 @@ def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def _show(text: str, output: Path | None) -> None:
+    if output is None:
+        sys.stdout.write(text)
+    else:
+        _write_text(output, text)
 
 
 def _write_text(path: Path, text: str) -> None:

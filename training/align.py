@@ -81,18 +81,19 @@ def align_units(
             "check that text and recording belong together"
         )
     best_of_units = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)
-    share = np.exp(best_of_units - best_of_units.max(axis=1, keepdims=True))
-    share /= share.sum(axis=1, keepdims=True)
     phones: list[Phone] = []
     for aligned in units_of_path(path, graph):
         onset_s = frame_time_s(aligned.start)
+        # share of the unit among all units, had one of them been said in these frames
+        evidence = best_of_units[aligned.start : aligned.end].sum(axis=0, dtype=np.float64)
+        share = np.exp(evidence - evidence.max())
         phones.append(
             Phone(
                 index=len(phones),
                 unit=UNITS[aligned.unit],
                 onset_s=onset_s,
                 duration_s=frame_time_s(aligned.end) - onset_s,
-                confidence=float(share[aligned.start : aligned.end, aligned.unit].mean()),
+                confidence=float(share[aligned.unit] / share.sum()),
                 final=True,
             )
         )

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from training import SYNTHETIC_WEIGHT
+
 app = typer.Typer(no_args_is_help=True, help="Train the models.")
 
 Corpora = Annotated[
@@ -27,7 +29,7 @@ def gmm(
     output: Model,
     seed: Seed = 0,
     mixtures: Annotated[int, typer.Option(help="Gaussians a state, a power of two.")] = 16,
-    synthetic_weight: SyntheticWeight = 1.0,
+    synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
     any_licence: AnyLicence = False,
 ) -> None:
     """Train the Gaussian mixture model of the paper; a model card is written beside it."""
@@ -41,6 +43,42 @@ def gmm(
         synthetic_weight=synthetic_weight,
         shipping=not any_licence,
     )
+
+
+@app.command()
+def neural(
+    corpus: Corpora,
+    output: Model,
+    aligner: Annotated[Path, typer.Option(help="A model that 'gmm' wrote.")],
+    seed: Seed = 0,
+    epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 8,
+    synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
+    any_licence: AnyLicence = False,
+) -> None:
+    """Train the network on frames that a Gaussian mixture model has aligned."""
+    from training.recipes import train_neural
+
+    train_neural(
+        corpus,
+        output,
+        aligner=aligner,
+        seed=seed,
+        num_epochs=epochs,
+        synthetic_weight=synthetic_weight,
+        shipping=not any_licence,
+    )
+
+
+@app.command(name="combine")
+def combine_models(
+    corpus: Corpora,
+    output: Model,
+    part: Annotated[list[Path], typer.Option(help="Model in the same folder; give two.")],
+) -> None:
+    """Choose on dev how much each of two models counts."""
+    from training.recipes import combine
+
+    combine(part, output, corpus)
 
 
 @app.command()

@@ -67,7 +67,7 @@ def read_corpus(folder: Path, errors: RowErrors) -> list[Utterance]:
     Parameters
     ----------
     folder
-        The corpus.
+        The corpus, or its manifest.
     errors
         Receives a message for every row that cannot be used.
 
@@ -76,8 +76,10 @@ def read_corpus(folder: Path, errors: RowErrors) -> list[Utterance]:
     UserError
         If the folder holds none of the layouts.
     """
-    if (folder / "manifest.tsv").is_file():
+    if folder.suffix == ".tsv" and folder.is_file():
         rows = _manifest_rows(folder)
+    elif (folder / "manifest.tsv").is_file():
+        rows = _manifest_rows(folder / "manifest.tsv")
     elif (folder / "wav.scp").is_file():
         rows = _kaldi_rows(folder)
     elif (folder / "transcript").is_dir() and (folder / "wav").is_dir():
@@ -136,8 +138,7 @@ def _duration_s(path: Path) -> float:
         raise ValueError(f"cannot read {path}: {error}") from error
 
 
-def _manifest_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    path = folder / "manifest.tsv"
+def _manifest_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     needed = {"utt_id", "path", "pinyin"}
     with path.open(encoding="utf-8", newline="") as lines:
         reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
@@ -147,7 +148,7 @@ def _manifest_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
         for number, row in enumerate(reader, start=2):
             place = f"{path.name} row {number} ({row['utt_id']})"
             cells = {key: value or "" for key, value in row.items() if key}
-            yield place, {**cells, "path": str(folder / cells["path"])}
+            yield place, {**cells, "path": str(path.parent / cells["path"])}
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:

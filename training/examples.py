@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.errors import UserError
+from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
 from training.corpus import RowErrors, Utterance, may_ship, read_corpus
 from training.feature_cache import log_mel_of
 
-SYNTHETIC_WEIGHT = 0.1  # chosen on development data
 _EVEN_MINUTES = 30.0
 _LEAST_WEIGHT, _MOST_WEIGHT = 0.3, 3.0
 _MARGIN_FRAMES = 25  # of silence left at both ends

@@ -17,12 +17,13 @@ from services.recognizer.combined import save_combined
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import NUM_FEATURES, cepstra_of_all
 from services.recognizer.gmm import GmmModel
-from services.recognizer.load import MODEL_PATH, load_model
+from services.recognizer.load import load_model
 from shared.errors import UserError
 from shared.phones import SILENCE, UNITS
+from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
 from training.corpus import RowErrors
-from training.examples import SYNTHETIC_WEIGHT, Example, load_examples
+from training.examples import Example, load_examples
 from training.gmm import (
     FrameSet,
     Hmm,
@@ -143,7 +144,7 @@ def train_neural(
     corpora: Sequence[Path],
     output: Path,
     *,
-    aligner: Path = MODEL_PATH,
+    aligner: Path,
     seed: int = 0,
     num_epochs: int = 8,
     synthetic_weight: float = SYNTHETIC_WEIGHT,

@@ -9,7 +9,15 @@ from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.model_file import read_archive
 from shared.errors import UserError
 
-MODEL_PATH = Path(__file__).parent / "models" / "gmm.npz"
+MODELS = Path(__file__).parent / "models"
+SHIPPED = ("combined", "gmm", "neural")
+DEFAULT_MODEL = "combined"
+MODEL_PATH = MODELS / f"{DEFAULT_MODEL}.npz"
+
+
+def model_path(name: str) -> Path:
+    """Return the file of a shipped model's name; other names are files themselves."""
+    return MODELS / f"{name}.npz" if name in SHIPPED else Path(name)
 
 
 def load_model(path: Path = MODEL_PATH) -> AcousticModel:

@@ -32,7 +32,7 @@ from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
-DEFAULT_RULE = (1, 0.85)  # frames that must agree, confidence that each needs
+DEFAULT_RULE = (3, 0.55)  # N as in the paper, and the confidence that each frame needs
 _SIL = UNIT_INDEX[SILENCE]
 _WARM_UP_S = 6  # long enough that the search also forgets once, which is code of its own
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final

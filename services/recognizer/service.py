@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import AcousticModel
-from services.recognizer.load import load_model
+from services.recognizer.load import load_model, model_path
 from services.recognizer.pcm import SLICE, BadAudio, level_db, pcm16_of, samples_of, slices
 from services.recognizer.pipeline import Recognizer, warm_up
 from services.recognizer.resample import Resampler
@@ -153,7 +153,7 @@ class RecognizerService(Service):
             "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),
             "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
         }
-        self._model = load_model()
+        self._model = load_model(model_path(config.acoustic))
         warm_up(self._model)
         self.listen(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_finish})
         self.listen(self._phones, {})

@@ -43,11 +43,12 @@ LONGEST_LOOK_AHEAD_S = 0.3
 _TRANSITION_S = 0.06  # from one plan to the next
 _FLUSH_S = 0.14  # to rest after an interruption
 _RELAX_S = 0.3  # to rest when no sound comes
-_NEWS_S = 0.12  # a recognizer says a unit so long after its onset: no news, no onset before that
+_NEWS_S = 0.11  # a recognizer says a unit so long after its onset: no news, no onset before that
 _LATE_CLOSURE_S = 0.1  # a closure recognised up to this much late is still shown, late
 _CATCH_UP_S = 0.04  # and takes this long
 _CLOSED = 10.0  # FAP units from its target at which a lip counts as closed
 _MEMORY_S = 1.5  # units that ended longer ago have no weight left
+_BEGUN_S = 0.02
 _SLOPE_STEP_S = 1e-3
 
 _MOUTH = np.array(MOUTH_FAPS) - 1
@@ -166,7 +167,9 @@ class LiveSynthesizer:
         """Take the beginning or the end of voice activity."""
         self._speaking = change.active
         if not change.active and math.isfinite(change.time_s):
-            self._speech_ends_s.append(change.time_s)
+            # whatever was recognised before this was told has ended, be the time ever so early
+            began_s = [phone.onset_s for phone in self._phones.values()]
+            self._speech_ends_s.append(max([change.time_s, *(s + _BEGUN_S for s in began_s)]))
             self._changed = True
 
     def accept_level(self, time_s: float, level_db: float) -> None:

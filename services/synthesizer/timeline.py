@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.visemes import VISEME_INDEX, shapes_of
+from services.synthesizer.visemes import SHAPES, VISEME_INDEX, shapes_of
 from shared.phones import INITIALS, SILENCE, Phone
 
 EXPECTED = -1
@@ -26,7 +26,10 @@ LONGEST_HOLD_S = 1.5  # a unit goes on for so long past its estimate if nothing 
 _GO_ON_SOFTNESS_S = 0.03
 _GO_ON_FACTOR = 1.35
 _EXPECTED_AFTER_S = 0.3  # how long the expected viseme lasts before the mouth relaxes
-_EXPECTED_FINAL, _EXPECTED_INITIAL = "ei", "g"  # middling ones of their kind
+# What usually follows looks like: a middling final; after a final, a mouth less open, which keeps
+# its rounding.
+_EXPECTED_AFTER_INITIAL, _EXPECTED_AFTER_FINAL, _EXPECTED_AFTER_ROUNDED = "ei", "i", "u"
+_ROUNDED_LAST_SHAPES = frozenset({"o", "ou", "u", "v"})
 EDGE_S = 0.08  # a viseme's centre is at most this far from its beginning and its end
 _SHORTEST_UNIT_S = 0.01
 # A hole this short between two units is a rounding of their times, no pause.
@@ -133,7 +136,12 @@ def build_timeline(
         visemes += _shapes_between(phone, next_unit, end_s)
     visemes.sort(key=lambda row: row[1:])
     if open_end_s is not None:
-        expected = _EXPECTED_FINAL if spoken[-1].unit in INITIALS else _EXPECTED_INITIAL
+        if spoken[-1].unit in INITIALS:
+            expected = _EXPECTED_AFTER_INITIAL
+        elif SHAPES[spoken[-1].unit][-1][0] in _ROUNDED_LAST_SHAPES:
+            expected = _EXPECTED_AFTER_ROUNDED
+        else:
+            expected = _EXPECTED_AFTER_FINAL
         visemes.append(
             (
                 VISEME_INDEX[expected],

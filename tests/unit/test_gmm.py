@@ -6,7 +6,8 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from services.recognizer.acoustic_model import Topology
+from services.recognizer.acoustic_model import AcousticModel, Topology
+from services.recognizer.combined import save_combined
 from services.recognizer.features import NUM_FEATURES, NUM_STATIC, LogMel
 from services.recognizer.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
 from services.recognizer.load import MODEL_PATH, load_model
@@ -121,6 +122,55 @@ def test_a_stream_scores_the_same_in_any_pieces_and_after_reset(make: type) -> N
     pieces = [stream.accept(piece) for piece in np.split(log_mel, [0, 1, 3, 10, 11, 30])]
     np.testing.assert_array_equal(np.concatenate([*pieces, stream.finish()]), whole)
     assert len(stream.finish()) == 0
+
+
+def combined_file(folder: Path, scales: tuple[float, float] = (0.5, 2.0)) -> Path:
+    random_gmm().save(folder / "gmm.npz")
+    random_neural().save(folder / "neural.npz")
+    path = folder / "combined.npz"
+    save_combined(path, random_gmm().topology, ["gmm.npz", "neural.npz"], scales)
+    return path
+
+
+def test_combined_scores_are_the_weighted_sum(tmp_path: Path) -> None:
+    combined = load_model(combined_file(tmp_path))
+    noise = np.random.default_rng(0).normal(0, 0.1, 6000).astype(np.float32)
+    log_mel = LogMel().accept_waveform(noise)
+
+    def scores(model: AcousticModel, pieces: list[np.ndarray]) -> np.ndarray:
+        stream = model.stream()
+        parts = [stream.accept(piece) for piece in pieces]
+        return np.concatenate([*parts, stream.finish()])
+
+    expected = 0.5 * scores(load_model(tmp_path / "gmm.npz"), [log_mel])
+    expected += 2.0 * scores(load_model(tmp_path / "neural.npz"), [log_mel])
+    whole = scores(combined, [log_mel])
+    np.testing.assert_allclose(whole, expected, rtol=1e-4)
+    np.testing.assert_array_equal(scores(combined, np.split(log_mel, [1, 2, 9, 30])), whole)
+    stream = combined.stream()
+    assert stream.look_ahead_frames == 4  # the slower part's
+    first = stream.accept(log_mel)
+    stream.reset()
+    np.testing.assert_array_equal(stream.accept(log_mel), first)
+
+
+def test_combined_files_are_checked(tmp_path: Path) -> None:
+    path = combined_file(tmp_path)
+    arrays = read_archive(path).arrays
+    for names, message in (
+        (["gmm.npz", "combined.npz"], "part of itself"),
+        (["gmm.npz", "../neural.npz"], "plain file names"),
+        (["gmm.npz", "none.npz"], "no acoustic model"),
+        (["gmm.npz"], "scales has shape"),
+    ):
+        write_archive(path, {**arrays, "part_files": np.array(names)})
+        with pytest.raises(UserError, match=message):
+            load_model(path)
+    other = {**arrays, "first_state": np.arange(len(UNITS) + 1)}
+    short = {name: other[name][: len(UNITS)] for name in ("log_stay", "log_leave")}
+    write_archive(path, {**other, **short})
+    with pytest.raises(UserError, match="other states"):
+        load_model(path)
 
 
 def test_the_model_that_ships_loads_and_fits() -> None:

@@ -75,6 +75,13 @@ def test_a_unit_whose_end_is_never_heard_fades() -> None:
     assert not live.advance(60.0)[-1][1].round(1).any()
 
 
+def test_an_end_of_speech_told_too_early_still_ends_it() -> None:
+    live = LiveSynthesizer(PARAMETERS)
+    speak(live)
+    live.accept_speech(SpeechChange(active=False, time_s=0.35))
+    assert not live.advance(1.2)[-1][1].round(1).any()
+
+
 def test_flush_returns_to_rest_within_150_ms() -> None:
     live = LiveSynthesizer(PARAMETERS)
     before = speak(live)[-1][0]

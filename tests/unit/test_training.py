@@ -10,6 +10,7 @@ import pytest
 import soundfile
 
 from services.recognizer.features import NUM_BANDS
+from services.recognizer.load import load_model
 from shared.errors import UserError
 from shared.phones import UNIT_INDEX, UNITS
 from training import feature_cache
@@ -32,7 +33,7 @@ from training.gmm import (
     viterbi_path,
 )
 from training.neural import FRAME_OFFSETS, gradients_of, train_network
-from training.recipes import train_gmm, train_neural
+from training.recipes import combine, train_gmm, train_neural
 
 pytestmark = pytest.mark.unit
 
@@ -99,6 +100,7 @@ def test_manifest_and_its_bad_rows(tmp_path: Path) -> None:
     )
     errors = RowErrors()
     good = read_corpus(tmp_path, errors)
+    assert read_corpus(tmp_path / "manifest.tsv", RowErrors()) == good
     assert [u.utterance_id for u in good] == ["a", "e"]
     assert [UNITS[unit] for unit in good[0].units] == ["n", "i", "h", "ao"]
     assert good[0].syllables == (2, 2)
@@ -415,6 +417,11 @@ def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
     neural = tmp_path / "neural.npz"
     train_neural([tmp_path / "corpus"], neural, aligner=gmm, num_epochs=1, report=lines.append)
     assert "Neural" in neural.with_suffix(".md").read_text()
+    together = tmp_path / "together.npz"
+    combine([gmm, neural], together, [tmp_path / "corpus"], report=lines.append)
+    assert load_model(together).topology.num_states == 300
+    with pytest.raises(UserError, match="not in the folder"):
+        combine([gmm, neural], tmp_path / "corpus" / "x.npz", [tmp_path / "corpus"])
     with pytest.raises(UserError, match="no Gaussian mixture model"):
         train_neural([tmp_path / "corpus"], neural, aligner=neural)
     with pytest.raises(UserError, match="power of two"):
@@ -422,8 +429,6 @@ def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
 
 
 def test_alignment_refuses_what_cannot_be() -> None:
-    from services.recognizer.load import load_model  # noqa: PLC0415
-
     model = load_model()
     sound = np.zeros(4000, np.float32)
     with pytest.raises(UserError, match="text is empty"):
