@@ -32,12 +32,14 @@ from services.supervisor import Supervisor
 from shared.audio_file import read_audio
 from shared.client import Client
 from shared.config import SynthesizerConfig
+from shared.errors import UserError
 from shared.faps import NUM_FAPS
 from shared.messages import EndOfFaps, FapFrame
 
 CHUNK_S = 0.02
 IMAGE_SIZES = ((640, 480, 0), (1280, 720, 4))  # width, height, samples a pixel
 NUM_IMAGES = 60
+END_LIMIT_S = 30.0  # for the last frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,12 +138,16 @@ def _stream(
             if left_s > 0.001:
                 output.wait(left_s)
             take()
-        session.send(samples[begin : begin + chunk])
+        if not session.send(samples[begin : begin + chunk]):
+            raise UserError("the recognizer takes no audio; this machine is too busy to measure on")
         sent_s.append(time.perf_counter())
     live_until_s = time.perf_counter()
     session.finish()
+    end_s = time.perf_counter() + END_LIMIT_S
     while not take():
         output.wait(1.0)
+        if time.perf_counter() > end_s:
+            raise UserError("the last frame did not come; this machine is too busy to measure on")
     session.close()
     to_frame, from_sound = [], []
     for media_s, arrival_s in arrived:
@@ -164,14 +170,16 @@ def _cpu_s(client: Client) -> dict[str, float]:
 def _images_per_s() -> dict[str, float]:
     rates = {}
     for width_px, height_px, num_samples in IMAGE_SIZES:
-        renderer = Renderer(Head.load(), width_px, height_px, samples=num_samples)
+        head = Head.load(detail="fine" if num_samples else "coarse")
+        renderer = Renderer(head, width_px, height_px, samples=num_samples)
         faps = np.zeros(NUM_FAPS, np.float32)
         renderer.draw(faps)
         begin_s = time.perf_counter()
         for number in range(NUM_IMAGES):
             faps[2] = 300 * np.sin(number)
             renderer.draw(faps)
-        name = f"{width_px}x{height_px}" + f", {num_samples}x anti-aliased" * (num_samples > 0)
+        kind = f"video, {num_samples}x anti-aliased" if num_samples else "live, coarse head"
+        name = f"{width_px}x{height_px} {kind}"
         rates[name] = NUM_IMAGES / (time.perf_counter() - begin_s)
         renderer.close()
     return rates

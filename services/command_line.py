@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
@@ -71,7 +72,7 @@ def main() -> None:
     try:
         app()
     except UserError as error:
-        CONSOLE.print(f"[red]kouxing:[/] {error}", highlight=False, soft_wrap=True)
+        CONSOLE.print(f"kouxing: {error}", style="red", markup=False, soft_wrap=True)
         sys.exit(2)
 
 
@@ -151,7 +152,7 @@ def run(
         with CONSOLE.status("starting control, recognizer, synthesizer, driver and gateway"):
             supervisor.start()
             supervisor.wait_ready(control_config.commands)
-        CONSOLE.print(f"the face is at [bold]{page}")
+        _say(f"the face is at {page}")
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if browser and not stop_after and (has_display or sys.platform == "darwin"):
             webbrowser.open(page)
@@ -176,10 +177,10 @@ def _play_sample(path: Path, control: str) -> None:
     from shared.audio_file import open_audio
 
     spoken = stream(open_audio(path), control, CONSOLE, session="demo", record=True)
-    CONSOLE.print(f"spoke {path.name}: {spoken.num_phones} phones in {spoken.duration_s:.1f} s")
+    _say(f"spoke {path.name}: {spoken.num_phones} phones in {spoken.duration_s:.1f} s")
     if not spoken.video:
         raise UserError("no video was written; see the messages above")
-    CONSOLE.print(f"wrote [bold]{spoken.video}")
+    _say(f"wrote {spoken.video}")
 
 
 # --- clients -------------------------------------------------------------------------------------
@@ -214,11 +215,9 @@ def speak(
     spoken = stream(
         audio, _control(control), CONSOLE, session=session, record=record, paced=not fast
     )
-    CONSOLE.print(
-        f"session {spoken.session}: {spoken.num_phones} phones in {spoken.duration_s:.1f} s"
-    )
+    _say(f"session {spoken.session}: {spoken.num_phones} phones in {spoken.duration_s:.1f} s")
     if spoken.video:
-        CONSOLE.print(f"wrote {spoken.video}")
+        _say(f"wrote {spoken.video}")
 
 
 @app.command()
@@ -251,12 +250,12 @@ def status(control: Control = "", json_file: JsonFile = None) -> None:
             if name.endswith(("_p50", "_p95")) or name in SHOWN_FIGURES or _is_drop(name)
         )
         table.add_row(
-            service.service,
-            service.instance,
+            escape(service.service),
+            escape(service.instance),
             service.state,
             f"{service.age_s:.1f}",
             f"{service.clock_offset_ms:.1f}",
-            figures,
+            escape(figures),
         )
     out.print(table)
     sessions = Table("session", "state", "open s", "speaking", "recognizer", "synthesizer")
@@ -305,8 +304,8 @@ def render(
             on_progress=lambda share: progress.update(drawing, completed=share),
         )
     if not phones:
-        CONSOLE.print(f"[yellow]{audio}: no speech was heard; the mouth stays closed")
-    CONSOLE.print(f"wrote {video}: {num_images} images, {len({p.index for p in phones})} phones")
+        _say(f"{audio}: no speech was heard; the mouth stays closed")
+    _say(f"wrote {video}: {num_images} images, {len({p.index for p in phones})} phones")
 
 
 @app.command()
@@ -326,7 +325,7 @@ def phones(
     samples = offline.mono_16k(audio)
     found = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
     if not found:
-        CONSOLE.print(f"[yellow]{audio}: no speech was heard")
+        _say(f"{audio}: no speech was heard")
     _show(format_phones(found, form.value, len(samples) / MEDIA_RATE_HZ), output)
 
 
@@ -373,7 +372,7 @@ def head_export(
     from services.driver.head import Head
 
     export_glb(Head.load(), glb)
-    CONSOLE.print(f"wrote {glb} ({glb.stat().st_size / 1e6:.1f} MB)")
+    _say(f"wrote {glb} ({glb.stat().st_size / 1e6:.1f} MB)")
 
 
 # --- inside --------------------------------------------------------------------------------------
@@ -391,6 +390,10 @@ def _overrides(settings: list[str] | None) -> dict[str, str]:
 
 def _is_drop(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
+
+
+def _say(text: str) -> None:
+    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _control(given: str) -> str:

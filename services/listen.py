@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -40,18 +41,18 @@ def listen(session: str, output: Path | None, control: str, console: Console) ->
         socket = client.bus.connect_subscriber(faps)
         for kind in (FapFrame, EndOfFaps):
             socket.subscribe(kind, session)
+        frames = _frames(socket, client, session)
         try:
             if output is None:
-                frames = _follow(socket, client, session, sys.stdout, as_json=False)
+                num_frames = _print(frames, sys.stdout, _as_row)
             elif output.suffix == ".jsonl":
                 with output.open("w", encoding="utf-8") as file:
-                    frames = _follow(socket, client, session, file, as_json=True)
+                    num_frames = _print(frames, file, _as_json)
             else:
-                frames = _follow(socket, client, session, None, as_json=False)
-                _write_fap(output, session, frames)
+                num_frames = _write_fap(output, session, list(frames))
         except OSError as error:
             raise UserError(f"{output}: cannot be written: {error.strerror}") from None
-    console.print(f"session {session} ended: {len(frames)} FAP frames")
+    console.print(f"session {session} ended: {num_frames} FAP frames", highlight=False)
 
 
 def _publisher_of(session: str, client: Client) -> str:
@@ -65,48 +66,52 @@ def _publisher_of(session: str, client: Client) -> str:
         time.sleep(OPEN_POLL_S)
 
 
-def _follow(
-    socket: Socket, client: Client, session: str, out: IO[str] | None, *, as_json: bool
-) -> list[tuple[float, NDArray[np.float32]]]:
-    frames: list[tuple[float, NDArray[np.float32]]] = []
+def _frames(socket: Socket, client: Client, session: str) -> Iterator[FapFrame]:
+    """Yield frames until the session ends or the user interrupts."""
     try:
         while True:
             if not socket.wait(2.0) and not _is_open(session, client.status()):
-                return frames
+                return
             for received in socket.receive():
-                message = received.message
-                if isinstance(message, EndOfFaps):
-                    return frames
-                if isinstance(message, FapFrame):
-                    values = np.frombuffer(message.values, "<f4").astype(np.float32)
-                    frames.append((to_seconds(message.media_time), values))
-                    if out is not None:
-                        out.write(_line(message, values, as_json=as_json))
-                        out.flush()
+                if isinstance(received.message, EndOfFaps):
+                    return
+                if isinstance(received.message, FapFrame):
+                    yield received.message
     except KeyboardInterrupt:
-        return frames
+        return
 
 
 def _is_open(session: str, report: StatusReport) -> bool:
     return any(each.session == session for each in report.sessions)
 
 
-def _line(frame: FapFrame, values: NDArray[np.float32], *, as_json: bool) -> str:
+def _print(frames: Iterator[FapFrame], out: IO[str], form: Callable[[FapFrame], str]) -> int:
+    num_frames = 0
+    for num_frames, frame in enumerate(frames, start=1):  # noqa: B007 - the count is the answer
+        out.write(form(frame) + "\n")
+        out.flush()
+    return num_frames
+
+
+def _values(frame: FapFrame) -> NDArray[np.float32]:
+    return np.frombuffer(frame.values, "<f4").astype(np.float32)
+
+
+def _as_json(frame: FapFrame) -> str:
+    faps = [round(float(value), 2) for value in _values(frame)]
     time_s = to_seconds(frame.media_time)
-    if as_json:
-        entry = {
-            "time_s": time_s,
-            "sequence": frame.sequence,
-            "faps": [round(float(v), 2) for v in values],
-        }
-        return json.dumps(entry) + "\n"
+    return json.dumps({"time_s": time_s, "sequence": frame.sequence, "faps": faps})
+
+
+def _as_row(frame: FapFrame) -> str:
+    values = _values(frame)
     shown = "  ".join(f"{FAPS[n - 1].name} {values[n - 1]:5.0f}" for n in SHOWN_FAPS)
-    return f"{time_s:9.3f} s  {shown}\n"
+    return f"{to_seconds(frame.media_time):9.3f} s  {shown}"
 
 
-def _write_fap(path: Path, session: str, frames: list[tuple[float, NDArray[np.float32]]]) -> None:
-    times_s = np.array([time_s for time_s, _ in frames])
-    steps_s = np.diff(times_s)
+def _write_fap(path: Path, session: str, frames: list[FapFrame]) -> int:
+    steps_s = np.diff([to_seconds(frame.media_time) for frame in frames])
     frame_rate_hz = float(1.0 / np.median(steps_s[steps_s > 0])) if (steps_s > 0).any() else 50.0
-    values = np.array([faps for _, faps in frames], np.float32).reshape(-1, NUM_FAPS)
-    write_fap(path, FapAnimation(name=session, frame_rate_hz=frame_rate_hz, faps=values))
+    faps = np.array([_values(frame) for frame in frames], np.float32).reshape(-1, NUM_FAPS)
+    write_fap(path, FapAnimation(name=session, frame_rate_hz=frame_rate_hz, faps=faps))
+    return len(frames)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from shared.audio_file import AudioSource, Samples
+from shared.audio_file import AudioSource
 from shared.bus import Socket
 from shared.client import Client, Session
 from shared.errors import UserError
@@ -65,13 +67,13 @@ def speak(
         events.subscribe(Event, opened.name)
         try:
             duration_s, clipped, peak = _stream(source, opened, events, console, paced=paced)
-            opened.finish()
+            _patiently(opened.finish)
             _wait_for_end(output, opened, events, console)
             num_phones = _count_phones(phones)
-            video = _wait_for_video(events, console) if record else ""
         finally:
             with contextlib.suppress(UserError):  # closed already, or control is gone
                 opened.close()
+        video = _wait_for_video(events, console) if record else ""
     _comment(console, source.name, num_phones, clipped, peak)
     return Spoken(opened.name, duration_s, num_phones, video)
 
@@ -88,7 +90,7 @@ def _stream(
         begin_s = time.monotonic()
         try:
             for block in source.blocks:
-                _send(session, block)
+                _patiently(functools.partial(session.send, block))
                 num_sent += len(block)
                 num_clipped += int(np.count_nonzero(np.abs(block) >= 0.999).item())
                 peak = max(peak, float(np.abs(block).max()))
@@ -103,9 +105,10 @@ def _stream(
     return duration_s, num_clipped / max(1, num_sent * source.num_channels), peak
 
 
-def _send(session: Session, block: Samples) -> None:
+def _patiently(send: Callable[[], bool]) -> None:
+    """Send what the queue may be too full for at first."""
     end_s = time.monotonic() + END_LIMIT_S
-    while not session.send(block):
+    while not send():
         if time.monotonic() > end_s:
             raise UserError(
                 f"the recognizer has taken no audio for {END_LIMIT_S:g} s; is it running?"
@@ -130,7 +133,7 @@ def _heed(session: Session, events: Socket, console: Console) -> None:
         If the session is lost.
     """
     for error in session.errors():
-        console.print(f"[yellow]{error.code}: {error.text}")
+        _warn(console, f"{error.code}: {error.text}")
         if error.code in ("unknown-session", "bad-token", "finished"):
             raise UserError("the session was lost; speak again to open a new one")
     for received in events.receive():
@@ -138,7 +141,7 @@ def _heed(session: Session, events: Socket, console: Console) -> None:
         if isinstance(event, Event) and event.name == "session-closed":
             raise UserError(f"the session was closed: {event.detail}")
         if isinstance(event, Event) and event.name == "error":
-            console.print(f"[yellow]{event.detail}")
+            _warn(console, event.detail)
 
 
 def _count_phones(phones: Socket) -> int:
@@ -161,8 +164,8 @@ def _wait_for_video(events: Socket, console: Console) -> str:
                 event = received.message
                 if isinstance(event, Event) and event.name == "recorded":
                     return event.detail
-                if isinstance(event, Event) and event.name in ("error", "session-closed"):
-                    console.print(f"[yellow]no video: {event.detail}")
+                if isinstance(event, Event) and event.detail.startswith("no-video"):
+                    _warn(console, event.detail)
                     return ""
     raise UserError("the driver wrote no video; see 'kouxing status'")
 
@@ -170,8 +173,13 @@ def _wait_for_video(events: Socket, console: Console) -> str:
 def _comment(console: Console, name: str, num_phones: int, clipped: float, peak: float) -> None:
     if num_phones == 0:
         reason = "it is silent" if peak < QUIET_PEAK else "is there a voice in it?"
-        console.print(f"[yellow]{name}: no speech was heard; {reason}")
+        _warn(console, f"{name}: no speech was heard; {reason}")
     if clipped > CLIPPED_SHARE:
-        console.print(
-            f"[yellow]{name}: {clipped:.0%} of the samples are clipped; record at a lower level"
+        _warn(
+            console,
+            f"{name}: {clipped:.0%} of the samples are clipped; record at a lower level",
         )
+
+
+def _warn(console: Console, text: str) -> None:
+    console.print(text, style="yellow", markup=False, highlight=False)

@@ -151,7 +151,7 @@ class Supervisor:
                 log.flush()
                 text = _as_warning(line)
                 if text:
-                    self._console.print(f"[dim]{service}:[/] {text}", highlight=False)
+                    self._console.print(f"{service}: {text}", markup=False, highlight=False)
 
 
 def _as_warning(line: bytes) -> str:

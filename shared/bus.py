@@ -221,6 +221,8 @@ class Bus:
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
         if kind == zmq.XPUB:
             raw.setsockopt(zmq.XPUB_VERBOSE, 1)
+        if kind == zmq.ROUTER:
+            raw.setsockopt(zmq.ROUTER_HANDOVER, 1)
         try:
             raw.bind(endpoint)
         except zmq.ZMQError as error:
@@ -235,6 +237,8 @@ class Bus:
 
     def _connect(self, kind: int, *endpoints: str, queue_length: int) -> Socket:
         raw = self._open(kind, queue_length)
+        if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
+            raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))
         for endpoint in endpoints:
             split_endpoint(endpoint, "endpoint")
             raw.setsockopt(zmq.IPV6, "[" in endpoint)

@@ -96,6 +96,10 @@ class Client:
                     continue
                 for received in self._commands.receive():
                     answer = received.message
+                    if isinstance(answer, Error) and answer.code == "bad-message":
+                        raise Refused(
+                            answer.code, answer.text
+                        )  # control could not read our request
                     if getattr(answer, "request", None) != message.request:
                         continue
                     if isinstance(answer, Error):
@@ -156,17 +160,18 @@ class Session:
             self._num_frames_sent += num_frames
         return sent
 
-    def finish(self) -> None:
-        """Say that no more audio comes."""
-        self._sequence += 1
-        self._audio.send(
+    def finish(self) -> bool:
+        """Say that no more audio comes; False if the queue is full, as in ``send``."""
+        sent = self._audio.send(
             EndOfAudio(
                 session=self.name,
                 token=self.opened.token,
-                sequence=self._sequence,
+                sequence=self._sequence + 1,
                 media_time=self.media_time,
             )
         )
+        self._sequence += sent
+        return sent
 
     def errors(self) -> Iterator[Error]:
         """Yield what the recognizer complained about since the last call."""

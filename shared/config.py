@@ -201,7 +201,7 @@ def _check(section: str, config: Config) -> None:
     ranges: dict[str, tuple[float, float]] = {
         "agreement": (1, 20),
         "least_confidence": (0, 1),
-        "frame_rate_hz": (1, 240),
+        "frame_rate_hz": (10, 240),
         "look_ahead_ms": (0, 300),
         "width_px": (16, 7680),
         "height_px": (16, 4320),
@@ -218,8 +218,12 @@ def _check(section: str, config: Config) -> None:
                     f"{section}.{field.name}: {getattr(config, field.name)} is outside "
                     f"{low:g} to {high:g}"
                 )
-    if isinstance(config, DriverConfig) and config.view not in ("auto", "window", "none"):
-        raise UserError("driver.view: one of auto, window, none")
+    if isinstance(config, DriverConfig):
+        if config.view not in ("auto", "window", "none"):
+            raise UserError("driver.view: one of auto, window, none")
+        for key in ("width_px", "height_px"):
+            if getattr(config, key) % 2:
+                raise UserError(f"driver.{key}: must be even, for H.264")
     if isinstance(config, GatewayConfig):
         _require_secure(config.host, "gateway.host", config)
 

@@ -14,7 +14,6 @@ from shared.messages import Acknowledge, Message
 
 RESEND_AFTER_S = 0.5
 ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
-MAX_UNACKNOWLEDGED = 4096  # beyond this the oldest are let go: the face lives in the present
 
 
 class ReliableSender:
@@ -25,8 +24,13 @@ class ReliableSender:
         self._session = session
         self._epoch = epoch
         self._next = 1
-        self._waiting: deque[Message] = deque(maxlen=MAX_UNACKNOWLEDGED)
+        self._waiting: deque[Message] = deque()  # its owner limits it by the backlog
         self._heard_s = 0.0
+
+    @property
+    def waiting(self) -> tuple[Message, ...]:
+        """The messages that are not acknowledged yet, oldest first."""
+        return tuple(self._waiting)
 
     @property
     def backlog(self) -> int:
@@ -77,9 +81,9 @@ class ReliableReceiver:
 
         The first message of a greater epoch starts anew at whatever number it carries.
         """
-        self._peer = sender
         if message.epoch < self._epoch:
             return False
+        self._peer = sender
         if message.epoch > self._epoch:
             self._epoch = message.epoch
             self._last = message.sequence - 1

@@ -100,6 +100,9 @@ class Service:
         """Finish what is under way; called again until it returns True or the time is up."""
         return True
 
+    def on_stopped(self) -> None:
+        """Save what can be saved when the time to drain is over."""
+
     def idle_s(self) -> dict[str, float]:
         """Return for how long each session has had no input, for control's idle limit."""
         return {}
@@ -197,6 +200,7 @@ class Service:
         self._stop_requested = True
         while not self.on_drain() and time.monotonic() < deadline_s:
             self.step(TICK_S)
+        self.on_stopped()
         self._beat()
         self.bus.close()
         LOG.info("stopped")
@@ -252,8 +256,15 @@ class Service:
         self.clock_offset.update(seen.sent_ns, seen.received_ns, seen.replied_ns, now_ns())
 
     def _on_start(self, start: StartSession, _sender: bytes) -> None:
-        if self.start_session(start):
-            self.session_started(start)
+        if self._stop_requested:
+            return
+        try:
+            if self.start_session(start):
+                self.session_started(start)
+        except UserError as error:
+            self.warn("start", str(error), start.session)
+            if self.control is not None:
+                self.control.send(Error(session=start.session, code="timeout", text=str(error)))
 
     def _on_error(self, error: Error, _sender: bytes) -> None:
         self.warn(error.code, f"control says: {error.text}", error.session)
@@ -270,5 +281,8 @@ def run_service(make: Callable[[], Service], section: str, log_level: str) -> in
     except UserError as error:
         print(f"{section}: {error}", file=sys.stderr)
         return 2
-    service.run()
+    try:
+        service.run()
+    except UserError as error:  # not the user's: nothing was typed; the supervisor starts it again
+        raise RuntimeError(str(error)) from error
     return 0

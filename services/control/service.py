@@ -12,9 +12,11 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
-from services.control.sessions import REQUIRED, Refusal, Registry, SessionRecord
+from services.control.sessions import ENDPOINTS, REQUIRED, Refusal, Registry, SessionRecord
+from shared.bus import split_endpoint
 from shared.clock import now_ns
 from shared.config import ControlConfig, reachable
+from shared.errors import UserError
 from shared.logs import LOG
 from shared.messages import (
     CloseSession,
@@ -40,6 +42,7 @@ from shared.service import Handler, Service
 
 STOPPED = "stopped"  # why a service is gone that said goodbye
 START_LIMIT_S = 5.0  # for the services to take a session
+REPLACE_LIMIT_S = 20.0  # for a lost recognizer or synthesizer to come back
 Request = OpenSession | CloseSession | FlushSession | StatusRequest
 
 NUM_REMEMBERED = 1000  # answers kept for repeated requests
@@ -88,8 +91,10 @@ class ControlService(Service):
             self._service_gone(instance, "no heartbeat")
         for record in list(self._registry.sessions.values()):
             absent = [service for service in REQUIRED if not self._registry.serves(record, service)]
-            if absent and now_s - record.started_s > START_LIMIT_S:
+            if absent and now_s - record.started_s > REPLACE_LIMIT_S:
                 self._end(record, f"the {' and the '.join(absent)} is lost")
+            elif not record.announced and not record.waiting_for:
+                self._announce(record)  # the last one that was waited for is gone
             elif record.waiting_for and now_s - record.started_s > START_LIMIT_S:
                 self._give_up_waiting(record)
 
@@ -183,7 +188,14 @@ class ControlService(Service):
 
     def _on_heartbeat(self, heartbeat: Heartbeat, sender: bytes) -> None:
         received_ns = now_ns()
+        problem = _wrong_endpoints(heartbeat)
+        if problem:
+            self.warn("endpoints", f"{heartbeat.instance}: {problem}")
+            self._commands.send(Error(code="bad-message", text=problem), to=sender)
+            return
         is_new = heartbeat.instance not in self._registry.services
+        if is_new and heartbeat.state == "draining":
+            return
         if is_new:
             for instance in self._registry.displaced_by(heartbeat):
                 self._service_gone(instance, f"{heartbeat.instance} took its place")
@@ -199,22 +211,26 @@ class ControlService(Service):
             self._service_gone(heartbeat.instance, STOPPED)
         for session, idle_s in heartbeat.idle_s.items():
             record = self._registry.sessions.get(session)
-            if record is None:  # of an earlier run of control, or just closed
+            if record is None or not self._registry.takes_part(heartbeat, record):
+                # of an earlier run of control, just closed, or served by another now
                 self._commands.send(StopSession(session=session), to=sender)
-            elif idle_s > self._idle_limit_s:
+            elif heartbeat.instance == record.recognizer and idle_s > self._idle_limit_s:
                 self._end(record, f"no audio for {self._idle_limit_s:g} s")
 
     def _on_started(self, done: Done, sender: bytes) -> None:
         record = self._registry.sessions.get(done.session)
         if record is None or done.request != _start_request(record):
             return
-        record.waiting_for -= {
+        started = {
             instance
-            for instance, service in self._registry.services.items()
-            if service.address == sender
+            for instance in record.waiting_for
+            if instance in self._registry.services
+            and self._registry.services[instance].address == sender
         }
-        if not record.waiting_for:
-            self._announce(record)
+        if started:
+            record.waiting_for -= started
+            if not record.waiting_for:
+                self._announce(record)
 
     def _on_speech(self, speech: Speech, _sender: bytes) -> None:
         record = self._registry.sessions.get(speech.session)
@@ -264,7 +280,7 @@ class ControlService(Service):
                 record.waiting_for.discard(instance)
 
     def _announce(self, record: SessionRecord) -> None:
-        if record.announced:
+        if record.announced or not all(self._registry.serves(record, s) for s in REQUIRED):
             return
         record.announced = True
         self._publish("session-opened", record.name)
@@ -334,3 +350,16 @@ class ControlService(Service):
 
 def _start_request(record: SessionRecord) -> str:
     return f"start-{record.name}-{record.epoch}"
+
+
+def _wrong_endpoints(heartbeat: Heartbeat) -> str:
+    """Return what is wrong with the endpoints that others are to connect to, if anything."""
+    for key in ENDPOINTS.get(heartbeat.service, ()):
+        endpoint = heartbeat.endpoints.get(key, "")
+        try:
+            host, port = split_endpoint(endpoint, key)
+        except UserError as error:
+            return str(error)
+        if "*" in (host, port):
+            return f"{key}: {endpoint!r} names no host or port to connect to"
+    return ""

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 
 from shared.messages import Heartbeat, OpenSession, SessionOpened
 
-REQUIRED = ("recognizer", "synthesizer")  # one of each serves a session; others all take part
+REQUIRED = ("recognizer", "synthesizer")  # one of each serves a session
+OBSERVERS = ("driver", "gateway")  # all of them take part
+ENDPOINTS = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 
 
 @dataclass(slots=True)
@@ -32,6 +34,7 @@ class SessionRecord:
     started_s: float  # when its services were last told to start it, or one was lost
     recognizer: str
     synthesizer: str
+    audio: str  # the endpoint that the client was given
     epoch: int = 1
     waiting_for: set[str] = field(default_factory=set)  # instances that have not started it yet
     announced: bool = False  # the client was told
@@ -65,7 +68,9 @@ class Registry:
         return [
             instance
             for instance, record in self.services.items()
-            if heartbeat.endpoints and record.heartbeat.endpoints == heartbeat.endpoints
+            if heartbeat.service in REQUIRED
+            and record.heartbeat.service == heartbeat.service
+            and record.heartbeat.endpoints == heartbeat.endpoints
         ]
 
     def silent(self, now_s: float) -> list[str]:
@@ -73,7 +78,7 @@ class Registry:
         return [
             instance
             for instance, record in self.services.items()
-            if now_s - record.heard_s > self._lost_after_s
+            if record.address and now_s - record.heard_s > self._lost_after_s
         ]
 
     def ready(self, service: str) -> list[str]:
@@ -115,6 +120,7 @@ class Registry:
             started_s=now_s,
             recognizer=chosen["recognizer"],
             synthesizer=chosen["synthesizer"],
+            audio=self.services[chosen["recognizer"]].heartbeat.endpoints["audio"],
         )
         record.waiting_for = set(self.participants(record))
         self.sessions[name] = record
@@ -125,7 +131,7 @@ class Registry:
         observers = [
             instance
             for instance, service in self.services.items()
-            if service.heartbeat.service not in REQUIRED
+            if service.heartbeat.service in OBSERVERS
         ]
         placed = [i for i in (record.recognizer, record.synthesizer) if i in self.services]
         return placed + observers
@@ -133,6 +139,13 @@ class Registry:
     def serves(self, record: SessionRecord, service: str) -> bool:
         """Return whether the session's recognizer or synthesizer is alive."""
         return getattr(record, service) in self.services
+
+    def takes_part(self, heartbeat: Heartbeat, record: SessionRecord) -> bool:
+        """Return whether a service is one that serves or observes the session."""
+        return heartbeat.service in OBSERVERS or heartbeat.instance in (
+            record.recognizer,
+            record.synthesizer,
+        )
 
     def owned(self, session: str, token: str) -> SessionRecord:
         """Return a session whose token is given.
@@ -150,11 +163,14 @@ class Registry:
         return record
 
     def replace(self, record: SessionRecord, now_s: float) -> bool:
-        """Place a session again whose recognizer or synthesizer is gone; return success."""
+        """Place a session again whose recognizer or synthesizer is gone; return success.
+
+        The client keeps sending to the endpoint it was given, so only a recognizer there will do.
+        """
         try:
             for service in REQUIRED:
                 if not self.serves(record, service):
-                    setattr(record, service, self._choose(service))
+                    setattr(record, service, self._choose(service, record))
         except Refusal:
             return False
         record.epoch += 1
@@ -180,8 +196,14 @@ class Registry:
         """Return for how long a session has been open."""
         return time.monotonic() - record.opened_s
 
-    def _choose(self, service: str) -> str:
+    def _choose(self, service: str, moved: SessionRecord | None = None) -> str:
         instances = self.ready(service)
+        if moved is not None and service == "recognizer":
+            instances = [
+                instance
+                for instance in instances
+                if self.services[instance].heartbeat.endpoints["audio"] == moved.audio
+            ]
         if not instances:
             raise Refusal(
                 "no-service",

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from services.driver.render import Renderer
 from services.driver.video import VideoWriter
+from shared.errors import UserError
 from shared.messages import MEDIA_RATE_HZ
 
+LONGEST_SILENCE_S = 600.0  # that is put in for missing sound
 Faps = NDArray[np.float32]
 
 
@@ -45,8 +47,16 @@ class Recording:
             self._frames.append((time_s, faps))
 
     def accept_sound(self, media_time: int, samples: NDArray[np.float32]) -> None:
-        """Take sound of shape ``(n,)``; what is missing before it becomes silence."""
+        """Take sound of shape ``(n,)``; what is missing before it becomes silence.
+
+        Raises
+        ------
+        UserError
+            If very much is missing, or the file cannot be written.
+        """
         missing = media_time - self._num_samples
+        if missing > LONGEST_SILENCE_S * MEDIA_RATE_HZ:
+            raise UserError(f"{missing / MEDIA_RATE_HZ:.0f} s of sound are missing; no video")
         if missing > 0:
             samples = np.concatenate([np.zeros(missing, np.float32), samples])
         elif missing < 0:
@@ -71,6 +81,10 @@ class Recording:
     def close(self) -> None:
         """Finish the file."""
         self._writer.close()
+
+    def discard(self) -> None:
+        """Give the unfinished file up."""
+        self._writer.discard()
 
     def _at(self, time_s: float) -> Faps:
         (begin_s, begin), (end_s, end) = (

@@ -73,8 +73,14 @@ class DriverService(Service):
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""
-        if start.session in self._followers:
-            self._leave(self._followers[start.session])
+        recording = None
+        old = self._followers.get(start.session)
+        if old is not None:
+            if (
+                old.start.token == start.token
+            ):  # the same session after a crash goes on in its video
+                recording, old.recording = old.recording, None
+            self._leave(old)
         socket = self.bus.connect_subscriber(start.phones, start.faps)
         follower = _Follower(start=start, socket=socket)
         self.listen(
@@ -89,7 +95,7 @@ class DriverService(Service):
         kinds = (FapFrame, EndOfFaps, Sound) if start.record else (FapFrame, EndOfFaps)
         socket.subscribe_session(kinds, start.session)
         if start.record:
-            follower.recording = self._begin_recording(start.session)
+            follower.recording = recording or self._begin_recording(start.session)
         self._followers[start.session] = follower
         return False
 
@@ -122,6 +128,12 @@ class DriverService(Service):
         self._render_until(time.monotonic() + RENDER_BUDGET_S)
         return not self._unfinished
 
+    def on_stopped(self) -> None:
+        """Keep what was drawn of the videos that could not be finished in time."""
+        for session, recording in self._unfinished:
+            LOG.warning("the video ends early", extra={"session": session})
+            self._finish(session, recording)
+
     def idle_s(self) -> dict[str, float]:
         """Name the sessions followed, so that control can say which of them are no more."""
         return dict.fromkeys(self._followers, 0.0)
@@ -146,7 +158,11 @@ class DriverService(Service):
     def _on_sound(self, follower: _Follower, sound: Sound) -> None:
         if follower.recording is not None:
             samples = np.frombuffer(sound.pcm, "<i2").astype(np.float32) / np.float32(32768)
-            follower.recording.accept_sound(sound.media_time, samples)
+            try:
+                follower.recording.accept_sound(sound.media_time, samples)
+            except UserError as error:
+                self._give_up(follower.start.session, follower.recording, error)
+                follower.recording = None
 
     def _on_end(self, follower: _Follower) -> None:
         follower.ended = True
@@ -203,25 +219,42 @@ class DriverService(Service):
     def _render_until(self, end_s: float) -> None:
         for follower in self._followers.values():
             while follower.recording is not None and time.monotonic() < end_s:
-                if not follower.recording.step():
-                    break
+                try:
+                    if not follower.recording.step():
+                        break
+                except UserError as error:
+                    self._give_up(follower.start.session, follower.recording, error)
+                    follower.recording = None
         while self._unfinished and time.monotonic() < end_s:
             session, recording = self._unfinished[0]
-            if recording.step():
-                continue
-            self._unfinished.pop(0)
-            recording.close()
-            self.metrics.count("videos")
-            LOG.info("wrote %s", recording.path, extra={"session": session})
-            if self.control is not None:
-                self.control.send(
-                    Recorded(
-                        session=session,
-                        path=str(recording.path),
-                        num_images=recording.num_images,
-                        duration_s=recording.duration_s,
-                    )
+            try:
+                if recording.step():
+                    continue
+                self._unfinished.pop(0)
+                self._finish(session, recording)
+            except UserError as error:
+                self._unfinished = [
+                    entry for entry in self._unfinished if entry[1] is not recording
+                ]
+                self._give_up(session, recording, error)
+
+    def _finish(self, session: str, recording: Recording) -> None:
+        recording.close()
+        self.metrics.count("videos")
+        LOG.info("wrote %s", recording.path, extra={"session": session})
+        if self.control is not None:
+            self.control.send(
+                Recorded(
+                    session=session,
+                    path=str(recording.path),
+                    num_images=recording.num_images,
+                    duration_s=recording.duration_s,
                 )
+            )
+
+    def _give_up(self, session: str, recording: Recording, error: UserError) -> None:
+        recording.discard()
+        self._report(session, "no-video", str(error))
 
     def _report(self, session: str, code: str, text: str) -> None:
         LOG.error(text, extra={"session": session})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import secrets
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -66,7 +67,8 @@ class VideoWriter:
         self._path = Path(path)
         self._shape = (height_px, width_px, 3)
         self._sample_rate_hz = sample_rate_hz
-        self._unfinished = self._path.with_name(f".{self._path.name}.part")
+        # Another process may be writing a video of the same name.
+        self._unfinished = self._path.with_name(f".{self._path.name}.{secrets.token_hex(4)}.part")
         self._num_images = self._num_samples = 0
         try:
             if self._path.is_dir():

@@ -42,7 +42,9 @@ from shared.reliable import ReliableSender
 from shared.service import Service
 
 GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, less is jitter
+LAST_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
+BACKLOG_LIMIT_S = 5.0  # for so long; then the session's link is given up for the others' sake
 
 
 class _Stream:
@@ -56,14 +58,28 @@ class _Stream:
         self.heard_s = time.monotonic()
         self.finished = False
         self.speaking = False
-        self.media_time_in: int | None = None  # of the next chunk, if nothing is lost
+        self.late_since_s: float | None = None  # since when the synthesizer owes too much
+        self._origin_in: int | None = None  # media time of the first chunk without a gap since
+        self._num_in = 0  # samples in the session's own rate since then
         self._model = model
         self._rule = rule
         self._next_index = 0
         self.restart(0)
 
+    @property
+    def media_time_in(self) -> int | None:
+        """Media time of the next chunk if nothing is lost; None before the first."""
+        if self._origin_in is None:
+            return None
+        return self._origin_in + self._num_in * MEDIA_RATE_HZ // self.start.sample_rate_hz
+
+    def begin(self, media_time: int) -> None:
+        """Begin anew with a chunk that does not follow the last one."""
+        self._origin_in, self._num_in = media_time, 0
+        self.restart(media_time)
+
     def restart(self, media_time: int) -> None:
-        """Begin anew at a media time: after a pause in the stream or an interruption."""
+        """Forget what was being said; the next audio is that of a media time."""
         self.origin = media_time
         self.num_samples = 0
         self._slice: list[NDArray[np.float32]] = []  # what came of the 20 ms under way
@@ -85,9 +101,7 @@ class _Stream:
     def accept(self, pcm: bytes) -> list[Message]:
         """Take a chunk in the session's encoding; return what is to be said about it."""
         samples = samples_of(pcm, self.start.encoding, self.start.num_channels)
-        rate_hz = self.start.sample_rate_hz
-        if self.media_time_in is not None:
-            self.media_time_in += len(samples) * MEDIA_RATE_HZ // rate_hz
+        self._num_in += len(samples)
         mono = self._resampler.accept_waveform(samples)
         messages: list[Message] = [Sound(media_time=self.media_time, pcm=pcm16_of(mono))]
         for part in slices(mono, self.num_samples):
@@ -166,8 +180,11 @@ class RecognizerService(Service):
             self._streams[start.session] = stream
         if stream.link is None or stream.start.epoch != start.epoch:
             stream.start = start
+            owed = stream.link.waiting if stream.link is not None else ()
             socket = self._connect(start.phone_input)
             stream.link = ReliableSender(socket, start.session, start.epoch)
+            for message in owed:
+                stream.link.send(message, time.monotonic())
         return True
 
     def stop_session(self, session: str) -> None:
@@ -178,19 +195,28 @@ class RecognizerService(Service):
         """Forget what was being said; the next audio begins anew."""
         stream = self._streams.get(session)
         if stream is not None:
-            stream.restart(stream.media_time)
+            media_time = stream.media_time_in
+            stream.restart(stream.media_time if media_time is None else media_time)
             if stream.speaking:
                 stream.speaking = False
                 self._say(stream, [Speech(media_time=stream.media_time, active=False)])
 
     def on_tick(self, now_s: float) -> None:
         """Repeat what the synthesizer did not acknowledge, and let audio wait if it is behind."""
-        backlog = 0
-        for stream in self._streams.values():
-            if stream.link is not None:
-                self.metrics.count("resent", stream.link.tick(now_s))
-                backlog = max(backlog, stream.link.backlog)
-        self.pause(self._audio, paused=backlog > BACKLOG_LIMIT)
+        any_late = False
+        for session, stream in self._streams.items():
+            if stream.link is None:
+                continue
+            self.metrics.count("resent", stream.link.tick(now_s))
+            if stream.link.backlog <= BACKLOG_LIMIT:
+                stream.late_since_s = None
+                continue
+            any_late = True
+            stream.late_since_s = stream.late_since_s or now_s
+            if now_s - stream.late_since_s > BACKLOG_LIMIT_S:
+                self.warn("no-link", "the synthesizer takes no phones; they are dropped", session)
+                stream.link = None
+        self.pause(self._audio, paused=any_late)
 
     def on_drain(self) -> bool:
         """Finish every utterance and wait until the synthesizer has it."""
@@ -210,14 +236,13 @@ class RecognizerService(Service):
         if stream is None:
             return
         started_s = time.perf_counter()
-        if stream.media_time_in is None:
-            stream.restart(chunk.media_time)
-            stream.media_time_in = chunk.media_time
-        elif chunk.media_time > stream.media_time_in + GAP:
+        expected = stream.media_time_in
+        if expected is None:
+            stream.begin(chunk.media_time)
+        elif chunk.media_time > expected + GAP:
             self.metrics.count("audio_gaps")
             self._say(stream, stream.finish())
-            stream.restart(chunk.media_time)
-            stream.media_time_in = chunk.media_time
+            stream.begin(chunk.media_time)
         try:
             said = stream.accept(chunk.pcm)
         except BadAudio as error:
@@ -243,6 +268,9 @@ class RecognizerService(Service):
         elif stream.finished:
             text = f"session {message.session!r} has ended; open another"
             self._refuse(message, sender, "finished", text)
+        elif message.media_time > LAST_MEDIA_TIME:
+            text = f"media_time {message.media_time} is no sample index at 16 kHz; count from 0"
+            self._refuse(message, sender, "bad-audio", text)
         elif message.sequence <= stream.sequence_in:
             text = f"sequence {message.sequence} came after {stream.sequence_in}; it must grow"
             self._refuse(message, sender, "replayed", text)

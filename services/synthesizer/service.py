@@ -37,6 +37,7 @@ from shared.reliable import ReliableReceiver
 from shared.service import Service
 
 STALL_S = 0.2  # a live stream silent for so long has stalled
+LONGEST_GAP_S = 10.0  # of media time that is filled with frames
 REST_S = 0.3  # within which any face is at rest
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
@@ -49,6 +50,8 @@ class _Face:
         self.start = start
         self.live = live
         self.receiver: ReliableReceiver | None = None
+        self.epoch_in = 0  # of the newest message from the recognizer
+        self.heard_media_s = 0.0  # media time of that message
         self.sequence_out = 0
         self.media_time = 0  # of the newest frame
         self.heard_s = time.monotonic()
@@ -149,17 +152,24 @@ class SynthesizerService(Service):
         if face is None or face.receiver is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)
             return
+        if message.epoch != face.start.epoch:  # sent again until control has told both ends
+            self.metrics.count("other_epoch")
+            return
         if not face.receiver.accept(message, sender):
             self.metrics.count("repeated")
             return
         if isinstance(message, PhoneHeard) and message.unit not in UNIT_INDEX:
             self.warn("unknown-unit", f"{message.unit!r} is none of the 60 units", message.session)
             return
-        if face.sequence_out == 0 and message.epoch > 1:  # a session that moved here in mid-stream
-            face.live.reset(to_seconds(message.media_time))
         started_s = time.perf_counter()
         face.heard_s = time.monotonic()
         time_s = to_seconds(message.media_time)
+        # After a crash the recognizer counts its units anew; after a long gap nobody wants the
+        # frames in between.
+        is_new_epoch = message.epoch not in (face.epoch_in, face.epoch_in or 1)
+        if is_new_epoch or time_s - face.heard_media_s > LONGEST_GAP_S:
+            face.live.reset(max(0.0, time_s - self._look_ahead_s))
+        face.epoch_in, face.heard_media_s = message.epoch, time_s
         if isinstance(message, PhoneHeard):
             face.live.accept_phone(
                 Phone(
@@ -193,7 +203,12 @@ class SynthesizerService(Service):
         face.finished = True
         face.sequence_out += 1
         self._faps.send(
-            EndOfFaps(session=session, sequence=face.sequence_out, media_time=face.media_time)
+            EndOfFaps(
+                session=session,
+                epoch=face.start.epoch,
+                sequence=face.sequence_out,
+                media_time=face.media_time,
+            )
         )
         LOG.info("end of frames", extra={"session": session})
 

@@ -17,7 +17,14 @@ pytestmark = pytest.mark.bench
 
 def test_it_prints_a_table_and_writes_the_same_figures(tmp_path: Path) -> None:
     figures = tmp_path / "latency.json"
-    arguments: list[str | Path] = ["bench", DEMO / "vowels-male.wav", "--repeats", "1", "--json", figures]
+    arguments: list[str | Path] = [
+        "bench",
+        DEMO / "vowels-male.wav",
+        "--repeats",
+        "1",
+        "--json",
+        figures,
+    ]
     result = subprocess.run(
         [sys.executable, "-m", "services", *arguments],
         env={**os.environ, **ONE_THREAD},

@@ -250,6 +250,94 @@ def test_a_gap_in_media_time_keeps_the_new_time(client: Client, witness: Session
     session.close()
 
 
+def test_a_wall_clock_for_media_time_is_refused(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="f32le")
+    audio = client.bus.connect_dealer(session.opened.audio)
+    token = session.opened.token
+    audio.send(AudioChunk(session=session.name, token=token, sequence=1, media_time=2**53, pcm=b""))
+    assert next(answers(audio)).code == "bad-audio"
+    session.close()
+
+
+def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
+    client: Client, witness: Session
+) -> None:
+    session = client.open_session(encoding="f32le", paced=False)
+    output = session.subscribe(FapFrame)
+    audio = client.bus.connect_dealer(session.opened.audio)
+    later = 2**39
+    pcm = np.zeros(8000, "<f4").tobytes()
+    for sequence, media_time in ((1, 0), (2, later)):
+        audio.send(
+            AudioChunk(
+                session=session.name,
+                token=session.opened.token,
+                sequence=sequence,
+                media_time=media_time,
+                pcm=pcm,
+            )
+        )
+    times: list[int] = []
+    end_s = time.monotonic() + 10
+    while not times or times[-1] < later:
+        assert time.monotonic() < end_s
+        output.wait(0.1)
+        times += [
+            received.message.media_time
+            for received in output.receive()
+            if isinstance(received.message, FapFrame)
+        ]
+    assert len(times) < 100
+    session.close()
+
+
+def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) -> None:
+    with Bus() as bus:
+        stranger = bus.connect_dealer(f"tcp://127.0.0.1:{system.ports['synthesizer.phones']}")
+        for epoch in (0, 2, 2**53):
+            stranger.send(
+                Progress(
+                    session=witness.name, epoch=epoch, sequence=5, media_time=2**53, level_db=0.0
+                )
+            )
+        time.sleep(0.3)
+    system.assert_all_alive()
+
+
+@pytest.mark.parametrize(
+    "endpoints",
+    [{}, {"audio": "x", "phones": "y"}, {"audio": "tcp://*:1", "phones": "tcp://*:2"}],
+)
+def test_a_false_recognizer_is_not_given_sessions(
+    system: System, client: Client, witness: Session, endpoints: dict[str, str]
+) -> None:
+    with Bus() as bus:
+        stranger = bus.connect_dealer(system.control)
+        stranger.send(
+            Heartbeat(
+                service="recognizer",
+                instance="a-false-one",
+                state="ready",
+                sent_ns=0,
+                endpoints=endpoints,
+                idle_s={witness.name: 1e9},
+            )
+        )
+        assert next(answers(stranger)).code == "bad-message"
+    assert "a-false-one" not in {state.instance for state in client.status().services}
+
+
+def test_an_observer_that_never_answers_delays_no_session(
+    system: System, client: Client, witness: Session
+) -> None:
+    with Bus() as bus:
+        mute = bus.connect_dealer(system.control)
+        mute.send(Heartbeat(service="gateway", instance="mute", state="ready", sent_ns=0))
+        time.sleep(0.2)
+        session = client.open_session(encoding="f32le")
+        session.close()
+
+
 def test_a_client_that_goes_away_leaves_no_trace(system: System, witness: Session) -> None:
     with Client(system.control) as vanishing:
         vanishing.open_session(session="ghost", encoding="f32le").send(np.zeros(320, np.float32))

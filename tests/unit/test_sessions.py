@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from services.control.sessions import Refusal, Registry
@@ -16,7 +18,10 @@ def heartbeat(service: str, instance: str, state: str = "ready") -> Heartbeat:
         instance=instance,
         state=state,
         sent_ns=0,
-        endpoints={"here": f"tcp://127.0.0.1:{abs(hash(instance)) % 60000}"},
+        endpoints={
+            "audio": f"tcp://{instance}:5560",
+            "phones": f"tcp://{instance}:5561",
+        },
     )
 
 
@@ -107,7 +112,10 @@ def test_a_lost_recognizer_is_replaced_with_a_greater_epoch() -> None:
     record = made.open(opening(), b"client", 0.0)
     del made.services["recognizer-1"]
     assert not made.replace(record, 1.0)
-    made.beat(heartbeat("recognizer", "recognizer-2"), b"r2", 1.0)
+    made.beat(heartbeat("recognizer", "elsewhere"), b"r2", 1.0)
+    assert not made.replace(record, 1.0), "the client goes on sending to where it was told to"
+    again = dataclasses.replace(heartbeat("recognizer", "recognizer-1"), instance="recognizer-2")
+    made.beat(again, b"r3", 1.0)
     assert made.replace(record, 1.0)
     assert (record.recognizer, record.synthesizer, record.epoch) == (
         "recognizer-2",
