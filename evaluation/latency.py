@@ -14,6 +14,7 @@ driver's renderer alone.
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import tempfile
@@ -151,7 +152,7 @@ def _stream(
     session.close()
     to_frame, from_sound = [], []
     for media_s, arrival_s in arrived:
-        last_needed = round((media_s + look_ahead_s) / CHUNK_S) - 1
+        last_needed = math.ceil((media_s + look_ahead_s) / CHUNK_S - 1e-6) - 1
         last_shown = max(0, round(media_s / CHUNK_S) - 1)
         if arrival_s < live_until_s and last_needed < len(sent_s):
             to_frame.append(arrival_s - sent_s[max(0, last_needed)])

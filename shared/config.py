@@ -63,7 +63,7 @@ class SynthesizerConfig(Config):
     phones: str = "tcp://127.0.0.1:5570"
     faps: str = "tcp://127.0.0.1:5571"
     frame_rate_hz: float = 50.0
-    look_ahead_ms: float = 150.0  # how much later than its sound a frame is made
+    look_ahead_ms: float = 160.0  # how much later than its sound a frame is made; steps of 20
     gesture_seed: int = 3  # of blinks, gaze and head motion; 0: the mouth alone moves
 
 
