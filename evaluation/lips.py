@@ -24,7 +24,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -254,7 +253,3 @@ def main(folder: Path, output: Path | None = None, parameters: Path | None = Non
         console.print(table)
     if output is not None:
         output.write_text(json.dumps([asdict(score) for score in scores], indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -35,7 +35,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from rich.progress import track
 from scipy.optimize import minimize
@@ -533,7 +532,3 @@ def train(folder: Path, output: Path) -> None:
     parameters = estimate(frames_of(clips, [label_clip(model, clip) for clip in clips]))
     names = ", ".join(clip.name for clip in clips)
     save_parameters(parameters, output, f"{_SOURCE}; learned from {names} (FACEGOOD, MIT)")
-
-
-if __name__ == "__main__":
-    typer.run(train)
