@@ -76,9 +76,7 @@ class DriverService(Service):
         recording = None
         old = self._followers.get(start.session)
         if old is not None:
-            if (
-                old.start.token == start.token
-            ):  # the same session after a crash goes on in its video
+            if old.start.token == start.token:  # the same after a crash: its video goes on
                 recording, old.recording = old.recording, None
             self._leave(old)
         socket = self.bus.connect_subscriber(start.phones, start.faps)
@@ -183,7 +181,13 @@ class DriverService(Service):
         if self._config.view == "none" or (self._config.view == "auto" and not has_display):
             return None
         head = Head.load(detail="coarse")  # live, smooth motion is worth more than smooth outlines
-        return Window(head, self._config.width_px, self._config.height_px)
+        try:
+            return Window(head, self._config.width_px, self._config.height_px)
+        except UserError as error:
+            if self._config.view == "window":
+                raise
+            LOG.warning("no window: %s", error)
+            return None
 
     def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
         """Return the newest frame, or while none comes one that fades to rest."""
