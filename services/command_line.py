@@ -147,6 +147,7 @@ def run(
     log_folder = Path(getattr(driver_config, "out", "out")) / "logs"
     supervisor = Supervisor(arguments, log_folder, CONSOLE)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
     page = f"http://{gateway_config.host}:{gateway_config.port}"
     try:
         with CONSOLE.status("starting control, recognizer, synthesizer, driver and gateway"):

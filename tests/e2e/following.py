@@ -108,7 +108,9 @@ def stream_into(
             while time.monotonic() < due_s:
                 output.wait(max(0.001, due_s - time.monotonic()))
                 collect(output.receive(), heard)
-    opened.finish()
+    while not opened.finish():
+        output.wait(0.02)
+        collect(output.receive(), heard)
     end_s = time.monotonic() + 60
     while not heard.ended:
         assert time.monotonic() < end_s, "the last frame did not come"

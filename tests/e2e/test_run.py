@@ -87,9 +87,11 @@ def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
             check=False,
         )
         assert spoken.returncode == 0, spoken.stderr
-    finally:
         running.send_signal(signal.SIGINT)
         _, log = running.communicate(timeout=30)
+    finally:
+        running.kill()
+        running.communicate()
     assert running.returncode == 0, log
     assert "Traceback" not in log
 
