@@ -27,7 +27,10 @@ from shared.errors import UserError
 from training.commands import app as training_app
 
 app = typer.Typer(
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Live Mandarin speech in, a talking 3-D face out.",
 )
 head_app = typer.Typer(no_args_is_help=True, help="The 3-D head.")
 app.add_typer(head_app, name="head")
