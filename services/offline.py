@@ -19,9 +19,8 @@ from services.recognizer.load import load_model
 from services.recognizer.pcm import level_db, slices
 from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler
-from services.synthesizer.live import LiveSynthesizer
+from services.synthesizer.live import REST_S, LiveSynthesizer
 from services.synthesizer.parameters import load_parameters
-from services.synthesizer.service import REST_S
 from shared.audio_file import open_audio
 from shared.config import RecognizerConfig, SynthesizerConfig
 from shared.messages import MEDIA_RATE_HZ

@@ -89,10 +89,6 @@ class Socket:
             return False
         return True
 
-    def send_raw(self, parts: list[bytes]) -> None:
-        """Send parts as they are; for tests that play a broken peer."""
-        self._raw.send_multipart(parts)
-
     def subscribe(self, kind: type[Message], session: str | None) -> None:
         """Subscribe to a kind of message, of one session or (None) of all."""
         self._raw.setsockopt(zmq.SUBSCRIBE, _filter(kind, session))
@@ -105,10 +101,6 @@ class Socket:
         """
         for kind in (*kinds, Joined):
             self.subscribe(kind, session)
-
-    def unsubscribe(self, kind: type[Message], session: str | None) -> None:
-        """Take a subscription back."""
-        self._raw.setsockopt(zmq.UNSUBSCRIBE, _filter(kind, session))
 
     def receive(self) -> Iterator[Received]:
         """Yield what has arrived, up to a fair batch.

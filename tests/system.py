@@ -34,6 +34,25 @@ def free_port(host: str = "127.0.0.1") -> int:
     return port
 
 
+def own_environment(folder: Path) -> dict[str, str]:
+    """Return an environment in which all services run on ports of their own, driver headless."""
+    environment = {
+        **os.environ,
+        **ONE_THREAD,
+        "KOUXING_GATEWAY_PORT": str(free_port()),
+        "KOUXING_DRIVER_VIEW": "none",
+        "KOUXING_DRIVER_OUT": str(folder),
+        "KOUXING_DRIVER_WIDTH_PX": "320",
+        "KOUXING_DRIVER_HEIGHT_PX": "240",
+    }
+    for service, keys in BINDS.items():
+        for key in keys:
+            endpoint = f"tcp://127.0.0.1:{free_port()}"
+            environment[f"KOUXING_{service.upper()}_{key}"] = endpoint
+    environment["KOUXING_CONTROL"] = environment["KOUXING_CONTROL_COMMANDS"]
+    return environment
+
+
 class System:
     """Services as processes, each on the address given for it."""
 

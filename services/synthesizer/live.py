@@ -42,7 +42,7 @@ FapFrame = tuple[float, NDArray[np.float32]]
 LONGEST_LOOK_AHEAD_S = 0.3
 _TRANSITION_S = 0.06  # from one plan to the next
 _FLUSH_S = 0.14  # to rest after an interruption
-_RELAX_S = 0.3  # to rest when no sound comes
+REST_S = 0.3  # to rest when no sound comes
 _NEWS_S = 0.11  # a recognizer says a unit so long after its onset: no news, no onset before that
 _LATE_CLOSURE_S = 0.1  # a closure recognised up to this much late is still shown, late
 _CATCH_UP_S = 0.04  # and takes this long
@@ -204,7 +204,7 @@ class LiveSynthesizer:
         where the face is then.
         """
         if self._rest_decay is None:
-            duration_s = _RELAX_S if self._phones else _FLUSH_S
+            duration_s = REST_S if self._phones else _FLUSH_S
             self._rest_decay = _Decay(
                 self._position - self._parameters.neutral,
                 self._slope,

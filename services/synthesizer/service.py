@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.live import LiveSynthesizer
+from services.synthesizer.live import REST_S, LiveSynthesizer
 from services.synthesizer.parameters import load_parameters
 from shared.clock import to_samples, to_seconds
 from shared.config import SynthesizerConfig, reachable
@@ -38,7 +38,6 @@ from shared.service import Service
 
 STALL_S = 0.2  # a live stream silent for so long has stalled
 LONGEST_GAP_S = 10.0  # of media time that is filled with frames
-REST_S = 0.3  # within which any face is at rest
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 

@@ -19,7 +19,7 @@ from shared.client import Client, Session
 from shared.errors import UserError
 from shared.messages import FapFrame
 from tests.e2e.following import samples_of_file
-from tests.system import BINDS, DEMO, ONE_THREAD, free_port
+from tests.system import DEMO, own_environment
 
 pytestmark = pytest.mark.e2e
 
@@ -28,14 +28,8 @@ class Watched:
     """A supervisor on ports of its own, checked as ``kouxing run`` does."""
 
     def __init__(self, folder: Path) -> None:
-        environment = {**ONE_THREAD, "KOUXING_DRIVER_VIEW": "none"}
-        for service, keys in BINDS.items():
-            for key in keys:
-                endpoint = f"tcp://127.0.0.1:{free_port()}"
-                environment[f"KOUXING_{service.upper()}_{key}"] = endpoint
-        environment["KOUXING_GATEWAY_PORT"] = str(free_port())
-        self.control = environment["KOUXING_CONTROL_COMMANDS"]
-        environment["KOUXING_CONTROL"] = self.control
+        environment = own_environment(folder)
+        self.control = environment["KOUXING_CONTROL"]
         self.shown = io.StringIO()
         console = Console(file=self.shown, width=200)
         self.supervisor = Supervisor([], folder, console, environment)

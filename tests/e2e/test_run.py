@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,25 +11,9 @@ from pathlib import Path
 import av
 import pytest
 
-from tests.system import BINDS, DEMO, ONE_THREAD, ROOT, free_port
+from tests.system import DEMO, ROOT, own_environment
 
 pytestmark = pytest.mark.e2e
-
-
-def own_environment(folder: Path) -> dict[str, str]:
-    environment = {**os.environ, **ONE_THREAD, "KOUXING_DRIVER_VIEW": "none"}
-    for service, keys in BINDS.items():
-        for key in keys:
-            endpoint = f"tcp://127.0.0.1:{free_port()}"
-            environment[f"KOUXING_{service.upper()}_{key}"] = endpoint
-    environment |= {
-        "KOUXING_CONTROL": environment["KOUXING_CONTROL_COMMANDS"],
-        "KOUXING_GATEWAY_PORT": str(free_port()),
-        "KOUXING_DRIVER_OUT": str(folder),
-        "KOUXING_DRIVER_WIDTH_PX": "320",
-        "KOUXING_DRIVER_HEIGHT_PX": "240",
-    }
-    return environment
 
 
 def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:
