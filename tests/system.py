@@ -53,6 +53,30 @@ def own_environment(folder: Path) -> dict[str, str]:
     return environment
 
 
+def kouxing(
+    *arguments: object,
+    control: str = "",
+    environment: dict[str, str] | None = None,
+    stdin: bytes | None = None,
+) -> subprocess.CompletedProcess[str]:
+    """Run the command line to its end; no input may bring a traceback."""
+    environment = {**os.environ, **ONE_THREAD, "COLUMNS": "200", **(environment or {})}
+    if control:
+        environment["KOUXING_CONTROL"] = control
+    result = subprocess.run(
+        [sys.executable, "-m", "services", *map(str, arguments)],
+        env=environment,
+        cwd=ROOT,
+        capture_output=True,
+        input=stdin,
+        timeout=110,
+        check=False,
+    )
+    texts = (result.stdout.decode(), result.stderr.decode())
+    assert "Traceback" not in texts[1], texts[1]
+    return subprocess.CompletedProcess(result.args, result.returncode, *texts)
+
+
 class System:
     """Services as processes, each on the address given for it."""
 

