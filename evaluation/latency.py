@@ -8,8 +8,7 @@ time in 20 ms chunks, and for every FAP frame is measured:
 - *sound to frame*: from sending the last sample of the chunk that the frame belongs to: that plus
   the look-ahead. A page that delays the sound by this much is in sync.
 
-CPU is what the processes' own clocks say, per second of audio. Images per second are those of the
-driver's renderer alone.
+CPU is what the processes' own clocks say, per second of audio.
 """
 
 from __future__ import annotations
@@ -27,19 +26,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from services.driver.head import Head
-from services.driver.render import Renderer
 from services.supervisor import Supervisor
 from shared.audio_file import read_audio
 from shared.client import Client
 from shared.config import SynthesizerConfig
 from shared.errors import UserError
-from shared.faps import NUM_FAPS
 from shared.messages import EndOfFaps, FapFrame
 
 CHUNK_S = 0.02
-IMAGE_SIZES = ((640, 480, 0), (1280, 720, 4))  # width, height, samples a pixel
-NUM_IMAGES = 60
 END_LIMIT_S = 30.0  # for the last frame
 
 
@@ -52,7 +46,6 @@ class Latency:
     look_ahead_ms: float
     num_frames: int
     cpu_s_per_audio_s: dict[str, float]
-    images_per_s: dict[str, float]
 
 
 def measure(path: Path, num_repeats: int, console: Console) -> Latency:
@@ -89,7 +82,6 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
         look_ahead_ms=look_ahead_s * 1e3,
         num_frames=len(to_frame_ms),
         cpu_s_per_audio_s={name: (after[name] - before[name]) / audio_s for name in after},
-        images_per_s=_images_per_s(),
     )
 
 
@@ -106,10 +98,6 @@ def show(latency: Latency, console: Console) -> None:
     for name, value in latency.cpu_s_per_audio_s.items():
         costs.add_row(name, f"{value:.3f}")
     console.print(costs)
-    images = Table("renderer", "images per s")
-    for name, value in latency.images_per_s.items():
-        images.add_row(name, f"{value:.0f}")
-    console.print(images)
 
 
 def _stream(
@@ -166,24 +154,6 @@ def _percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:
 
 def _cpu_s(client: Client) -> dict[str, float]:
     return {state.service: state.metrics.get("cpu_s", 0.0) for state in client.status().services}
-
-
-def _images_per_s() -> dict[str, float]:
-    rates = {}
-    for width_px, height_px, num_samples in IMAGE_SIZES:
-        head = Head.load(detail="fine" if num_samples else "coarse")
-        renderer = Renderer(head, width_px, height_px, samples=num_samples)
-        faps = np.zeros(NUM_FAPS, np.float32)
-        renderer.draw(faps)
-        begin_s = time.perf_counter()
-        for number in range(NUM_IMAGES):
-            faps[2] = 300 * np.sin(number)
-            renderer.draw(faps)
-        kind = f"video, {num_samples}x anti-aliased" if num_samples else "live, coarse head"
-        name = f"{width_px}x{height_px} {kind}"
-        rates[name] = NUM_IMAGES / (time.perf_counter() - begin_s)
-        renderer.close()
-    return rates
 
 
 def _own_ports() -> dict[str, str]:

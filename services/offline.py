@@ -1,4 +1,4 @@
-"""Audio file to phones, FAP frames and video in one process, without running services.
+"""Audio file to phones and FAP frames in one process, without running services.
 
 The same recognizer and synthesizer as live, fed in the same 20 ms steps: the frames are those that
 the services would send.
@@ -12,9 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head import Head
-from services.driver.recording import Recording
-from services.driver.render import Renderer
 from services.recognizer.load import load_model
 from services.recognizer.pcm import level_db, slices
 from services.recognizer.pipeline import Recognizer
@@ -95,30 +92,3 @@ def live_frames(
     synthesizer.accept_speech(SpeechChange(active=False, time_s=end_s))
     frames += synthesizer.advance(end_s + look_ahead_s + REST_S)
     return phones, frames
-
-
-def render_video(
-    samples: NDArray[np.float32],
-    frames: list[Frame],
-    path: Path,
-    *,
-    width_px: int,
-    height_px: int,
-    frame_rate_hz: float,
-    on_progress: ProgressCallback = lambda _share: None,
-) -> int:
-    """Write a video of FAP frames with their sound; return the number of images.
-
-    Raises
-    ------
-    UserError
-        If the video cannot be written or nothing can be drawn on this system.
-    """
-    recording = Recording(path, Renderer(Head.load(), width_px, height_px), frame_rate_hz)
-    recording.accept_sound(0, samples)
-    for time_s, faps in frames:
-        recording.accept_frame(time_s, faps)
-    while recording.step():
-        on_progress(min(1.0, recording.duration_s / max(frames[-1][0], 1e-9)))
-    recording.close()
-    return recording.num_images

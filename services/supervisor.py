@@ -22,6 +22,7 @@ from shared.service import DRAIN_LIMIT_S, PARENT_VARIABLE
 
 SERVICES = ("control", "recognizer", "synthesizer", "driver", "gateway")
 BACKOFF_S = (0.2, 5.0)  # first and longest wait before a crashed service starts again
+CHECK_EVERY_S = 0.2
 STEADY_S = 30.0  # after which a crash counts as the first one again
 USER_ERROR = 2  # exit status of a service that was configured wrongly
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
@@ -56,6 +57,9 @@ class Supervisor:
         self._started_s: dict[str, float] = {}
         self._wait_s = dict.fromkeys(SERVICES, BACKOFF_S[0])
         self._due_s: dict[str, float] = {}
+        self._watcher: threading.Thread | None = None
+        self._stopping = threading.Event()
+        self._failure: UserError | None = None
         log_folder.mkdir(parents=True, exist_ok=True)
 
     def start(self) -> None:
@@ -81,6 +85,31 @@ class Supervisor:
                         return
                 time.sleep(0.1)
         raise UserError(f"the services did not start; their logs are in {self._log_folder}")
+
+    def watch(self) -> None:
+        """From now on start crashed services again, whatever this thread does; see ``wait``."""
+        self._watcher = threading.Thread(target=self._watch, daemon=True)
+        self._watcher.start()
+
+    def wait(self) -> None:
+        """Wait for ever.
+
+        Raises
+        ------
+        UserError
+            If a watched service says that it is configured wrongly.
+        """
+        while not self._stopping.wait(CHECK_EVERY_S):
+            if self._failure is not None:
+                raise self._failure
+
+    def _watch(self) -> None:
+        while not self._stopping.wait(CHECK_EVERY_S):
+            try:
+                self.check()
+            except UserError as error:
+                self._failure = error
+                return
 
     def check(self) -> None:
         """Start crashed services again.
@@ -117,6 +146,9 @@ class Supervisor:
 
     def stop(self) -> None:
         """Ask every service to finish, and end those that do not."""
+        self._stopping.set()
+        if self._watcher is not None:
+            self._watcher.join()
         for process in self._processes.values():
             process.send_signal(signal.SIGTERM)
         end_s = time.monotonic() + DRAIN_LIMIT_S + 1.0

@@ -73,6 +73,10 @@ class DriverConfig(Config):
 
     view: str = "auto"  # window, none, or auto: a window where there is a display
     out: str = "out"  # folder for recorded videos
+    head: str = "woman"  # a head of the package, an .npz, or a .glb with morph targets
+    background: str = "studio"  # studio, #rrggbb, or a colour's name
+    camera: str = "face"  # what fills the picture: face, head, mouth
+    virtual_camera: bool = False  # also be a camera for other programs
     width_px: int = 1280
     height_px: int = 720
     frame_rate_hz: float = 25.0
@@ -84,6 +88,7 @@ class GatewayConfig(Config):
 
     host: str = "127.0.0.1"
     port: int = 8080
+    head: str = ""  # another head for the page: a GLB that 'kouxing head export' wrote
 
 
 SECTIONS: dict[str, type[Config]] = {

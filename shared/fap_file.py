@@ -6,6 +6,10 @@ line. What differs in the wild and is accepted: Greta's mask has a 69th digit an
 number, where Xface has four (and six for FAP 2); digits of the mask may stand without blanks;
 values may be ``inf`` or ``nan`` (taken as 0); a file may set only the inner or only the outer lips
 (the others follow them).
+
+FAP 1 is ``viseme_select1 viseme_select2 viseme_blend viseme_def`` and FAP 2 ``expression_select1
+expression_intensity1 expression_select2 expression_intensity2 init_face expression_def`` (ISO/IEC
+14496-2, annex C); a single number selects one at full strength.
 """
 
 from __future__ import annotations
@@ -23,9 +27,14 @@ from shared.faps import NUM_FAPS
 
 _VERSION = "2.1"
 _GRETA_MASK_DIGITS = NUM_FAPS + 1
-# numbers that a set FAP 1 and FAP 2 bring: all of the standard's, or the selection alone
-_VISEME_NUMBERS = (4, 1)
-_EXPRESSION_NUMBERS = (6, 1)
+# highest values of the numbers that a set FAP 1 and FAP 2 bring; the flags at their ends say
+# nothing to a head whose shapes are given, and programs write anything there
+_ANY = 2**31
+_VISEME_LIMITS = (14, 14, 63, _ANY)
+_EXPRESSION_LIMITS = (6, 63, 6, 63, _ANY, _ANY)
+# what a selection alone stands for: all of it
+_VISEME_ALONE = (0, 63, 0)
+_EXPRESSION_ALONE = (63, 0, 0, 0, 0)
 # inner lip FAP: the outer one
 _LIP_PAIRS = {
     4: 51, 5: 52, 6: 53, 7: 54, 8: 55, 9: 56, 10: 57, 11: 58, 12: 59, 13: 60,
@@ -39,6 +48,8 @@ class FapAnimation:
     name: str
     frame_rate_hz: float
     faps: NDArray[np.float32]  # (num_frames, 68), FAP units; FAP 1 and 2: the first selection
+    visemes: NDArray[np.int64] | None = None  # (num_frames, 4), the numbers of FAP 1; None: unset
+    expressions: NDArray[np.int64] | None = None  # (num_frames, 6), those of FAP 2
 
 
 class _BadFileError(Exception):
@@ -69,21 +80,31 @@ def read_fap(path: Path) -> FapAnimation:
 def write_fap(
     path: Path, animation: FapAnimation, style: Literal["xface", "greta"] = "xface"
 ) -> None:
-    """Write FAPs 3 to 68 as a ``.fap`` file; Greta's have a longer mask and whole numbers.
+    """Write a ``.fap`` file.
+
+    Greta's have a longer mask, whole numbers and one number for FAP 1; FAP 2 is left out there.
 
     Raises
     ------
     UserError
         The file cannot be written.
     """
-    faps = animation.faps[:, 2:]
+    visemes, expressions = animation.visemes, animation.expressions
+    low = animation.faps[:, 2:]
     if style == "greta":
-        mask, rows = "0 0" + " 1" * 66 + " 0", [[f"{value:.0f}" for value in row] for row in faps]
+        expressions = None
+        visemes = None if visemes is None else visemes[:, :1]
+        rows = [[f"{value:.0f}" for value in row] for row in low]
     else:
         # nine digits give every float32 back
-        mask, rows = "0 0" + " 1" * 66, [[f"{value:.9g}" for value in row] for row in faps]
+        rows = [[f"{value:.9g}" for value in row] for row in low]
+    for high in (expressions, visemes):
+        if high is not None:
+            rows = [[*map(str, head), *row] for head, row in zip(high, rows, strict=True)]
+    digits = [str(int(high is not None)) for high in (visemes, expressions)]
+    mask = " ".join([*digits, *["1"] * 66, *["0"] * (style == "greta")])
     name = " ".join(animation.name.split()) or "kouxing"
-    lines = [f"{_VERSION} {name} {animation.frame_rate_hz:.10g} {len(faps)}"]
+    lines = [f"{_VERSION} {name} {animation.frame_rate_hz:.10g} {len(low)}"]
     for number, row in enumerate(rows):
         lines += [mask, f"{number} {' '.join(row)}"]
     try:
@@ -107,12 +128,15 @@ def _parse(text: str) -> FapAnimation:
             lines[1 + 2 * num_frames][0], f"more than the {num_frames} frames of the first line"
         )
     faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
+    visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
+    expressions = np.zeros((num_frames, len(_EXPRESSION_LIMITS)), dtype=np.int64)
     used = np.zeros(NUM_FAPS, dtype=bool)
     first_number: int | None = None
     for frame in range(num_frames):
         mask = _parse_mask(*lines[1 + 2 * frame])
         line_number, words = lines[2 + 2 * frame]
-        faps[frame, mask] = _parse_values(line_number, words, mask)
+        visemes[frame], expressions[frame], values = _parse_values(line_number, words, mask)
+        faps[frame, 2:][mask[2:]] = values
         number = _parse_int(line_number, words[0], "a frame number")
         first_number = number if first_number is None else first_number
         if number != first_number + frame:
@@ -120,12 +144,19 @@ def _parse(text: str) -> FapAnimation:
                 line_number, f"frame {number} where {first_number + frame} must follow"
             )
         used |= mask
+    faps[:, 0], faps[:, 1] = visemes[:, 0], expressions[:, 0]
     for inner, outer in _LIP_PAIRS.items():
         if used[inner - 1] and not used[outer - 1]:
             faps[:, outer - 1] = faps[:, inner - 1]
         elif used[outer - 1] and not used[inner - 1]:
             faps[:, inner - 1] = faps[:, outer - 1]
-    return FapAnimation(name, frame_rate_hz, faps)
+    return FapAnimation(
+        name,
+        frame_rate_hz,
+        faps,
+        visemes if used[0] else None,
+        expressions if used[1] else None,
+    )
 
 
 def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
@@ -167,19 +198,37 @@ def _parse_mask(line_number: int, words: list[str]) -> NDArray[np.bool_]:
 
 def _parse_values(
     line_number: int, words: list[str], mask: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Values of the set FAPs, the first number of each of FAP 1 and 2."""
+) -> tuple[list[int], list[int], NDArray[np.float32]]:
+    """Numbers of FAP 1 (4) and of FAP 2 (6), and the values of the other set FAPs."""
     try:
         values = [float(word) for word in words[1:]]
     except ValueError:
         raise _BadFileError(line_number, "a value is not a number") from None
     # how many numbers FAP 1 and 2 have shows in the length of the line
-    for num_viseme in _VISEME_NUMBERS if mask[0] else (0,):
-        for num_expression in _EXPRESSION_NUMBERS if mask[1] else (0,):
+    for num_viseme in (len(_VISEME_LIMITS), 1) if mask[0] else (0,):
+        for num_expression in (len(_EXPRESSION_LIMITS), 1) if mask[1] else (0,):
             high = num_viseme + num_expression
             if len(values) == high + int(mask[2:].sum()):
-                heads = [at for at, set_ in ((0, mask[0]), (num_viseme, mask[1])) if set_]
-                taken = np.array([values[at] for at in heads] + values[high:], dtype=np.float64)
-                sane = np.where(np.abs(taken) <= np.finfo(np.float32).max, taken, 0.0)
-                return sane.astype(np.float32)
+                low = np.array(values[high:], dtype=np.float64)
+                sane = np.where(np.abs(low) <= np.finfo(np.float32).max, low, 0.0)
+                return (
+                    _parse_high(line_number, 1, values[:num_viseme], _VISEME_LIMITS),
+                    _parse_high(line_number, 2, values[num_viseme:high], _EXPRESSION_LIMITS),
+                    sane.astype(np.float32),
+                )
     raise _BadFileError(line_number, f"{len(values)} values, the mask asks for {int(mask.sum())}")
+
+
+def _parse_high(
+    line_number: int, fap: int, given: list[float], limits: tuple[int, ...]
+) -> list[int]:
+    if not given:
+        return [0] * len(limits)
+    if len(given) == 1:
+        given = [*given, *(_VISEME_ALONE if fap == 1 else _EXPRESSION_ALONE)]
+    for value, limit in zip(given, limits, strict=True):
+        if not (0 <= value <= limit and value == int(value)):
+            raise _BadFileError(
+                line_number, f"FAP {fap} has {value:g}; a whole number from 0 to {limit} is due"
+            )
+    return [int(value) for value in given]

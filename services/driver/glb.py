@@ -1,8 +1,9 @@
 """Export a head as a standard binary glTF (GLB) that a browser or an engine can move by FAPs.
 
-Khronos glTF 2.0. Every displacement FAP is a morph target (sparse accessors), named by the FAP;
-the rotations (FAPs 23 to 26 and 48 to 50) turn nodes. ``extras.kouxing`` of the root node and of
-the scene says how a FAP becomes a weight or an angle:
+Khronos glTF 2.0. Every displacement FAP is a morph target (sparse accessors), named by the FAP,
+and so is each of ARKit's 52 shapes, a sum of FAPs by ``arkit.tsv``; drive the head by the ones or
+by the others. The rotations (FAPs 23 to 26 and 48 to 50) turn nodes. ``extras.kouxing`` of the root
+node and of the scene says how a FAP becomes a weight or an angle:
 
 - weight = FAP / ``unitsPerWeight``, never clamped;
 - angle in rad = FAP * 1e-5 about ``rotation.axis`` of the node ``rotation.node``; several on one
@@ -24,15 +25,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head import ROTATIONS, Head, Part
+from services.driver.arkit import ARKIT, ARKIT_NAMES
+from services.driver.head import ASSETS, Head, Part
 from services.driver.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
-from services.driver.render import BACKGROUND, Camera
+from services.driver.render import BACKGROUND
+from services.driver.scene import camera
 from shared.errors import UserError
-from shared.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
+from shared.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 
 _COMPONENT = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
-_FINEST_M = 2e-5  # smaller displacements at one FAPU are left out
+_MOST_SHORT = 65535  # vertices that numbers of two bytes tell apart; the last is no number
+_FINEST_M = 2e-5  # smaller displacements at one FAPU are left out,
+_FINEST_SHAPE_M = 1e-4  # and smaller ones of an ARKit shape at weight 1
 _ANGLE_UNITS_PER_WEIGHT = 1 / RADIANS_PER_ANGLE_UNIT  # a weight of 1 is 1 rad
 
 _ROTATION_OF = {
@@ -44,6 +49,7 @@ _ROTATION_OF = {
     49: ("head", (0, 1, 0)),
     50: ("head", (0, 0, 1)),
 }
+_TURNS_EYES = np.isin(np.arange(1, NUM_FAPS + 1), (23, 24, 25, 26))
 
 
 class _Document:
@@ -103,6 +109,7 @@ class _Document:
         self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int
     ) -> int:
         """Store displacements (N, 3) that are zero but in ``rows``."""
+        number = np.uint16 if count <= _MOST_SHORT else np.uint32
         padded = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])
         return self.add(
             "accessors",
@@ -115,8 +122,8 @@ class _Document:
                 "sparse": {
                     "count": len(rows),
                     "indices": {
-                        "bufferView": self.view(rows.astype(np.uint16).tobytes()),
-                        "componentType": _COMPONENT["u2"],
+                        "bufferView": self.view(rows.astype(number).tobytes()),
+                        "componentType": _COMPONENT[np.dtype(number).str[1:]],
                     },
                     "values": {"bufferView": self.view(values.tobytes())},
                 },
@@ -172,13 +179,16 @@ def export_glb(head: Head, path: str | Path) -> None:
     nodes: dict[str, int] = {}
     for part in head.parts:
         nodes[part.name] = _part_node(document, head, part, textures)
-    inside = [name for name in nodes if name not in ("skin", "garment")]
-    nodes["head"] = document.add("nodes", {"name": "head", "children": [nodes[n] for n in inside]})
-    nodes["body"] = document.add("nodes", {"name": "body", "children": [nodes["head"]]})
+    carriers = {part.name: _carrier(head, part) for part in head.parts}
+    on_head, on_body, skinned = (
+        [nodes[name] for name, carrier in carriers.items() if carrier == kind]
+        for kind in ("head", "body", "both")
+    )
+    nodes["head"] = document.add("nodes", _parent("head", on_head))
+    nodes["body"] = document.add("nodes", _parent("body", [nodes["head"]]))
     extras = {"kouxing": _description(head)}
     nodes["kouxing"] = document.add(
-        "nodes",
-        {"name": "kouxing", "children": [nodes["body"], nodes["garment"]], "extras": extras},
+        "nodes", _parent("kouxing", [nodes["body"], *on_body]) | {"extras": extras}
     )
     identity = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)).reshape(2, 16)
     matrices = document.accessor(identity, "MAT4")
@@ -191,8 +201,18 @@ def export_glb(head: Head, path: str | Path) -> None:
     document.save(
         Path(path),
         scene=0,
-        scenes=[{"name": head.name, "nodes": [nodes["kouxing"], nodes["skin"]], "extras": extras}],
+        scenes=[{"name": head.name, "nodes": [nodes["kouxing"], *skinned], "extras": extras}],
     )
+
+
+def _carrier(head: Head, part: Part) -> str:
+    """Say what carries a part: the head, the body, or both, as the neck."""
+    share = np.round(head.head_weight[part.vertices] * 255)
+    return "head" if share.min() == 255 else "body" if share.max() == 0 else "both"
+
+
+def _parent(name: str, children: list[int]) -> dict[str, Any]:
+    return {"name": name} | ({"children": children} if children else {})
 
 
 def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, int]) -> int:
@@ -212,7 +232,7 @@ def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, 
             np.round(colors * 65535).astype(np.uint16), "VEC4", normalized=True
         ),
     }
-    if part.name == "skin":
+    if _carrier(head, part) == "both":
         share = np.round(head.head_weight[part.vertices] * 255).astype(np.uint8)
         joints, weights = np.zeros((2, len(vertices), 4), np.uint8)
         joints[:, 1] = share > 0  # an unused joint must be 0
@@ -220,7 +240,9 @@ def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, 
         attributes["JOINTS_0"] = document.accessor(joints, "VEC4")
         attributes["WEIGHTS_0"] = document.accessor(weights, "VEC4", normalized=True)
         node["skin"] = 0
-    indices = (head.triangles[part.triangles] - part.vertices.start).astype(np.uint16).ravel()
+    indices = (head.triangles[part.triangles] - part.vertices.start).ravel()
+    if len(vertices) <= _MOST_SHORT:
+        indices = indices.astype(np.uint16)
     primitive: dict[str, Any] = {
         "attributes": attributes,
         "indices": document.accessor(indices, "SCALAR", target=_ELEMENT_BUFFER),
@@ -254,17 +276,28 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
 
 def _targets(document: _Document, head: Head, part: Part) -> tuple[list[dict[str, int]], list[str]]:
     """Morph targets of a part, and their names."""
-    rows = head.basis[3 * part.vertices.start : 3 * part.vertices.stop].tocsc()
     count = part.vertices.stop - part.vertices.start
-    targets, names = [], []
-    for fap in FAPS:
-        column = rows[:, [fap.number - 1]].toarray().reshape(count, 3)
-        shift = (column * _units_per_weight(fap.fapu)).astype(np.float32)
-        moved = np.flatnonzero(np.abs(shift).max(axis=1) > _FINEST_M)
+    fields = head.basis[3 * part.vertices.start : 3 * part.vertices.stop].T.toarray()  # (68, 3 V)
+    shapes = ARKIT @ fields
+    targets: list[dict[str, int]] = []
+    names = []
+
+    def add(name: str, shift: NDArray[np.float32], finest_m: float) -> None:
+        moved = np.flatnonzero(np.abs(shift).max(axis=1) > finest_m)
         if len(moved):
             accessor = document.sparse_vectors(moved, shift[moved], count)
             targets.append({"POSITION": accessor})
-            names.append(fap.name)
+            names.append(name)
+
+    for fap in FAPS:
+        shift = fields[fap.number - 1] * np.float32(_units_per_weight(fap.fapu))
+        add(fap.name, shift.reshape(count, 3), _FINEST_M)
+    for name, faps, shape in zip(ARKIT_NAMES, ARKIT, shapes, strict=True):
+        shift = shape.reshape(count, 3)
+        turn = np.where(_TURNS_EYES, faps, 0).astype(np.float32)
+        if part.name.startswith("eye") and turn.any():  # engines may know shapes alone
+            shift = shift + (head.deform(turn) - head.vertices)[part.vertices]
+        add(name, shift, _FINEST_SHAPE_M)
     return targets, names
 
 
@@ -275,15 +308,17 @@ def _units_per_weight(fapu: str) -> float:
 def _description(head: Head) -> dict[str, Any]:
     """Say what a viewer needs to turn FAPs into weights and angles."""
     faps: list[dict[str, Any]] = []
+    turning = {"head"} | {part.name for part in head.parts}
     for fap in FAPS[2:]:
         entry: dict[str, Any] = {"number": fap.number, "name": fap.name, "fapu": fap.fapu}
-        if fap.number in ROTATIONS:
-            node, axis = _ROTATION_OF[fap.number]
+        node, axis = _ROTATION_OF.get(fap.number, ("", ()))
+        if node in turning:
             entry["rotation"] = {"node": node, "axis": axis}
         else:
             entry["unitsPerWeight"] = _units_per_weight(fap.fapu)
         faps.append(entry)
-    camera = Camera()
+    view = camera(head)
+    own = (ASSETS / f"{head.name}.npz").is_file()
     return {
         "version": 1,
         "faps": faps,
@@ -293,19 +328,19 @@ def _description(head: Head) -> dict[str, Any]:
             for name, vertex in head.feature_points.items()
         },
         "camera": {
-            "position": camera.position,
-            "target": camera.target,
-            "fovYDegrees": camera.field_of_view_deg,
+            "position": view.position,
+            "target": view.target,
+            "fovYDegrees": view.field_of_view_deg,
         },
         "background": BACKGROUND[0],
         "visemes": _shapes(VISEME_NAMES, VISEMES),
         "expressions": _shapes(EXPRESSION_NAMES, EXPRESSIONS),
-        "licence": "CC0-1.0",
-    }
+        "arkit": _shapes(ARKIT_NAMES, ARKIT),
+    } | ({"licence": "CC0-1.0"} if own else {})
 
 
 def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:
-    """List what FAP 1 and FAP 2 select, as low-level FAPs."""
+    """List shapes as low-level FAPs."""
     return [
         {"name": name, "faps": {FAPS[i].name: round(float(row[i]), 1) for i in np.flatnonzero(row)}}
         for name, row in zip(names, values, strict=True)

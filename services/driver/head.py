@@ -26,7 +26,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,7 @@ from shared.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"
-DEFAULT_HEAD = "asian_female_young"
-ROTATIONS = (23, 24, 25, 26, 48, 49, 50)
+DEFAULT_HEAD = "woman"
 
 Detail = Literal["fine", "coarse"]
 Float32 = NDArray[np.float32]
@@ -58,6 +57,61 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
+class Shading:
+    """Normals of a surface that a basis bends."""
+
+    rest: Float32  # (V, 3), of the neutral face
+    triangles: NDArray[np.uint32]  # those the basis bends
+    vertices: NDArray[np.int64]  # theirs
+    incidence: sparse.csr_array  # (vertices, triangles)
+
+    @classmethod
+    def of(
+        cls,
+        vertices: Float32,
+        triangles: NDArray[np.uint32],
+        basis: sparse.csr_array,
+        welds: NDArray[np.int64] | None = None,
+    ) -> Shading:
+        """Find what bends.
+
+        Parameters
+        ----------
+        vertices, triangles, basis
+            As in ``Head``.
+        welds
+            Number (V,) of the vertex whose normal each one has; several stand in one place where a
+            texture is cut. By default each has its own.
+        """
+        same = np.arange(len(vertices)) if welds is None else welds
+        welded = same[triangles.astype(np.int64)]
+        moves = np.zeros(len(vertices), dtype=bool)
+        moves[same[np.unique(basis.nonzero()[0] // 3)]] = True
+        turns = np.zeros(len(vertices), dtype=bool)
+        turns[welded[moves[welded].any(axis=1)]] = True
+        around = turns[welded].any(axis=1)  # a normal needs every triangle round its vertex
+        soft = np.flatnonzero(turns[same])
+        return cls(
+            rest=_normals(vertices, triangles, welded)[same],
+            triangles=triangles[around],
+            vertices=soft,
+            incidence=_incidence(welded[around], len(vertices))[same[soft]],
+        )
+
+    def normals(self, vertices: Float32) -> Float32:
+        """Find the normals (V, 3) of bent vertices (V, 3)."""
+        normals = self.rest.copy()
+        a, b, c = vertices[self.triangles.T]
+        soft = self.incidence @ _cross(b - a, c - a)
+        length = np.sqrt(np.einsum("ij,ij->i", soft, soft))[:, None]
+        # where triangles have no area the neutral normal stays
+        normals[self.vertices] = np.where(
+            length > 1e-14, soft / np.maximum(length, 1e-14), normals[self.vertices]
+        )
+        return normals
+
+
+@dataclass(frozen=True, slots=True)
 class Head:
     """A head that FAPs move.
 
@@ -69,8 +123,6 @@ class Head:
         Skin, garment, eyes, teeth, tongue, hair and lashes.
     vertices
         Neutral face (V, 3), m.
-    normals
-        Of the neutral face (V, 3), unit length.
     triangles
         Vertex numbers (F, 3), counter-clockwise seen from outside.
     uv
@@ -89,12 +141,13 @@ class Head:
         Left and right (2, 3), m.
     textures
         Encoded images (JPEG or PNG) by name.
+    shading
+        How the normals follow the vertices.
     """
 
     name: str
     parts: tuple[Part, ...]
     vertices: Float32
-    normals: Float32
     triangles: NDArray[np.uint32]
     uv: Float32
     colors: Float32
@@ -104,9 +157,12 @@ class Head:
     feature_points: dict[str, int]
     eye_centres: Float32
     textures: dict[str, bytes]
-    _soft_triangles: NDArray[np.uint32]  # those the basis bends
-    _soft_vertices: NDArray[np.int64]
-    _soft_incidence: sparse.csr_array  # (soft vertices, soft triangles)
+    shading: Shading
+
+    @property
+    def normals(self) -> Float32:
+        """Normals of the neutral face (V, 3), unit length."""
+        return self.shading.rest
 
     @classmethod
     def load(cls, path: str | Path = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
@@ -134,7 +190,7 @@ class Head:
         try:
             with file.open("rb") as stream, np.load(stream, allow_pickle=False) as asset:
                 arrays = {key: asset[key] for key in asset.files}
-            return _assemble(file.stem, arrays, detail)
+            return assemble(file.stem, arrays, detail)
         except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
             raise UserError(
                 f"{file} is no intact head ({error}); make one with python -m"
@@ -162,14 +218,7 @@ class Head:
     def pose(self, faps: Float32) -> tuple[Float32, Float32]:
         """Move the vertices and find their normals, both (V, 3)."""
         vertices = self._bend(faps)
-        normals = self.normals.copy()
-        a, b, c = vertices[self._soft_triangles.T]
-        soft = self._soft_incidence @ _cross(b - a, c - a)
-        length = np.sqrt(np.einsum("ij,ij->i", soft, soft))[:, None]
-        # where triangles have no area the neutral normal stays
-        normals[self._soft_vertices] = np.where(
-            length > 1e-14, soft / np.maximum(length, 1e-14), normals[self._soft_vertices]
-        )
+        normals = self.shading.normals(vertices)
         return self._turn(vertices, faps, points=True), self._turn(normals, faps, points=False)
 
     def _bend(self, faps: Float32) -> Float32:
@@ -181,12 +230,14 @@ class Head:
     def _turn(self, rows: Float32, faps: Float32, *, points: bool) -> Float32:
         """Turn eyeballs and head; ``rows`` are points, or normals that no centre shifts."""
         angle = np.asarray(faps, dtype=np.float64) * RADIANS_PER_ANGLE_UNIT
-        for side, (yaw, pitch) in enumerate(((23, 25), (24, 26))):
+        for side, (name, yaw, pitch) in enumerate((("eye_left", 23, 25), ("eye_right", 24, 26))):
             if angle[yaw - 1] or angle[pitch - 1]:
-                where = self.part(("eye_left", "eye_right")[side]).vertices
                 turn = _rotation(angle[yaw - 1], angle[pitch - 1], 0.0)
                 centre = self.eye_centres[side] * np.float32(points)
-                rows[where] = (rows[where] - centre) @ turn.T + centre
+                for part in self.parts:  # an eye may have several, or none
+                    if part.name.startswith(name):
+                        where = part.vertices
+                        rows[where] = (rows[where] - centre) @ turn.T + centre
         pitch, yaw, roll = angle[47:50]
         if pitch or yaw or roll:
             turned = rows @ _rotation(yaw, pitch, roll).T
@@ -213,7 +264,7 @@ def _cross(a: Float32, b: Float32) -> Float32:
     return out
 
 
-def _incidence(triangles: NDArray[np.uint32], num_vertices: int) -> sparse.csr_array:
+def _incidence(triangles: NDArray[Any], num_vertices: int) -> sparse.csr_array:
     rows = triangles.T.ravel()
     columns = np.tile(np.arange(len(triangles)), 3)
     return sparse.csr_array(
@@ -221,16 +272,24 @@ def _incidence(triangles: NDArray[np.uint32], num_vertices: int) -> sparse.csr_a
     )
 
 
-def _normals(vertices: Float32, triangles: NDArray[np.uint32]) -> Float32:
+def _normals(
+    vertices: Float32, triangles: NDArray[np.uint32], welded: NDArray[np.int64]
+) -> Float32:
     a, b, c = vertices[triangles.T]
-    normals = _incidence(triangles, len(vertices)) @ _cross(b - a, c - a)
+    normals = _incidence(welded, len(vertices)) @ _cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     ahead = np.array([0.0, 0.0, 1.0])  # for vertices whose triangles have no area
     return np.where(length > 1e-12, normals / np.maximum(length, 1e-20), ahead).astype(np.float32)
 
 
-def _assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail) -> Head:
-    """Build a head out of the arrays that ``build_head`` wrote."""
+def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine") -> Head:
+    """Build a head out of the arrays of its file.
+
+    Raises
+    ------
+    ValueError, KeyError, IndexError
+        If they do not fit each other.
+    """
     if str(arrays["format"]) != FORMAT:
         raise ValueError(f"format {arrays['format']}, expected {FORMAT}")
     coarse = detail == "coarse"
@@ -267,21 +326,14 @@ def _assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail)
     faces = np.concatenate(triangles)
     vertices = arrays["vertices"].astype(np.float32)[kept]
     basis = _basis(arrays, place, len(kept))
-    moving = np.unique(basis.nonzero()[0] // 3)
-    is_moving = np.zeros(len(kept), dtype=bool)
-    is_moving[moving] = True
-    soft = faces[is_moving[faces].any(axis=1)]
-    soft_vertices = np.unique(soft).astype(np.int64)
-    # their normals need every triangle round them
-    is_soft = np.zeros(len(kept), dtype=bool)
-    is_soft[soft_vertices] = True
-    soft = faces[is_soft[faces].any(axis=1)]
+    welds = place[arrays["welds"].astype(np.int64)[kept]] if "welds" in arrays else None
+    shading = Shading.of(vertices, faces, basis, welds)
     centres = arrays["eye_centres"].astype(np.float32)
     return Head(
         name=name,
         parts=tuple(parts),
         vertices=vertices,
-        normals=_normals(vertices, faces),
+        shading=shading,
         triangles=faces,
         uv=arrays["uv"].astype(np.float32)[kept] / np.float32(65535),
         colors=(arrays["colors"].astype(np.float32)[kept] / np.float32(255)) ** 2,
@@ -307,9 +359,6 @@ def _assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail)
             for key, value in arrays.items()
             if key.startswith("texture_")
         },
-        _soft_triangles=soft,
-        _soft_vertices=soft_vertices,
-        _soft_incidence=_incidence(soft, len(kept))[soft_vertices],
     )
 
 

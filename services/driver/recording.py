@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.driver.render import Renderer
-from services.driver.video import VideoWriter
+from services.driver.video import open_writer
 from shared.errors import UserError
 from shared.messages import MEDIA_RATE_HZ
 
@@ -22,9 +22,28 @@ Faps = NDArray[np.float32]
 
 
 class Recording:
-    """Writes images and sound to a video; the file appears when it is closed."""
+    """Writes images and sound to a video; the file appears when it is closed.
 
-    def __init__(self, path: Path, renderer: Renderer, frame_rate_hz: float) -> None:
+    Parameters
+    ----------
+    path
+        As ``open_writer`` takes it.
+    renderer
+        What draws; its background decides whether the video is transparent.
+    frame_rate_hz
+        Images a second.
+    sound
+        Whether there will be sound.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be written.
+    """
+
+    def __init__(
+        self, path: Path, renderer: Renderer, frame_rate_hz: float, *, sound: bool = True
+    ) -> None:
         self.path = path
         self.num_images = 0
         self.ended = False
@@ -32,8 +51,12 @@ class Recording:
         self._frame_rate_hz = frame_rate_hz
         self._frames: deque[tuple[float, Faps]] = deque()
         self._num_samples = 0
-        self._writer = VideoWriter(
-            path, *renderer.size, frame_rate_hz=frame_rate_hz, sample_rate_hz=MEDIA_RATE_HZ
+        self._writer = open_writer(
+            path,
+            renderer.size,
+            frame_rate_hz,
+            MEDIA_RATE_HZ if sound else None,
+            transparent=renderer.transparent,
         )
 
     @property
@@ -74,7 +97,8 @@ class Recording:
         last_s = self._frames[-1][0]
         if time_s > last_s:
             return False
-        self._writer.write_image(self._renderer.draw(self._at(time_s)))
+        after = self._frames[min(1, len(self._frames) - 1)]
+        self._writer.write_image(self._renderer.draw(between(self._frames[0], after, time_s)))
         self.num_images += 1
         return True
 
@@ -86,12 +110,11 @@ class Recording:
         """Give the unfinished file up."""
         self._writer.discard()
 
-    def _at(self, time_s: float) -> Faps:
-        (begin_s, begin), (end_s, end) = (
-            self._frames[0],
-            self._frames[min(1, len(self._frames) - 1)],
-        )
-        if time_s <= begin_s or end_s <= begin_s:
-            return begin
-        weight = np.float32((time_s - begin_s) / (end_s - begin_s))
-        return begin + (end - begin) * weight
+
+def between(before: tuple[float, Faps], after: tuple[float, Faps], time_s: float) -> Faps:
+    """Return the FAPs (68,) at a time between two frames; outside, the nearer frame's."""
+    (begin_s, begin), (end_s, end) = before, after
+    if end_s <= begin_s:
+        return begin
+    weight = np.float32(np.clip((time_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
+    return begin + (end - begin) * weight

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes.util
 import io
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,12 @@ from shared.errors import UserError
 UInt8 = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
+Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB, middle and edge
+
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
+
+
+_LEAST_ASPECT = 0.7  # narrower pictures show more above and below, so that the face still fits
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +40,25 @@ class Camera:
     position: tuple[float, float, float] = (0.0, 0.030, 1.05)
     target: tuple[float, float, float] = (0.0, 0.018, 0.0)
     field_of_view_deg: float = 15.0  # vertical
+
+    def view_projection(self, width_px: int, height_px: int) -> Float32:
+        """Make the matrix (4, 4) from the head's axes to the picture's."""
+        eye = np.array(self.position)
+        ahead = np.array(self.target) - eye
+        ahead /= np.linalg.norm(ahead)
+        right = np.cross(ahead, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(right, ahead), -ahead])
+        view = np.eye(4)
+        view[:3, :3], view[:3, 3] = axes, -axes @ eye
+        near, far = 0.1, 5.0
+        scale = 1.0 / np.tan(np.radians(self.field_of_view_deg) / 2)
+        scale *= min(1.0, width_px / height_px / _LEAST_ASPECT)
+        projection = np.zeros((4, 4))
+        projection[0, 0], projection[1, 1] = scale * height_px / width_px, scale
+        projection[2, 2:] = (far + near) / (near - far), 2 * far * near / (near - far)
+        projection[3, 2] = -1.0
+        return np.asarray(projection @ view, dtype=np.float32)
 
 
 BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))  # sRGB, middle and edge
@@ -142,17 +167,18 @@ _KEY = np.array([-0.42, 0.50, 0.80]) / np.linalg.norm([-0.42, 0.50, 0.80])  # as
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
 _MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
-    "skin": ((0.55, 0.34, 0.28), 22.0, 0.16),
+    "skin": ((0.50, 0.34, 0.29), 22.0, 0.16),
     "garment": ((0.25, 0.25, 0.25), 8.0, 0.05),
     "eye_left": ((0.4, 0.36, 0.36), 8.0, 0.0),
     "eye_right": ((0.4, 0.36, 0.36), 8.0, 0.0),
     "teeth_upper": ((0.4, 0.36, 0.32), 60.0, 0.30),
     "teeth_lower": ((0.4, 0.36, 0.32), 60.0, 0.30),
     "tongue": ((0.5, 0.3, 0.3), 30.0, 0.20),
-    "hair": ((0.3, 0.3, 0.3), 14.0, 0.12),
-    "hair_tips": ((0.3, 0.3, 0.3), 14.0, 0.12),
+    "hair": ((0.3, 0.3, 0.3), 14.0, 0.05),
+    "hair_tips": ((0.3, 0.3, 0.3), 14.0, 0.05),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
+_PLAIN = ((0.3, 0.3, 0.3), 14.0, 0.08)  # of parts that bring no material known here
 
 
 def standalone_context() -> moderngl.Context:
@@ -214,7 +240,7 @@ class Renderer:
         width_px: int,
         height_px: int,
         *,
-        background: tuple[tuple[float, ...], tuple[float, ...]] | None = BACKGROUND,
+        background: Background = BACKGROUND,
         samples: int = 4,
         camera: Camera | None = None,
         context: moderngl.Context | None = None,
@@ -223,6 +249,7 @@ class Renderer:
         if width_px < 1 or height_px < 1:
             raise UserError(f"a picture of {width_px} x {height_px} pixels; give a positive size")
         self.head = head
+        self.transparent = background is None
         self._background = background
         self._camera = camera or Camera()
         self._context = context or standalone_context()
@@ -271,6 +298,11 @@ class Renderer:
                 indices,
             )
 
+    @property
+    def description(self) -> str:
+        """What draws, as OpenGL names it."""
+        return str(self._context.info["GL_RENDERER"])
+
     def resize(self, width_px: int, height_px: int) -> None:
         """Change the size of the pictures."""
         self.size = (width_px, height_px)
@@ -304,21 +336,53 @@ class Renderer:
         -------
         Pixels (H, W, 3), top row first; (H, W, 4) with alpha if the background is transparent.
         """
+        self._upload(*self.head.pose(faps))
+        self._draw()
+        return self._read()
+
+    def stages_s(self, faps: Float32) -> dict[str, float]:
+        """Draw one picture and say how long deform, upload, draw and read back take, s."""
+        times = [time.perf_counter()]
+
+        def passed() -> None:
+            self._context.finish()
+            times.append(time.perf_counter())
+
+        posed = self.head.pose(faps)
+        passed()
+        self._upload(*posed)
+        passed()
+        self._draw()
+        passed()
+        self._read()
+        passed()
+        names = ("deform", "upload", "draw", "read back")
+        return dict(zip(names, np.diff(times).tolist(), strict=True))
+
+    def _upload(self, vertices: Float32, normals: Float32) -> None:
+        self._stage[:, :3], self._stage[:, 3:] = vertices, normals
+        self._moving.write(self._stage)
+
+    def _draw(self) -> None:
         self._context.copy_framebuffer(self._canvas, self._blank)
-        self._paint(faps, self._canvas)
+        self._paint(self._canvas)
         if self._canvas is not self._result:
             self._context.copy_framebuffer(self._result, self._canvas)
-        channels = 4 if self._background is None else 3
+
+    def _read(self) -> UInt8:
+        channels = 4 if self.transparent else 3
         width, height = self.size
         raw = self._result.read(components=channels, alignment=1)
-        return np.frombuffer(raw, np.uint8).reshape(height, width, channels)[::-1]
+        pixels = np.frombuffer(raw, np.uint8).reshape(height, width, channels)[::-1]
+        return _unmixed(pixels) if self.transparent else pixels
 
     def draw_on_screen(self, faps: Float32) -> None:
         """Draw into the window the context came from."""
         screen = self._context.screen
         screen.viewport = (0, 0, *self.size)
         self._clear(screen)
-        self._paint(faps, screen)
+        self._upload(*self.head.pose(faps))
+        self._paint(screen)
 
     def _clear(self, target: Any) -> None:
         """Leave nothing but the background."""
@@ -331,14 +395,13 @@ class Renderer:
             self._backdrop_program["edge"] = edge
             self._backdrop.render()
 
-    def _paint(self, faps: Float32, target: Any) -> None:
+    def _paint(self, target: Any) -> None:
         context = self._context
-        self._stage[:, :3], self._stage[:, 3:] = self.head.pose(faps)
-        self._moving.write(self._stage)
         target.use()
         eye = np.array(self._camera.position)
+        matrix = tuple(self._camera.view_projection(*self.size).T.ravel())
         for program in (self._program, self._eye_program):
-            program["view_projection"] = tuple(self._view_projection().T.ravel())
+            program["view_projection"] = matrix
             program["eye"] = self._camera.position
         half_way = _KEY + eye / np.linalg.norm(eye)
         self._eye_program["half_way"] = tuple(half_way / np.linalg.norm(half_way))
@@ -362,7 +425,7 @@ class Renderer:
 
     def _draw_part(self, part: Part) -> None:
         program = self._eye_program if part.name in _EYES else self._program
-        wrap, gloss, shine = _MATERIALS[part.name]
+        wrap, gloss, shine = _MATERIALS.get(part.name, _PLAIN)
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
             ("two_sided", float(part.double_sided)),
@@ -372,25 +435,17 @@ class Renderer:
         self._textures[part.texture].use()
         self._arrays[part.name].render()
 
-    def _view_projection(self) -> Float32:
-        eye = np.array(self._camera.position)
-        ahead = np.array(self._camera.target) - eye
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross(ahead, [0.0, 1.0, 0.0])
-        right /= np.linalg.norm(right)
-        axes = np.stack([right, np.cross(right, ahead), -ahead])
-        view = np.eye(4)
-        view[:3, :3], view[:3, 3] = axes, -axes @ eye
-        near, far = 0.1, 5.0
-        scale = 1.0 / np.tan(np.radians(self._camera.field_of_view_deg) / 2)
-        width, height = self.size
-        projection = np.zeros((4, 4))
-        projection[0, 0], projection[1, 1] = scale * height / width, scale
-        projection[2, 2:] = (far + near) / (near - far), 2 * far * near / (near - far)
-        projection[3, 2] = -1.0
-        return np.asarray(projection @ view, dtype=np.float32)
-
     def close(self) -> None:
         """Give the OpenGL context back."""
         if self._own_context:
             self._context.release()
+
+
+def _unmixed(pixels: UInt8) -> UInt8:
+    """Take the black background out of the colours where it shines through (H, W, 4)."""
+    out = pixels.copy()
+    row, column = np.nonzero((pixels[..., 3] > 0) & (pixels[..., 3] < 255))
+    mixed = pixels[row, column].astype(np.float32)
+    pure = mixed[:, :3] * (255 / mixed[:, 3:])
+    out[row, column, :3] = np.minimum(np.round(pure), 255).astype(np.uint8)
+    return out

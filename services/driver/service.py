@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from services.driver.head import Head
 from services.driver.recording import Recording
 from services.driver.render import Renderer
+from services.driver.scene import Framing, background, camera, load_head
+from services.driver.virtual_camera import VirtualCamera
 from services.driver.window import Window
 from shared.bus import Socket
 from shared.clock import to_seconds
@@ -63,13 +64,25 @@ class DriverService(Service):
         self._config = config
         self._followers: dict[str, _Follower] = {}
         self._unfinished: list[tuple[str, Recording]] = []
-        self._head = Head.load()
+        self._head = load_head(config.head)
+        self._background = background(config.background)
+        if self._background is None:
+            raise UserError(
+                "driver.background: a window and MP4 have no transparency; give a colour"
+            )
+        if config.camera not in list(Framing):
+            raise UserError(f"driver.camera: one of {', '.join(Framing)}")
+        self._camera = camera(self._head, Framing(config.camera))
         self._renderer: Renderer | None = None
         self._faps = np.zeros(NUM_FAPS, np.float32)
         self._frame_s = time.monotonic()
         self._stalled = False
         self._window = self._open_window()
         self._visible = self._window is not None
+        self._virtual_camera: VirtualCamera | None = None
+        if config.virtual_camera:
+            self._virtual_camera = VirtualCamera(self._own_renderer(), config.frame_rate_hz)
+            LOG.info("the virtual camera is %s", self._virtual_camera.device)
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""
@@ -117,6 +130,8 @@ class DriverService(Service):
             if not self._visible:
                 LOG.info("the window was closed")
                 self._window.hide()  # videos under way go on drawing in its context
+        if self._virtual_camera is not None:
+            self._virtual_camera.draw(self._shown(now_s), now_s)
         self._render_until(time.monotonic() + RENDER_BUDGET_S)
 
     def on_drain(self) -> bool:
@@ -131,6 +146,8 @@ class DriverService(Service):
         for session, recording in self._unfinished:
             LOG.warning("the video ends early", extra={"session": session})
             self._finish(session, recording)
+        if self._virtual_camera is not None:
+            self._virtual_camera.close()
 
     def idle_s(self) -> dict[str, float]:
         """Name the sessions followed, so that control can say which of them are no more."""
@@ -180,9 +197,16 @@ class DriverService(Service):
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if self._config.view == "none" or (self._config.view == "auto" and not has_display):
             return None
-        head = Head.load(detail="coarse")  # live, smooth motion is worth more than smooth outlines
+        config = self._config
+        head = load_head(config.head, "coarse")  # live, smooth motion is worth more than outlines
         try:
-            return Window(head, self._config.width_px, self._config.height_px)
+            return Window(
+                head,
+                config.width_px,
+                config.height_px,
+                background=self._background,
+                camera=self._camera,
+            )
         except UserError as error:
             if self._config.view == "window":
                 raise
@@ -192,25 +216,40 @@ class DriverService(Service):
     def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
         """Return the newest frame, or while none comes one that fades to rest."""
         silent_s = now_s - self._frame_s
-        live = any(not follower.ended for follower in self._followers.values())
-        if silent_s > STALL_S and not self._stalled and live:
-            LOG.warning("no FAP frames for %g s: the face goes to rest", STALL_S)
-        self._stalled = silent_s > STALL_S
+        stalled = silent_s > STALL_S
+        if stalled != self._stalled:
+            live = any(not follower.ended for follower in self._followers.values())
+            lost = stalled and live
+            if lost:
+                LOG.warning("no FAP frames for %g s: the face goes to rest", STALL_S)
+            if self._window is not None:
+                self._window.say("no frames come" if lost else "")
+            self._stalled = stalled
         fade = np.float32(np.clip(1.0 - (silent_s - STALL_S) / 0.3, 0.0, 1.0))
         return self._faps * fade
 
     # --- recording -----------------------------------------------------------------------------
 
+    def _own_renderer(self) -> Renderer:
+        """Make what draws beside the window, once."""
+        if self._renderer is None:
+            self._renderer = Renderer(
+                self._head,
+                self._config.width_px,
+                self._config.height_px,
+                background=self._background,
+                camera=self._camera,
+                context=None if self._window is None else self._window.context,
+            )
+        return self._renderer
+
     def _begin_recording(self, session: str) -> Recording | None:
         config = self._config
         try:
-            if self._renderer is None:
-                context = None if self._window is None else self._window.context
-                size = (config.width_px, config.height_px)
-                self._renderer = Renderer(self._head, *size, context=context)
+            renderer = self._own_renderer()
             path = Path(config.out) / f"{session}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
-            return Recording(path, self._renderer, config.frame_rate_hz)
+            return Recording(path, renderer, config.frame_rate_hz)
         except (UserError, OSError) as error:
             self._report(session, "no-video", str(error))
             return None

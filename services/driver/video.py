@@ -1,21 +1,33 @@
-"""Write MP4 files: H.264 pictures and AAC sound in sync.
+"""Write pictures and sound in sync: MP4, MOV, WebM, or a sequence of PNG files.
 
 Picture ``n`` is shown at ``n / frame_rate_hz``, sound sample ``n`` is heard at
 ``n / sample_rate_hz``, both from the file's start.
+
+======================  ====================================  ==============================
+file                    opaque                                with a transparent background
+======================  ====================================  ==============================
+``.mp4``                H.264 and AAC                         not possible
+``.mov``                H.264 and AAC                         ProRes 4444 and AAC
+``.webm``               VP9 and Opus                          VP9 with alpha and Opus
+folder, ``name%05d``    PNG, no sound                         PNG with alpha, no sound
+======================  ====================================  ==============================
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import re
 import secrets
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 import av
 import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
 from shared.errors import UserError
@@ -23,23 +35,111 @@ from shared.errors import UserError
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
-SAMPLE_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)  # of AAC
-QUALITY = 18  # constant rate factor of x264; 18 is visually lossless
+AAC_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
+OPUS_RATES_HZ = (8000, 12000, 16000, 24000, 48000)
+VIDEO_SUFFIXES = (".mp4", ".mov", ".webm")
+_NUMBER = re.compile(r"%0?\d*d")  # in the name of a sequence's pictures
+
+
+@dataclass(frozen=True, slots=True)
+class _Codec:
+    """How a stream of pictures is encoded."""
+
+    name: str
+    pixels: str
+    options: dict[str, str] = field(default_factory=dict)
+
+
+# visually lossless
+_H264 = _Codec("libx264", "yuv420p", {"crf": "18", "preset": "veryfast"})
+_PRORES = _Codec("prores_ks", "yuva444p10le", {"profile": "4444"})
+_VP9_OPTIONS = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "6"}
+_VP9 = _Codec("libvpx-vp9", "yuv420p", _VP9_OPTIONS)
+_VP9_ALPHA = _Codec("libvpx-vp9", "yuva420p", _VP9_OPTIONS)
+# suffix: codecs of opaque and of transparent pictures, codec of the sound, its rates
+_FORMATS = {
+    ".mp4": (_H264, None, "aac", AAC_RATES_HZ),
+    ".mov": (_H264, _PRORES, "aac", AAC_RATES_HZ),
+    ".webm": (_VP9, _VP9_ALPHA, "libopus", OPUS_RATES_HZ),
+}
+
+
+class Writer(Protocol):
+    """Where pictures and sound go."""
+
+    def write_image(self, image: UInt8) -> None:
+        """Append a picture (H, W, 3), or (H, W, 4) with alpha, sRGB."""
+
+    def write_sound(self, samples: Float32) -> None:
+        """Append mono sound (N,), -1 to 1."""
+
+    def close(self) -> None:
+        """Finish what was written."""
+
+    def discard(self) -> None:
+        """Give up what was written."""
+
+
+def open_writer(
+    path: Path,
+    size: tuple[int, int],
+    frame_rate_hz: float,
+    sample_rate_hz: int | None,
+    *,
+    transparent: bool = False,
+) -> Writer:
+    """Open what the name stands for: a video, or for a folder or ``name%05d.png`` pictures.
+
+    Raises
+    ------
+    UserError
+        If the name is none of these, or it cannot be written.
+    """
+    check_name(path)
+    if path.suffix in _FORMATS:
+        return VideoWriter(path, *size, frame_rate_hz, sample_rate_hz, transparent=transparent)
+    return PictureSequence(path)
+
+
+def check_name(path: Path) -> None:
+    """See whether a name stands for a video or for pictures, in a folder that exists.
+
+    Raises
+    ------
+    UserError
+        If it does not.
+    """
+    if path.suffix not in _FORMATS and not is_sequence(path):
+        raise UserError(
+            f"{path}: give a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder, or a name"
+            " with a number such as face%05d.png"
+        )
+    if not path.parent.is_dir():
+        raise _unwritable(path, FileNotFoundError(errno.ENOENT, "no such folder"))
+
+
+def is_sequence(path: Path) -> bool:
+    """Say whether a name stands for one picture a frame."""
+    if path.suffix == ".png":
+        return _NUMBER.search(path.name) is not None
+    return path.is_dir() or not path.suffix
 
 
 class VideoWriter:
-    """An MP4 file that appears under its name when it is complete.
+    """A video that appears under its name when it is complete.
 
     Parameters
     ----------
     path
-        File to write; an existing one is replaced on ``close``.
+        File to write, of ``VIDEO_SUFFIXES``; an existing one is replaced on ``close``.
     width_px, height_px
         Even numbers.
     frame_rate_hz
         Pictures a second.
     sample_rate_hz
-        One of ``SAMPLE_RATES_HZ``.
+        One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``; None for no sound.
+    transparent
+        The pictures have an alpha channel.
 
     Raises
     ------
@@ -53,19 +153,31 @@ class VideoWriter:
         width_px: int,
         height_px: int,
         frame_rate_hz: float,
-        sample_rate_hz: int,
+        sample_rate_hz: int | None,
+        *,
+        transparent: bool = False,
     ) -> None:
+        self._path = Path(path)
+        opaque, with_alpha, sound_codec, rates_hz = _FORMATS.get(
+            self._path.suffix, _FORMATS[".mp4"]
+        )
+        codec = with_alpha if transparent else opaque
+        if codec is None:
+            raise UserError(
+                f"{self._path}: MP4 has no transparency; write .mov, .webm, or pictures (a folder)"
+            )
         if width_px < 2 or height_px < 2 or width_px % 2 or height_px % 2:
             raise UserError(
                 f"a video of {width_px} x {height_px} pixels; give even, positive sizes"
             )
         if not frame_rate_hz > 0:
             raise UserError(f"a frame rate of {frame_rate_hz} Hz; give a positive one")
-        if sample_rate_hz not in SAMPLE_RATES_HZ:
-            rates = ", ".join(str(rate) for rate in SAMPLE_RATES_HZ)
-            raise UserError(f"AAC has no sample rate of {sample_rate_hz} Hz; give one of {rates}")
-        self._path = Path(path)
-        self._shape = (height_px, width_px, 3)
+        if sample_rate_hz is not None and sample_rate_hz not in rates_hz:
+            rates = ", ".join(str(rate) for rate in rates_hz)
+            raise UserError(
+                f"{sound_codec} has no sample rate of {sample_rate_hz} Hz; give one of {rates}"
+            )
+        self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz
         # Another process may be writing a video of the same name.
         self._unfinished = self._path.with_name(f".{self._path.name}.{secrets.token_hex(4)}.part")
@@ -74,20 +186,28 @@ class VideoWriter:
             if self._path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
             self._unfinished.touch()  # FFmpeg would open it only at the first packet
-            self._container = av.open(
-                str(self._unfinished), "w", format="mp4", options={"movflags": "faststart"}
-            )
+            container = self._path.suffix.removeprefix(".") or "mp4"
+            options = {} if container == "webm" else {"movflags": "faststart"}
+            self._container = av.open(str(self._unfinished), "w", format=container, options=options)
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise _unwritable(self._path, error) from error
         rate = Fraction(frame_rate_hz).limit_denominator(1001)
-        self._video = self._container.add_stream(
-            "libx264", rate=rate, options={"crf": str(QUALITY), "preset": "veryfast"}
-        )
+        video: Any = self._container.add_stream(codec.name, rate=rate, options=codec.options)
+        self._video = video
         self._video.width, self._video.height = width_px, height_px
-        self._video.pix_fmt = "yuv420p"
-        self._video.codec_context.time_base = 1 / rate
-        self._video.codec_context.thread_count = 1
-        self._sound = self._container.add_stream("aac", rate=sample_rate_hz, layout="mono")
+        self._video.pix_fmt = codec.pixels
+        context: Any = self._video.codec_context
+        context.time_base = 1 / rate
+        context.thread_count = 1
+        # players guess the colours of a file that does not name them, by its size
+        context.color_primaries = context.color_trc = context.colorspace = Colorspace.ITU709
+        context.color_range = ColorRange.MPEG
+        self._sound: Any = None
+        if sample_rate_hz is not None:
+            self._sound = self._container.add_stream(
+                sound_codec, rate=sample_rate_hz, layout="mono"
+            )
+            self._sample_format = "fltp" if sound_codec == "aac" else "flt"
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -104,10 +224,16 @@ class VideoWriter:
             self.discard()
 
     def write_image(self, image: UInt8) -> None:
-        """Append a picture (H, W, 3), sRGB."""
+        """Append a picture (H, W, 3), or (H, W, 4) if the video is transparent; sRGB."""
         if image.shape != self._shape:
             raise ValueError(f"expected a picture of shape {self._shape}, got {image.shape}")
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        kind = "rgba" if image.shape[2] == 4 else "rgb24"
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=kind)
+        frame = frame.reformat(
+            format=self._video.pix_fmt,
+            dst_colorspace=Colorspace.ITU709,
+            dst_color_range=ColorRange.MPEG,
+        )
         frame.pts = self._num_images
         frame.time_base = self._video.codec_context.time_base
         self._num_images += 1
@@ -115,13 +241,13 @@ class VideoWriter:
 
     def write_sound(self, samples: Float32) -> None:
         """Append mono sound (N,), -1 to 1."""
-        if not len(samples):
+        if not len(samples) or self._sound is None:
             return
         block = np.ascontiguousarray(samples, dtype=np.float32)[None, :]
-        frame = av.AudioFrame.from_ndarray(block, format="fltp", layout="mono")
-        frame.sample_rate = self._sample_rate_hz
+        frame = av.AudioFrame.from_ndarray(block, format=self._sample_format, layout="mono")
+        frame.sample_rate = self._sample_rate_hz or 0
         frame.pts = self._num_samples
-        frame.time_base = Fraction(1, self._sample_rate_hz)
+        frame.time_base = Fraction(1, self._sample_rate_hz or 1)
         self._num_samples += len(samples)
         self._mux(self._sound.encode(frame))
 
@@ -130,7 +256,7 @@ class VideoWriter:
             self._container.mux(packets)
         except OSError as error:
             self.discard()
-            raise self._unwritable(error) from error
+            raise _unwritable(self._path, error) from error
 
     def close(self) -> None:
         """Finish the file and give it its name."""
@@ -142,7 +268,7 @@ class VideoWriter:
             self._unfinished.replace(self._path)
         except OSError as error:
             self._unfinished.unlink(missing_ok=True)
-            raise self._unwritable(error) from error
+            raise _unwritable(self._path, error) from error
 
     def discard(self) -> None:
         """Give the unfinished file up."""
@@ -150,8 +276,74 @@ class VideoWriter:
             self._container.close()
         self._unfinished.unlink(missing_ok=True)
 
-    def _unwritable(self, error: OSError) -> UserError:
-        return UserError(
-            f"{self._path} cannot be written ({error.strerror or error}); give a path in a folder"
-            " that exists and may be written"
-        )
+
+class PictureSequence:
+    """One PNG file a picture; what is there already is replaced.
+
+    Parameters
+    ----------
+    path
+        A folder, in which ``00000.png`` and so on are written, or a name such as
+        ``face%05d.png`` in a folder that exists.
+
+    Raises
+    ------
+    UserError
+        If the folder cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._pattern = path
+        self._num_images = 0
+        if path.suffix != ".png":
+            try:
+                path.mkdir(exist_ok=True)
+            except OSError as error:
+                raise _unwritable(path, error) from error
+            self._pattern = path / "%05d.png"
+
+    def write_image(self, image: UInt8) -> None:
+        """Write a picture (H, W, 3) or (H, W, 4), sRGB."""
+        name = _NUMBER.sub(lambda found: found[0] % self._num_images, self._pattern.name, count=1)
+        write_picture(self._pattern.with_name(name), image)
+        self._num_images += 1
+
+    def write_sound(self, samples: Float32) -> None:
+        """Leave the sound out."""
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+    def discard(self) -> None:
+        """Keep the pictures that are there."""
+
+
+def write_picture(path: Path, image: UInt8) -> None:
+    """Write a picture (H, W, 3), or (H, W, 4) with alpha, as PNG.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be written.
+    """
+    try:
+        path.write_bytes(encode_picture(image))
+    except OSError as error:
+        raise _unwritable(path, error) from error
+
+
+def encode_picture(image: UInt8) -> bytes:
+    """Encode a picture (H, W, 3), or (H, W, 4) with alpha, as PNG."""
+    kind = "rgba" if image.shape[2] == 4 else "rgb24"
+    encoder = av.CodecContext.create("png", "w")
+    encoder.height, encoder.width = image.shape[:2]
+    encoder.pix_fmt, encoder.time_base = kind, Fraction(1)
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=kind)
+    return b"".join(bytes(packet) for packet in [*encoder.encode(frame), *encoder.encode(None)])
+
+
+def _unwritable(path: Path, error: OSError) -> UserError:
+    return UserError(
+        f"{path} cannot be written ({error.strerror or error}); give a path in a folder"
+        " that exists and may be written"
+    )

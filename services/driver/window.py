@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.driver.head import Head
-from services.driver.render import Renderer
+from services.driver.render import BACKGROUND, Background, Camera, Renderer
 from shared.errors import UserError
 
 Float32 = NDArray[np.float32]
@@ -23,6 +23,8 @@ class Window:
         Whom to show.
     width_px, height_px
         Size at first.
+    background, camera
+        As the renderer takes them.
 
     Raises
     ------
@@ -30,7 +32,15 @@ class Window:
         If there is no display, or no OpenGL 3.3 on it.
     """
 
-    def __init__(self, head: Head, width_px: int, height_px: int) -> None:
+    def __init__(
+        self,
+        head: Head,
+        width_px: int,
+        height_px: int,
+        *,
+        background: Background = BACKGROUND,
+        camera: Camera | None = None,
+    ) -> None:
         glfw.ERROR_REPORTING = "ignore"  # the results are checked here
         if not glfw.init():
             raise UserError(
@@ -41,7 +51,14 @@ class Window:
             glfw.destroy_window(self._window)
             self._open(width_px, height_px, num_samples=4)
         size = glfw.get_framebuffer_size(self._window)
-        self._renderer = Renderer(head, *size, context=self._context, on_screen=True)
+        self._renderer = Renderer(
+            head,
+            *size,
+            background=background,
+            camera=camera,
+            context=self._context,
+            on_screen=True,
+        )
 
     def _open(self, width_px: int, height_px: int, num_samples: int) -> None:
         glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
@@ -84,6 +101,10 @@ class Window:
             self._renderer.draw_on_screen(faps)
         glfw.swap_buffers(self._window)
         return True
+
+    def say(self, remark: str) -> None:
+        """Show a remark beside the name in the title."""
+        glfw.set_window_title(self._window, f"kouxing ({remark})" if remark else "kouxing")
 
     def hide(self) -> None:
         """Take the window off the screen; its context stays."""

@@ -101,6 +101,7 @@ class GatewayService(Service):
         super().__init__(config)
         self._listener = _bind(config.host, config.port)
         self._loopback = is_loopback(config.host)
+        self._head = config.head
         host = config.advertise or config.host
         port = self._listener.getsockname()[1]
         self.endpoints = {"page": f"http://{f'[{host}]' if ':' in host else host}:{port}/"}
@@ -359,7 +360,11 @@ class GatewayService(Service):
     async def _file(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info.get("name", "index.html")
         path = PAGE / name
-        if path.parent != PAGE or path.suffix not in SUFFIXES or not path.is_file():
+        if name == "head.glb" and self._head:
+            path = Path(self._head)
+        elif path.parent != PAGE or path.suffix not in SUFFIXES:
+            raise web.HTTPNotFound
+        if not path.is_file():
             if name == "head.glb":
                 text = f"the head is missing; make it with 'kouxing head export {path}'\n"
                 raise web.HTTPNotFound(text=text)

@@ -21,5 +21,10 @@ def test_it_prints_a_table_and_writes_the_same_figures(tmp_path: Path) -> None:
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
     assert latency["sound_to_frame_ms"]["p50"] > latency["look_ahead_ms"]
     assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
-    assert all(rate > 0 for rate in latency["images_per_s"].values())
+    rendering = latency["rendering"]
+    assert all(rate > 0 for rate in rendering["images_per_s"].values())
+    live, video = rendering["stages_ms"].values()
+    assert list(live) == ["deform", "upload", "draw", "read back"]
+    assert list(video) == [*live, "encode"]
+    assert rendering["asset_bytes"] > 500_000
     assert f"{latency['chunk_to_frame_ms']['p50']:.1f}" in result.stdout

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.e2e
 
 
 class Watched:
-    """A supervisor on ports of its own, checked as ``kouxing run`` does."""
+    """A supervisor on ports of its own, which watches as in ``kouxing run``: beside other work."""
 
     def __init__(self, folder: Path) -> None:
         environment = own_environment(folder)
@@ -43,11 +43,10 @@ class Watched:
     def kill(self, service: str) -> None:
         os.kill(self.supervisor.process_number(service), signal.SIGKILL)
 
-    def check_until_replaced(self, client: Client, service: str, old: str) -> None:
+    def until_replaced(self, client: Client, service: str, old: str) -> None:
         end_s = time.monotonic() + 30
         while self.instance(client, service) in ("", old):
             assert time.monotonic() < end_s, f"{service} did not come back"
-            self.supervisor.check()
             time.sleep(0.05)
 
 
@@ -57,6 +56,7 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
     try:
         made.supervisor.start()
         made.supervisor.wait_ready(made.control)
+        made.supervisor.watch()
         yield made
     finally:
         made.supervisor.stop()
@@ -84,7 +84,7 @@ def test_a_session_goes_on_after_a_crash(watched: Watched, service: str) -> None
         assert moves(session, samples[:24000])
         old = watched.instance(client, service)
         watched.kill(service)
-        watched.check_until_replaced(client, service, old)
+        watched.until_replaced(client, service, old)
         time.sleep(0.5)
         assert moves(session, samples[24000:72000])
         session.close()
@@ -96,7 +96,7 @@ def test_the_driver_and_the_gateway_come_back_too(watched: Watched) -> None:
         for service in ("driver", "gateway"):
             old = watched.instance(client, service)
             watched.kill(service)
-            watched.check_until_replaced(client, service, old)
+            watched.until_replaced(client, service, old)
 
 
 def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
@@ -105,7 +105,6 @@ def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
         time.sleep(0.1)
         end_s = time.monotonic() + 30
         while True:
-            watched.supervisor.check()
             try:
                 session = client.open_session(encoding="f32le")
                 break
@@ -114,3 +113,15 @@ def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
                 time.sleep(0.2)
         assert moves(session, samples_of_file(DEMO / "hello-female.wav")[:32000])
         session.close()
+
+
+def test_a_service_that_is_configured_wrongly_ends_the_wait(tmp_path: Path) -> None:
+    arguments = ["--config", str(tmp_path / "absent.toml")]
+    supervisor = Supervisor(arguments, tmp_path, Console(file=io.StringIO()))
+    try:
+        supervisor.start()
+        supervisor.watch()
+        with pytest.raises(UserError, match="cannot start"):
+            supervisor.wait()
+    finally:
+        supervisor.stop()

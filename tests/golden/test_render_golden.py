@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.driver.head import Head, neutral_faps
+from services.driver.head import neutral_faps
 from services.driver.render import Renderer
+from tests import heads
 
 pytestmark = pytest.mark.golden
 
@@ -28,12 +29,20 @@ SHAPES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_picture(shape: str) -> None:
-    renderer = Renderer(Head.load(detail="coarse"), 192, 144, samples=0)
+PICTURES = [
+    *(("woman", shape) for shape in SHAPES),
+    ("man", "a"),
+    ("elder", "rest"),
+    ("child", "a"),
+]
+
+
+@pytest.mark.parametrize(("name", "shape"), PICTURES)
+def test_picture(name: str, shape: str) -> None:
+    renderer = Renderer(heads.load(name, "coarse"), 192, 144, samples=0)
     image = renderer.draw(SHAPES[shape])
     renderer.close()
-    stored = Path(__file__).with_name(f"render_{shape}.png")
+    stored = Path(__file__).with_name(f"render_{name}_{shape}.png")
     if os.environ.get("KOUXING_WRITE_GOLDEN"):
         Image.fromarray(image).save(stored)
     golden = np.asarray(Image.open(stored).convert("RGB"), dtype=float)

@@ -59,6 +59,10 @@ def test_frame_of_xface(tmp_path: Path) -> None:
     assert got.name == "C:\\some where\\file"
     assert got.frame_rate_hz == 25.0
     assert got.faps[0, [0, 1, 2, 50]].tolist() == [5.0, 2.0, 120.0, -7.0]
+    assert got.visemes is not None
+    assert got.expressions is not None
+    assert got.visemes.tolist() == [[5, 0, 63, 0], [0, 0, 0, 0]]
+    assert got.expressions.tolist() == [[2, 40, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0]]
     assert got.faps[1, 2] == 150.0
 
 
@@ -69,6 +73,35 @@ def test_frame_of_greta(tmp_path: Path) -> None:
     got = read_fap(path)
     assert got.name == "AU Interpolation_1111.fap"
     assert got.faps[0, [0, 2, 47]].tolist() == [0.0, 80.0, -900.0]
+    assert got.visemes is not None
+    assert got.visemes.tolist() == [[0, 0, 63, 0]]
+    assert got.expressions is None
+
+
+def test_a_selection_alone_is_meant_in_full(tmp_path: Path) -> None:
+    got = read_fap(write(tmp_path, "2.1 x 25 1", mask(1, 2), "0 3 6"))
+    assert got.visemes is not None
+    assert got.expressions is not None
+    assert got.visemes.tolist() == [[3, 0, 63, 0]]
+    assert got.expressions.tolist() == [[6, 63, 0, 0, 0, 0]]
+
+
+def test_viseme_and_expression_are_written_back(tmp_path: Path) -> None:
+    faps = np.zeros((2, 68), dtype=np.float32)
+    faps[:, 0], faps[:, 1], faps[:, 2] = [4, 0], [1, 2], [7, 8]
+    visemes = np.array([[4, 9, 31, 0], [0, 0, 0, 0]])
+    expressions = np.array([[1, 63, 3, 20, 0, 0], [2, 5, 0, 0, 0, 0]])
+    path = tmp_path / "some.fap"
+    write_fap(path, FapAnimation("x", 25.0, faps, visemes, expressions))
+    again = read_fap(path)
+    np.testing.assert_array_equal(again.faps, faps)
+    np.testing.assert_array_equal(again.visemes, visemes)
+    np.testing.assert_array_equal(again.expressions, expressions)
+    write_fap(path, FapAnimation("x", 25.0, faps, visemes, expressions), "greta")
+    again = read_fap(path)
+    assert again.visemes is not None
+    assert again.visemes[:, 0].tolist() == [4, 0]
+    assert again.expressions is None
 
 
 def test_digits_without_blanks_and_values_without_bounds(tmp_path: Path) -> None:
@@ -94,6 +127,11 @@ def test_outer_lips_follow_the_inner_ones_where_the_file_has_only_those(tmp_path
         (["2.1 x 25 1"], "ends after 0 of 1 frames"),
         (["2.1 x 25 2", mask(3), "0 1"], "line 3: the file ends after 1 of 2 frames"),
         (["2.1 x 25 1", mask(3)], "ends after 0"),
+        (["2.1 x 25 1", mask(1), "0 15 0 63 0"], "line 3: FAP 1 has 15; .* from 0 to 14"),
+        (["2.1 x 25 1", mask(1), "0 1 0 64 0"], "line 3: FAP 1 has 64; .* from 0 to 63"),
+        (["2.1 x 25 1", mask(1), "0 nan"], "line 3: FAP 1 has nan"),
+        (["2.1 x 25 1", mask(2), "0 1.5"], "line 3: FAP 2 has 1.5; a whole number from 0 to 6"),
+        (["2.1 x 25 1", mask(1, 3), "0 1 2 3"], "line 3: 3 values, the mask asks for 2"),
         (["2.1 x 25 1", "0 1 0", "0"], "line 2: expected a mask of 68"),
         (["2.1 x 25 1", mask(69, digits=69), "0 1"], "line 2: the mask sets a 69th"),
         (["2.1 x 25 1", mask(3, 4), "0 1"], "line 3: 1 values, the mask asks for 2"),

@@ -1,4 +1,4 @@
-"""The head: every feature point lands where its FAP says; broken assets are refused."""
+"""Every head: each feature point lands where its FAP says; broken assets are refused."""
 
 from __future__ import annotations
 
@@ -6,61 +6,72 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from services.driver.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
 from shared.errors import UserError
-from shared.faps import FAPS, NUM_FAPS, Fap
+from shared.faps import FAPS, NUM_FAPS
+from tests import heads
 
 pytestmark = pytest.mark.unit
 
-AXES = {
-    "down": (1, -1.0),
-    "up": (1, 1.0),
-    "left": (0, 1.0),
-    "right": (0, -1.0),
-    "forward": (2, 1.0),
-}
-DISPLACING = [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"]
 LIP_POINTS = [f"2.{n}" for n in range(2, 10)] + [f"8.{n}" for n in range(1, 9)]
+LEVELS = [("woman", "coarse"), *((name, "fine") for name in heads.NAMES)]
 
 
-@pytest.fixture(scope="module", params=["fine", "coarse"])
+@pytest.fixture(scope="module", params=LEVELS, ids="-".join)
 def head(request: pytest.FixtureRequest) -> Head:
-    detail: Detail = request.param
-    return Head.load(detail=detail)
+    name: str = request.param[0]
+    detail: Detail = request.param[1]
+    return heads.load(name, detail)
 
 
-def moved(head: Head, number: int, value: float) -> NDArray[np.float32]:
-    faps = np.zeros(NUM_FAPS, np.float32)
-    faps[number - 1] = value
-    return head.deform(faps) - head.vertices
+def test_there_are_several_heads() -> None:
+    assert {"woman", "man", "elder", "child"} <= set(heads.NAMES)
+    assert DEFAULT_HEAD in heads.NAMES
+    for name in heads.NAMES:
+        assert (ASSETS / f"{name}.npz").stat().st_size < 1_250_000
 
 
-@pytest.mark.parametrize("fap", DISPLACING, ids=lambda fap: fap.name)
-def test_feature_points_land(head: Head, fap: Fap) -> None:
-    axis, sign = AXES[fap.direction]
-    for value in (300.0, -120.0):
-        wanted = sign * value * head.fapu[fap.fapu] / 1024
-        shift = moved(head, fap.number, value)
-        for point in fap.feature_points:
-            assert shift[head.feature_points[point], axis] == pytest.approx(wanted, rel=0.05)
+def test_every_point_lands_where_its_fap_says(head: Head) -> None:
+    shown = set()
+    for fap in heads.DISPLACING:
+        for value in (300.0, -120.0):
+            axis, wanted = heads.travel_m(head, fap, value)
+            shift = head.deform(heads.only(fap.number, value)) - head.vertices
+            for point in fap.feature_points:
+                shown.add(point)
+                came = shift[head.feature_points[point], axis]
+                assert came == pytest.approx(wanted, rel=0.05), (fap.name, point)
+    assert len(shown) > 40
+
+
+def test_pupils_grow_by_what_the_fap_says(head: Head) -> None:
+    for number, eye in ((29, "eye_left"), (30, "eye_right")):
+        where = head.part(eye).vertices
+        moved = head.deform(heads.only(number, 200.0))
+        shift = np.linalg.norm((moved - head.vertices)[where], axis=1).max()
+        assert 2 * shift == pytest.approx(200 * head.fapu["IRISD"] / 1024, rel=0.05)  # diameter
+
+
+def test_every_fap_moves_something(head: Head) -> None:
+    for fap in FAPS[2:]:
+        assert np.abs(head.deform(heads.only(fap.number, 1000.0)) - head.vertices).max() > 1e-4, fap
 
 
 def test_no_fap_moves_a_lip_point_of_another_along_its_axis(head: Head) -> None:
-    lips = {p: fap for fap in DISPLACING for p in fap.feature_points if p in LIP_POINTS}
-    vertical = [f for f in DISPLACING if AXES[f.direction][0] == 1 and f.number != 18]
-    assert lips
+    vertical = [
+        fap for fap in heads.DISPLACING if heads.AXES[fap.direction][0] == 1 and fap.number != 18
+    ]
     for fap in vertical:
         travel = 300 * head.fapu[fap.fapu] / 1024
-        shift = moved(head, fap.number, 300.0)
+        shift = head.deform(heads.only(fap.number, 300.0)) - head.vertices
         for point in LIP_POINTS:
             if point not in fap.feature_points:
                 assert abs(shift[head.feature_points[point], 1]) < 0.05 * travel, (fap.name, point)
 
 
 def test_open_jaw_does_not_part_the_lips(head: Head) -> None:
-    shift = moved(head, 3, 500.0)
+    shift = head.deform(heads.only(3, 500.0)) - head.vertices
     inner = [head.feature_points[f"2.{n}"] for n in range(2, 10)]
     assert np.abs(shift[inner, 1]).max() < 0.05 * 500 * head.fapu["MNS"] / 1024
 
@@ -78,7 +89,7 @@ def test_neutral_faps_leave_the_face_alone(head: Head) -> None:
 
 
 def test_both_levels_move_alike() -> None:
-    fine, coarse = Head.load(detail="fine"), Head.load(detail="coarse")
+    fine, coarse = heads.load("woman"), heads.load("woman", "coarse")
     assert len(coarse.vertices) < 0.6 * len(fine.vertices)
     faps = neutral_faps(open_jaw=300, raise_b_midlip=-300, stretch_l_cornerlip=-100)
     for point, vertex in fine.feature_points.items():
@@ -88,28 +99,26 @@ def test_both_levels_move_alike() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "point", "axis", "sign"),
+    ("name", "point", "about", "axis", "sign"),
     [
-        ("yaw_l_eyeball", "3.5", 0, 1),  # to the subject's left
-        ("yaw_r_eyeball", "3.6", 0, 1),
-        ("pitch_l_eyeball", "3.5", 1, -1),  # down
-        ("pitch_r_eyeball", "3.6", 1, -1),
-        ("head_yaw", "9.3", 0, 1),
-        ("head_pitch", "9.3", 1, -1),
-        ("head_roll", "11.4", 0, -1),  # the top tilts to the subject's right
+        ("yaw_l_eyeball", "3.5", 1, 0, 1),  # to the subject's left
+        ("yaw_r_eyeball", "3.6", 1, 0, 1),
+        ("pitch_l_eyeball", "3.5", 0, 1, -1),  # down
+        ("pitch_r_eyeball", "3.6", 0, 1, -1),
+        ("head_yaw", "9.3", 1, 0, 1),
+        ("head_pitch", "9.3", 0, 1, -1),
+        ("head_roll", "11.4", 2, 0, -1),  # the top tilts to the subject's right
     ],
 )
-def test_rotations(head: Head, name: str, point: str, axis: int, sign: int) -> None:
+def test_rotations(head: Head, name: str, point: str, about: int, axis: int, sign: int) -> None:
     vertices = head.deform(neutral_faps(**{name: 10_000.0}))  # 0.1 rad
     vertex = head.feature_points[point]
-    assert sign * (vertices[vertex] - head.vertices[vertex])[axis] > 0.0005
     eye = int(name.split("_")[1] == "r")
     pivot = head.eye_centres[eye] if "eyeball" in name else np.zeros(3)
-    np.testing.assert_allclose(
-        np.linalg.norm(vertices[vertex] - pivot),
-        np.linalg.norm(head.vertices[vertex] - pivot),
-        rtol=1e-4,
-    )
+    before, after = (np.delete(v[vertex] - pivot, about) for v in (head.vertices, vertices))
+    assert sign * (vertices[vertex] - head.vertices[vertex])[axis] > 0.0005
+    turned = np.arccos(before @ after / np.linalg.norm(before) / np.linalg.norm(after))
+    assert turned == pytest.approx(0.1, rel=0.01)
 
 
 def test_shoulders_stay_when_the_head_turns(head: Head) -> None:

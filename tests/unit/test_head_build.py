@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.driver.build_head import paint, parts, surface, zones
+from services.driver.build_head import hair, paint_parts, parts, people, surface, texture, zones
 from services.driver.render import decode_image
 
 pytestmark = pytest.mark.unit
@@ -80,6 +80,46 @@ def test_smoothest_field_meets_its_points() -> None:
     assert np.abs(fields).max() < 1.5
 
 
+def test_vertices_of_a_group_move_as_one() -> None:
+    vertices, quads = sheet(9, 9)
+    triangles = surface.triangles_of(quads)
+    border = np.flatnonzero(
+        (vertices[:, :2] < 0.3).any(axis=1) | (vertices[:, :2] > 7.7).any(axis=1)
+    )
+    groups = [np.array([30, 31]), np.array([50])]
+    fields = surface.smoothest(vertices, triangles, groups, border)
+    np.testing.assert_allclose(fields[[30, 31, 50]], [[1, 0], [1, 0], [0, 1]], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["man", "elder", "child"])
+def test_short_hair_lies_over_the_scalp(name: str) -> None:
+    style = people.PEOPLE[name].hair
+    rng = np.random.default_rng(1)
+    away = rng.standard_normal((1500, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    middle = np.array([0.0, 5.93, 0.42])
+    made = style.parts(middle + 0.8 * away)
+    assert list(made) == ["hair", "hair_tips"]
+    for part in made.values():
+        reach = np.linalg.norm(part.vertices - middle, axis=1)
+        assert reach.min() > 0.79
+        assert reach.max() < 1.1
+        assert (part.uv >= 0).all()
+        assert (part.uv <= 1).all()
+    crown, chin, brow = np.array([[0.0, 6.7, 0.3], [0.0, 4.8, 1.1], [0.3, 5.95, 1.2]])
+    inside = style.roots(*np.stack([crown, chin, brow], axis=1))
+    assert inside[0] > 1
+    assert (inside[1:] < 0).all()
+
+
+def test_shells_of_short_hair_thin_out() -> None:
+    painted = paint_parts.hair((0.1, 0.1, 0.1), people.PEOPLE["man"].hair)
+    shells = np.split(painted[..., 3], hair.NUM_SHELLS, axis=1)
+    cover = [float(shell.mean()) for shell in shells]
+    assert cover == sorted(cover, reverse=True)
+    assert all(shell[-1].max() < 0.3 for shell in shells)  # nothing is left at the hairline
+
+
 def test_clip_cuts_at_height_zero() -> None:
     vertices, quads = sheet(3, 3)
     triangles = surface.triangles_of(quads)
@@ -97,7 +137,7 @@ def test_images_survive_encoding(channels: int) -> None:
     image = np.zeros((16, 24, channels))
     image[..., 0] = np.linspace(0.2, 0.8, 24)
     image[..., -1] = np.linspace(0.3, 0.9, 16)[:, None]
-    pixels = decode_image(paint.encode(image))
+    pixels = decode_image(texture.encode(image))
     tolerance = 6 if channels == 3 else 1  # JPEG loses a little
     np.testing.assert_allclose(pixels[..., :channels], image * 255, atol=tolerance)
 

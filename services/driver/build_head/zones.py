@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse import linalg
 
 from services.driver.build_head import surface
 from services.driver.build_head.feature_points import FEATURE_POINTS
@@ -117,56 +116,9 @@ def axis_of(fap: int) -> tuple[int, float]:
     return _AXES[FAPS[fap - 1].direction]
 
 
-def smoothest(skin: Skin, points: Index, fixed: Index) -> Float:
-    """Interpolate between points as smoothly as the surface allows.
-
-    Minimises the squared Laplacian (cotangent weights) integrated over the surface.
-
-    Parameters
-    ----------
-    skin
-        The surface.
-    points
-        Vertices (P,).
-    fixed
-        Vertices where every field is 0.
-
-    Returns
-    -------
-    Fields (V, P): field ``p`` is 1 at ``points[p]`` and 0 at the other points.
-    """
-    num_vertices = len(skin.vertices)
-    laplacian, area = _laplacian(skin.vertices, surface.triangles_of(skin.quads))
-    energy = (laplacian @ sparse.diags_array(1 / area) @ laplacian).tocsc()
-    is_free = np.ones(num_vertices, dtype=bool)
-    is_free[points] = is_free[fixed] = False
-    free = np.flatnonzero(is_free)
-    fields = np.zeros((num_vertices, len(points)))
-    fields[points, np.arange(len(points))] = 1.0
-    right = -(energy[free] @ fields)
-    solve = linalg.splu(energy[free][:, free].tocsc())
-    fields[free] = solve.solve(right)
-    return fields
-
-
-def _laplacian(vertices: Float, triangles: Index) -> tuple[sparse.csr_array, Float]:
-    rows, columns, weights = [], [], []
-    area = np.zeros(len(vertices))
-    for corner in range(3):
-        i, j, k = (triangles[:, (corner + step) % 3] for step in range(3))
-        a, b = vertices[j] - vertices[i], vertices[k] - vertices[i]
-        double_area = np.maximum(np.linalg.norm(np.cross(a, b), axis=1), 1e-9)
-        cotangent = np.clip((a * b).sum(axis=1) / double_area, -5, 5) / 2
-        rows += [j, k]
-        columns += [k, j]
-        weights += [cotangent, cotangent]
-        np.add.at(area, i, double_area / 6)
-    shape = (len(vertices),) * 2
-    adjacency = sparse.csr_array(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape
-    )
-    degree = np.asarray(adjacency.sum(axis=1)).ravel()
-    return sparse.csr_array(sparse.diags_array(degree) - adjacency), np.maximum(area, 1e-8)
+def smoothest(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
+    """Interpolate between points of the skin, see ``surface.smoothest``."""
+    return surface.smoothest(skin.vertices, surface.triangles_of(skin.quads), points, fixed)
 
 
 def _along(fap: int, weight: Float) -> Float:
@@ -273,6 +225,9 @@ class FaceFields:
             left = weight / weight[skin.point("2.1")]
             for name, field in taken_out.items():
                 left = left - left[skin.point(name)] * field
+            if fap == 15:  # no FAP moves the lips' middle aside: the lower lip follows the jaw half
+                for name in ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8"):
+                    left = left - 0.5 * left[skin.point(name)] * self.lip_y[name]
             self._add(fap, left)
 
     def _eyes(self, blink: tuple[Float, Float], squint: tuple[Float, Float]) -> None:
@@ -286,31 +241,37 @@ class FaceFields:
                 self.fields[fap] = unit / travel * self.fapu["IRISD"]
 
     def _brows(self) -> None:
-        _, y, z = self.skin.vertices.T
-        names = ("4.1", "4.3", "4.5", "4.2", "4.4", "4.6")
-        points = self.skin.points(*names)
-        fixed = np.flatnonzero((y < 5.885) | (y > 6.42) | (z < 0.75) | self.cavity)
-        fixed = np.setdiff1d(fixed, points)
-        raised = smoothest(self.skin, points, fixed)
+        x, y, z = self.skin.vertices.T
+        fixed = np.flatnonzero((y < 5.87) | (y > 6.42) | (z < 0.75) | self.cavity)
+
+        def bars(*names: str) -> list[Index]:
+            """Take the hairs above and below a point along, so that a brow keeps its breadth."""
+            groups = []
+            for point in self.skin.points(*names):
+                near = (np.abs(x - x[point]) < 0.022) & (np.abs(y - y[point]) < 0.050) & (z > 0.75)
+                groups.append(np.union1d(np.flatnonzero(near & (y > 5.90)), [point]))
+            return groups
+
+        raised = smoothest(self.skin, bars("4.1", "4.3", "4.5", "4.2", "4.4", "4.6"), fixed)
         for fap, weight in zip((31, 33, 35, 32, 34, 36), raised.T, strict=True):
             self._add(fap, weight)
-        ends = self.skin.points("4.1", "4.2", "4.5", "4.6")
-        squeezed = smoothest(self.skin, ends, np.setdiff1d(fixed, ends))
+        squeezed = smoothest(self.skin, bars("4.1", "4.2", "4.5", "4.6"), fixed)
         self._add(37, squeezed[:, 0])
         self._add(38, squeezed[:, 1])
 
     def _zones(self) -> None:
-        lips = np.concatenate([self.skin.points(*_INNER), self.skin.points(*_OUTER)])
         chin = self.skin.points("2.1", "8.2", "8.7", "8.8")
-        lids = self.skin.points("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
         nose = self.skin.points("9.1", "9.2", "9.3", "9.4", "9.5", "9.15")
+        lips = np.concatenate([self.skin.points(*_INNER), self.skin.points(*_OUTER)])
         self._zone(18, "2.10", 0.02, 0.26, chin)
-        for fap, name in ((39, "5.1"), (40, "5.2")):
-            self._zone(fap, name, 0.10, 0.40, np.concatenate([lips, nose]))
-            # a puffed cheek comes forward, too
-            self.fields[fap][:, 2] = 0.5 * np.abs(self.fields[fap][:, 0])
-        for fap, name in ((41, "5.3"), (42, "5.4")):
-            self._zone(fap, name, 0.05, 0.30, np.concatenate([lips, lids, nose]))
+        # a puffed cheek comes forward, too, and a lifted one swells
+        for fap, name, reach, forward in (
+            (39, "5.1", 0.46, 0.5), (40, "5.2", 0.46, 0.5),
+            (41, "5.3", 0.36, 0.25), (42, "5.4", 0.36, 0.25),
+        ):  # fmt: skip
+            weight = self._bump(name, reach)
+            self._add(fap, weight)
+            self.fields[fap][:, 2] = forward * weight * self.fapu[FAPS[fap - 1].fapu]
         for fap, name in ((61, "9.1"), (62, "9.2")):
             others = np.setdiff1d(np.concatenate([nose, lips]), self.skin.points(name))
             self._zone(fap, name, 0.03, 0.16, others)
@@ -322,6 +283,21 @@ class FaceFields:
         for fap, side in ((27, "l"), (28, "r")):
             names = ("3.1", "3.3", "3.7", "3.11") if side == "l" else ("3.2", "3.4", "3.8", "3.12")
             self._zone(fap, names, 0.05, 0.22, nose)
+
+    def _bump(self, name: str, reach: float) -> Float:
+        """Swell a cheek smoothly between lips, nose and eyelids."""
+        _, y, _ = self.skin.vertices.T
+        lids = ("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
+        held = self._far((name,), reach) | self.cavity | (y > 5.80)
+        for others, margin in (
+            (_INNER + _OUTER, 0.07),
+            (("9.1", "9.2", "9.15"), 0.10),
+            (lids, 0.07),
+        ):
+            held |= ~self._far(others, margin)
+        top = np.flatnonzero(~self._far((name,), 0.08))
+        bump: Float = smoothest(self.skin, [top], np.flatnonzero(held))[:, 0]
+        return bump
 
     def _zone(
         self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index

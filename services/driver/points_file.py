@@ -1,0 +1,128 @@
+"""Read where the MPEG-4 feature points of a mesh lie.
+
+Two forms: text lines ``point x y z`` (in the mesh's own axes and lengths) or ``point vertex``
+(numbered from 0 in the order of the file), apart by blanks or tabs, ``#`` begins a comment; and
+XfaceEd's ``.fdp`` (XML), whose ``<fdp name="2.1" affects="MESH" index="VERTEX">`` names a vertex of
+a mesh and whose ``<fapu>`` holds lengths. The zones and weights of an ``.fdp`` are not taken over:
+the fields come out of the surface, as those of the package's own heads do.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+
+MAX_BYTES = 16 * 1024 * 1024
+# ISO/IEC 14496-2, annex C: how many points each group has
+_GROUP_SIZES = {2: 14, 3: 14, 4: 6, 5: 4, 6: 4, 7: 1, 8: 10, 9: 15, 10: 10, 11: 6}
+_LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
+
+Place = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """What a file says.
+
+    Attributes
+    ----------
+    places
+        Point: coordinates (3,), or a vertex as (mesh name or "", number).
+    fapu
+        Lengths that the file gives, in the mesh's own unit.
+    """
+
+    places: dict[str, Place | tuple[str, int]]
+    fapu: dict[str, float] = field(default_factory=dict)
+
+
+def read_points(path: Path) -> Points:
+    """Read a file of feature points.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read or holds something else; the text names the line where there is one.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UserError(f"{path}: too large for a file of feature points")
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    points = _from_xml(path, text) if text.lstrip().startswith("<") else _from_lines(path, text)
+    if not points.places:
+        raise UserError(
+            f"{path}: it has no feature points; write lines such as '2.1 0.0 -0.07 0.07'"
+        )
+    return points
+
+
+def _from_lines(path: Path, text: str) -> Points:
+    places: dict[str, Place | tuple[str, int]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.partition("#")[0].split()
+        if not words or (number == 1 and not words[0][0].isdigit()):
+            continue  # empty, or the names of the columns
+        where = f"{path}, line {number}"
+        name = _known(words[0], where, places)
+        try:
+            values = [float(word) for word in words[1:]]
+        except ValueError:
+            raise UserError(f"{where}: {line.strip()!r} has a value that is no number") from None
+        if len(values) == 3 and all(map(math.isfinite, values)):
+            places[name] = np.array(values)
+        elif len(values) == 1 and values[0] >= 0 and values[0] == int(values[0]):
+            places[name] = ("", int(values[0]))
+        else:
+            raise UserError(f"{where}: expected 'point x y z' or 'point vertex'")
+    return Points(places)
+
+
+def _from_xml(path: Path, text: str) -> Points:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise UserError(f"{path}: an .fdp file has no document type; remove it")
+    try:
+        root = ET.fromstring(text)  # noqa: S314 - entities are refused above
+    except ET.ParseError as error:
+        raise UserError(f"{path}: no intact XML: {error}") from error
+    places: dict[str, Place | tuple[str, int]] = {}
+    for entry in root.iter("fdp"):
+        if "name" not in entry.attrib:
+            continue
+        where = f"{path}, <fdp name={entry.attrib['name']!r}>"
+        name = _known(entry.attrib["name"], where, places)
+        try:
+            number = int(entry.attrib["index"])
+        except (KeyError, ValueError):
+            raise UserError(f"{where}: it has no index of a vertex") from None
+        if number < 0:
+            raise UserError(f"{where}: vertex {number}")
+        places[name] = (entry.attrib.get("affects", ""), number)
+    fapu = {}
+    for entry in root.iter("fapu"):
+        for name in _LENGTHS:
+            try:
+                length = float(entry.attrib.get(f"{name}0", "nan"))
+            except ValueError:
+                length = math.nan
+            if 0 < length < math.inf:
+                fapu[name] = length
+    return Points(places, fapu)
+
+
+def _known(name: str, where: str, places: dict[str, Place | tuple[str, int]]) -> str:
+    match = re.fullmatch(r"(\d+)\.(\d+)", name)
+    if not match or not 1 <= int(match[2]) <= _GROUP_SIZES.get(int(match[1]), 0):
+        raise UserError(f"{where}: {name!r} is no MPEG-4 feature point")
+    if name in places:
+        raise UserError(f"{where}: {name} comes twice")
+    return name

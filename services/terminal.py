@@ -1,0 +1,57 @@
+"""What commands share: the console, and writing results."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from shared.errors import UserError
+
+CONSOLE = Console(stderr=True)
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the figures here.")]
+
+
+def say(text: str) -> None:
+    """Print a line for the user, beside what a command puts out."""
+    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def show(text: str, output: Path | None) -> None:
+    """Put text out, or write it to a file."""
+    if output is None:
+        sys.stdout.write(text)
+    else:
+        write_text(output, text)
+
+
+def write_json(path: Path | None, figures: object) -> None:
+    """Write figures if there is a file for them."""
+    if path is not None:
+        write_text(path, json.dumps(figures, indent=1, ensure_ascii=False, default=_plain))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file and the folders it lies in.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no JSON form")

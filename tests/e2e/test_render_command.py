@@ -1,0 +1,160 @@
+"""``kouxing render`` and ``kouxing head``: files in, files out."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from services.command_line import _chosen_head
+from services.driver.film import frames_of
+from services.driver.glb import export_glb
+from services.driver.head import Head
+from services.offline_commands import CameraName, head_import, render
+from shared.config import DriverConfig
+from shared.errors import UserError
+from shared.fap_file import FapAnimation, write_fap
+from tests.glb_writer import write_glb
+from tests.meshes import meshes
+from tests.system import DEMO, ROOT, free_port, kouxing
+
+pytestmark = pytest.mark.e2e
+SENTENCE = DEMO / "vowels-male.wav"
+
+
+@pytest.fixture(scope="module")
+def face(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten frames at 20 Hz: the mouth opens by FAP 1 alone, and joy comes by FAP 2."""
+    visemes = np.zeros((10, 4), np.int64)
+    visemes[:, 0], visemes[:, 2] = 10, np.linspace(0, 63, 10)
+    expressions = np.zeros((10, 6), np.int64)
+    expressions[:, 0], expressions[:, 1] = 1, 63
+    path = tmp_path_factory.mktemp("fap") / "some face.fap"
+    animation = FapAnimation("a name", 20.0, np.zeros((10, 68), np.float32), visemes, expressions)
+    write_fap(path, animation)
+    return path
+
+
+def test_a_fap_file_becomes_a_video_with_sound(face: Path, tmp_path: Path) -> None:
+    video = tmp_path / "face.mp4"
+    arguments = ("--sound", SENTENCE, "--size", "160x120", "--background", "white")
+    result = kouxing("render", face, video, *arguments)
+    assert result.returncode == 0, result.stderr
+    assert "phones" not in result.stderr
+    with av.open(str(video)) as film:
+        assert film.streams.video[0].average_rate == 20
+        assert len(film.streams.audio) == 1
+        images = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(images) / 20 == pytest.approx(2.3, abs=0.1), "the last face is held"
+    assert images[0][3, 3].min() > 245
+    change = np.abs(images[9].astype(int) - images[0]).mean(axis=2)
+    assert change[70:100, 60:100].max() > 40, "the mouth opens"
+    np.testing.assert_allclose(images[-1].astype(int), images[12], atol=25)
+
+
+def test_one_transparent_picture_of_another_head(face: Path, tmp_path: Path) -> None:
+    pictures = []
+    for head, yaw in (("man", 0.0), ("man", 40.0), ("child", 0.0)):
+        path = tmp_path / f"{head}{yaw:.0f}.png"
+        render(
+            face, path, head=head, size="161x121", background="transparent",
+            camera=CameraName.HEAD, yaw=yaw, at=0.2,
+        )  # fmt: skip
+        pictures.append(np.asarray(Image.open(path)).astype(int))
+    for picture in pictures:
+        assert picture.shape == (121, 161, 4)
+        assert picture[3, 3, 3] == 0
+        assert picture[60, 80, 3] == 255
+    assert np.abs(pictures[0] - pictures[1]).mean() > 5
+    assert np.abs(pictures[0] - pictures[2]).mean() > 5
+
+
+def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
+    (tmp_path / "bad.fap").write_text("2.1 x 25 1\n0 1\n0 7\n", encoding="utf-8")
+    result = kouxing("render", tmp_path / "bad.fap", tmp_path / "out.mp4")
+    assert result.returncode == 2
+    assert "bad.fap, line 2: expected a mask of 68" in result.stderr
+    assert not (tmp_path / "out.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "said"),
+    [
+        ("a.mp4", {"background": "transparent"}, "MP4 has no transparency"),
+        ("a.mp4", {"background": "mud"}, "write studio, transparent"),
+        ("a.mp4", {"at": 0.1}, "--at says when one picture"),
+        ("a.mp4", {"size": "161x120"}, "even for a video"),
+        ("a.avi", {}, "give a name that ends in .mp4, .mov, .webm"),
+        ("a.png", {"at": 9.0}, "lasts from 0 to 0.45 s"),
+        ("a.png", {"head": "nobody"}, "there is no head 'nobody'"),
+        ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
+        ("no/a.mp4", {}, "cannot be written"),
+        ("no/a.png", {"size": "64x48"}, "cannot be written"),
+    ],
+)
+def test_what_does_not_fit_is_named(
+    face: Path, tmp_path: Path, output: str, options: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        render(face, tmp_path / output, **options)
+
+
+def test_a_definition_of_a_viseme_holds_the_whole_shape() -> None:
+    faps = np.zeros((2, 68), np.float32)
+    faps[:, 2] = 100
+    visemes = np.array([[10, 0, 63, 0], [10, 0, 63, 1]])
+    frames = frames_of(FapAnimation("", 25.0, faps, visemes))
+    assert frames[0][1][2] > 150
+    assert frames[1][1][2] == 100
+
+
+def test_an_imported_mesh_speaks(face: Path, tmp_path: Path) -> None:
+    own = Head.load(detail="coarse")
+    write_glb(tmp_path / "mesh.glb", meshes(own))
+    rows = [
+        f"{name} {' '.join(map(str, own.vertices[vertex]))}"
+        for name, vertex in own.feature_points.items()
+    ]
+    (tmp_path / "points.tsv").write_text("\n".join(rows), encoding="utf-8")
+    head = tmp_path / "mine.npz"
+    head_import(tmp_path / "mesh.glb", tmp_path / "points.tsv", head)
+    render(face, tmp_path / "frames", head=str(head), size="64x48")
+    assert len(list((tmp_path / "frames").iterdir())) == 10
+
+
+def test_the_page_gets_the_head_that_is_chosen(tmp_path: Path) -> None:
+    assert _chosen_head(DriverConfig().head, tmp_path) == {}
+    export_glb(Head.load("child", "coarse"), tmp_path / "my.glb")
+    chosen = _chosen_head(str(tmp_path / "my.glb"), tmp_path / "out")
+    assert chosen["KOUXING_DRIVER_HEAD"] == str(tmp_path / "my.glb")
+    port = free_port()
+    environment = {**os.environ, **chosen, "KOUXING_GATEWAY_PORT": str(port)}
+    gateway = subprocess.Popen(
+        [sys.executable, "-m", "services", "gateway"],
+        env=environment,
+        cwd=ROOT,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        end_s = time.monotonic() + 60
+        while True:
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/head.glb") as answer:
+                    got = answer.read()
+                break
+            except OSError:
+                assert time.monotonic() < end_s
+                time.sleep(0.1)
+    finally:
+        gateway.terminate()
+        gateway.wait()
+    assert got == (tmp_path / "out" / "head.glb").read_bytes()

@@ -1,0 +1,88 @@
+"""Write small GLBs by hand, as other programs would: dense accessors, nothing of our own."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+
+@dataclass
+class Mesh:
+    name: str
+    vertices: NDArray[Any]
+    triangles: NDArray[Any]
+    targets: dict[str, NDArray[Any]] = field(default_factory=dict)
+    uv: NDArray[Any] | None = None
+    colors: NDArray[Any] | None = None  # (V, 3), linear
+    texture: bytes = b""  # PNG
+
+
+def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
+    binary = bytearray()
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(meshes)))}],
+        **{key: [] for key in ("nodes", "meshes", "accessors", "bufferViews", "materials")},
+        **rest,
+    }
+
+    def view(data: bytes) -> int:
+        document["bufferViews"].append(
+            {"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)}
+        )
+        binary.extend(data + b"\0" * (-len(data) % 4))
+        return len(document["bufferViews"]) - 1
+
+    def accessor(array: NDArray[Any], kind: str, component: int) -> int:
+        entry = {"bufferView": view(array.tobytes()), "componentType": component, "type": kind}
+        if kind == "VEC3":
+            entry |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        document["accessors"].append(entry | {"count": len(array)})
+        return len(document["accessors"]) - 1
+
+    for mesh in meshes:
+        attributes = {"POSITION": accessor(mesh.vertices.astype("<f4"), "VEC3", 5126)}
+        if mesh.uv is not None:
+            attributes["TEXCOORD_0"] = accessor(mesh.uv.astype("<f4"), "VEC2", 5126)
+        if mesh.colors is not None:
+            attributes["COLOR_0"] = accessor(mesh.colors.astype("<f4"), "VEC3", 5126)
+        surface: dict[str, Any] = {}
+        if mesh.texture:
+            document.setdefault("images", []).append(
+                {"bufferView": view(mesh.texture), "mimeType": "image/png"}
+            )
+            document.setdefault("textures", []).append({"source": len(document["images"]) - 1})
+            surface["baseColorTexture"] = {"index": len(document["textures"]) - 1}
+        document["materials"].append({"pbrMetallicRoughness": surface})
+        primitive = {
+            "attributes": attributes,
+            "indices": accessor(mesh.triangles.astype("<u4").ravel(), "SCALAR", 5125),
+            "material": len(document["materials"]) - 1,
+        }
+        entry: dict[str, Any] = {"primitives": [primitive]}
+        if mesh.targets:
+            primitive["targets"] = [
+                {"POSITION": accessor(shift.astype("<f4"), "VEC3", 5126)}
+                for shift in mesh.targets.values()
+            ]
+            entry["extras"] = {"targetNames": list(mesh.targets)}
+        document["meshes"].append(entry)
+        document["nodes"].append({"name": mesh.name, "mesh": len(document["meshes"]) - 1})
+    document["buffers"] = [{"byteLength": len(binary)}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + len(binary)
+    path.write_bytes(
+        struct.pack("<4sII", b"glTF", 2, length)
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + bytes(binary)
+    )
+    return path

@@ -1,0 +1,39 @@
+"""The heads of the package, read once for all tests."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head import ASSETS, Detail, Head
+from shared.faps import FAPS, NUM_FAPS, Fap
+
+NAMES = sorted(path.stem for path in ASSETS.glob("*.npz"))
+AXES = {
+    "down": (1, -1.0),
+    "up": (1, 1.0),
+    "left": (0, 1.0),
+    "right": (0, -1.0),
+    "forward": (2, 1.0),
+}
+DISPLACING = [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"]
+
+
+@functools.cache
+def load(name: str, detail: Detail = "fine") -> Head:
+    return Head.load(name, detail)
+
+
+def travel_m(head: Head, fap: Fap, value: float) -> tuple[int, float]:
+    """Axis along which a FAP moves its points, and how far."""
+    axis, sign = AXES[fap.direction]
+    return axis, sign * value * head.fapu[fap.fapu] / 1024
+
+
+def only(number: int, value: float) -> NDArray[np.float32]:
+    """FAPs (68,) of which one is not zero."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[number - 1] = value
+    return faps

@@ -1,0 +1,57 @@
+"""Our own head as a stranger's mesh: stripped of what moves it, or with shapes of other names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head import Head
+from tests.glb_writer import Mesh
+
+STIFF = ("hair_tips", "lashes")  # parts that need transparency, which the meshes here do without
+
+
+def meshes(head: Head, shapes: Mapping[str, NDArray[Any]] | None = None) -> list[Mesh]:
+    """Return the parts, with a morph target for each of some sums of FAPs (68,)."""
+    shown = [part for part in head.parts if not part.name.startswith(STIFF)]
+    made = {
+        part.name: Mesh(
+            part.name,
+            head.vertices[part.vertices],
+            head.triangles[part.triangles].astype(np.int64) - part.vertices.start,
+            uv=head.uv[part.vertices],
+            colors=head.colors[part.vertices],
+            texture=head.textures[part.texture],
+        )
+        for part in shown
+    }
+    for name, faps in (shapes or {}).items():
+        shift = (head.basis @ np.asarray(faps, np.float32)).reshape(-1, 3)
+        for part in shown:
+            if np.abs(shift[part.vertices]).max() > 1e-6:
+                made[part.name].targets[name] = shift[part.vertices]
+    return list(made.values())
+
+
+def write_obj(path: Path, parts: list[Mesh]) -> None:
+    """Write vertices with colours, and texture places that cut the mesh at x = 0."""
+    lines, first = [], 1
+    for part in parts:
+        lines.append(f"o {part.name}")
+        colors = np.ones_like(part.vertices) if part.colors is None else np.sqrt(part.colors)
+        for row, color in zip(part.vertices, colors, strict=True):
+            lines.append("v " + " ".join(f"{value:.6f}" for value in (*row, *color)))
+        for side in (0, 1):
+            lines += [f"vt {0.5 + x:.5f} {side}" for x in part.vertices[:, 0]]
+        count = len(part.vertices)
+        texture = 2 * (first - 1) + 1
+        for corners in part.triangles:
+            side = int(part.vertices[corners, 0].mean() > 0)
+            words = [f"{first + v}/{texture + side * count + v}" for v in corners]
+            lines.append("f " + " ".join(words))
+        first += count
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,336 @@
+"""GLBs with ARKit, Oculus or FAP morph targets are driven directly; broken ones are refused."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.driver.arkit import ARKIT, ARKIT_NAMES, OCULUS_NAMES
+from services.driver.glb import export_glb
+from services.driver.glb_head import read_glb
+from services.driver.head import Head, neutral_faps
+from services.driver.high_level import VISEMES
+from services.driver.render import Renderer
+from services.driver.scene import camera, load_head
+from shared.errors import UserError
+from shared.faps import NUM_FAPS
+from tests.glb_writer import Mesh, write_glb
+from tests.meshes import meshes
+
+pytestmark = pytest.mark.unit
+
+SHAPES = {name: ARKIT[row] for row, name in enumerate(ARKIT_NAMES)}
+VISEME_SHAPES = dict(zip(OCULUS_NAMES, VISEMES, strict=True))
+ORDER = np.random.default_rng(3).permutation(52)
+
+
+@pytest.fixture(scope="module")
+def own() -> Head:
+    return Head.load(detail="coarse")
+
+
+def skin(head: Head, faps: np.ndarray) -> np.ndarray:
+    """Displacement of the skin in eye distances (V, 3)."""
+    moved = head.deform(np.asarray(faps, np.float32)) - head.vertices
+    unit = np.linalg.norm(head.eye_centres[0] - head.eye_centres[1])
+    shift: np.ndarray = moved[head.part("skin").vertices] / unit
+    return shift
+
+
+def off(head: Head, own: Head, faps: np.ndarray) -> float:
+    """How far two heads' faces differ, as a share of the way that they go."""
+    wanted = skin(own, faps)
+    return float(np.linalg.norm(skin(head, faps) - wanted) / np.linalg.norm(wanted))
+
+
+def test_our_own_export_is_the_same_head_again(own: Head, tmp_path: Path) -> None:
+    export_glb(own, tmp_path / "own.glb")
+    head = load_head(str(tmp_path / "own.glb"))
+    assert [part.name for part in head.parts] == [part.name for part in own.parts]
+    rng = np.random.default_rng(0)
+    faps = rng.uniform(-200, 200, NUM_FAPS)
+    faps[22:26] = faps[47:50] = 10_000
+    assert off(head, own, faps) < 0.01
+    pictures = []
+    for each in (own, head):
+        renderer = Renderer(each, 96, 72, samples=0, camera=camera(each))
+        pictures.append(renderer.draw(np.asarray(faps, np.float32)).astype(float))
+        renderer.close()
+    assert np.abs(pictures[0] - pictures[1]).mean() < 3
+
+
+def test_the_arkit_shapes_of_our_own_export_are_enough(own: Head, tmp_path: Path) -> None:
+    path = tmp_path / "own.glb"
+    export_glb(own, path)
+    document, binary = chunks(path)
+    for mesh in document["meshes"]:
+        names = mesh.get("extras", {}).get("targetNames", [])
+        names[:] = [name if name in ARKIT_NAMES else f"x{row}" for row, name in enumerate(names)]
+    write_chunks(path, document, binary)
+    head = read_glb(path)
+    for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
+        assert off(head, own, SHAPES[name]) < 0.25, name
+
+
+@pytest.mark.parametrize(
+    "rename",
+    [
+        lambda n: n,
+        lambda n: "Face_BS." + n,
+        lambda n: n.replace("Left", "_L").replace("Right", "_R"),
+    ],
+    ids=["plain", "prefixed", "sides"],
+)
+def test_arkit_shapes_in_any_order(own: Head, tmp_path: Path, rename: Callable[[str], str]) -> None:
+    shapes = {rename(ARKIT_NAMES[row]): ARKIT[row] for row in ORDER}
+    shapes |= {"somethingElse": ARKIT[0]}
+    head = read_glb(write_glb(tmp_path / "my.glb", meshes(own, shapes)))
+    for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
+        assert off(head, own, SHAPES[name]) < 0.25, name
+    for viseme in ("PP", "aa", "ou", "ih"):
+        assert off(head, own, VISEME_SHAPES[viseme]) < 0.5, viseme
+
+
+def test_a_few_arkit_shapes_still_open_and_round_the_mouth(own: Head, tmp_path: Path) -> None:
+    few = (
+        "jawOpen", "mouthClose", "mouthPucker", "mouthFunnel", "mouthSmileLeft", "mouthSmileRight",
+        "mouthLowerDownLeft", "mouthLowerDownRight", "mouthUpperUpLeft", "mouthUpperUpRight",
+        "eyeBlinkLeft", "eyeBlinkRight",
+    )  # fmt: skip
+    path = write_glb(tmp_path / "my.glb", meshes(own, {name: SHAPES[name] for name in few}))
+    head = read_glb(path)
+    points = own.feature_points
+    opened = skin(head, VISEME_SHAPES["aa"])
+    assert opened[points["2.2"], 1] - opened[points["2.3"], 1] > 0.1
+    rounded = skin(head, VISEME_SHAPES["ou"])
+    assert rounded[points["8.3"], 0] - rounded[points["8.4"], 0] < -0.1
+    assert skin(head, neutral_faps(close_t_l_eyelid=900))[points["3.1"], 1] < -0.08
+
+
+@pytest.mark.parametrize("short", [False, True], ids=["oculus", "ready player me"])
+def test_oculus_visemes(own: Head, tmp_path: Path, short: bool) -> None:
+    names = {"ih": "I", "oh": "O", "ou": "U"} if short else {}
+    shapes = {f"viseme_{names.get(n, n)}": faps for n, faps in VISEME_SHAPES.items()}
+    shapes |= {name: SHAPES[name] for name in ("eyeBlinkLeft", "eyeBlinkRight")}
+    head = read_glb(write_glb(tmp_path / "my.glb", meshes(own, shapes)))
+    for viseme in ("PP", "FF", "kk", "aa", "ih", "oh", "ou"):
+        assert off(head, own, VISEME_SHAPES[viseme]) < 0.15, viseme
+    assert off(head, own, neutral_faps(close_t_l_eyelid=700, close_t_r_eyelid=700)) < 0.4
+
+
+def test_units_place_and_direction_do_not_matter(own: Head, tmp_path: Path) -> None:
+    parts = meshes(own, SHAPES)
+    for part in parts:
+        part.vertices = part.vertices * [-250, 250, -250] + [3, 1600, 40]
+        part.targets = {name: shift * [-250, 250, -250] for name, shift in part.targets.items()}
+    head = read_glb(write_glb(tmp_path / "my.glb", parts))
+    assert off(head, own, SHAPES["jawOpen"]) < 0.25
+    same_place(head, own)
+
+
+def same_place(head: Head, own: Head) -> None:
+    """Heads are alike up to their size and the pivot that they turn about."""
+    first, second = own_rows(head, own), head.vertices
+    scale = np.ptp(second[:, 1]) / np.ptp(first[:, 1])
+    shift = second - scale * first
+    assert np.ptp(shift, axis=0).max() < 1e-4
+    assert np.abs(shift).max() < 0.01
+
+
+def own_rows(head: Head, own: Head) -> np.ndarray:
+    """Vertices of our head for the parts that a GLB of it kept."""
+    names = [part.name for part in head.parts]
+    return np.concatenate([own.vertices[own.part(name).vertices] for name in names])
+
+
+def test_gaze_by_shapes_where_there_are_no_eyeballs(own: Head, tmp_path: Path) -> None:
+    parts = [part for part in meshes(own, SHAPES) if not part.name.startswith("eye_")]
+    looks = np.flatnonzero(own.vertices[own.part("skin").vertices][:, 1] > 0.03)
+    shift = np.zeros_like(parts[0].vertices)
+    shift[looks[:50], 0] = 0.004
+    for name in ("eyeLookOutLeft", "eyeLookInLeft"):
+        parts[0].targets[name] = shift * (1 if "Out" in name else -1)
+    head = read_glb(write_glb(tmp_path / "my.glb", parts))
+    assert skin(head, neutral_faps(yaw_l_eyeball=25_000))[looks[:50], 0].min() > 0.01
+
+
+def test_a_skeleton_turns_the_head_and_leaves_the_shoulders(own: Head, tmp_path: Path) -> None:
+    """Nodes as avatars have them: Hips > Neck > Head, and a mesh skinned to Hips and Head."""
+    path = write_glb(tmp_path / "my.glb", meshes(own, SHAPES))
+    document, binary = chunks(path)
+    count = len(document["nodes"])
+    document["nodes"] += [
+        {"name": "Hips", "children": [count + 1], "translation": [0, -1, 0]},
+        {"name": "Neck", "children": [count + 2], "translation": [0, 0.9, 0]},
+        {"name": "Head", "translation": [0, 0.1, 0]},
+    ]
+    document["scenes"][0]["nodes"].append(count)
+    document["skins"] = [{"joints": [count, count + 2]}]
+    matrices = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
+    matrices[0, 3, 1] = 1.0  # column-major: the bind pose undoes the place of the hips
+    add(document, binary, matrices.reshape(2, 16), "MAT4", 5126)
+    document["skins"][0]["inverseBindMatrices"] = len(document["accessors"]) - 1
+    for node in document["nodes"][:count]:
+        attributes = document["meshes"][node["mesh"]]["primitives"][0]["attributes"]
+        rows = document["accessors"][attributes["POSITION"]]["count"]
+        joints = np.zeros((rows, 4), "u1")
+        joints[:, 0] = 0 if node["name"] == "garment" else 1
+        add(document, binary, joints, "VEC4", 5121)
+        attributes["JOINTS_0"] = len(document["accessors"]) - 1
+        add(document, binary, np.tile(np.array([1, 0, 0, 0], "<f4"), (rows, 1)), "VEC4", 5126)
+        attributes["WEIGHTS_0"] = len(document["accessors"]) - 1
+        node["skin"] = 0
+    write_chunks(path, document, binary)
+    head = read_glb(path)
+    same_place(head, own)
+    moved = np.abs(head.deform(neutral_faps(head_yaw=40_000)) - head.vertices).max(axis=1)
+    assert moved[head.part("garment").vertices].max() == 0
+    assert moved[head.part("hair").vertices].max() > 0.02
+
+
+# --- broken files ---------------------------------------------------------------------------------
+
+
+def chunks(path: Path) -> tuple[dict[str, Any], bytearray]:
+    data = path.read_bytes()
+    (size,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + size]), bytearray(data[28 + size :])
+
+
+def write_chunks(path: Path, document: dict[str, Any], binary: bytes | bytearray) -> None:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    path.write_bytes(
+        head
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(binary), b"BIN\0")
+        + bytes(binary)
+    )
+
+
+def add(document: dict[str, Any], binary: bytearray, array: Any, kind: str, component: int) -> None:
+    document["bufferViews"].append({"byteOffset": len(binary), "byteLength": array.nbytes})
+    document["accessors"].append(
+        {
+            "bufferView": len(document["bufferViews"]) - 1,
+            "componentType": component,
+            "type": kind,
+            "count": len(array),
+        }
+    )
+    binary += array.tobytes() + b"\0" * (-array.nbytes % 4)
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]])
+    targets = {name: np.full((4, 3), 0.001 * row) for row, name in enumerate(ARKIT_NAMES, start=1)}
+    targets["eyeBlinkLeft"], targets["eyeBlinkRight"] = np.zeros((2, 4, 3))
+    targets["eyeBlinkLeft"][1], targets["eyeBlinkRight"][0] = 0.01, 0.01
+    mesh = Mesh("face", vertices, np.array([[0, 1, 2], [1, 3, 2]]), targets)
+    return write_glb(tmp_path / "small.glb", [mesh])
+
+
+def test_the_small_one_is_intact(small: Path) -> None:
+    assert len(read_glb(small).vertices) == 4
+
+
+def change(key: str, index: int, **values: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda document: document[key][index].update(values)
+
+
+def sparse(document: dict[str, Any]) -> None:
+    document["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": 0, "componentType": 5125, "byteOffset": 12},
+        "values": {"bufferView": 0},
+    }
+
+
+def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda document: document["meshes"][0]["primitives"][0].update(values)
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (change("accessors", 0, count=10**9), "an accessor of 1000000000 elements"),
+        (change("accessors", 0, count=5), "larger than its buffer view"),
+        (change("accessors", 0, count=-1), "an accessor of -1"),
+        (change("accessors", 0, byteOffset=-4), "larger than its buffer view"),
+        (change("accessors", 0, componentType=1), "no intact GLB"),
+        (change("accessors", 0, type="VEC4"), "larger than its buffer view"),
+        (change("accessors", 0, bufferView=999), "there is no bufferViews 999"),
+        (change("bufferViews", 0, byteLength=10**9), "outside the file"),
+        (change("bufferViews", 0, byteOffset=-1), "outside the file"),
+        (change("bufferViews", 0, byteStride=4), "larger than its buffer view"),
+        (change("nodes", 0, children=[0]), "form no tree"),
+        (change("nodes", 0, children=[7]), "there is no nodes 7"),
+        (change("nodes", 0, mesh=7), "there is no meshes 7"),
+        (change("nodes", 0, matrix=[1, 2]), "no intact GLB"),
+        (sparse, "writes outside itself"),
+        (primitive(indices=0), "corner that does not exist"),
+        (primitive(mode=0), "no triangles"),
+        (primitive(attributes={}), "no intact GLB"),
+        (lambda d: d["meshes"][0].pop("extras"), "too few known names"),
+        (lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco"),
+        (lambda d: d.update(scene=5), "no intact GLB"),
+        (lambda d: d.update(nodes=[]), "there is no nodes 0"),
+    ],
+)
+def test_broken_descriptions(
+    small: Path, damage: Callable[[dict[str, Any]], None], said: str
+) -> None:
+    document, binary = chunks(small)
+    damage(document)
+    write_chunks(small, document, binary)
+    with pytest.raises(UserError, match=said):
+        read_glb(small)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "no binary glTF"),
+        (b"\0" * 100, "no binary glTF"),
+        (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
+        (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "no glTF description"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "no glTF description"),
+    ],
+)
+def test_broken_bytes(tmp_path: Path, data: bytes, said: str) -> None:
+    (tmp_path / "my.glb").write_bytes(data)
+    with pytest.raises(UserError, match=said):
+        read_glb(tmp_path / "my.glb")
+
+
+def test_every_flipped_byte_is_read_or_refused(small: Path) -> None:
+    data = small.read_bytes()
+    rng = np.random.default_rng(1)
+    for place in rng.integers(0, len(data), 150):
+        broken = bytearray(data)
+        broken[place] ^= 1 << rng.integers(0, 8)
+        small.write_bytes(broken)
+        try:
+            head = read_glb(small)
+        except UserError:
+            continue
+        assert np.isfinite(head.vertices).all()
+
+
+def test_too_few_names_are_told_with_what_there_is(tmp_path: Path, own: Head) -> None:
+    shapes = dict.fromkeys(("Fcl_MTH_A", "Fcl_MTH_I", "jawOpen"), ARKIT[0])
+    path = write_glb(tmp_path / "my.glb", meshes(own, shapes))
+    said = r"1 of at least 12 ARKit shapes.*0 of at least 8 Oculus.*fclmtha.*jawopen.*Name them as"
+    with pytest.raises(UserError, match=said):
+        read_glb(path)

@@ -1,0 +1,284 @@
+"""A stranger's mesh and its feature points become a head; what is wrong with them is said."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.driver.head import Head, neutral_faps
+from services.driver.import_head import import_head
+from shared.errors import UserError
+from shared.faps import FAPS, NUM_FAPS
+from tests.glb_writer import Mesh, write_glb
+from tests.meshes import meshes, write_obj
+
+pytestmark = pytest.mark.unit
+
+AXES = {"down": (1, -1), "up": (1, 1), "left": (0, 1), "right": (0, -1), "forward": (2, 1)}
+TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
+OPEN = neutral_faps(
+    open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
+    lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,
+    raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def own() -> Head:
+    return Head.load(detail="coarse")
+
+
+def lines(head: Head, place: Callable[[np.ndarray], np.ndarray]) -> str:
+    rows = []
+    for name, vertex in head.feature_points.items():
+        x, y, z = place(head.vertices[vertex].astype(float))
+        rows.append(f"{name}\t{x:.6f}\t{y:.6f}\t{z:.6f}\n")
+    return "point\tx\ty\tz\n" + "".join(rows)
+
+
+@pytest.fixture(scope="module")
+def imported(own: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
+    """Another face: longer, in centimetres, elsewhere, looking the other way."""
+    folder = tmp_path_factory.mktemp("import")
+
+    def place(points: np.ndarray) -> np.ndarray:
+        placed: np.ndarray = points * [100, 112, 100] * TURN + [30, 150, -7]
+        return placed
+
+    parts = meshes(own)
+    for part in parts:
+        part.vertices = place(part.vertices)
+    write_glb(folder / "face.glb", parts)
+    (folder / "points.tsv").write_text(lines(own, place), encoding="utf-8")
+    remarks = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
+    assert remarks == ["without points, these FAPs move nothing: dilate_l_pupil, dilate_r_pupil"]
+    return Head.load(folder / "face.npz")
+
+
+def moved(head: Head, faps: np.ndarray) -> np.ndarray:
+    return head.deform(np.asarray(faps, np.float32)) - head.vertices
+
+
+def test_parts_textures_and_units(imported: Head, own: Head) -> None:
+    assert {"skin", "eye_left", "eye_right", "teeth_lower", "tongue"} <= {
+        part.name for part in imported.parts
+    }
+    assert imported.textures[imported.part("skin").texture] == own.textures["skin"]
+    rows = imported.part("skin").vertices
+    np.testing.assert_allclose(
+        imported.colors[rows], own.colors[own.part("skin").vertices], atol=0.01
+    )
+    assert imported.fapu["MNS"] / imported.fapu["MW"] == pytest.approx(
+        1.12 * own.fapu["MNS"] / own.fapu["MW"], rel=0.01
+    )
+
+
+@pytest.mark.parametrize(
+    "fap",
+    [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"],
+    ids=lambda fap: fap.name,
+)
+def test_feature_points_land(imported: Head, fap: object) -> None:
+    axis, sign = AXES[fap.direction]  # type: ignore[attr-defined]
+    for value in (300.0, -120.0):
+        faps = np.zeros(NUM_FAPS)
+        faps[fap.number - 1] = value  # type: ignore[attr-defined]
+        wanted = sign * value * imported.fapu[fap.fapu] / 1024  # type: ignore[attr-defined]
+        for point in fap.feature_points:  # type: ignore[attr-defined]
+            vertex = imported.feature_points.get(point)
+            if vertex is not None:
+                assert moved(imported, faps)[vertex, axis] == pytest.approx(wanted, rel=0.05)
+
+
+def test_an_open_mouth_moves_what_belongs_to_the_jaw_alone(imported: Head) -> None:
+    shift = moved(imported, OPEN)
+    unit = imported.fapu["MNS"]
+    lower, upper = (imported.feature_points[name] for name in ("2.3", "2.2"))
+    assert shift[lower, 1] < -0.4 * unit
+    assert shift[upper, 1] > 0.1 * unit
+    teeth = imported.part("teeth_lower").vertices
+    assert shift[teeth, 1].max() < -0.05 * unit
+    for name in ("teeth_upper", "hair", "garment", "eye_left"):
+        assert np.abs(shift[imported.part(name).vertices]).max() < 0.02 * unit, name
+
+
+def test_eyes_head_and_shoulders(imported: Head) -> None:
+    turn = moved(imported, neutral_faps(yaw_l_eyeball=30_000))
+    left, right = (imported.part(name).vertices for name in ("eye_left", "eye_right"))
+    assert np.abs(turn[left]).max() > 0.002
+    assert not turn[right].any()
+    ball = imported.vertices[left]
+    middle = (ball.min(axis=0) + ball.max(axis=0)) / 2
+    np.testing.assert_allclose(imported.eye_centres[0], middle, atol=1e-5)
+    nod = np.abs(moved(imported, neutral_faps(head_yaw=30_000))).max(axis=1)
+    assert nod[imported.feature_points["2.1"]] > 0.01
+    assert nod[np.argmin(imported.vertices[:, 1])] < 0.001
+
+
+def test_obj_with_vertex_numbers_and_seams(own: Head, tmp_path: Path) -> None:
+    parts = [part for part in meshes(own) if part.name in ("garment", "skin")][::-1]
+    write_obj(tmp_path / "face.obj", parts)
+    first = len(parts[0].vertices) if parts[0].name == "garment" else 0
+    rows = [
+        f"{name} {first + vertex}"
+        for name, vertex in own.feature_points.items()
+        if vertex < own.part("skin").vertices.stop
+    ]
+    eyes = {"3.5": own.eye_centres[0], "3.6": own.eye_centres[1]}
+    rows += [f"{name} {' '.join(map(str, place))}  # inside" for name, place in eyes.items()]
+    (tmp_path / "points.txt").write_text("\n".join(rows), encoding="utf-8")
+    remarks = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
+    assert "no eyeballs apart from the skin: the eyes do not turn" in remarks
+    head = Head.load(tmp_path / "out.npz")
+    shift = moved(head, OPEN)
+    assert shift[head.feature_points["2.3"], 1] < -0.4 * head.fapu["MNS"]
+    # a vertex that the texture's seam doubles moves, and is lit, as one
+    skin = head.part("skin").vertices
+    places = np.round(head.vertices[skin], 5)
+    _, group = np.unique(places, axis=0, return_inverse=True)
+    group = group.ravel()
+    assert len(places) > group.max() + 10
+    normals = head.pose(OPEN)[1][skin]
+    for values in (shift[skin], normals):
+        first_of = np.zeros((group.max() + 1, 3))
+        first_of[group] = values
+        assert np.abs(first_of[group] - values).max() < 1e-4
+
+
+def test_fdp_of_xfaceed(own: Head, tmp_path: Path) -> None:
+    write_glb(tmp_path / "face.glb", meshes(own))
+    skin = own.part("skin").vertices
+    entries = "".join(
+        f'<fdp name="{name}" affects="skin" index="{vertex}"><indices>1 2 3</indices>'
+        '<influence fap="2" type="RaisedCosInfluenceSph" weight="0.5"/></fdp>'
+        for name, vertex in own.feature_points.items()
+        if skin.start <= vertex < skin.stop and name != "9.15"
+    )
+    mns = own.fapu["MNS"]
+    (tmp_path / "face.fdp").write_text(
+        f'<?xml version="1.0"?><xfdp><head><file version="0.2"/><fapu MNS0="{mns}" MW0="1"/></head>'
+        f"{entries}</xfdp>",
+        encoding="utf-8",
+    )
+    import_head(tmp_path / "face.glb", tmp_path / "face.fdp", tmp_path / "out.npz")
+    head = Head.load(tmp_path / "out.npz")
+    scale = head.fapu["ES"] / own.fapu["ES"]
+    assert head.fapu["MNS"] == pytest.approx(mns * scale, rel=0.02)
+    assert moved(head, OPEN)[head.feature_points["2.1"], 1] < -0.3 * head.fapu["MNS"]
+
+
+@pytest.fixture
+def face(own: Head, tmp_path: Path) -> Path:
+    return write_glb(tmp_path / "face.glb", meshes(own))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no feature points"),
+        ("2.1 0 0", "line 1: expected 'point x y z' or 'point vertex'"),
+        ("# good\n2.1 0 0 x", "line 2: .* no number"),
+        ("2.1 nan 0 0", "line 1: expected"),
+        ("2.1 1.5", "line 1: expected"),
+        ("99.1 0 0 0", "'99.1' is no MPEG-4 feature point"),
+        ("2.15 0 0 0", "'2.15' is no MPEG-4 feature point"),
+        ("2.1 0 0 0\n2.1 0 0 0", "line 2: 2.1 comes twice"),
+        ("2.1 1000000", "vertex 1000000, but there are"),
+        ("2.1 0 -0.07 0.07", r"points are missing: 2.2, .* 8.8, 3.5 \(or its eyelids\)"),
+        ("<xfdp><fdp", "no intact XML"),
+        ("<!DOCTYPE x><xfdp/>", "document type"),
+        ("<xfdp><fdp name='2.1' affects='skin'/></xfdp>", "no index"),
+        ("<xfdp/>", "no feature points"),
+    ],
+)
+def test_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "points.tsv").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=said):
+        import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda rows: rows.replace("\n8.1\t", "\n8.1 1 0 0 #"),
+            "off the mesh, in its unit: 8.1 by 0.8",
+        ),
+        (lambda rows: exchange(rows, "8.3", "8.4"), "MW is not positive"),
+        (lambda rows: exchange(rows, "2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),
+        (
+            lambda rows: re.sub("\n2.4\t.*(?s:(.*\n)8.3)(\t.*)", r"\n2.4\2\g<1>8.3\2", rows),
+            "2.4 and 8.3 fall on one vertex",
+        ),
+    ],
+)
+def test_points_that_make_no_face(
+    own: Head, face: Path, tmp_path: Path, change: Callable[[str], str], said: str
+) -> None:
+    (tmp_path / "points.tsv").write_text(change(lines(own, lambda p: p)), encoding="utf-8")
+    with pytest.raises(UserError, match=said):
+        import_head(face, tmp_path / "points.tsv", tmp_path / "out.npz")
+    assert not (tmp_path / "out.npz").exists()
+
+
+def exchange(rows: str, *names: str) -> str:
+    """Give each name the place of the next one."""
+    places = dict(row.split("\t", 1) for row in rows.splitlines()[1:])
+    shifted = {name: places[names[(i + 1) % len(names)]] for i, name in enumerate(names)}
+    return "".join(f"{name}\t{place}\n" for name, place in (places | shifted).items())
+
+
+def no_faces(folder: Path) -> Path:
+    (folder / "face.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n", encoding="utf-8")
+    return folder / "face.obj"
+
+
+def garbage(folder: Path) -> Path:
+    (folder / "face.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9\n")
+    return folder / "face.ply"
+
+
+def too_large(folder: Path) -> Path:
+    side = 260
+    grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), [0.0]), -1).reshape(-1, 3)
+    return write_glb(folder / "face.glb", [Mesh("a", grid, np.array([[0, 1, side]]))])
+
+
+def other_form(folder: Path) -> Path:
+    return folder / "face.fbx"
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (no_faces, "has no faces"),
+        (garbage, "no intact mesh"),
+        (too_large, "67600 vertices; reduce it to 65535"),
+        (other_form, "one of the forms .obj, .glb, .ply"),
+        (lambda folder: folder / "absent.obj", "no such file"),
+    ],
+)
+def test_bad_meshes(tmp_path: Path, make: Callable[[Path], Path], said: str) -> None:
+    (tmp_path / "points.tsv").write_text("2.1 0\n", encoding="utf-8")
+    with pytest.raises(UserError, match=said):
+        import_head(make(tmp_path), tmp_path / "points.tsv", tmp_path / "out.npz")
+
+
+def test_joined_lips_are_told(own: Head, tmp_path: Path) -> None:
+    part = meshes(own)[0]
+    skin = own.vertices[own.part("skin").vertices]
+    inner = own.part("skin").vertices
+    points = {n: v for n, v in own.feature_points.items() if inner.start <= v < inner.stop}
+    # sew the lips together: a triangle strip between the middles
+    part.triangles = np.concatenate(
+        [part.triangles, [[points["2.2"], points["2.3"], points["2.6"]]]]
+    )
+    write_glb(tmp_path / "face.glb", [part])
+    rows = [f"{name} {' '.join(map(str, skin[vertex]))}" for name, vertex in points.items()]
+    (tmp_path / "points.tsv").write_text("\n".join(rows), encoding="utf-8")
+    remarks = import_head(tmp_path / "face.glb", tmp_path / "points.tsv", tmp_path / "out.npz")
+    assert any("the lips are joined" in remark for remark in remarks)

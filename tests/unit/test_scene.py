@@ -1,0 +1,92 @@
+"""Where the camera stands, what is behind the head, what a name stands for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.driver.head import Head, neutral_faps
+from services.driver.render import BACKGROUND, Camera, Renderer
+from services.driver.scene import Framing, background, camera, load_head
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+
+@pytest.fixture(scope="module")
+def head() -> Head:
+    return load_head(detail="coarse")
+
+
+def seen(head: Head, framing: Framing, point: str, size: tuple[int, int] = (160, 90)) -> np.ndarray:
+    """Where a feature point is in the picture, -1 to 1."""
+    matrix = camera(head, framing).view_projection(*size)
+    place = matrix @ [*head.vertices[head.feature_points[point]], 1.0]
+    seen_at: np.ndarray = place[:2] / place[3]
+    return seen_at
+
+
+def test_the_default_is_the_face(head: Head) -> None:
+    face, plain = camera(head), Camera()
+    assert face.position == pytest.approx(plain.position, abs=0.003)
+    assert face.target == pytest.approx(plain.target, abs=0.003)
+
+
+@pytest.mark.parametrize("framing", list(Framing))
+def test_what_is_framed_is_in_the_picture(head: Head, framing: Framing) -> None:
+    points = {"face": ("2.1", "11.1", "10.1"), "head": ("11.4",), "mouth": ("9.3", "2.1", "8.3")}
+    for point in points[framing]:
+        assert np.abs(seen(head, framing, point)).max() < 0.97
+
+
+def test_closer_framings_show_more(head: Head) -> None:
+    widths = [
+        seen(head, framing, "8.3")[0] for framing in (Framing.HEAD, Framing.FACE, Framing.MOUTH)
+    ]
+    assert widths == sorted(widths)
+    assert widths[2] > 2.5 * widths[1]
+    assert np.abs(seen(head, Framing.MOUTH, "2.2")).max() < 0.15
+
+
+def test_a_narrow_picture_shows_the_whole_face(head: Head) -> None:
+    assert abs(seen(head, Framing.FACE, "10.1", (90, 160))[0]) < 0.97
+
+
+def test_yaw_and_pitch(head: Head) -> None:
+    left = camera(head, yaw_deg=90)
+    assert left.position[0] > 0.9
+    assert left.position[2] == pytest.approx(0, abs=0.01)
+    assert camera(head, pitch_deg=30).position[1] > 0.4
+
+
+def test_transparent_edges_keep_the_colours_of_the_head(head: Head) -> None:
+    renderer = Renderer(head, 160, 120, background=None)
+    image = renderer.draw(neutral_faps())
+    renderer.close()
+    renderer = Renderer(head, 160, 120, background=background("white"))
+    on_white = renderer.draw(neutral_faps()).astype(float)
+    renderer.close()
+    alpha = image[..., 3:].astype(float) / 255
+    assert ((alpha > 0.1) & (alpha < 0.9)).sum() > 100
+    over_white = image[..., :3] * alpha + 255 * (1 - alpha)
+    assert np.abs(over_white - on_white).mean() < 0.5
+    assert np.abs(over_white - on_white)[(alpha > 0)[..., 0]].mean() < 2
+
+
+def test_backgrounds() -> None:
+    assert background("studio") == BACKGROUND
+    assert background("transparent") is None
+    assert background("#Ff8000") == ((1.0, 128 / 255, 0.0),) * 2
+    assert background("white") == ((1.0, 1.0, 1.0),) * 2
+    for text in ("", "pink-ish", "#12345", "#gggggg"):
+        with pytest.raises(UserError, match="write studio, transparent, #rrggbb"):
+            background(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("nobody", "there is no head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
+)
+def test_no_such_head(name: str, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        load_head(name)

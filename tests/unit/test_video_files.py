@@ -1,0 +1,96 @@
+"""Transparent videos, PNG files and sequences, read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from services.driver.video import VideoWriter, open_writer, write_picture
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+PICTURE = np.zeros((48, 64, 4), np.uint8)
+PICTURE[10:30, 10:40] = [200, 50, 20, 255]
+PICTURE[30:40, 10:40] = [20, 50, 200, 128]
+
+
+def first_picture(path: Path) -> NDArray[np.uint8]:
+    """Decode as a program does that knows about alpha in VP9: through libvpx."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        decoder = stream.codec_context
+        if decoder.name == "vp9":
+            assert stream.metadata["alpha_mode"] == "1"
+            decoder = av.CodecContext.create("libvpx-vp9", "r")
+        for packet in container.demux(stream):
+            for frame in decoder.decode(packet if packet.size else None):
+                return np.asarray(frame.to_ndarray(format="rgba"), dtype=np.uint8)
+    raise AssertionError("no picture")
+
+
+@pytest.mark.parametrize("name", ["out.mov", "out.webm"])
+def test_alpha_is_in_the_video(tmp_path: Path, name: str) -> None:
+    with VideoWriter(tmp_path / name, 64, 48, 25.0, 16000, transparent=True) as writer:
+        for _ in range(5):
+            writer.write_image(PICTURE)
+            writer.write_sound(np.zeros(640, np.float32))
+    got = first_picture(tmp_path / name)
+    inner = np.zeros((48, 64), dtype=bool)
+    inner[12:28, 12:38] = inner[32:38, 12:38] = inner[:8] = True  # away from smoothed edges
+    np.testing.assert_allclose(got[inner, 3].astype(int), PICTURE[inner, 3], atol=3)
+    np.testing.assert_allclose(got[20, 20].astype(int), [200, 50, 20, 255], atol=6)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec"), [("a.mp4", "h264"), ("a.mov", "h264"), ("a.webm", "vp9")]
+)
+def test_opaque_videos_name_their_colours(tmp_path: Path, name: str, codec: str) -> None:
+    with VideoWriter(tmp_path / name, 64, 48, 25.0, None) as writer:
+        for _ in range(5):
+            writer.write_image(np.ascontiguousarray(PICTURE[..., :3]))
+    with av.open(str(tmp_path / name)) as container:
+        assert container.streams.video[0].codec_context.name == codec
+        assert not container.streams.audio
+        frame = next(container.decode(video=0))
+        assert frame.colorspace == 1  # ITU-R BT.709
+        np.testing.assert_allclose(
+            frame.to_ndarray(format="rgb24")[20, 20].astype(int), [200, 50, 20], atol=8
+        )
+
+
+def test_mp4_has_no_transparency(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="MP4 has no transparency"):
+        VideoWriter(tmp_path / "out.mp4", 64, 48, 25.0, 16000, transparent=True)
+
+
+@pytest.mark.parametrize("name", ["frames", "face%03d.png"])
+def test_a_sequence(tmp_path: Path, name: str) -> None:
+    writer = open_writer(tmp_path / name, (64, 48), 25.0, 16000, transparent=True)
+    for _ in range(3):
+        writer.write_image(PICTURE)
+        writer.write_sound(np.zeros(640, np.float32))
+    writer.close()
+    files = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.png"))
+    names = ["frames/00000.png", "frames/00001.png", "frames/00002.png"]
+    assert files == (names if name == "frames" else ["face000.png", "face001.png", "face002.png"])
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / files[2])), PICTURE)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("out.avi", "ends in"), ("out.png", "number"), ("no/frames", "cannot be written")],
+)
+def test_names_that_stand_for_nothing(tmp_path: Path, name: str, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        open_writer(tmp_path / name, (64, 48), 25.0, None)
+
+
+def test_a_picture_that_cannot_be_written(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be written"):
+        write_picture(tmp_path / "no" / "out.png", PICTURE)

@@ -1,0 +1,59 @@
+"""The virtual camera takes pictures at its rate; without a device or library the fix is named."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from services.driver.head import Head, neutral_faps
+from services.driver.render import Renderer
+from services.driver.virtual_camera import VirtualCamera
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+
+class Device:
+    """Stands for the library's camera: there is none on a machine that runs tests."""
+
+    device = "/dev/video0"
+
+    def __init__(self, width: int, height: int, fps: float) -> None:
+        self.shape = (height, width, 3)
+        self.sent: list[np.ndarray] = []
+
+    def send(self, image: np.ndarray) -> None:
+        assert image.shape == self.shape
+        assert image.dtype == np.uint8
+        assert image.flags.c_contiguous
+        self.sent.append(image)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(Head.load(detail="coarse"), 64, 48, samples=0)
+
+
+def test_pictures_go_out_at_their_rate(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", SimpleNamespace(Camera=Device))
+    camera = VirtualCamera(renderer, 25.0)
+    for tick in range(101):
+        camera.draw(neutral_faps(), 100 + tick * 0.01)
+    assert 25 <= len(camera._camera.sent) <= 26
+
+
+def test_what_lacks_is_named(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", None)
+    with pytest.raises(UserError, match=r"kouxing\[camera\]"):
+        VirtualCamera(renderer, 25.0)
+
+    def no_device(*_: Any) -> None:
+        raise RuntimeError("no v4l2 loopback device found")
+
+    monkeypatch.setitem(sys.modules, "pyvirtualcam", SimpleNamespace(Camera=no_device))
+    with pytest.raises(UserError, match="modprobe v4l2loopback"):
+        VirtualCamera(renderer, 25.0)
