@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.synthesizer.amplitude import Amplitude
 from services.synthesizer.blending import blend
 from services.synthesizer.parameters import VisemeParameters
 from services.synthesizer.timeline import Timeline, build_timeline
@@ -29,6 +30,7 @@ def synthesize(
     phones: Sequence[Phone],
     num_frames: int,
     frame_rate_hz: float = 50.0,
+    levels: Sequence[tuple[float, float]] = (),
 ) -> NDArray[np.float32]:
     """FAP frames of an utterance.
 
@@ -40,6 +42,8 @@ def synthesize(
     num_frames : int
         Frame ``k`` is at ``k / frame_rate_hz`` seconds.
     frame_rate_hz : float
+    levels : sequence of (time in seconds, level in dB of full scale)
+        Of the sound, if it is known.
 
     Returns
     -------
@@ -54,6 +58,11 @@ def synthesize(
         times = time_s[first : first + block]
         near = _within(timeline, times[0] - _REACH_S, times[-1] + _REACH_S)
         faps[first : first + block, np.array(MOUTH_FAPS) - 1] = blend(parameters, near, times)
+    amplitude = Amplitude(parameters.level_db)
+    for level in levels:
+        amplitude.accept_level(*level)
+    for frame, faps_now in zip(time_s, faps, strict=True):
+        amplitude.scale(faps_now, timeline, float(frame), np.inf, 1.0 / frame_rate_hz)
     return faps
 
 

@@ -26,9 +26,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from services.synthesizer.amplitude import Amplitude
 from services.synthesizer.blending import around, blend
 from services.synthesizer.gesture import Gesture
-from services.synthesizer.loudness import Loudness
 from services.synthesizer.parameters import NUM_MOUTH_FAPS, VisemeParameters
 from services.synthesizer.timeline import Timeline, build_timeline
 from services.synthesizer.visemes import MOUTH_FAPS
@@ -40,10 +40,11 @@ Array = NDArray[np.float64]
 FapFrame = tuple[float, NDArray[np.float32]]
 
 LONGEST_LOOK_AHEAD_S = 0.3
-_TRANSITION_S = 0.06  # from one plan to the next
+_TRANSITION_S = 0.04  # from one plan to the next
+_SHORTEST_TRANSITION_S = 0.02  # of lips that must meet at once
 _FLUSH_S = 0.14  # to rest after an interruption
 REST_S = 0.3  # to rest when no sound comes
-_NEWS_S = 0.11  # a recognizer says a unit so long after its onset: no news, no onset before that
+_NEWS_S = 0.12  # most units are known so long after their onset: no news, no onset before that
 _LATE_CLOSURE_S = 0.1  # a closure recognised up to this much late is still shown, late
 _CATCH_UP_S = 0.04  # and takes this long
 _CLOSED = 10.0  # FAP units from its target at which a lip counts as closed
@@ -131,7 +132,8 @@ class LiveSynthesizer:
         self._position = self._parameters.neutral.copy()
         self._slope = np.zeros(NUM_MOUTH_FAPS)
         self._timeline = build_timeline(())
-        self._plan = self._timeline  # the part of the timeline that acts now
+        self._current = self._timeline  # the same as it is seen at the last frame
+        self._plan = self._timeline  # the part of it that acts now
         self._acting = b""
         self._changed = False
         self._decay = _NO_DECAY
@@ -142,7 +144,7 @@ class LiveSynthesizer:
         self._frozen_s = 0.0  # media time stands still for so long: see relax
         self._rest_decay: _Decay | None = None
         self._speaking = False
-        self._loudness = Loudness()
+        self._amplitude = Amplitude(self._parameters.level_db)
         self._gesture = None if self._gesture_seed is None else Gesture(self._gesture_seed)
         self._num_frames = 0  # put out so far; eyes and head move on when media time stands still
 
@@ -171,10 +173,11 @@ class LiveSynthesizer:
             began_s = [phone.onset_s for phone in self._phones.values()]
             self._speech_ends_s.append(max([change.time_s, *(s + _BEGUN_S for s in began_s)]))
             self._changed = True
+            self._transition_s = _FLUSH_S  # if it is told late
 
     def accept_level(self, time_s: float, level_db: float) -> None:
         """Take the sound's level around a time: louder speech opens the mouth further."""
-        self._loudness.accept_level(time_s, level_db)
+        self._amplitude.accept_level(time_s, level_db)
 
     def advance(self, time_s: float) -> list[FapFrame]:
         """Compute the frames that are due when the sound is known up to ``time_s``.
@@ -211,6 +214,7 @@ class LiveSynthesizer:
                 np.full(NUM_MOUTH_FAPS, duration_s),
             )
             self._frozen_s = 0.0
+            self._transition_s = _FLUSH_S  # as gently back
         frames = []
         for _ in range(num_frames):
             self._frozen_s += 1.0 / self._frame_rate_hz
@@ -236,10 +240,10 @@ class LiveSynthesizer:
             self._timeline = build_timeline(
                 tuple(self._phones.values()), self._speech_ends_s, live=True
             )
-        timeline = self._postpone_late_closures(
+        self._current = self._postpone_late_closures(
             self._timeline.go_on(time_s + self._look_ahead_s - _NEWS_S), time_s
         )
-        self._plan = timeline.select(around(timeline, time_s, self._look_ahead_s))
+        self._plan = self._current.select(around(self._current, time_s, self._look_ahead_s))
         acting = self._plan.unit_index.tobytes() + self._plan.viseme.tobytes()
         if self._changed or acting != self._acting or self._rest_decay is not None:
             self._acting = acting
@@ -263,12 +267,13 @@ class LiveSynthesizer:
         """Carry the face over from where it is to the new plan."""
         value, slope = self._evaluate_plan(self._time_s)
         duration_s = np.full(NUM_MOUTH_FAPS, self._transition_s)
-        shortest_s = 1.0 / self._frame_rate_hz
         for row in np.flatnonzero(self._closing[self._plan.viseme]):
             if self._plan.centre_end_s[row] > self._time_s:
-                left_s = max(self._plan.centre_start_s[row] - self._time_s, shortest_s)
+                left_s = self._plan.centre_start_s[row] - self._time_s
                 closes = self._closes[self._plan.viseme[row]]
-                duration_s[closes] = np.minimum(duration_s[closes], left_s)
+                duration_s[closes] = np.minimum(
+                    duration_s[closes], max(left_s, _SHORTEST_TRANSITION_S)
+                )
         self._decay = _Decay(self._position - value, self._slope - slope, duration_s)
         self._decay_start_s = self._time_s
         self._transition_s = _TRANSITION_S
@@ -282,7 +287,13 @@ class LiveSynthesizer:
     def _frame(self) -> NDArray[np.float32]:
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
         faps[_MOUTH] = self._position
-        self._loudness.scale(faps, self._time_s + self._look_ahead_s, 1.0 / self._frame_rate_hz)
+        self._amplitude.scale(
+            faps,
+            self._current,
+            self._time_s,
+            self._time_s + self._look_ahead_s,
+            1.0 / self._frame_rate_hz,
+        )
         if self._gesture is not None:
             self._gesture.add_to(faps, self._num_frames / self._frame_rate_hz, self._speaking)
         self._num_frames += 1
@@ -302,7 +313,7 @@ class LiveSynthesizer:
         start_s, end_s = timeline.centre_start_s.copy(), timeline.centre_end_s.copy()
         for row in np.flatnonzero(self._closing[timeline.viseme]):
             unit = int(timeline.unit_index[row])
-            if unit in self._closed_units:
+            if unit in self._closed_units and unit not in self._late_closures_s:
                 continue
             late = self._time_s - _LATE_CLOSURE_S < end_s[row] < time_s
             if late and unit not in self._late_closures_s:

@@ -7,9 +7,11 @@ for closures C and T; per FAP the silence models; one exponent c.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from services.synthesizer.visemes import MOUTH_FAPS, VISEMES
 from shared.errors import UserError
 
-FORMAT = "kouxing viseme parameters 1"
+FORMAT = "kouxing viseme parameters 2"
 NUM_MOUTH_FAPS = len(MOUTH_FAPS)
 
 _PER_VISEME = ("alpha", "theta_minus", "theta_plus", "offset_s", "target", "closes")
@@ -32,6 +34,7 @@ _LIMITS = {  # lowest and highest value that makes sense
     "target": (-2000.0, 2000.0),
     "neutral": (-2000.0, 2000.0),
     "closes": (0.0, 1.0),
+    "level": (-60.0, 30.0),
     "c": (0.5, 3.0),
     "closure_ratio": (20.0, 1e6),
     "closure_reach_s": (0.02, 0.2),
@@ -52,6 +55,7 @@ class VisemeParameters:
     offset_s: NDArray[np.float64]  # t_o: the FAP's centre minus the acoustic centre, seconds
     target: NDArray[np.float64]  # T, FAP units
     closes: NDArray[np.float64]  # 1 where the closure rule holds, else 0
+    level_db: NDArray[np.float64]  # (num_visemes,) usual level beside the speaker's mean
     alpha_left: NDArray[np.float64]
     alpha_right: NDArray[np.float64]
     theta_left: NDArray[np.float64]  # s**-c
@@ -71,6 +75,8 @@ class VisemeParameters:
                 shape = (len(VISEMES), NUM_MOUTH_FAPS)
             elif field.name in _PER_SILENCE:
                 shape = (NUM_MOUTH_FAPS,)
+            elif field.name == "level_db":
+                shape = (len(VISEMES),)
             if value.shape != shape:
                 raise UserError(
                     f"viseme parameters: {field.name} has shape {value.shape}, expected {shape}; "
@@ -85,8 +91,25 @@ class VisemeParameters:
                 )
 
 
-def save_parameters(parameters: VisemeParameters, path: Path, source: str) -> None:
-    """Write parameters as JSON, one line for each viseme and array; ``source`` says whose."""
+def save_parameters(
+    parameters: VisemeParameters,
+    path: Path,
+    source: str,
+    *,
+    learnt_from: Sequence[str] = (),
+    chosen_with: Sequence[str] = (),
+) -> None:
+    """Write parameters as JSON, one line for each viseme and array.
+
+    Parameters
+    ----------
+    parameters : VisemeParameters
+    path : Path
+    source : str
+        Whose they are.
+    learnt_from, chosen_with : sequence of str
+        Names of clips that an honest score leaves out.
+    """
 
     def line(name: str, values: NDArray[np.float64]) -> str:
         # seven digits: far below what a face shows, and the same on every machine
@@ -95,6 +118,7 @@ def save_parameters(parameters: VisemeParameters, path: Path, source: str) -> No
     visemes = ",\n".join(
         f"  {json.dumps(viseme)}: {{\n"
         + ",\n".join(f"   {line(name, getattr(parameters, name)[i])}" for name in _PER_VISEME)
+        + f',\n   "level_db": {parameters.level_db[i]:.4g}'
         + "\n  }"
         for i, viseme in enumerate(VISEMES)
     )
@@ -104,6 +128,8 @@ def save_parameters(parameters: VisemeParameters, path: Path, source: str) -> No
         for name, value in (
             ("format", FORMAT),
             ("source", source),
+            ("learnt_from", list(learnt_from)),
+            ("chosen_with", list(chosen_with)),
             ("c", parameters.c),
             ("closure_ratio", parameters.closure_ratio),
             ("closure_reach_s", parameters.closure_reach_s),
@@ -125,11 +151,7 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
         The file cannot be read or what it holds makes no sense.
     """
     try:
-        if path is None:
-            text = resources.files("services.synthesizer").joinpath("parameters.json").read_text()
-        else:
-            text = path.read_text(encoding="utf-8")
-        data = json.loads(text)
+        data = _read(path)
         if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
             raise ValueError(f"not a file of '{FORMAT}'")
         arrays = {
@@ -139,6 +161,7 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
         arrays |= {name: np.array(data["silence"][name], dtype=float) for name in _PER_SILENCE}
         return VisemeParameters(
             **arrays,
+            level_db=np.array([data["visemes"][viseme]["level_db"] for viseme in VISEMES]),
             c=float(data["c"]),
             closure_ratio=float(data["closure_ratio"]),
             closure_reach_s=float(data["closure_reach_s"]),
@@ -148,5 +171,18 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"cannot read viseme parameters from {path or 'parameters.json'}: {error}; "
-            "give a file written by training/visemes.py"
+            "give a file written by 'kouxing train visemes'"
         ) from error
+
+
+def clips_seen(path: Path | None = None) -> frozenset[str]:
+    """Return the names of the clips that parameters were learnt from or chosen with."""
+    data = _read(path)
+    return frozenset((*data["learnt_from"], *data["chosen_with"]))
+
+
+def _read(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        path = Path(str(resources.files("services.synthesizer"))) / "parameters.json"
+    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return data

@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.synthesizer.visemes import SHAPES, VISEME_INDEX, shapes_of
-from shared.phones import INITIALS, SILENCE, Phone
+from shared.phones import FINALS, INITIALS, SILENCE, Phone
 
 EXPECTED = -1
 LONGEST_HOLD_S = 1.5  # a unit goes on for so long past its estimate if nothing follows
 _GO_ON_SOFTNESS_S = 0.03
-_GO_ON_FACTOR = 1.35
+_GO_ON_FACTOR = 3.0  # below, a long vowel half closes before it is held
+_HELD = frozenset(VISEME_INDEX[SHAPES[unit][-1][0]] for unit in FINALS)
 _EXPECTED_AFTER_S = 0.3  # how long the expected viseme lasts before the mouth relaxes
 # What usually follows looks like: a middling final; after a final, a mouth less open, which keeps
 # its rounding.
@@ -35,7 +36,7 @@ _SHORTEST_UNIT_S = 0.01
 # A hole this short between two units is a rounding of their times, no pause.
 _TOUCHING_S = 0.03
 _LONGEST_ERROR_S = 0.3  # an estimated end may be so much too early
-_EXPECTED_EDGE_S = 0.04
+_EXPECTED_EDGE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,12 +49,13 @@ class Timeline:
     unit_index: NDArray[np.int64]  # (num_visemes,) Phone.index, EXPECTED for the expected viseme
     silence_start_s: NDArray[np.float64]  # (num_silences,) end of speech; -inf before all speech
     silence_end_s: NDArray[np.float64]  # (num_silences,) start of speech; inf after all speech
+    syllable_s: NDArray[np.float64]  # (num_syllables,) when each syllable's final begins
     # Estimated end of the last unit, where nothing is known of what follows; else None. Then the
     # last two visemes are that unit's last and the expected one, and the last silence follows.
     open_end_s: float | None = None
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
-        """Timeline with the chosen visemes, by mask or by rows, and all silences."""
+        """Timeline with the chosen visemes, by mask or by rows, and all silences and syllables."""
         return replace(
             self,
             viseme=self.viseme[chosen],
@@ -66,15 +68,16 @@ class Timeline:
     def go_on(self, until_s: float) -> Timeline:
         """Let an open unit last: nothing that follows it had begun at ``until_s``.
 
-        Its end moves from the estimate to ``until_s``, smoothly, and beyond, since what has lasted
-        long is not about to end; as far as ``LONGEST_HOLD_S``.
+        Its end moves from the estimate to ``until_s``, smoothly, and that of a final
+        beyond, since what has lasted long is not about to end; as far as ``LONGEST_HOLD_S``.
         """
         if self.open_end_s is None:
             return self
         overdue_s = _GO_ON_SOFTNESS_S * np.logaddexp(
             0.0, (until_s - self.open_end_s) / _GO_ON_SOFTNESS_S
         )
-        later_s = min(_GO_ON_FACTOR * float(overdue_s), LONGEST_HOLD_S)
+        factor = _GO_ON_FACTOR if self.viseme[-2] in _HELD else 1.0
+        later_s = min(factor * float(overdue_s), LONGEST_HOLD_S)
         start_s, end_s = self.centre_start_s.copy(), self.centre_end_s.copy()
         silence_start_s = self.silence_start_s.copy()
         start_s[-1] += later_s
@@ -157,6 +160,7 @@ def build_timeline(
         unit_index=np.array([row[3] for row in visemes], dtype=np.int64),
         silence_start_s=np.array([row[0] for row in silences], dtype=float),
         silence_end_s=np.array([row[1] for row in silences], dtype=float),
+        syllable_s=np.array([each.onset_s for each in spoken if each.unit not in INITIALS]),
         open_end_s=open_end_s,
     )
 

@@ -19,7 +19,7 @@ from services.synthesizer.timeline import EDGE_S, build_timeline
 from services.synthesizer.visemes import MOUTH_FAPS, VISEME_INDEX, static_targets
 from shared.errors import UserError
 from shared.phones import Phone
-from training.visemes import starting_parameters
+from training.viseme_start import starting_parameters
 
 pytestmark = pytest.mark.unit
 
@@ -159,7 +159,9 @@ def test_full_model_does_not_depend_on_its_blocks() -> None:
     spoken = phones("d:0.1 a:0.2 sil:0.3 b:0.1 iao:0.2 " * 8)
     faps = synthesize(PARAMETERS, spoken, 500)
     whole = blend(PARAMETERS, build_timeline(spoken), np.arange(500) / 50.0)
-    np.testing.assert_allclose(faps[:, np.array(MOUTH_FAPS) - 1], whole, atol=0.01)
+    unscaled = [fap for fap in MOUTH_FAPS if fap in (6, 7, 12, 13, 14, 16, 17, 53, 54)]
+    columns = [MOUTH_FAPS.index(fap) for fap in unscaled]
+    np.testing.assert_allclose(faps[:, np.array(unscaled) - 1], whole[:, columns], atol=0.01)
     assert synthesize(PARAMETERS, [], 3).shape == (3, 68)
 
 

@@ -1,4 +1,4 @@
-"""Learning viseme parameters and scoring lips, on made-up speakers."""
+"""Learning viseme parameters, on made-up speakers."""
 
 import json
 from dataclasses import replace
@@ -8,60 +8,18 @@ import numpy as np
 import pytest
 import soundfile
 
-from evaluation.lips import loudness_frames, score_clips
 from services.synthesizer.blending import blend
 from services.synthesizer.timeline import build_timeline
 from services.synthesizer.visemes import MOUTH_FAPS, VISEME_INDEX
 from shared.errors import UserError
-from shared.faps import NUM_FAPS
-from shared.phones import Phone
-from training.visemes import (
-    LipClip,
-    estimate,
-    frames_of,
-    read_clips,
-    starting_parameters,
-    train,
-)
+from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
+from training.lip_clips import SAMPLE_RATE_HZ, part_of, read_clips
+from training.viseme_start import starting_parameters
+from training.visemes import closure_reach, estimate, frames_of, train, usual_levels
 
 pytestmark = pytest.mark.unit
 
-JAW, LOWER_LIP, WIDTH = (MOUTH_FAPS.index(fap) for fap in (3, 5, 6))
 START = starting_parameters()
-
-
-def utterance(seed: int, num_units: int) -> list[Phone]:
-    rng = np.random.default_rng(seed)
-    onset_s, phones = 0.3, []
-    for index in range(num_units):
-        unit = str(rng.choice(["d", "g", "sh", "b"] if index % 2 == 0 else ["a", "i", "u"]))
-        duration_s = float(rng.uniform(0.06, 0.25))
-        phones.append(
-            Phone(
-                index=index,
-                unit=unit,
-                onset_s=onset_s,
-                duration_s=duration_s,
-                confidence=1.0,
-                final=True,
-            )
-        )
-        onset_s += duration_s + (0.5 if rng.random() < 0.15 and index % 2 else 0.0)
-    return phones
-
-
-def clip_of(time_s: np.ndarray, faps: np.ndarray) -> LipClip:
-    return LipClip(
-        name="made_up",
-        speaker="nobody",
-        licence="CC0",
-        is_rig=False,
-        is_held=False,
-        transcript="",
-        time_s=time_s,
-        faps=faps,
-        samples=np.zeros(0, dtype=np.float32),
-    )
 
 
 def test_estimation_finds_what_made_the_curves() -> None:
@@ -92,38 +50,37 @@ def test_estimation_finds_what_made_the_curves() -> None:
         found.target[:, MOUTH_FAPS.index(45)], START.target[:, MOUTH_FAPS.index(45)]
     )
     assert found.target[VISEME_INDEX["b"], LOWER_LIP] == 0.0
+    assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
 
 
-def test_late_lips_are_found_late_and_closures_met() -> None:
-    phones = utterance(1, 40)
-    time_s = np.arange(0.0, phones[-1].onset_s + 1.0, 0.02)
-    curve = blend(START, build_timeline(phones), time_s)
-    made = np.zeros((len(time_s), NUM_FAPS))
-    made[:, np.array(MOUTH_FAPS) - 1] = blend(START, build_timeline(phones), time_s - 0.05)
-    still = np.zeros_like(made)
-
-    scores = score_clips([clip_of(time_s, curve)], [{"late": made, "still": still}])
-
-    late = {score.measure: score for score in scores if score.scheme == "late"}
-    assert late["opening"].best_lag_ms == 50
-    assert late["opening"].best_correlation == pytest.approx(1.0, abs=0.01)
-    assert late["opening"].correlation < 0.95
-    assert late["opening"].closures >= 3
-    assert late["opening"].closures_met == late["opening"].closures
-    assert [score.correlation for score in scores if score.scheme == "still"] == [0.0, 0.0, 0.0]
+def test_usual_levels_tell_vowels_from_consonants() -> None:
+    phones = utterance(2, 60)
+    end_s = phones[-1].onset_s + phones[-1].duration_s + 0.3
+    samples = np.zeros(int(end_s * SAMPLE_RATE_HZ), dtype=np.float32)
+    noise = np.random.default_rng(0).normal(0.0, 0.1, len(samples))
+    for phone in phones:
+        first = round(phone.onset_s * SAMPLE_RATE_HZ)
+        last = first + round(phone.duration_s * SAMPLE_RATE_HZ)
+        samples[first:last] = noise[first:last] * (1.0 if phone.unit in "aiu" else 0.2)
+    clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
+    found = usual_levels([clip], [phones])
+    assert 8.0 < found[VISEME_INDEX["a"]] - found[VISEME_INDEX["g"]] < 18.0
+    assert found[VISEME_INDEX["er"]] == START.level_db[VISEME_INDEX["er"]]  # never said
 
 
-def test_loudness_opens_the_mouth() -> None:
-    samples = np.zeros(16_000, dtype=np.float32)
-    samples[6_000:10_000] = np.random.default_rng(0).normal(0.0, 0.1, 4_000)
-    faps = loudness_frames(samples)
-    assert faps[25, 4] < -500.0
-    assert abs(faps[5, 4]) < 1.0
+def test_closures_are_as_long_as_the_lips_are_shut() -> None:
+    phones = utterance(3, 80)
+    time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.02)
+    for reach_s in (0.05, 0.1):
+        curve = blend(replace(START, closure_reach_s=reach_s), build_timeline(phones), time_s)
+        assert closure_reach(START, [clip_of(time_s, curve)], [phones]) == reach_s
 
 
-def write_clip(folder: Path, name: str, language: str, header: str, row: str) -> None:
+def write_clip(
+    folder: Path, name: str, language: str, header: str, row: str, licence: str = "MIT"
+) -> None:
     (folder / f"{name}.json").write_text(
-        json.dumps({"language": language, "speaker": "one", "licence": "MIT", "transcript": ""})
+        json.dumps({"language": language, "speaker": "one", "licence": licence, "transcript": ""})
     )
     (folder / f"{name}.csv").write_text(f"{header}\n{row}\n")
     soundfile.write(folder / f"{name}.flac", np.zeros(1600), 16_000)
@@ -140,10 +97,29 @@ def test_clips_of_both_kinds_are_read(tmp_path: Path) -> None:
         read_clips(tmp_path)
     (tmp_path / "b_rig.json").unlink()
     (film,) = read_clips(tmp_path)
-    assert film.is_held
-    assert not film.is_rig
+    assert film.part == "held"
     assert film.faps[0, [JAW, LOWER_LIP]].tolist() == [10.0, -20.0]
     assert np.isnan(film.faps[0, WIDTH])
+
+
+def test_a_rule_says_what_clips_are_for(tmp_path: Path) -> None:
+    names = [f"clip_{k}" for k in range(40)]
+    free, closed = ([part_of(name, may_train=free) for name in names] for free in (True, False))
+    assert {"train", "choice", "held"} == set(free)
+    assert {"choice", "held"} == set(closed)
+    assert [k for k in range(40) if free[k] == "held"] == [
+        k for k in range(40) if closed[k] == "held"
+    ]
+    header, row = "t,ok,F3_open_jaw", "0.5,1,10"
+    for name in names[:12]:
+        write_clip(tmp_path, name, "zh", header, row, licence="academic use only")
+    assert "train" not in {clip.part for clip in read_clips(tmp_path)}
+    with pytest.raises(UserError, match="--any-licence"):
+        train(tmp_path, tmp_path / "out.json")
+    clips = read_clips(tmp_path, any_licence=True)
+    assert {clip.name: clip.part for clip in clips} == {
+        name: part for name, part in zip(names, free, strict=True) if name in names[:12]
+    }
 
 
 def test_folders_without_clips_are_refused(tmp_path: Path) -> None:

@@ -1,0 +1,204 @@
+"""Clips of real lips with their sound: tracked video, or an animator's rig.
+
+A folder of lips holds for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame
+with ``t`` in seconds) and ``<clip>.json`` (licence, speaker, language, transcript). Columns are
+FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig
+(``mouth_stretch_c``).
+
+Every clip is for one thing only: to learn parameters from (``train``), to choose settings by
+(``choice``), or to score with (``held``). A rule says which (`part_of`), so that nobody picks;
+``held.txt`` in the folder names further clips and speakers that are held.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.pcm import level_db
+from services.recognizer.pipeline import recognize
+from services.synthesizer.parameters import NUM_MOUTH_FAPS
+from services.synthesizer.visemes import MOUTH_FAPS
+from shared.errors import UserError
+from shared.phones import Phone
+from training.align import align_text
+from training.corpus import may_ship
+from training.feature_cache import read_audio
+from training.viseme_start import columns
+
+Array = NDArray[np.float64]
+
+SAMPLE_RATE_HZ = 16_000
+LEVEL_STEP_S = 0.02
+
+# What a weight of 1 of FACEGOOD's rig does to these FAPs, for the ARKit shape of the same name on
+# MakeHuman's face (CC0); left and right of a pair together. The rig's jaw goes further than a
+# speaker's: scaled so that its continuous clip opens as far as filmed speakers do; so do its
+# pursed lips: scaled to half a centimetre. Pursing draws real lips nearly together, which those
+# shapes do not: their lip heights are set by the filmed speakers' u. The jaw's swing backwards is
+# left to the head's own jaw.
+_RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
+_JAW_SCALE = 0.6
+_DEPTH_SCALE = 0.6
+_DEPTH_FAPS = (16, 17)
+_RIG_DELAY_S = 0.04  # of its lips against the sound, beside filmed speakers'
+_RIG = {
+    "mouth_stretch_c": [
+        _JAW_SCALE * value
+        for value in (1021, -47, -1995, -41, 153, -1649, -739, 0, 0, 129, -1884, -50, 276, -1438,
+                      -716)
+    ],
+    "mouth_lowerLipDepress": [-58, 0, -222, 3, 0, -264, -53, 70, 0, 0, -188, 3, 0, -206, -23],
+    "mouth_upperLipRaise": [0, -294, 0, -9, -311, 12, 76, 0, 24, -222, 0, -9, -270, 18, 82],
+    "mouth_press": [24, -46, 188, 146, -141, 158, 270, 0, 24, 24, 246, 135, -35, 258, 288],
+    "mouth_suck_d": [-65, 0, 188, 2, 0, 59, -41, -270, 0, 0, 317, -2, 0, 153, 0],
+    "mouth_suck_u": [0, 70, 0, 9, 29, 0, 35, 0, -563, 434, 0, 2, 311, 0, 6],
+    "mouth_pucker": [0, 60, 250, -130, 40, 190, 6, 511, 481, -106, 200, -125, -94, 140, -18],
+    "mouth_funnel": [0, -100, -250, -70, 40, -100, -18, 293, 581, -150, -100, -86, -12, 20, 0],
+    "mouth_oo_c": [0, 60, 250, -140, 40, 190, 6, 511, 481, -106, 200, -135, -94, 140, -18],
+    "mouth_oh_c": [0, 60, 250, -130, 40, 190, 0, 450, 500, -100, 200, -120, -70, 140, -14],
+    "mouth_lipStretch": [0, 12, -46, 121, 65, -77, -147, 0, 36, 46, -24, 121, 94, -41, -158],
+    "mouth_lipCornerPull": [0, -188, 352, 169, -311, 393, 739, 24, 24, -130, 410, 168, -229, 511,
+                            768],
+    "mouth_dimple": [0, -46, 18, 118, -94, 71, 164, 12, 12, 24, 70, 121, -41, 135, 176],
+    "mouth_chinRaise_u": [6, 0, 293, -2, 0, 170, 35, 246, 0, 0, 311, -2, 0, 164, 18],
+}  # fmt: skip
+MIRROR = {
+    7: 6, 9: 8, 11: 10, 13: 12, 54: 53, 56: 55, 58: 57, 60: 59,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LipClip:
+    """A recording with what its speaker's mouth did."""
+
+    name: str
+    speaker: str
+    licence: str
+    part: str  # "train", "choice" or "held"
+    transcript: str  # Chinese, empty where unknown
+    time_s: Array  # (num_frames,)
+    faps: Array  # (num_frames, num_mouth_faps), FAP units, nan where not measured
+    samples: NDArray[np.float32]  # 16 kHz mono
+
+
+def level_track(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
+    """Return times in seconds and levels in dB of full scale, as the live system measures them."""
+    step = round(LEVEL_STEP_S * SAMPLE_RATE_HZ)
+    ends = range(step, len(samples) + 1, step)
+    return [(end / SAMPLE_RATE_HZ, level_db(samples[end - step : end])) for end in ends]
+
+
+def part_of(name: str, *, may_train: bool) -> str:
+    """Say what a clip is for, by the CRC-32 of its name modulo 4.
+
+    2: held. Odd: train, if the licence allows it. All others: choice.
+    """
+    remainder = zlib.crc32(name.encode()) % 4
+    if remainder == 2:
+        return "held"
+    return "train" if may_train and remainder % 2 else "choice"
+
+
+def read_clips(folder: Path, *, any_licence: bool = False) -> list[LipClip]:
+    """Read all Mandarin clips of a folder.
+
+    Parameters
+    ----------
+    folder : Path
+    any_licence : bool
+        Learn also from clips that forbid giving away what was learnt.
+
+    Raises
+    ------
+    UserError
+        The folder holds no clips, or one of them cannot be read.
+    """
+    held = folder / "held.txt"
+    left_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
+    clips = []
+    for path in sorted(folder.glob("*.json")):
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+            if not str(about.get("language", "zh")).startswith("zh"):
+                continue
+            licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
+            with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
+                rows = list(csv.DictReader(file))
+            values = {
+                name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]
+            }
+            is_rig = "mouth_stretch_c" in values
+            part = part_of(path.stem, may_train=any_licence or may_ship(licence))
+            clips.append(
+                LipClip(
+                    name=path.stem,
+                    speaker=speaker,
+                    licence=licence,
+                    part="held" if {path.stem, speaker} & left_out else part,
+                    transcript=about.get("transcript") or "",
+                    time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
+                    faps=_rig_faps(values) if is_rig else _tracked_faps(values),
+                    samples=read_audio(path.with_suffix(".flac")),
+                )
+            )
+        except (OSError, ValueError, KeyError, IndexError) as error:
+            raise UserError(f"cannot read the clip {path.stem}: {error!r}; remove it") from error
+    if not clips:
+        raise UserError(f"no Mandarin clips in {folder}; give a folder of .flac, .csv and .json")
+    return clips
+
+
+def _tracked_faps(tracks: dict[str, Array]) -> Array:
+    faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
+    for name, values in tracks.items():
+        number = name[1:].partition("_")[0]
+        if name.startswith("F") and number.isdigit() and int(number) in MOUTH_FAPS:
+            faps[:, MOUTH_FAPS.index(int(number))] = values
+    faps[tracks.get("ok", np.ones(len(faps))) == 0.0] = np.nan
+    return faps
+
+
+def _rig_faps(tracks: dict[str, Array]) -> Array:
+    faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
+    faps[:, columns(_RIG_FAPS)] = 0.0
+    for shape, effect in _RIG.items():
+        # a side is named in up to three letters: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
+        sides = [
+            values
+            for name, values in tracks.items()
+            if name.startswith(shape) and len(name) - len(shape) <= 3
+        ]
+        weight = np.mean(np.stack(sides), axis=0)
+        faps[:, columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
+    faps[:, columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
+    for upper, lower in columns((4, 5)), columns((8, 10)):
+        # inner lips that meet stop
+        crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)
+        faps[:, upper] -= 0.5 * crossed
+        faps[:, lower] -= 0.5 * crossed
+    for right, left in MIRROR.items():
+        faps[:, MOUTH_FAPS.index(right)] = faps[:, MOUTH_FAPS.index(left)]
+    return faps
+
+
+def aligned_units(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
+    """Units of a clip by its text, or None where that is unknown or cannot be read."""
+    if not clip.transcript:
+        return None
+    try:
+        return align_text(model, clip.samples, SAMPLE_RATE_HZ, clip.transcript)
+    except UserError:
+        return None
+
+
+def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
+    """Units of a clip: aligned where its text is known, else recognised."""
+    return aligned_units(model, clip) or recognize(model, clip.samples, SAMPLE_RATE_HZ)
