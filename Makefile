@@ -5,6 +5,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
 SAMPLE := shared/demo/hello-female.wav
+TORCH := torch==2.13.0
+TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --retries 0 --timeout 10
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: run demo setup test check clean
@@ -38,7 +40,8 @@ clean:
 
 .venv/installed-dev: .venv/installed
 	sh deploy/system_packages.sh test
-	$(BIN)/python -m pip install --quiet --editable '.[page,dev,training]'
+	$(BIN)/python -m pip install --quiet $(TORCH_CPU) $(TORCH) || $(BIN)/python -m pip install --quiet $(TORCH)
+	$(BIN)/python -m pip install --quiet --editable '.[page,dev,neural-training]'
 	touch $@
 
 $(PAGE)/node_modules/.package-lock.json: $(PAGE)/package-lock.json | .venv/installed

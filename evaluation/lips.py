@@ -42,6 +42,7 @@ from services.synthesizer.full import synthesize
 from services.synthesizer.live import LiveSynthesizer
 from services.synthesizer.parameters import VisemeParameters, clips_seen, load_parameters
 from services.synthesizer.visemes import MOUTH_FAPS
+from shared.config import SynthesizerConfig
 from shared.errors import UserError
 from shared.faps import NUM_FAPS
 from shared.phones import Phone, SpeechChange
@@ -56,7 +57,8 @@ from training.lip_clips import (
 Array = NDArray[np.float64]
 Heard = tuple[float, float, list[Phone | SpeechChange]]  # time in s, level in dB, what was said
 
-LOOK_AHEADS_S = (0.0, 0.05, 0.1, 0.2, 0.3)
+DEFAULT_LOOK_AHEAD_S = SynthesizerConfig().look_ahead_ms / 1e3
+LOOK_AHEADS_S = sorted({0.0, 0.05, 0.1, 0.2, 0.3, DEFAULT_LOOK_AHEAD_S})
 NEXT_UNIT_LOOK_AHEAD_S = 0.05
 FRAME_RATE_HZ = 50.0
 _LONGEST_LAG_S = 0.3
@@ -82,9 +84,9 @@ class LipScore:
     group: str
     measure: str
     num_clips: int
-    correlation: float
-    best_lag_ms: float
-    best_correlation: float
+    correlation: float | None  # None: the synthesized lips stand still
+    best_lag_ms: float | None
+    best_correlation: float | None
     rmse: float  # FAP units, own means removed
     bpm_met: int  # units that close
     bpm: int
@@ -101,23 +103,27 @@ class ClipLips:
     acoustic_closures_s: Array  # of its b p m
 
 
-def hear(model: AcousticModel, clip: LipClip) -> list[Heard]:
-    """Run the live recognizer over a clip, fed as the sound would arrive."""
+def hear(model: AcousticModel, samples: NDArray[np.float32]) -> list[Heard]:
+    """Run the live recognizer over a sound (16 kHz mono), fed as it would arrive."""
     recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
     heard, start = [], 0
-    for time_s, level in level_track(clip.samples):
+    for time_s, level in level_track(samples):
         end = round(time_s * SAMPLE_RATE_HZ)
-        heard.append((time_s, level, recognizer.accept_waveform(clip.samples[start:end])))
+        heard.append((time_s, level, recognizer.accept_waveform(samples[start:end])))
         start = end
-    rest = recognizer.accept_waveform(clip.samples[start:]) + recognizer.input_finished()
-    heard.append((len(clip.samples) / SAMPLE_RATE_HZ, -np.inf, rest))
+    rest = recognizer.accept_waveform(samples[start:]) + recognizer.input_finished()
+    heard.append((len(samples) / SAMPLE_RATE_HZ, -np.inf, rest))
     return heard
 
 
 def live_frames(
-    parameters: VisemeParameters, heard: Sequence[Heard], look_ahead_s: float, wait_for_next: bool
+    parameters: VisemeParameters,
+    heard: Sequence[Heard],
+    look_ahead_s: float,
+    *,
+    wait_for_next: bool = False,
 ) -> Array:
-    """Frames (num_frames, 68) of the live synthesizer."""
+    """Frames (num_frames, 68) of the live synthesizer, ``FRAME_RATE_HZ`` of them a second."""
     live = LiveSynthesizer(parameters, frame_rate_hz=FRAME_RATE_HZ, look_ahead_s=look_ahead_s)
     frames = []
     for time_s, level, results in heard:
@@ -134,7 +140,7 @@ def live_frames(
 
 def loudness_frames(samples: NDArray[np.float32]) -> Array:
     """Frames (num_frames, 68) of a mouth that opens with the level, 0 to 1 over 40 dB."""
-    hop = int(16_000 / FRAME_RATE_HZ)
+    hop = int(SAMPLE_RATE_HZ / FRAME_RATE_HZ)
     num_frames = len(samples) // hop + 1
     padded = np.pad(samples.astype(float), (hop, 2 * hop))
     power = [np.mean(padded[k * hop : (k + 2) * hop] ** 2) for k in range(num_frames)]
@@ -158,13 +164,13 @@ def lips_of_clip(model: AcousticModel, parameters: VisemeParameters, clip: LipCl
     schemes = {}
     aligned = aligned_units(model, clip)
     recognised = recognize(model, clip.samples, SAMPLE_RATE_HZ)
-    heard = hear(model, clip)
+    heard = hear(model, clip.samples)
     if aligned is not None:
         schemes["1 aligned"] = full(aligned)
     schemes["2 recognised"] = full(recognised)
     for look_ahead_s in LOOK_AHEADS_S:
         schemes[f"3 live {1e3 * look_ahead_s:.0f} ms"] = live_frames(
-            parameters, heard, look_ahead_s, wait_for_next=False
+            parameters, heard, look_ahead_s
         )
     schemes["4 next unit"] = live_frames(
         parameters, heard, NEXT_UNIT_LOOK_AHEAD_S, wait_for_next=True
@@ -194,6 +200,11 @@ def real_faps(clip: LipClip) -> Array:
     faps = np.full((len(clip.time_s), NUM_FAPS), np.nan)
     faps[:, np.array(MOUTH_FAPS) - 1] = clip.faps
     return faps
+
+
+def _measured(clip: LipClip, measure: str) -> bool:
+    """Whether a clip has any frame of a measure."""
+    return not np.isnan(MEASURES[measure](real_faps(clip))).all()
 
 
 def _aligned(clip: LipClip, frames: Array, measure: str, lag_s: float) -> tuple[Array, Array]:
@@ -245,11 +256,14 @@ def score_clips(group: str, lips: Sequence[ClipLips]) -> list[LipScore]:
     here = len(lags) // 2
     real_closures = [_real_closures(each.clip) for each in lips]
     for scheme in dict.fromkeys(name for each in lips for name in each.schemes):
-        used = [k for k, each in enumerate(lips) if scheme in each.schemes]
-        made = [lips[k].schemes[scheme] for k in used]
-        acoustic = [lips[k].acoustic_closures_s for k in used]
-        real = [real_closures[k] for k in used]
+        made_by_scheme = [k for k, each in enumerate(lips) if scheme in each.schemes]
         for measure in MEASURES:
+            used = [k for k in made_by_scheme if _measured(lips[k].clip, measure)]
+            if not used:
+                continue
+            made = [lips[k].schemes[scheme] for k in used]
+            acoustic = [lips[k].acoustic_closures_s for k in used]
+            real = [real_closures[k] for k in used]
             joined = []
             for lag_s in lags:
                 pairs = [
@@ -258,7 +272,14 @@ def score_clips(group: str, lips: Sequence[ClipLips]) -> list[LipScore]:
                 ]
                 joined.append([np.concatenate(side) for side in zip(*pairs, strict=True)])
             correlations = [_correlation(a, b) for a, b in joined]
-            best = int(np.argmax(correlations))
+            best = max(
+                (
+                    (value, float(lag_s))
+                    for value, lag_s in zip(correlations, lags, strict=True)
+                    if value is not None
+                ),
+                default=(None, None),
+            )
             scores.append(
                 LipScore(
                     scheme=scheme,
@@ -266,8 +287,8 @@ def score_clips(group: str, lips: Sequence[ClipLips]) -> list[LipScore]:
                     measure=measure,
                     num_clips=len(used),
                     correlation=correlations[here],
-                    best_lag_ms=round(1e3 * float(lags[best])),
-                    best_correlation=correlations[best],
+                    best_lag_ms=None if best[1] is None else round(1e3 * best[1]),
+                    best_correlation=best[0],
                     rmse=float(np.sqrt(np.mean((joined[here][0] - joined[here][1]) ** 2))),
                     bpm_met=sum(map(_met, acoustic, made)),
                     bpm=sum(map(len, acoustic)),
@@ -278,9 +299,9 @@ def score_clips(group: str, lips: Sequence[ClipLips]) -> list[LipScore]:
     return scores
 
 
-def _correlation(a: Array, b: Array) -> float:
+def _correlation(a: Array, b: Array) -> float | None:
     size = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / size if size > 0.0 else 0.0
+    return float(a @ b) / size if size > 0.0 else None
 
 
 def clips_to_score(folder: Path, parameters: Path | None) -> list[LipClip]:
@@ -297,7 +318,13 @@ def clips_to_score(folder: Path, parameters: Path | None) -> list[LipClip]:
         raise UserError(
             f"{folder}: the parameters were learnt from or chosen with every clip; give other clips"
         )
-    return clips
+    measured = [clip for clip in clips if any(_measured(clip, name) for name in MEASURES)]
+    if not measured:
+        raise UserError(
+            f"{folder}: no clip measures lip opening (FAP 4 and 5), mouth width (FAP 6 and 7) or "
+            "jaw (FAP 3); add such columns"
+        )
+    return measured
 
 
 def main(folder: Path, parameters: Path | None = None) -> list[LipScore]:
@@ -309,7 +336,7 @@ def main(folder: Path, parameters: Path | None = None) -> list[LipScore]:
     ]
     groups: dict[str, list[ClipLips]] = {"all": lips}
     for each in lips:
-        groups.setdefault(each.clip.name.split("_")[0], []).append(each)
+        groups.setdefault(each.clip.speaker, []).append(each)
     scores = [
         score
         for group, members in groups.items()
@@ -329,12 +356,17 @@ def main(folder: Path, parameters: Path | None = None) -> list[LipScore]:
                     score.group,
                     score.scheme,
                     str(score.num_clips),
-                    f"{score.correlation:.2f}",
-                    f"{score.best_correlation:.2f}",
-                    f"{score.best_lag_ms:.0f}",
+                    _figure(score.correlation, ".2f"),
+                    _figure(score.best_correlation, ".2f"),
+                    _figure(score.best_lag_ms, ".0f"),
                     f"{score.rmse:.0f}",
                     f"{score.bpm_met}/{score.bpm}",
                     f"{score.closures_met}/{score.closures}",
                 )
-        console.print(table)
+        if table.row_count:
+            console.print(table)
     return scores
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)

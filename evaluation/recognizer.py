@@ -14,7 +14,6 @@ Every recording is a session of its own, so the live mean starts from the prior 
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -23,9 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.decoder import Decoder
@@ -35,7 +32,7 @@ from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from services.synthesizer.visemes import SHAPES
 from shared.errors import UserError
-from shared.phones import FINALS, INITIALS, SILENCE, UNIT_INDEX, UNITS, Phone
+from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone
 from training.align import align_units, spoken
 from training.corpus import RowErrors, Utterance, read_corpus
 from training.feature_cache import read_audio
@@ -44,6 +41,7 @@ from training.feature_cache import read_audio
 RULES = (*((agreement, 0.0) for agreement in (1, 2, 3, 4, 5, 6)), DEFAULT_RULE)
 _CHUNK_SAMPLES = 160  # sound is fed as it would arrive, 10 ms at a time
 _NUM_RESAMPLES = 2000
+_SESSIONS_TOGETHER = 16
 
 
 @dataclass(slots=True, kw_only=True)
@@ -90,8 +88,9 @@ class Score:
             out[f"{measure}_error_rate"] = total.rate
             out[f"{measure}_interval_95"] = bootstrap_interval(list(by_speaker.values()), rng)
             out[f"{measure}_errors"] = asdict(total)
-            out[f"{measure}_error_rate_by_speaker"] = {
-                speaker: counts.rate for speaker, counts in sorted(by_speaker.items())
+            out[f"{measure}_errors_by_speaker"] = {
+                speaker: {"rate": counts.rate, **asdict(counts)}
+                for speaker, counts in sorted(by_speaker.items())
             }
         if self.delays_s:
             p50, p95 = np.percentile(self.delays_s, [50, 95])
@@ -159,8 +158,13 @@ def mouth_shapes(units: Iterable[str]) -> list[str]:
 
 def bootstrap_interval(
     by_speaker: Sequence[ErrorCounts], rng: np.random.Generator
-) -> tuple[float, float]:
-    """95 % interval of the error rate when speakers are drawn anew (Efron 1979)."""
+) -> tuple[float, float] | None:
+    """95 % interval of the error rate when speakers are drawn anew (Efron 1979).
+
+    None for a single speaker, who says nothing about others.
+    """
+    if len(by_speaker) < 2:
+        return None
     errors = np.array([c.insertions + c.deletions + c.substitutions for c in by_speaker])
     lengths = np.array([c.reference for c in by_speaker])
     picks = rng.integers(len(by_speaker), size=(_NUM_RESAMPLES, len(by_speaker)))
@@ -175,7 +179,6 @@ def evaluate_recognizer(
     split: str,
     *,
     rules: Sequence[tuple[int, float]] = RULES,
-    confusion_picture: Path | None = None,
 ) -> dict[str, object]:
     """Measure a model on one split of a corpus.
 
@@ -189,29 +192,37 @@ def evaluate_recognizer(
         Its split, such as ``dev`` or ``test``.
     rules
         Output rules to try: N, and the confidence that a frame needs.
-    confusion_picture
-        Where to write a picture of the confusions, if anywhere.
+
+    Returns
+    -------
+    dict
+        Figures for a JSON file; ``confusions`` counts said (row) against heard (column) units, the
+        last row and column being nothing. Rows that could not be used are in ``bad_rows``.
 
     Raises
     ------
     UserError
-        If there is no such corpus or split.
+        If there is no such corpus, or no usable recording in the split.
     """
     errors = RowErrors()
-    utterances = [u for u in read_corpus(corpus, errors) if u.split == split]
-    if not utterances:
-        raise UserError(f"{corpus} has no recordings in the split {split!r}; name another split")
+    utterances = read_corpus(corpus, errors, split=split)
     full = Score(name="full traceback")
     live = [
         Score(name=f"N = {agreement}" + (f", sure by {confidence}" if confidence else ""))
         for agreement, confidence in rules
     ]
     confusion = np.zeros((len(UNITS), len(UNITS)), dtype=np.int64)
+    used: list[Utterance] = []
     seconds = 0.0
     for utterance in track(utterances, description=f"recognising {split}"):
-        samples = read_audio(utterance.path)
+        try:
+            samples = read_audio(utterance.path)
+            truth = _truth(model, utterance, samples)
+        except (UserError, ValueError) as error:
+            errors.add(utterance.utterance_id, str(error))
+            continue
+        used.append(utterance)
         seconds += len(samples) / SAMPLE_RATE_HZ
-        truth = _truth(model, utterance, samples)
         heard = spoken(recognize(model, samples, SAMPLE_RATE_HZ))
         _count(full.phones, utterance.speaker, _units(truth), _units(heard))
         _count(full.visemes, utterance.speaker, _shapes(truth), _shapes(heard))
@@ -224,60 +235,25 @@ def evaluate_recognizer(
             _count(score.visemes, utterance.speaker, _shapes(truth), _shapes(phones))
             _count(score.corrected, utterance.speaker, _units(truth), _units(finals))
             score.delays_s += _delays(truth, phones, put_out_s)
-    if confusion_picture is not None:
-        draw_confusions(confusion, confusion_picture)
+    if not used:
+        raise UserError(
+            f"{corpus} has no usable recordings in the split {split!r}; name another split"
+            + "".join(f"\n{message}" for message in errors.messages[:5])
+        )
     rng = np.random.default_rng(0)
     return {
         "split": split,
-        "recordings": len(utterances),
-        "speakers": len({utterance.speaker for utterance in utterances}),
+        "recordings": len(used),
+        "speakers": len({utterance.speaker for utterance in used}),
         "seconds": seconds,
+        "num_bad_rows": len(errors.messages),
         "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (full, *live)],
         "most_confused": most_confused(confusion),
-        "cpu_per_audio_second": cpu_by_stage(model, read_audio(utterances[0].path)),
+        "confusions": confusion.tolist(),
+        "cpu_per_audio_second": (cost := cpu_by_stage(model, read_audio(used[0].path))),
+        "sessions_a_core": sessions_a_core(model, read_audio(used[0].path), cost),
     }
-
-
-def print_scores(results: dict[str, object], console: Console) -> None:
-    """Print the figures as tables."""
-    table = Table(title=f"{results['split']}: {results['recordings']} recordings")
-    for column in (
-        "output",
-        "phone error %",
-        "95 %",
-        "ins / del / sub %",
-        "viseme error %",
-        "95 %",
-        "phone error % once final",
-    ):
-        table.add_column(column, justify="right")
-    table.add_column("delay p50 / p95 ms", justify="right")
-    scores = results["scores"]
-    assert isinstance(scores, list)  # noqa: S101 (narrows the type for the checker)
-    for score in scores:
-        kinds = score["phone_errors"]
-        split = " / ".join(
-            f"{100 * kinds[kind] / max(1, kinds['reference']):.1f}"
-            for kind in ("insertions", "deletions", "substitutions")
-        )
-        delay = score.get("delay_ms")
-        table.add_row(
-            score["output"],
-            f"{100 * score['phone_error_rate']:.1f}",
-            _interval(score["phone_interval_95"]),
-            split,
-            f"{100 * score['viseme_error_rate']:.1f}",
-            _interval(score["viseme_interval_95"]),
-            f"{100 * score['final_error_rate']:.1f}" if "final_error_rate" in score else "",
-            f"{delay['p50']:.0f} / {delay['p95']:.0f}" if delay else "",
-        )
-    console.print(table)
-    console.print(f"CPU seconds per second of sound: {json.dumps(results['cpu_per_audio_second'])}")
-
-
-def _interval(bounds: tuple[float, float]) -> str:
-    return f"{100 * bounds[0]:.1f} - {100 * bounds[1]:.1f}"
 
 
 def _truth(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float32]) -> list[Phone]:
@@ -359,25 +335,6 @@ def most_confused(confusion: NDArray[np.int64], count: int = 15) -> list[dict[st
     ]
 
 
-def draw_confusions(confusion: NDArray[np.int64], path: Path) -> None:
-    """Draw the confusion matrix, rows normalised; the last row is insertions, column deletions."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (slow to load)
-    from matplotlib.figure import Figure  # noqa: PLC0415
-
-    names = [*INITIALS, *FINALS, "-"]
-    share = confusion / np.maximum(1, confusion.sum(axis=1, keepdims=True))
-    figure = Figure(figsize=(11, 10), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    picture = axes.imshow(share, cmap="viridis", vmin=0, vmax=1)
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    axes.set_yticks(range(len(names)), names, fontsize=7)
-    axes.set_xlabel("heard (-: nothing)")
-    axes.set_ylabel("said (-: nothing)")
-    figure.colorbar(picture, label="share of what was said", shrink=0.8)
-    figure.savefig(path, dpi=110)
-
-
 def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, float]:
     """CPU seconds per second of sound of each stage, fed 10 ms at a time."""
     chunks = [samples[at : at + _CHUNK_SAMPLES] for at in range(0, len(samples), _CHUNK_SAMPLES)]
@@ -410,3 +367,20 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         "acoustic_model": run(stream.accept, (log_mel[t : t + 1] for t in range(len(log_mel)))),
         "decoder": run(decoder.accept, scores),
     }
+
+
+def sessions_a_core(
+    model: AcousticModel, samples: NDArray[np.float32], cost: dict[str, float]
+) -> float:
+    """Sessions that one core can hear when 16 of them are scored together, fed 10 ms at a time.
+
+    ``cost`` is what :func:`cpu_by_stage` measured for one; the resampler, which sound at 16 kHz
+    does not need, is left out.
+    """
+    log_mel = LogMel().accept_waveform(samples)
+    streams = [model.stream() for _ in range(_SESSIONS_TOGETHER)]
+    begin = time.process_time()
+    for frame in range(len(log_mel)):
+        model.score([(stream, log_mel[frame : frame + 1]) for stream in streams])
+    together = (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples) / _SESSIONS_TOGETHER
+    return 1 / (together + cost["voice_activity"] + cost["log_mel"] + cost["decoder"])

@@ -21,8 +21,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from evaluation.figures import new_figure, save_figure
 from evaluation.lips import FRAME_RATE_HZ, MEASURES, clips_to_score, real_faps
-from evaluation.viseme_plots import draw_sound, new_figure, save_figure
+from evaluation.viseme_plots import draw_sound
 from services.recognizer.load import load_model
 from services.synthesizer.full import synthesize
 from services.synthesizer.parameters import VisemeParameters, load_parameters
@@ -120,7 +121,10 @@ def _centred(each: FittedClip, measure: str) -> tuple[Array, Array, Array]:
     real = MEASURES[measure](real_faps(each.clip))
     known = ~np.isnan(real)
     values = (real, MEASURES[measure](each.learnt), MEASURES[measure](each.guessed))
-    real, learnt, guessed = (value - value[known].mean() for value in values)
+    if known.any():
+        real, learnt, guessed = (value - value[known].mean() for value in values)
+    else:
+        _, learnt, guessed = values
     return real, learnt, guessed
 
 

@@ -14,68 +14,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evaluation.figures import new_figure, save_figure
+from evaluation.lips import DEFAULT_LOOK_AHEAD_S, FRAME_RATE_HZ, hear, live_frames
 from services.driver.head import Head
 from services.driver.render import Camera, Renderer
-from services.offline import Frame, live_frames, mono_16k
+from services.offline import mono_16k
 from services.recognizer.load import load_model
 from services.recognizer.pipeline import recognize
 from services.synthesizer.blending import around, blend, log_weights, softmax
 from services.synthesizer.full import synthesize
-from services.synthesizer.live import LiveSynthesizer
+from services.synthesizer.live import FapFrame, LiveSynthesizer
 from services.synthesizer.parameters import VisemeParameters, load_parameters
 from services.synthesizer.timeline import Timeline, build_timeline
 from services.synthesizer.visemes import MOUTH_FAPS, REST, SHAPES, VISEMES
 from shared.errors import UserError
 from shared.faps import FAPS, NUM_FAPS
 from shared.phones import SILENCE, Phone, SpeechChange
-from training.lip_clips import level_track
+from training.lip_clips import SAMPLE_RATE_HZ, level_track
 
 Array = NDArray[np.float64]
 
-SAMPLE_RATE_HZ = 16_000
-DOTS_PER_INCH = 80
-_FACE_PX = 190
+_FACE_WIDTH_PX, _FACE_HEIGHT_PX = 190, 230
+# From the front, nose to chin: from the side the hollow of the cheek shows at one corner alone.
 _FACE_CAMERA = Camera(
-    position=(0.07, -0.025, 0.62), target=(0.0, -0.042, 0.0), field_of_view_deg=9.0
+    position=(0.0, -0.023, 0.62), target=(0.0, -0.031, 0.0), field_of_view_deg=9.8
 )
 _FACES_A_ROW = 9
 _SHOWN_FAPS = (3, 4, 5, 6, 17)  # jaw, both lips, a corner, protrusion
-_FRAME_RATE_HZ = 200.0  # of curves
+_CURVE_RATE_HZ = 200.0
 _JAW = MOUTH_FAPS.index(3)
 _SYLLABLE = (("sil", 0.30), ("a", 0.30), ("sil", 0.30))
 _WORD = (("sil", 0.25), ("n", 0.08), ("i", 0.14), ("m", 0.08), ("en", 0.20), ("sil", 0.30))
-
-
-def new_figure(width_in: float, height_in: float) -> Any:
-    """Make an empty figure.
-
-    Raises
-    ------
-    UserError
-        If matplotlib is missing.
-    """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (optional)
-        from matplotlib.figure import Figure  # noqa: PLC0415
-    except ImportError:
-        raise UserError("pictures need matplotlib: pip install 'kouxing[training]'") from None
-    figure = Figure(figsize=(width_in, height_in), dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure as the kind of picture that the name of its file says.
-
-    Raises
-    ------
-    UserError
-        If it cannot be written.
-    """
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: the picture cannot be written: {error}") from error
 
 
 def plot_visemes(folder: Path, audio: Path, parameters_file: Path | None) -> list[Path]:
@@ -124,9 +93,9 @@ def spoken(units: Sequence[tuple[str, float]]) -> list[Phone]:
 
 def faces_figure(parameters: VisemeParameters) -> Any:
     """Draw a face for every viseme, at its static targets, with the units that have it."""
-    renderer = Renderer(Head.load(), _FACE_PX, _FACE_PX, camera=_FACE_CAMERA)
+    renderer = Renderer(Head.load(), _FACE_WIDTH_PX, _FACE_HEIGHT_PX, camera=_FACE_CAMERA)
     num_rows = -(-len(VISEMES) // _FACES_A_ROW)
-    figure = new_figure(1.6 * _FACES_A_ROW, 2.0 * num_rows)
+    figure = new_figure(1.6 * _FACES_A_ROW, 2.35 * num_rows)
     axes = figure.subplots(num_rows, _FACES_A_ROW).ravel()
     for place, (axis, viseme) in enumerate(zip(axes, VISEMES, strict=False)):
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
@@ -161,7 +130,7 @@ def dominance_figure(parameters: VisemeParameters) -> Any:
         upper, lower = axes[:, column]
         phones = spoken(units)
         length_s = sum(duration_s for _, duration_s in units)
-        time_s = np.arange(0.0, length_s, 1.0 / _FRAME_RATE_HZ)
+        time_s = np.arange(0.0, length_s, 1.0 / _CURVE_RATE_HZ)
         timeline = build_timeline(phones)
         full = blend(parameters, timeline, time_s)[:, _JAW]
         _draw_weights(upper, parameters, timeline, time_s, pairs=is_live)
@@ -204,8 +173,8 @@ def _live_curve(
     parameters: VisemeParameters, phones: Sequence[Phone], length_s: float
 ) -> tuple[Array, Array]:
     """Return times and jaw of the live model, told of each unit when it begins."""
-    live = LiveSynthesizer(parameters, frame_rate_hz=_FRAME_RATE_HZ, look_ahead_s=0.0)
-    frames: list[Frame] = []
+    live = LiveSynthesizer(parameters, frame_rate_hz=_CURVE_RATE_HZ, look_ahead_s=0.0)
+    frames: list[FapFrame] = []
     for phone in phones:
         frames += live.advance(phone.onset_s)
         live.accept_phone(phone)
@@ -218,13 +187,13 @@ def _live_curve(
 
 def sentence_figure(parameters: VisemeParameters, samples: NDArray[np.float32]) -> Any:
     """Draw FAP curves of a sentence under its waveform and phones, full model and live."""
-    phones = recognize(load_model(), samples, SAMPLE_RATE_HZ)
-    _, frames = live_frames(samples)
-    live_s = np.array([time_s for time_s, _ in frames])
-    live = np.array([faps for _, faps in frames])
-    num_frames = int(len(samples) / SAMPLE_RATE_HZ * _FRAME_RATE_HZ)
-    full = synthesize(parameters, phones, num_frames, _FRAME_RATE_HZ, level_track(samples))
-    time_s = np.arange(num_frames) / _FRAME_RATE_HZ
+    model = load_model()
+    phones = recognize(model, samples, SAMPLE_RATE_HZ)
+    live = live_frames(parameters, hear(model, samples), DEFAULT_LOOK_AHEAD_S)
+    live_s = np.arange(len(live)) / FRAME_RATE_HZ
+    num_frames = int(len(samples) / SAMPLE_RATE_HZ * _CURVE_RATE_HZ) + 1
+    full = synthesize(parameters, phones, num_frames, _CURVE_RATE_HZ, level_track(samples))
+    time_s = np.arange(num_frames) / _CURVE_RATE_HZ
     figure = new_figure(14.0, 7.5)
     sound, *curves = figure.subplots(
         1 + len(_SHOWN_FAPS), 1, sharex=True, height_ratios=(1.5, *([1.0] * len(_SHOWN_FAPS)))
@@ -237,7 +206,7 @@ def sentence_figure(parameters: VisemeParameters, samples: NDArray[np.float32]) 
         for phone in phones:
             axis.axvline(phone.onset_s, color="0.9", zorder=0)
     curves[0].legend(fontsize=8, loc="upper right")
-    curves[-1].set_xlim(0.0, time_s[-1])
+    curves[-1].set_xlim(0.0, num_frames / _CURVE_RATE_HZ)
     curves[-1].set_xlabel("s (FAP units; each FAP number with its name)")
     return figure
 

@@ -19,7 +19,7 @@ from shared.errors import UserError
 
 head_app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")
 
-Acoustic = Annotated[str, typer.Option(help="Model: combined, gmm, neural, or a file.")]
+Acoustic = Annotated[str, typer.Option(help="Model: neural, gmm, or a file.")]
 HeadName = Annotated[
     str, typer.Option("--head", help="woman, man, elder, child, an .npz, or a .glb with morphs.")
 ]
@@ -43,7 +43,13 @@ class CameraName(StrEnum):
     MOUTH = "mouth"
 
 
-Form = Annotated[PhoneFormat, typer.Option("--format", help="Form.")]
+Form = Annotated[
+    PhoneFormat | None,
+    typer.Option(
+        "--format", help="Form; if it is not said, the file's suffix tells, else a table."
+    ),
+]
+_FORMS = {f".{form.value}": form for form in PhoneFormat}
 
 
 def add_to(app: typer.Typer) -> None:
@@ -85,7 +91,7 @@ def render(
     from shared.fap_file import read_fap
 
     is_picture = output.suffix == ".png" and not is_sequence(output)
-    is_face = source.suffix == ".fap"
+    is_face = source.suffix.lower() == ".fap"
     width_px, height_px = _size(size, even=output.suffix in VIDEO_SUFFIXES)
     if at is not None and not is_picture:
         raise UserError("--at says when one picture is taken; give the name of one (.png)")
@@ -96,6 +102,7 @@ def render(
     colours = scene.background(background)
     if colours is None and output.suffix == ".mp4":
         raise UserError("MP4 has no transparency; write .mov, .webm, or pictures (.png)")
+    whose = scene.load_head(head)
 
     with Progress(console=CONSOLE, transient=True) as progress:
         num_phones = None
@@ -115,7 +122,6 @@ def render(
             num_phones = len({phone.index for phone in heard})
         if not frames:
             raise UserError(f"{source}: it has no frames")
-        whose = scene.load_head(head)
         renderer = Renderer(
             whose,
             width_px,
@@ -145,8 +151,8 @@ def render(
 
 def phones(
     audio: Annotated[Path, typer.Argument(help="Audio file.")],
-    acoustic: Acoustic = "combined",
-    form: Form = PhoneFormat.TABLE,
+    acoustic: Acoustic = "neural",
+    form: Form = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")] = None,
 ) -> None:
     """Recognise an audio file: units with their times."""
@@ -160,14 +166,14 @@ def phones(
     found = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
     if not found:
         say(f"{audio}: no speech was heard")
-    show(format_phones(found, form.value, len(samples) / MEDIA_RATE_HZ), output)
+    show(format_phones(found, _form(form, output), len(samples) / MEDIA_RATE_HZ), output)
 
 
 def align(
     audio: Annotated[Path, typer.Argument(help="Audio file.")],
     text: Annotated[str, typer.Argument(help="What is said: Chinese characters, or pinyin.")],
-    acoustic: Acoustic = "combined",
-    form: Form = PhoneFormat.TABLE,
+    acoustic: Acoustic = "neural",
+    form: Form = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")] = None,
 ) -> None:
     """Find when each unit of a known text is said."""
@@ -179,7 +185,7 @@ def align(
 
     samples = offline.mono_16k(audio)
     said = align_text(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ, text)
-    show(format_phones(said, form.value, len(samples) / MEDIA_RATE_HZ), output)
+    show(format_phones(said, _form(form, output), len(samples) / MEDIA_RATE_HZ), output)
 
 
 def bench(
@@ -230,6 +236,12 @@ def head_import(
     for remark in remarks:
         say(remark)
     say(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")
+
+
+def _form(form: PhoneFormat | None, output: Path | None) -> str:
+    if form is None and output is not None:
+        form = _FORMS.get(output.suffix.lower())
+    return (form or PhoneFormat.TABLE).value
 
 
 def _mono_16k(path: Path) -> NDArray[np.float32]:

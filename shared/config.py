@@ -51,9 +51,10 @@ class RecognizerConfig(Config):
 
     audio: str = "tcp://127.0.0.1:5560"
     phones: str = "tcp://127.0.0.1:5561"
-    acoustic: str = "combined"  # model: combined, gmm, neural, or a file
+    acoustic: str = "neural"  # model: neural, gmm, or a file
+    look_ahead_ms: float = 10.0  # of the neural model: 0, 10, 30 or 60
     agreement: int = 3  # frames that must agree before a unit is put out (N of Li 2011)
-    least_confidence: float = 0.55  # of each of those frames; 0 is the paper's rule
+    least_confidence: float = 0.75  # of each of those frames; 0 is the paper's rule
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

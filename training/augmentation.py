@@ -3,7 +3,14 @@
 Working on log-mel bands (instead of samples) makes a copy of an hour in seconds. The band
 energies of speech and noise add; their cross terms, zero on average, are replaced by the noise's
 own scatter. Warping the band axis lengthens or shortens the vocal tract (Jaitly and Hinton 2013,
-"Vocal tract length perturbation"); warping both axes together is a change of speed.
+"Vocal tract length perturbation"); stretching the time axis is a change of speed.
+
+======== ===================================================== ===============
+symbol   meaning                                               shape
+======== ===================================================== ===============
+P        energies of the recording, power                      (frames, 41)
+N        energies of the noise: gain(t) * spectrum(k) * scatter (frames, 41)
+======== ===================================================== ===============
 """
 
 from __future__ import annotations
@@ -12,10 +19,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from services.recognizer.features import LOG_FLOOR, NUM_BANDS
 
 _LOWEST_HZ, _HIGHEST_HZ = 40.0, 7600.0
+_WET = 0.5  # energy of a room's tail against the direct sound
 
 
 def _mel(hz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -24,6 +33,12 @@ def _mel(hz: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _hz(mel: NDArray[np.float64]) -> NDArray[np.float64]:
     return 700.0 * np.expm1(mel / 1127.0)
+
+
+def _over_bands(values: tuple[float, ...]) -> NDArray[np.float32]:
+    """Values at equal mel distances, interpolated to all bands, shape (40,)."""
+    at = np.linspace(0, NUM_BANDS - 1, len(values))
+    return np.interp(np.arange(NUM_BANDS), at, values).astype(np.float32)
 
 
 _LOWEST_MEL, _HIGHEST_MEL = _mel(np.array([_LOWEST_HZ, _HIGHEST_HZ]))
@@ -44,6 +59,10 @@ class Augmentation:
     decay: float  # share of the energy that stays for the next frame, 0 is a dry room
     narrow: bool  # a telephone line: 300 to 3400 Hz
     seed: int
+    highest_hz: float = 8000.0  # a codec or a poor microphone lets nothing higher through
+    noise_peaks: tuple[float, ...] = ()  # added to the noise's bands, like ``colour``
+    flutter: float = 0.0  # the noise's gain changes by this from breath to breath, natural log
+    knocks: float = 0.0  # share of the frames in which something knocks
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Augmentation:
@@ -60,6 +79,25 @@ class Augmentation:
             seed=int(rng.integers(2**31)),
         )
 
+    @classmethod
+    def draw_hard(cls, rng: np.random.Generator) -> Augmentation:
+        """Draw one at random, up to what a network still learns from: noise at 0 to 30 dB."""
+        return cls(
+            speed=float(np.exp(rng.uniform(-0.22, 0.22))),
+            warp=float(np.exp(rng.uniform(-0.13, 0.13))),
+            level=float(rng.uniform(-5.0, 2.0)),
+            noise_below=float(rng.uniform(0.0, 7.0) if rng.random() < 0.6 else 12.0),
+            noise_tilt=float(rng.uniform(-5.0, 1.5)),
+            colour=tuple(rng.normal(0.0, rng.uniform(0.3, 1.2), 6).tolist()),
+            decay=float(rng.uniform(0.3, 0.92)) if rng.random() < 0.5 else 0.0,
+            narrow=bool(rng.random() < 0.07),
+            seed=int(rng.integers(2**31)),
+            highest_hz=float(rng.uniform(3800.0, 8000.0)) if rng.random() < 0.3 else 8000.0,
+            noise_peaks=tuple(rng.normal(0.0, 1.0, 12).tolist()),
+            flutter=float(rng.uniform(0.3, 1.5)) if rng.random() < 0.4 else 0.0,
+            knocks=float(rng.uniform(0.005, 0.05)) if rng.random() < 0.2 else 0.0,
+        )
+
     def positions(self, num_frames: int) -> NDArray[np.float64]:
         """Where each new frame lies in a recording of so many frames."""
         return np.linspace(0, num_frames - 1, max(2, round(num_frames / self.speed)))
@@ -68,27 +106,42 @@ class Augmentation:
         """Change a recording: shape (frames, 41) to (frames / speed, 41)."""
         rng = np.random.default_rng(self.seed)
         at = self.positions(len(log_mel))
-        num_frames = len(at)
         low = np.minimum(at.astype(int), len(log_mel) - 2)
         share = (at - low)[:, None].astype(np.float32)
         frames = (1 - share) * log_mel[low] + share * log_mel[low + 1]
         bands, energy = self._warped(frames[:, 1:]), frames[:, 0]
-        shape = np.interp(np.arange(NUM_BANDS), np.linspace(0, NUM_BANDS - 1, 6), self.colour)
-        bands = bands + shape.astype(np.float32)
+        bands = bands + _over_bands(self.colour)
         power = np.exp(np.concatenate([energy[:, None], bands], axis=1))
-        for frame in range(1, num_frames if self.decay else 0):
-            power[frame] += self.decay * 0.5 * power[frame - 1]
-        loud = np.percentile(power, 90, axis=0).mean()
-        tilt = np.linspace(0, self.noise_tilt, NUM_BANDS)
-        noise = np.exp(np.concatenate([[0.0], tilt]) - self.noise_below) * loud
-        noise[0] = noise[1:].mean() * np.median(power[:, 0] / power[:, 1:].mean(axis=1))
-        power += noise * rng.gamma(4.0, 0.25, power.shape)  # a band's energy scatters
+        if self.decay:  # the room answers with a tail: half of it counts
+            tail = lfilter([0.0, 1 - self.decay], [1.0, -self.decay], power, axis=0)
+            power += _WET * self.decay * tail
+        power += self._noise(power, rng)
         out = np.log(power) + self.level
         if self.narrow:
             outside = (_BAND_HZ < 300.0) | (_BAND_HZ > 3400.0)
             out[:, 1:][:, outside] -= 8.0
+        out[:, 1:][:, self.highest_hz < _BAND_HZ] -= 6.0
         floored: NDArray[np.float32] = np.maximum(out, LOG_FLOOR).astype(np.float32)
         return floored
+
+    def _noise(self, power: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+        """Energies of a noise that fits the recording's level, shape (frames, 41)."""
+        num_frames = len(power)
+        loud = np.percentile(power, 90, axis=0).mean()
+        spectrum = np.linspace(0, self.noise_tilt, NUM_BANDS)
+        if self.noise_peaks:
+            spectrum = spectrum + _over_bands(self.noise_peaks)
+        noise = np.exp(np.concatenate([[0.0], spectrum]) - self.noise_below) * loud
+        noise[0] = noise[1:].mean() * np.median(power[:, 0] / power[:, 1:].mean(axis=1))
+        gain = np.ones(num_frames)
+        if self.flutter:
+            knots = rng.normal(0.0, self.flutter, 2 + num_frames // 15)
+            gain = np.exp(np.interp(np.arange(num_frames) / 15, np.arange(len(knots)), knots))
+        if self.knocks:
+            hits = (rng.random(num_frames) < self.knocks) * rng.uniform(1.0, 30.0, num_frames)
+            gain = gain + lfilter([1.0], [1.0, -0.4], hits)
+        scatter = rng.gamma(4.0, 0.25, power.shape)  # as a band's energy does
+        return np.asarray(gain[:, None] * noise * scatter)
 
     def _warped(self, bands: NDArray[np.float32]) -> NDArray[np.float32]:
         source = _mel(np.minimum(_BAND_HZ / self.warp, _HIGHEST_HZ))

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from services.terminal import check_output
+from shared.errors import UserError
 from training import SYNTHETIC_WEIGHT
 
 app = typer.Typer(no_args_is_help=True, help="Train the models.")
@@ -28,13 +30,14 @@ def gmm(
     corpus: Corpora,
     output: Model,
     seed: Seed = 0,
-    mixtures: Annotated[int, typer.Option(help="Gaussians a state, a power of two.")] = 16,
+    mixtures: Annotated[int, typer.Option(help="Gaussians a state, a power of two.")] = 32,
     synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
     any_licence: AnyLicence = False,
 ) -> None:
     """Train the Gaussian mixture model of the paper; a model card is written beside it."""
     from training.recipes import train_gmm
 
+    check_output(output)
     train_gmm(
         corpus,
         output,
@@ -49,44 +52,44 @@ def gmm(
 def neural(
     corpus: Corpora,
     output: Model,
-    aligner: Annotated[Path, typer.Option(help="A model that 'gmm' wrote.")],
+    aligner: Annotated[Path, typer.Option(help="A model file that aligns the first time.")],
+    second_task: Annotated[
+        Path | None, typer.Option(help="Folder of speech in another language, with its phones.")
+    ] = None,
     seed: Seed = 0,
-    epochs: Annotated[int, typer.Option(help="Passes over the data.")] = 8,
-    synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
+    steps: Annotated[int, typer.Option(help="Batches of 50 s of sound.")] = 4000,
+    voices: Annotated[int, typer.Option(help="Other voices for each real sentence.")] = 4,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the network on frames that a Gaussian mixture model has aligned."""
-    from training.recipes import train_neural
+    """Train the neural model; a model card and the training curves are written beside it."""
+    check_output(output)
+    try:
+        from training.neural_recipe import train_neural
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
+        ) from error
 
     train_neural(
         corpus,
         output,
         aligner=aligner,
+        second_task=second_task,
         seed=seed,
-        num_epochs=epochs,
-        synthetic_weight=synthetic_weight,
+        num_steps=steps,
+        num_voices=voices,
         shipping=not any_licence,
     )
-
-
-@app.command(name="combine")
-def combine_models(
-    corpus: Corpora,
-    output: Model,
-    part: Annotated[list[Path], typer.Option(help="Model in the same folder; give two.")],
-) -> None:
-    """Choose on dev how much each of two models counts."""
-    from training.recipes import combine
-
-    combine(part, output, corpus)
 
 
 @app.command()
 def visemes(
     lips: Annotated[Path, typer.Option("--clips", help="Folder of tracked lips with sound.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
+    any_licence: AnyLicence = False,
 ) -> None:
     """Learn the dynamic visemes' parameters from tracked lips."""
     from training.visemes import train
 
-    train(lips, output)
+    check_output(output)
+    train(lips, output, any_licence=any_licence)

@@ -3,7 +3,8 @@
 Layouts, told apart by what the folder holds:
 
 - ``manifest.tsv``: columns ``utt_id path speaker source licence split seconds text pinyin``;
-- a Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``), Chinese text;
+- a Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``), Chinese text; one called ``dev`` or
+  ``test`` is that split;
 - AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
 
 Bad rows are reported by row, skipped and counted, never fatal: a corpus of a thousand hours has
@@ -13,6 +14,7 @@ always some.
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,6 +30,7 @@ _FREE_LICENCE = re.compile(
 )
 _CLOSED_LICENCE = re.compile(r"\bnc\b|\bnd\b|non-?commercial|no-?deriv", re.I)
 _SHORTEST_UNIT_S = 0.03
+_KALDI_SPLITS = ("train", "dev", "test")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +64,12 @@ def may_ship(licence: str) -> bool:
     return bool(_FREE_LICENCE.search(licence)) and not _CLOSED_LICENCE.search(licence)
 
 
-def read_corpus(folder: Path, errors: RowErrors) -> list[Utterance]:
+def is_synthetic(licence: str) -> bool:
+    """Whether rows under this licence are synthetic speech."""
+    return "synthetic" in licence.lower()
+
+
+def read_corpus(folder: Path, errors: RowErrors, *, split: str | None = None) -> list[Utterance]:
     """Read a corpus folder in any of the three layouts.
 
     Parameters
@@ -70,11 +78,13 @@ def read_corpus(folder: Path, errors: RowErrors) -> list[Utterance]:
         The corpus, or its manifest.
     errors
         Receives a message for every row that cannot be used.
+    split
+        Read only the rows of this split; None reads all.
 
     Raises
     ------
     UserError
-        If the folder holds none of the layouts.
+        If the folder holds none of the layouts, or a list is missing or no UTF-8 text.
     """
     if folder.suffix == ".tsv" and folder.is_file():
         rows = _manifest_rows(folder)
@@ -89,12 +99,18 @@ def read_corpus(folder: Path, errors: RowErrors) -> list[Utterance]:
             f"{folder} holds no corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
             "text, or with AISHELL's wav and transcript folders"
         )
-    utterances = []
-    for place, row in rows:
-        utterance = _utterance(place, row, errors)
-        if utterance:
-            utterances.append(utterance)
-    return utterances
+    try:
+        chosen = [(place, row) for place, row in rows if split in (None, _split_of(row))]
+    except UnicodeDecodeError as error:
+        raise UserError(f"{folder}: its list is not UTF-8 text ({error}); convert it") from error
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    utterances = [_utterance(place, row, errors) for place, row in chosen]
+    return [utterance for utterance in utterances if utterance]
+
+
+def _split_of(row: dict[str, str]) -> str:
+    return row.get("split") or "train"
 
 
 def _utterance(place: str, row: dict[str, str], errors: RowErrors) -> Utterance | None:
@@ -113,7 +129,7 @@ def _utterance(place: str, row: dict[str, str], errors: RowErrors) -> Utterance 
     if not units:
         errors.add(place, "no text")
         return None
-    if len(units) * _SHORTEST_UNIT_S > seconds:
+    if not len(units) * _SHORTEST_UNIT_S <= seconds < math.inf:
         errors.add(place, f"{len(units)} units cannot be said in {seconds:.2f} s")
         return None
     return Utterance(
@@ -122,7 +138,7 @@ def _utterance(place: str, row: dict[str, str], errors: RowErrors) -> Utterance 
         speaker=row.get("speaker") or row["utt_id"],
         source=row.get("source", ""),
         licence=row.get("licence", ""),
-        split=row.get("split") or "train",
+        split=_split_of(row),
         seconds=seconds,
         units=units,
         syllables=tuple(len(syllable) for syllable in syllables),
@@ -140,7 +156,7 @@ def _duration_s(path: Path) -> float:
 
 def _manifest_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     needed = {"utt_id", "path", "pinyin"}
-    with path.open(encoding="utf-8", newline="") as lines:
+    with path.open(encoding="utf-8-sig", newline="") as lines:
         reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
         missing = needed - set(reader.fieldnames or ())
         if missing:
@@ -152,6 +168,9 @@ def _manifest_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    if (folder / "segments").is_file():
+        raise UserError(f"{folder} cuts its recordings with 'segments'; write the pieces as files")
+    split = folder.name if folder.name in _KALDI_SPLITS else "train"
     speakers = dict(_pairs(folder / "utt2spk")) if (folder / "utt2spk").is_file() else {}
     texts = dict(_pairs(folder / "text"))
     for number, (utterance_id, where) in enumerate(_pairs(folder / "wav.scp"), start=1):
@@ -162,6 +181,7 @@ def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
                 "utt_id": utterance_id,
                 "path": str(path),
                 "speaker": speakers.get(utterance_id, ""),
+                "split": split,
                 "text": texts.get(utterance_id, ""),
             },
         )
@@ -180,7 +200,10 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
                     "speaker": path.parent.name,
                     "source": "AISHELL-1",
                     "licence": "Apache-2.0",
-                    "split": path.relative_to(folder / "wav").parts[0],
+                    # no file tells the split of one that is missing; it shall be reported once
+                    "split": path.relative_to(folder / "wav").parts[0]
+                    if utterance_id in audio
+                    else "train",
                     "text": text,
                 },
             )

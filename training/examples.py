@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from shared.errors import UserError
 from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
-from training.corpus import RowErrors, Utterance, may_ship, read_corpus
+from training.corpus import RowErrors, Utterance, is_synthetic, may_ship, read_corpus
 from training.feature_cache import log_mel_of
 
 _EVEN_MINUTES = 30.0
 _LEAST_WEIGHT, _MOST_WEIGHT = 0.3, 3.0
+WORD_UNITS = 8  # a recording of at most so many units is a word, not connected speech
 _MARGIN_FRAMES = 25  # of silence left at both ends
 
 
@@ -38,6 +39,7 @@ class Example:
     licence: str = ""
     speaker: str = ""
     augmentation: Augmentation | None = None
+    voices: tuple[NDArray[np.float16], ...] = ()  # the same in other voices, (frames, 41) each
 
 
 def load_examples(
@@ -47,6 +49,8 @@ def load_examples(
     split: str = "train",
     shipping: bool = True,
     synthetic_weight: float = SYNTHETIC_WEIGHT,
+    num_voices: int = 0,
+    voice_seed: int = 0,
 ) -> list[Example]:
     """Read corpora, compute or fetch their log-mel features, and weigh the utterances.
 
@@ -62,6 +66,8 @@ def load_examples(
         Leave out rows whose licence forbids giving the model away.
     synthetic_weight
         Weight of rows whose licence says they are synthetic.
+    num_voices, voice_seed
+        Other voices for each real sentence, see :mod:`training.voice_change`.
 
     Raises
     ------
@@ -71,7 +77,7 @@ def load_examples(
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
     for corpus in corpora:
-        rows = [row for row in read_corpus(corpus, errors) if row.split == split]
+        rows = read_corpus(corpus, errors, split=split)
         if shipping:
             closed = [row for row in rows if not may_ship(row.licence)]
             for row in closed:
@@ -79,6 +85,7 @@ def load_examples(
             rows = [row for row in rows if may_ship(row.licence)]
         utterances += rows
         log_mels += log_mel_of(rows, errors)
+    voices = _voices_of(utterances, num_voices, voice_seed)
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60
@@ -86,13 +93,14 @@ def load_examples(
     for utterance, log_mel in zip(utterances, log_mels, strict=True):
         if log_mel is None:
             continue
-        trimmed = trim_silence(log_mel)
+        span = speech_span(log_mel)
+        trimmed = np.asarray(log_mel[span])
         if len(trimmed) < 3 * len(utterance.units):
             errors.add(utterance.utterance_id, "its text is longer than its sound")
             continue
         weight = np.sqrt(_EVEN_MINUTES / minutes[utterance.speaker])
         weight = float(np.clip(weight, _LEAST_WEIGHT, _MOST_WEIGHT))
-        if "synthetic" in utterance.licence.lower():
+        if is_synthetic(utterance.licence):
             weight *= synthetic_weight
         examples.append(
             Example(
@@ -102,6 +110,7 @@ def load_examples(
                 weight=weight,
                 licence=utterance.licence,
                 speaker=utterance.speaker,
+                voices=tuple(np.asarray(v[span]) for v in voices.get(utterance.utterance_id, ())),
             )
         )
     if not examples:
@@ -112,10 +121,28 @@ def load_examples(
     return examples
 
 
-def trim_silence(log_mel: NDArray[np.float16]) -> NDArray[np.float16]:
-    """Cut long silence from both ends, leaving a quarter of a second; shape (frames, 41)."""
+def _voices_of(
+    utterances: Sequence[Utterance], num_voices: int, seed: int
+) -> dict[str, list[NDArray[np.float16]]]:
+    """Other voices of the real sentences, by utterance."""
+    sentences = [
+        utterance
+        for utterance in utterances
+        if len(utterance.units) > WORD_UNITS and not is_synthetic(utterance.licence)
+    ]
+    if not (num_voices and sentences):
+        return {}
+    from training.voice_change import changed_voices  # noqa: PLC0415 (needs an extra of its own)
+
+    voices = changed_voices(sentences, num_voices=num_voices, seed=seed)
+    return {
+        utterance.utterance_id: blocks for utterance, blocks in zip(sentences, voices, strict=True)
+    }
+
+
+def speech_span(log_mel: NDArray[np.float16]) -> slice:
+    """Frames without the long silence at both ends, of which a quarter of a second is left."""
     log_energy = np.asarray(log_mel[:, 0], dtype=np.float32)
     low, high = np.percentile(log_energy, [5, 95])
     loud = np.flatnonzero(log_energy >= low + 0.3 * (high - low))
-    first, end = max(0, loud[0] - _MARGIN_FRAMES), loud[-1] + 1 + _MARGIN_FRAMES
-    return np.asarray(log_mel[first:end])
+    return slice(max(0, int(loud[0]) - _MARGIN_FRAMES), int(loud[-1]) + 1 + _MARGIN_FRAMES)

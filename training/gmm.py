@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import Topology
 from services.recognizer.features import (
-    HOP_S,
     NUM_FEATURES,
     LiveMean,
     cepstra_of_all,
@@ -37,11 +36,13 @@ from services.recognizer.features import (
 )
 from services.recognizer.gmm import GaussianMixtures, mixture_scores
 from shared.phones import SILENCE, UNIT_INDEX, UNITS
+from training.durations import AlignedUnit, UnitDurations
 from training.examples import Example
 
 SIL = UNIT_INDEX[SILENCE]
 _VARIANCE_FLOOR = 0.05  # of the variance of all speech
 _LEAST_FRAMES = 8.0  # a component must stand for this many frames, else it is dropped
+_BLOCK_FRAMES = 4096
 _LEAST_STAY, _MOST_STAY = 0.05, 0.99
 
 
@@ -69,15 +70,6 @@ class Graph:
     unit_of: NDArray[np.int64]  # (positions,) running number of the unit, pauses included
     units: NDArray[np.int64]  # (running numbers,) the units
     num_last: int  # positions from the end where an utterance may end: 1, or after the last unit
-
-
-@dataclass(frozen=True, slots=True)
-class AlignedUnit:
-    """A unit with its first frame and the frame after its last."""
-
-    unit: int
-    start: int
-    end: int
 
 
 def utterance_graph(
@@ -314,30 +306,35 @@ def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> Hmm:
     return estimate(frames, hmm)
 
 
-def estimate(frames: FrameSet, hmm: Hmm) -> Hmm:
-    """One step of expectation-maximisation along the current path (HTK book, eq. 8.6-8.13)."""
-    floor = (_VARIANCE_FLOOR * frames.features.var(axis=0)).astype(np.float32)
+def _variance_floor(frames: FrameSet) -> NDArray[np.float32]:
+    """Least variance of a component, shape (39,)."""
+    floor: NDArray[np.float32] = _VARIANCE_FLOOR * frames.features.var(axis=0)
+    return floor
+
+
+def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
+    """Expectation-maximisation along the current path (HTK book, eq. 8.6-8.13)."""
+    floor = _variance_floor(frames)
     mixtures = hmm.mixtures
-    matrix = mixtures.score_matrix().reshape(2 * NUM_FEATURES + 1, hmm.num_states, -1)
     weights, means, covars = mixtures.weights.copy(), mixtures.means.copy(), mixtures.covars.copy()
+    # With the path fixed, states do not depend on each other: each has all its iterations in turn.
     for state, numbers in enumerate(frames.by_state(hmm.num_states)):
         if len(numbers) < _LEAST_FRAMES:
             continue
         x = frames.features[numbers]
         design = np.concatenate([x * x, x, np.ones((len(x), 1), np.float32)], axis=1)
-        log_joint = design @ matrix[:, state]
-        log_joint -= log_joint.max(axis=1, keepdims=True)
-        gamma = np.exp(log_joint)
-        gamma *= (frames.weights[numbers] / gamma.sum(axis=1))[:, None]
-        sums = gamma.T.astype(np.float64) @ design
-        counts = sums[:, -1]
-        kept = counts > 0
-        safe = np.maximum(counts, 1e-9)[:, None]
-        mean = sums[:, NUM_FEATURES:-1] / safe
-        covar = np.maximum(sums[:, :NUM_FEATURES] / safe - mean**2, floor)
-        means[state, kept] = mean[kept]
-        covars[state, kept] = covar[kept]
-        weights[state] = counts / counts.sum()
+        one = slice(state, state + 1)
+        for _ in range(num_iterations):
+            now = GaussianMixtures(weights=weights[one], means=means[one], covars=covars[one])
+            sums = _component_sums(design, now.score_matrix(), frames.weights[numbers])
+            counts = sums[:, -1]
+            kept = counts > 0
+            safe = np.maximum(counts, 1e-9)[:, None]
+            mean = sums[:, NUM_FEATURES:-1] / safe
+            covar = np.maximum(sums[:, :NUM_FEATURES] / safe - mean**2, floor)
+            means[state, kept] = mean[kept]
+            covars[state, kept] = covar[kept]
+            weights[state] = counts / counts.sum()
     log_stay, log_leave = _transitions(frames, hmm)
     return replace(
         hmm,
@@ -345,6 +342,21 @@ def estimate(frames: FrameSet, hmm: Hmm) -> Hmm:
         log_leave=log_leave,
         mixtures=GaussianMixtures(weights=weights, means=means, covars=covars),
     )
+
+
+def _component_sums(
+    design: NDArray[np.float32], matrix: NDArray[np.float32], weights: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Sum [x^2, x, 1] over a state's frames, shared out to its components, (mixtures, 79)."""
+    sums = np.zeros((matrix.shape[1], design.shape[1]))
+    for start in range(0, len(design), _BLOCK_FRAMES):  # so that single precision is enough
+        block = design[start : start + _BLOCK_FRAMES]
+        gamma = block @ matrix
+        gamma -= gamma.max(axis=1, keepdims=True)
+        np.exp(gamma, out=gamma)
+        gamma *= (weights[start : start + _BLOCK_FRAMES] / gamma.sum(axis=1))[:, None]
+        sums += gamma.T @ block
+    return sums
 
 
 def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -403,20 +415,19 @@ def _drop_light(weights: NDArray[np.float32], count: float) -> None:
 
 def topology_of(hmm: Hmm, log_bigram: NDArray[np.float32], frames: FrameSet) -> Topology:
     """Make the search part of the model, with unit durations measured on the alignment."""
-    lengths: list[list[int]] = [[] for _ in UNITS]
-    for graph, path in zip(frames.graphs, frames.paths, strict=True):
+    durations = UnitDurations()
+    for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
         if len(path):
-            for aligned in units_of_path(path, graph):
-                lengths[aligned.unit].append(aligned.end - aligned.start)
-    mean = [float(np.mean(n)) * HOP_S if n else 0.1 for n in lengths]
-    spread = [float(np.std(n)) * HOP_S if n else 0.05 for n in lengths]
+            weight = float(frames.weights[frames.bounds[number]])
+            durations.add(units_of_path(path, graph), weight)
+    mean_s, spread_s = durations.mean_and_spread_s()
     return Topology(
         first_state=hmm.first_state,
         log_stay=hmm.log_stay,
         log_leave=hmm.log_leave,
         log_bigram=log_bigram,
-        duration_mean_s=np.array(mean, np.float32),
-        duration_spread_s=np.array(spread, np.float32),
+        duration_mean_s=mean_s,
+        duration_spread_s=spread_s,
     )
 
 
@@ -459,6 +470,8 @@ def decorrelate(
     """
     scatter, counts = _component_covariances(frames, hmm)
     num = NUM_FEATURES
+    if not counts.any():  # too little speech to tell
+        return hmm, np.eye(num, dtype=np.float32)
     flat = scatter.reshape(-1, num * num)
     transform = np.eye(num)  # rows a_i
     for _ in range(num_iterations):
@@ -471,7 +484,7 @@ def decorrelate(
             transform[row] = direction * np.sqrt(counts.sum() / (cofactor @ direction))
     rotation = transform.T.astype(np.float32)
     frames.features = frames.features @ rotation
-    floor = _VARIANCE_FLOOR * frames.features.var(axis=0)
+    floor = _variance_floor(frames)
     covars = np.einsum("ij,gjk,ik->gi", transform, scatter, transform, optimize=True)
     shape = hmm.mixtures.covars.shape
     mixtures = GaussianMixtures(

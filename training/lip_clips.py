@@ -132,10 +132,17 @@ def read_clips(folder: Path, *, any_licence: bool = False) -> list[LipClip]:
             licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
             with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
                 rows = list(csv.DictReader(file))
+            if not rows or None in rows[0]:
+                raise ValueError("its table has no rows, or rows longer than its head")
             values = {
                 name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]
             }
+            if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
+                raise ValueError("its times do not rise")
             is_rig = "mouth_stretch_c" in values
+            faps = _rig_faps(values) if is_rig else _tracked_faps(values)
+            if np.isnan(faps).all():
+                raise ValueError("it measures no FAP of the mouth")
             part = part_of(path.stem, may_train=any_licence or may_ship(licence))
             clips.append(
                 LipClip(
@@ -145,12 +152,14 @@ def read_clips(folder: Path, *, any_licence: bool = False) -> list[LipClip]:
                     part="held" if {path.stem, speaker} & left_out else part,
                     transcript=about.get("transcript") or "",
                     time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
-                    faps=_rig_faps(values) if is_rig else _tracked_faps(values),
+                    faps=faps,
                     samples=read_audio(path.with_suffix(".flac")),
                 )
             )
-        except (OSError, ValueError, KeyError, IndexError) as error:
-            raise UserError(f"cannot read the clip {path.stem}: {error!r}; remove it") from error
+        except KeyError as error:
+            raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
+        except (OSError, ValueError, AttributeError, csv.Error) as error:
+            raise UserError(f"cannot read the clip {path.stem}: {error}") from error
     if not clips:
         raise UserError(f"no Mandarin clips in {folder}; give a folder of .flac, .csv and .json")
     return clips
@@ -176,6 +185,8 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
             for name, values in tracks.items()
             if name.startswith(shape) and len(name) - len(shape) <= 3
         ]
+        if not sides:
+            raise KeyError(shape)
         weight = np.mean(np.stack(sides), axis=0)
         faps[:, columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
     faps[:, columns(_DEPTH_FAPS)] *= _DEPTH_SCALE

@@ -1,8 +1,7 @@
-"""From corpora to a model file with its card: the Gaussian mixture and the neural recognizer."""
+"""From corpora to a model file with its card: the Gaussian mixture recognizer."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -13,20 +12,17 @@ from numpy.typing import NDArray
 
 from evaluation.recognizer import ErrorCounts, count_errors
 from services.recognizer.acoustic_model import AcousticModel, Topology
-from services.recognizer.combined import save_combined
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import NUM_FEATURES, cepstra_of_all
 from services.recognizer.gmm import GmmModel
-from services.recognizer.load import load_model
 from shared.errors import UserError
 from shared.phones import SILENCE, UNITS
 from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
-from training.corpus import RowErrors
+from training.corpus import RowErrors, is_synthetic
 from training.examples import Example, load_examples
 from training.gmm import (
     FrameSet,
-    Hmm,
     decorrelate,
     estimate,
     first_estimate,
@@ -34,15 +30,18 @@ from training.gmm import (
     topology_of,
     unit_bigram,
 )
-from training.neural import train_network
 
 Report = Callable[[str], None]
 
 _STATES_PER_UNIT = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # of the differences: the textbook's
+_FLAT_STEP = 4  # one recording in so many makes the first alignment
 _ROTATED_AT = 8  # mixtures per state when the features are decorrelated
+_SENTENCE_SYLLABLES = 4  # real recordings of so many count as connected speech
+_SENTENCE_COPIES = 3
+_WORD_WEIGHT = 0.3  # of isolated words and syllables
+_SELDOM = 0.5  # recordings of less weight are thinned out
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the log scores of a model alone
-_SHARES = (0.25, 0.4, 0.55, 0.7, 1.0)  # of models together, on top of each one's own scale
 _UNIT_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)
 
 
@@ -55,7 +54,7 @@ class Choice:
     error_rate: float
 
 
-_UNCHOSEN = Choice((0.2,), -1.0, 1.0)
+UNCHOSEN = Choice((0.2,), -1.0, 1.0)
 
 
 def train_gmm(
@@ -63,7 +62,7 @@ def train_gmm(
     output: Path,
     *,
     seed: int = 0,
-    num_mixtures: int = 16,
+    num_mixtures: int = 32,
     synthetic_weight: float = SYNTHETIC_WEIGHT,
     shipping: bool = True,
     report: Report = print,
@@ -101,22 +100,24 @@ def train_gmm(
     first_state = np.arange(len(UNITS) + 1) * _STATES_PER_UNIT
     prior_mean = _mean_cepstra(heard)
     report(f"{len(heard)} recordings, {len(examples)} with their changed copies")
+    some = FrameSet.build(examples[::_FLAT_STEP], first_state, prior_mean, _HALF_WIDTH)
+    hmm = first_estimate(some, first_state)
+    for _ in range(4):
+        report(f"flat start: log likelihood {some.realign(hmm):.3f} per frame")
+        hmm = estimate(some, hmm)
     frames = FrameSet.build(examples, first_state, prior_mean, _HALF_WIDTH)
     rotation = np.eye(NUM_FEATURES, dtype=np.float32)
-    hmm = first_estimate(frames, first_state)
-    for _ in range(4):
-        report(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
-        hmm = estimate(frames, hmm)
+    report(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
+    hmm = estimate(frames, hmm, 3)
     size = 1
     while size < num_mixtures:
         size *= 2
-        hmm = _repeated(frames, split(hmm, frames, size), 6)
+        hmm = estimate(frames, split(hmm, frames, size), 5)
         if size == min(_ROTATED_AT, num_mixtures):
             hmm, rotation = decorrelate(frames, hmm)
-            hmm = _repeated(frames, hmm, 4)
-        if size > 2:
+            hmm = estimate(frames, hmm, 3)
             report(f"{size} mixtures: log likelihood {frames.realign(hmm):.3f} per frame")
-            hmm = _repeated(frames, hmm, 4)
+            hmm = estimate(frames, hmm, 3)
     log_bigram = unit_bigram([example.units for example in heard])
     model = GmmModel(
         topology=topology_of(hmm, log_bigram, frames),
@@ -125,10 +126,10 @@ def train_gmm(
         prior_mean=prior_mean,
         half_width=_HALF_WIDTH,
     )
-    choice = choose_search([model], corpora, shipping=shipping, report=report) or _UNCHOSEN
+    choice = choose_search([model], corpora, shipping=shipping, report=report) or UNCHOSEN
     topology = with_penalty(model.topology, choice.unit_penalty)
     replace(model, topology=topology, kappa=choice.scales[0]).save(output)
-    _write_card(
+    write_card(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
         f"{len(UNITS)} x {_STATES_PER_UNIT} states",
@@ -137,113 +138,7 @@ def train_gmm(
         errors=errors,
         choice=choice,
     )
-    _report_rows(errors, report)
-
-
-def train_neural(
-    corpora: Sequence[Path],
-    output: Path,
-    *,
-    aligner: Path,
-    seed: int = 0,
-    num_epochs: int = 8,
-    synthetic_weight: float = SYNTHETIC_WEIGHT,
-    shipping: bool = True,
-    report: Report = print,
-) -> None:
-    """Train the neural recognizer on frames that a Gaussian mixture model aligns.
-
-    Parameters
-    ----------
-    corpora, output, synthetic_weight, shipping, report
-        As for :func:`train_gmm`.
-    aligner
-        A model that :func:`train_gmm` wrote.
-    seed
-        Of weights, order and augmentation.
-    num_epochs
-        Passes over the data.
-
-    Raises
-    ------
-    UserError
-        If there is nothing to train on, or the aligner is no Gaussian mixture model.
-    """
-    gmm = load_model(aligner)
-    if not isinstance(gmm, GmmModel):
-        raise UserError(f"{aligner} is no Gaussian mixture model; give one that train-gmm wrote")
-    errors = RowErrors()
-    examples = load_examples(corpora, errors, shipping=shipping, synthetic_weight=synthetic_weight)
-    hmm = Hmm(
-        first_state=gmm.topology.first_state,
-        log_stay=gmm.topology.log_stay,
-        log_leave=gmm.topology.log_leave,
-        mixtures=gmm.mixtures,
-    )
-    frames = FrameSet.build(examples, hmm.first_state, gmm.prior_mean, gmm.half_width)
-    frames.features = frames.features @ gmm.rotation
-    report(f"{len(examples)} recordings, log likelihood {frames.realign(hmm):.3f} per frame")
-    states = [frames.states[a:b] for a, b in zip(frames.bounds, frames.bounds[1:], strict=False)]
-    aligned = [number for number, path in enumerate(states) if path[0] >= 0]
-    log_bigram = unit_bigram([example.units for example in examples])
-    model = train_network(
-        [examples[number] for number in aligned],
-        [states[number] for number in aligned],
-        topology_of(hmm, log_bigram, frames),
-        num_epochs=num_epochs,
-        seed=seed,
-        report=report,
-    )
-    choice = choose_search([model], corpora, shipping=shipping, report=report) or _UNCHOSEN
-    topology = with_penalty(model.topology, choice.unit_penalty)
-    replace(model, topology=topology, kappa=choice.scales[0]).save(output)
-    widths = " x ".join(str(layer.shape[1]) for layer in model.weights)
-    _write_card(
-        output,
-        title=f"Neural recognizer, layers {widths}",
-        details=f"seed {seed}, {num_epochs} epochs, synthetic weight {synthetic_weight:.2f}, "
-        f"aligned by `{aligner.name}`",
-        examples=examples,
-        errors=errors,
-        choice=choice,
-    )
-    _report_rows(errors, report)
-
-
-def combine(
-    parts: Sequence[Path],
-    output: Path,
-    corpora: Sequence[Path],
-    *,
-    shipping: bool = True,
-    report: Report = print,
-) -> None:
-    """Let two models listen together: choose their weights on ``dev`` and write the model.
-
-    Parameters
-    ----------
-    parts
-        Model files in the folder of ``output``.
-    output
-        The ``.npz`` file to write; it names the parts.
-    corpora, shipping, report
-        As for :func:`train_gmm`.
-
-    Raises
-    ------
-    UserError
-        If a part cannot be read or lies in another folder, or there is no split ``dev``.
-    """
-    models = []
-    for part in parts:
-        if part.parent.resolve() != output.parent.resolve():
-            raise UserError(f"{part} is not in the folder of {output}; copy it there")
-        models.append(load_model(part))
-    choice = choose_search(models, corpora, scales=_SHARES, shipping=shipping, report=report)
-    if choice is None:
-        raise UserError("the weights are chosen on recordings of split 'dev'; add some")
-    topology = with_penalty(models[0].topology, choice.unit_penalty)
-    save_combined(output, topology, [part.name for part in parts], choice.scales)
+    report_rows(errors, report)
 
 
 def choose_search(
@@ -312,13 +207,23 @@ def _all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
 
 
 def _copies(example: Example, rng: np.random.Generator) -> list[Example]:
-    """Give a rare speaker's recording changed copies that share its weight."""
-    num_copies = max(1, math.ceil(2 * example.weight))
+    """Give real sentences changed copies, each in full; words and syllables said alone count less.
+
+    Half of the recordings that come once are changed. What counts little comes seldom instead.
+    """
+    num_copies, weight = 1, example.weight
+    if not is_synthetic(example.licence):
+        if len(example.syllables) >= _SENTENCE_SYLLABLES:
+            num_copies = _SENTENCE_COPIES
+        else:
+            weight *= _WORD_WEIGHT
+    if weight < _SELDOM:
+        num_copies = int(rng.random() < weight / _SELDOM)
+        weight = _SELDOM
     copies = []
     for number in range(num_copies):
         changed = number > 0 or rng.random() < 0.5
         augmentation = Augmentation.draw(rng) if changed else None
-        weight = example.weight / num_copies
         copies.append(replace(example, weight=weight, augmentation=augmentation))
     return copies
 
@@ -333,20 +238,15 @@ def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
     return mean
 
 
-def _repeated(frames: FrameSet, hmm: Hmm, times: int) -> Hmm:
-    for _ in range(times):
-        hmm = estimate(frames, hmm)
-    return hmm
-
-
-def _report_rows(errors: RowErrors, report: Report) -> None:
-    for message in errors.messages[:20]:
+def report_rows(errors: RowErrors, report: Report) -> None:
+    """Say which rows were skipped."""
+    for message in errors.messages:
         report(message)
     if errors.messages:
         report(f"{len(errors.messages)} rows skipped")
 
 
-def _write_card(
+def write_card(
     output: Path,
     *,
     title: str,
@@ -375,7 +275,7 @@ def _write_card(
         "",
         f"{len(errors.messages)} rows were skipped.",
     ]
-    if choice is not _UNCHOSEN:
+    if choice is not UNCHOSEN:
         lines += [
             "",
             f"Chosen on dev: scale of the log scores {choice.scales[0]}, unit penalty "

@@ -36,7 +36,7 @@ from services.recognizer.load import load_model
 from services.synthesizer.blending import blend, softmax
 from services.synthesizer.dominance import log_left_silence, log_pause, log_right_silence
 from services.synthesizer.parameters import NUM_MOUTH_FAPS, VisemeParameters, save_parameters
-from services.synthesizer.timeline import build_timeline
+from services.synthesizer.timeline import Timeline, build_timeline
 from services.synthesizer.visemes import (
     CLOSURE_FAPS,
     LIP_HEIGHT_FAPS,
@@ -60,6 +60,7 @@ from training.viseme_start import INITIALS, columns, starting_parameters
 Array = NDArray[np.float64]
 
 _NEAR = 8  # visemes around a frame that can weigh anything
+_FAR_S = 60.0  # where a viseme weighs nothing
 _RIDGE = 10.0  # frames' worth of belief in the start: neighbouring frames tell the same
 _SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.04, "target": 1.0}
 # how far from the start, in spreads
@@ -91,10 +92,18 @@ class Frames:
 
 
 def frames_of(clips: Sequence[LipClip], labels: Sequence[list[Phone]]) -> Frames:
-    """Find what is near each frame; the rest of the model has no weight there."""
+    """Find what is near each frame; the rest of the model has no weight there.
+
+    Raises
+    ------
+    UserError
+        In no clip anything is said.
+    """
     parts = []
     for clip, phones in zip(clips, labels, strict=True):
-        timeline = build_timeline(phones)
+        timeline = _filled_up(build_timeline(phones))
+        if not len(timeline.silence_start_s):
+            continue
         time = clip.time_s[:, None]
 
         def nearest(starts: Array, ends: Array, count: int, time: Array = time) -> NDArray[np.intp]:
@@ -113,7 +122,23 @@ def frames_of(clips: Sequence[LipClip], labels: Sequence[list[Phone]]) -> Frames
                 clip.faps,
             )
         )
+    if not parts:
+        raise UserError("no speech was heard in the clips for training; give clips with speech")
     return Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _filled_up(timeline: Timeline) -> Timeline:
+    """Add visemes far away, so that a frame of a short clip has ``_NEAR`` of them too."""
+    far_s = np.full(
+        max(_NEAR - len(timeline.viseme), 0), np.append(timeline.centre_end_s, 0.0).max()
+    )
+    far_s += _FAR_S
+    return replace(
+        timeline,
+        viseme=np.append(timeline.viseme, np.full(len(far_s), VISEME_INDEX[REST])),
+        centre_start_s=np.append(timeline.centre_start_s, far_s),
+        centre_end_s=np.append(timeline.centre_end_s, far_s),
+    )
 
 
 class _FapFit:
@@ -268,11 +293,13 @@ def estimate(frames: Frames) -> VisemeParameters:
         if not np.isnan(frames.faps[:, column]).all() and MOUTH_FAPS[column] not in MIRROR
     ]
 
+    telling = [column for column in columns((3, 5, 6)) if column in measured] or measured[:1]
+
     def first_stage_loss(c: float) -> float:
         start = starting_parameters(c)
         return sum(
             _FapFit(start, frames, column).descend(_FINAL_ROWS, with_silences=True)
-            for column in columns((3, 5, 6))
+            for column in telling
         )
 
     c = min(_EXPONENTS, key=first_stage_loss)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+# Where a unit stands between two pauses; the last one is lengthened. One alone counts as last.
+FIRST, INSIDE, LAST = range(3)
+NUM_POSITIONS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -20,8 +25,8 @@ class Topology:
     log_stay: NDArray[np.float32]  # (states,) log probability of a state's loop
     log_leave: NDArray[np.float32]  # (states,) log probability of going on
     log_bigram: NDArray[np.float32]  # (60, 60) score of unit (column) after unit (row)
-    duration_mean_s: NDArray[np.float32]  # (60,) of each unit in the corpus, seconds
-    duration_spread_s: NDArray[np.float32]  # (60,) standard deviation, seconds
+    duration_mean_s: NDArray[np.float32]  # (3, 60) of each unit by position, seconds
+    duration_spread_s: NDArray[np.float32]  # (3, 60) standard deviation, seconds
 
     @property
     def num_states(self) -> int:
@@ -44,6 +49,13 @@ class AcousticStream(Protocol):
         """Forget the segment and the speaker."""
 
 
+# A stream with log-mel frames for it, (n, 41), or with None at the end of a segment.
+Work: TypeAlias = tuple[AcousticStream, NDArray[np.float32] | None]
+# What hands out work, is sent the scores, and returns a result in the end.
+T = TypeVar("T")
+Listening: TypeAlias = Generator[Work, NDArray[np.float32], T]
+
+
 class AcousticModel(Protocol):
     """A trained model that any number of streams share."""
 
@@ -53,3 +65,43 @@ class AcousticModel(Protocol):
 
     def stream(self) -> AcousticStream:
         """Start a stream of scores for one speaker."""
+
+    def score(self, work: Sequence[Work]) -> list[NDArray[np.float32]]:
+        """Score the work of different streams together; the scores are those of each alone."""
+
+
+def listen(model: AcousticModel, listenings: Sequence[Listening[T]]) -> list[T]:
+    """Let sessions listen side by side, so that the model scores their frames together.
+
+    Parameters
+    ----------
+    model
+        The model of all their streams.
+    listenings
+        One for each session.
+
+    Returns
+    -------
+    list
+        What each of them returns.
+    """
+    results: dict[int, T] = {}
+    scores: list[NDArray[np.float32] | None] = [None] * len(listenings)
+    going = list(range(len(listenings)))
+    while going:
+        work: list[Work] = []
+        still = []
+        for number in going:
+            try:
+                given = scores[number]
+                work.append(
+                    next(listenings[number]) if given is None else listenings[number].send(given)
+                )
+            except StopIteration as end:
+                results[number] = end.value
+            else:
+                still.append(number)
+        going = still
+        for number, rows in zip(going, model.score(work) if work else [], strict=True):
+            scores[number] = rows
+    return [results[number] for number in range(len(listenings))]

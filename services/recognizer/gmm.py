@@ -21,6 +21,7 @@ written as a product of [x^2, x, 1] with a matrix made once. The rotation is Gal
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,7 +29,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic_model import Topology
+from services.recognizer.acoustic_model import Topology, Work
 from services.recognizer.features import (
     NUM_FEATURES,
     NUM_STATIC,
@@ -119,6 +120,13 @@ class GmmModel:
     def stream(self) -> GmmStream:
         """Start a stream of scores for one speaker."""
         return GmmStream(self)
+
+    def score(self, work: Sequence[Work]) -> list[NDArray[np.float32]]:
+        """Score the frames of several streams, each alone; None ends a stream's segment."""
+        return [
+            stream.finish() if log_mel is None else stream.accept(log_mel)
+            for stream, log_mel in work
+        ]
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""

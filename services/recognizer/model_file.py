@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic_model import Topology
+from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
 from shared.errors import UserError
 from shared.phones import UNITS
 
@@ -99,6 +99,6 @@ def topology_from(archive: Archive) -> Topology:
         log_stay=archive.floats("log_stay", num_states),
         log_leave=archive.floats("log_leave", num_states),
         log_bigram=archive.floats("log_bigram", num_units, num_units),
-        duration_mean_s=archive.floats("duration_mean_s", num_units),
-        duration_spread_s=archive.floats("duration_spread_s", num_units),
+        duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_units),
+        duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_units),
     )

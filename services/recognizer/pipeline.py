@@ -8,10 +8,11 @@ Time is media time: seconds from the session's first sample. Feature frame ``t``
 10 ms around the middle of its window. A chunk of any size gives the same result as any other
 cutting of the same sound: every step works on whole frames and whole detector blocks, in order.
 
-Least delay of a unit after its onset, with ``L`` the frames that the acoustic model looks ahead (4)
-and ``N`` the agreement: 25 ms window + L * 10 ms + (N - 1) * 10 ms, 65 ms for N = 1. The paper
-leaves out the differences' look-ahead: 45 ms for N = 3, in truth 85. At the beginning of speech the
-voice detector adds its own 32 to 64 ms; above 16 kHz the resampler adds about 10 ms.
+Least delay of a unit after its onset, with ``L`` the frames that the acoustic model looks ahead (1,
+unless another look-ahead is set) and ``N`` the agreement (3): 25 ms window + L * 10 ms +
+(N - 1) * 10 ms = 55 ms. The paper, whose differences look 40 ms ahead, leaves those out: 45 ms, in
+truth 85. At the beginning of speech the voice detector adds its own 32 to 64 ms; above 16 kHz the
+resampler adds about 10 ms.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.acoustic_model import FIRST, INSIDE, AcousticModel, Listening, listen
 from services.recognizer.decoder import Decoder, Segment, segments_after
 from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S, LogMel
 from services.recognizer.output_rule import OutputRule
@@ -32,7 +33,7 @@ from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
-DEFAULT_RULE = (3, 0.55)  # N as in the paper, and the confidence that each frame needs
+DEFAULT_RULE = (3, 0.75)  # N as in the paper, and the confidence that each frame needs
 _SIL = UNIT_INDEX[SILENCE]
 _WARM_UP_S = 6  # long enough that the search also forgets once, which is code of its own
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
@@ -91,19 +92,19 @@ class SpeechScores:
         """Feature frames whose scores, if they are speech, have been returned."""
         return max(0, self._num_frames - self._stream.look_ahead_frames)
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> list[ScoreEvent]:
+    def hear(self, samples: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
         """Take samples of shape (n,) or (n, channels); return what became known."""
-        return self._accept(self._resampler.accept_waveform(samples))
+        return (yield from self._hear(self._resampler.accept_waveform(samples)))
 
-    def finish(self) -> list[ScoreEvent]:
+    def finish(self) -> Listening[list[ScoreEvent]]:
         """End the stream: what is still owed."""
-        events = self._accept(self._resampler.finish())
-        return events + self.end_speech()
+        events = yield from self._hear(self._resampler.finish())
+        return events + (yield from self.end_speech())
 
-    def end_speech(self) -> list[ScoreEvent]:
+    def end_speech(self) -> Listening[list[ScoreEvent]]:
         """End the speech now, as if it had become quiet."""
         self._detector.quieten()
-        return self._end() if self._speaking else []
+        return (yield from self._end()) if self._speaking else []
 
     def reset(self) -> None:
         """Start a new session: new clock, new speaker."""
@@ -112,40 +113,40 @@ class SpeechScores:
         self._detector.reset()
         self._reset_frames()
 
-    def _accept(self, samples: NDArray[np.float32]) -> list[ScoreEvent]:
+    def _hear(self, samples: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
         events: list[ScoreEvent] = []
         while len(samples):  # cut where the detector's blocks end, whatever the chunks are
             piece = samples[: BLOCK_SAMPLES - len(self._block)]
             samples = samples[len(piece) :]
             self._block = np.concatenate([self._block, piece])
-            events += self._frames(self._log_mel.accept_waveform(piece))
+            events += yield from self._frames(self._log_mel.accept_waveform(piece))
             if len(self._block) == BLOCK_SAMPLES:
-                events += self._judge()
+                events += yield from self._judge()
                 self._block = self._block[:0]
         return events
 
-    def _frames(self, log_mel: NDArray[np.float32]) -> list[ScoreEvent]:
+    def _frames(self, log_mel: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
         self._num_frames += len(log_mel)
         if not self._speaking:
             self._recent.extend(log_mel)
             return []
-        return _if_any(self._stream.accept(log_mel))
+        return _if_any((yield self._stream, log_mel))
 
-    def _judge(self) -> list[ScoreEvent]:
+    def _judge(self) -> Listening[list[ScoreEvent]]:
         speech = self._detector.accept_block(self._block).is_speech
         if speech and not self._speaking:
             self._speaking = True
             begin = VoiceBegins(self._num_frames - len(self._recent))
             pre_roll = np.array(self._recent)
             self._recent.clear()
-            return [begin, *_if_any(self._stream.accept(pre_roll))]
+            return [begin, *_if_any((yield self._stream, pre_roll))]
         if self._speaking and not speech:
-            return self._end()
+            return (yield from self._end())
         return []
 
-    def _end(self) -> list[ScoreEvent]:
+    def _end(self) -> Listening[list[ScoreEvent]]:
         self._speaking = False
-        return [*_if_any(self._stream.finish()), VoiceEnds(self._num_frames)]
+        return [*_if_any((yield self._stream, None)), VoiceEnds(self._num_frames)]
 
 
 def _if_any(scores: NDArray[np.float32]) -> list[ScoreEvent]:
@@ -156,8 +157,10 @@ class Recognizer:
     """Recognises units live.
 
     A unit is put out with ``final`` false and the unit's mean duration as soon as the output rule
-    allows (Li 2011, eq. 4). When the next unit is put out or speech ends, the same ``index``
-    follows with ``final`` true, its onset and its measured duration.
+    allows (Li 2011, eq. 4). The mean is that of a unit after a pause or of one inside a phrase;
+    that a unit is the last before a pause, and longer, nobody can know yet. When the next unit is
+    put out or speech ends, the same ``index`` follows with ``final`` true, its onset and its
+    measured duration.
 
     The paper leaves what was put out as it is. Here the best string may correct it: a unit that the
     search has given up for another comes again under its ``index`` with the other unit, and units
@@ -199,6 +202,7 @@ class Recognizer:
         least_confidence: float = DEFAULT_RULE[1],
     ) -> None:
         self._durations_s = model.topology.duration_mean_s
+        self._model = model
         self._scores = SpeechScores(model, sample_rate_hz, num_channels)
         self._decoder = Decoder(model.topology)
         self._rule = OutputRule(agreement, least_confidence, last_output=_SIL)
@@ -228,15 +232,23 @@ class Recognizer:
         UserError
             If the samples have another shape or are no numbers.
         """
-        return self._follow(self._scores.accept_waveform(samples))
+        return listen(self._model, [self.hear(samples)])[0]
+
+    def hear(self, samples: NDArray[np.float32]) -> Listening[list[Phone | SpeechChange]]:
+        """Like :meth:`accept_waveform`, for :func:`listen` beside other sessions."""
+        return self._follow((yield from self._scores.hear(samples)))
 
     def input_finished(self) -> list[Phone | SpeechChange]:
         """No more sound will come: return all that is still owed."""
-        return self._follow(self._scores.finish())
+        return listen(self._model, [self.hear_end()])[0]
+
+    def hear_end(self) -> Listening[list[Phone | SpeechChange]]:
+        """Like :meth:`input_finished`, for :func:`listen` beside other sessions."""
+        return self._follow((yield from self._scores.finish()))
 
     def flush(self) -> list[Phone | SpeechChange]:
         """End the speech now (an interruption); the clock and the speaker's mean go on."""
-        return self._follow(self._scores.end_speech())
+        return self._follow(listen(self._model, [self._scores.end_speech()])[0])
 
     def reset(self) -> None:
         """Start a new session: the clock at 0, the speaker unknown."""
@@ -249,6 +261,7 @@ class Recognizer:
         self._done = 0  # frame of the decoder up to which units are final
         self._decoder.reset()
         self._rule.reset()
+        self._after_pause = True
         self._open: Phone | None = None  # put out, not yet final
 
     def _follow(self, events: list[ScoreEvent]) -> list[Phone | SpeechChange]:
@@ -273,11 +286,12 @@ class Recognizer:
         if not self._rule.accept(unit, confidence):
             return []
         settled = self._settle(self._decoder.path_since(self._done))
+        position = FIRST if self._after_pause else INSIDE
         self._open = Phone(
             index=self._take_index(),
             unit=UNITS[unit],
             onset_s=frame_time_s(self._start_frame + max(start, self._done)),
-            duration_s=float(self._durations_s[unit]),
+            duration_s=float(self._durations_s[position, unit]),
             confidence=confidence,
             final=False,
         )
@@ -288,6 +302,7 @@ class Recognizer:
         phones: list[Phone | SpeechChange] = []
         for segment in segments:
             self._done = segment.end
+            self._after_pause = segment.unit == _SIL
             if self._open is None and not phones and segment.unit == _SIL:
                 continue  # before the first unit nothing but silence was said
             onset_s = frame_time_s(self._start_frame + segment.start)
@@ -349,7 +364,7 @@ def recognize(
     phones: list[Phone] = []
     offset = 0
     sureness: list[float] = []
-    for event in [*scores.accept_waveform(samples), *scores.finish()]:
+    for event in listen(model, [scores.hear(samples)])[0] + listen(model, [scores.finish()])[0]:
         if isinstance(event, VoiceBegins):
             offset = event.frame
             decoder.reset()

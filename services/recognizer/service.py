@@ -10,11 +10,12 @@ from __future__ import annotations
 import dataclasses
 import secrets
 import time
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.acoustic_model import AcousticModel, Listening, listen
 from services.recognizer.load import load_model, model_path
 from services.recognizer.pcm import SLICE, BadAudio, level_db, pcm16_of, samples_of, slices
 from services.recognizer.pipeline import Recognizer, warm_up
@@ -45,6 +46,9 @@ GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, 
 LAST_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 BACKLOG_LIMIT_S = 5.0  # for so long; then the session's link is given up for the others' sake
+MOST_WAITING = 64  # chunks that are heard together; more wait for the next turn
+
+Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
 
 
 class _Stream:
@@ -58,6 +62,7 @@ class _Stream:
         self.heard_s = time.monotonic()
         self.finished = False
         self.speaking = False
+        self.num_gaps = 0  # not yet counted
         self.late_since_s: float | None = None  # since when the synthesizer owes too much
         self._origin_in: int | None = None  # media time of the first chunk without a gap since
         self._num_in = 0  # samples in the session's own rate since then
@@ -98,29 +103,41 @@ class _Stream:
         """Up to here the audio has been heard."""
         return self.origin + self.num_samples
 
-    def accept(self, pcm: bytes) -> list[Message]:
-        """Take a chunk in the session's encoding; return what is to be said about it."""
-        samples = samples_of(pcm, self.start.encoding, self.start.num_channels)
+    def hear_chunks(self, chunks: list[Chunk]) -> Listening[list[Message]]:
+        """Take chunks in order; return what is to be said about them."""
+        messages: list[Message] = []
+        for media_time, samples in chunks:
+            expected = self.media_time_in
+            if expected is None:
+                self.begin(media_time)
+            elif media_time > expected + GAP:
+                self.num_gaps += 1
+                messages += yield from self.hear_end()
+                self.begin(media_time)
+            messages += yield from self._hear(samples)
+        return messages
+
+    def _hear(self, samples: NDArray[np.float32]) -> Listening[list[Message]]:
         self._num_in += len(samples)
         mono = self._resampler.accept_waveform(samples)
         messages: list[Message] = [Sound(media_time=self.media_time, pcm=pcm16_of(mono))]
         for part in slices(mono, self.num_samples):
             self.num_samples += len(part)
             self._slice.append(part)
-            messages += self._as_messages(self._recognizer.accept_waveform(part))
+            messages += self._as_messages((yield from self._recognizer.hear(part)))
             if self.num_samples % SLICE == 0:
                 level = level_db(np.concatenate(self._slice))
                 messages.append(Progress(media_time=self.media_time, level_db=level))
                 self._slice.clear()
         return messages
 
-    def finish(self) -> list[Message]:
+    def hear_end(self) -> Listening[list[Message]]:
         """End the audio; return what is left to say."""
         mono = self._resampler.finish()
         sound = Sound(media_time=self.media_time, pcm=pcm16_of(mono))
         self.num_samples += len(mono)
-        results = [*self._recognizer.accept_waveform(mono), *self._recognizer.input_finished()]
-        said = self._as_messages(results)
+        results = yield from self._recognizer.hear(mono)
+        said = self._as_messages(results + (yield from self._recognizer.hear_end()))
         if self.speaking:
             self.speaking = False
             said.append(Speech(media_time=self.media_time, active=False))
@@ -158,6 +175,8 @@ class RecognizerService(Service):
         super().__init__(config)
         self._rule = (config.agreement, config.least_confidence)
         self._streams: dict[str, _Stream] = {}
+        self._waiting: dict[str, list[Chunk]] = {}  # to be heard, by session
+        self._num_waiting = 0
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(
             config.audio, "recognizer.audio", queue_length=AUDIO_QUEUE_LENGTH
@@ -167,13 +186,19 @@ class RecognizerService(Service):
             "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),
             "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
         }
-        self._model = load_model(model_path(config.acoustic))
+        self._model = load_model(model_path(config.acoustic), look_ahead_ms=config.look_ahead_ms)
         warm_up(self._model)
         self.listen(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_finish})
         self.listen(self._phones, {})
 
+    def step(self, timeout_s: float) -> None:
+        """Take in what has arrived, then hear what all sessions said, together."""
+        super().step(timeout_s)
+        self._hear_waiting()
+
     def start_session(self, start: StartSession) -> bool:
         """Make a stream, or after a crash of the synthesizer give the old one a new link."""
+        self._hear_waiting()
         stream = self._streams.get(start.session)
         if stream is None or stream.start.token != start.token:
             stream = _Stream(start, self._model, self._rule)
@@ -189,10 +214,12 @@ class RecognizerService(Service):
 
     def stop_session(self, session: str) -> None:
         """Forget a session."""
+        self._hear_waiting()
         self._streams.pop(session, None)
 
     def flush_session(self, session: str) -> None:
         """Forget what was being said; the next audio begins anew."""
+        self._hear_waiting()
         stream = self._streams.get(session)
         if stream is not None:
             media_time = stream.media_time_in
@@ -220,6 +247,7 @@ class RecognizerService(Service):
 
     def on_drain(self) -> bool:
         """Finish every utterance and wait until the synthesizer has it."""
+        self._hear_waiting()
         for stream in self._streams.values():
             self._finish(stream)
         return all(s.link is None or s.link.backlog == 0 for s in self._streams.values())
@@ -235,23 +263,35 @@ class RecognizerService(Service):
         stream = self._admit(chunk, sender)
         if stream is None:
             return
-        started_s = time.perf_counter()
-        expected = stream.media_time_in
-        if expected is None:
-            stream.begin(chunk.media_time)
-        elif chunk.media_time > expected + GAP:
-            self.metrics.count("audio_gaps")
-            self._say(stream, stream.finish())
-            stream.begin(chunk.media_time)
         try:
-            said = stream.accept(chunk.pcm)
+            samples = samples_of(chunk.pcm, stream.start.encoding, stream.start.num_channels)
         except BadAudio as error:
             self._refuse(chunk, sender, "bad-audio", str(error))
             return
-        self._say(stream, said)
+        self._waiting.setdefault(chunk.session, []).append((chunk.media_time, samples))
+        self._num_waiting += 1
+        if self._num_waiting == MOST_WAITING:
+            self._hear_waiting()
+
+    def _hear_waiting(self) -> None:
+        """Hear the chunks that wait; the network scores all sessions' frames in one go."""
+        if not self._waiting:
+            return
+        started_s = time.perf_counter()
+        streams = [self._streams[session] for session in self._waiting]
+        listenings = [
+            stream.hear_chunks(chunks)
+            for stream, chunks in zip(streams, self._waiting.values(), strict=True)
+        ]
+        self._waiting, self._num_waiting = {}, 0
+        for stream, said in zip(streams, listen(self._model, listenings), strict=True):
+            self._say(stream, said)
+            self.metrics.count("audio_gaps", stream.num_gaps)
+            stream.num_gaps = 0
         self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
 
     def _on_finish(self, end: EndOfAudio, sender: bytes) -> None:
+        self._hear_waiting()
         stream = self._admit(end, sender)
         if stream is not None:
             self._finish(stream)
@@ -292,7 +332,8 @@ class RecognizerService(Service):
     def _finish(self, stream: _Stream) -> None:
         if not stream.finished:
             stream.finished = True
-            self._say(stream, [*stream.finish(), EndOfPhones(media_time=stream.media_time)])
+            self._say(stream, listen(self._model, [stream.hear_end()])[0])
+            self._say(stream, [EndOfPhones(media_time=stream.media_time)])
             LOG.info("end of audio", extra={"session": stream.start.session})
 
     def _say(self, stream: _Stream, messages: list[Message]) -> None:

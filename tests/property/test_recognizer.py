@@ -41,6 +41,31 @@ def test_any_chunking_is_heard_the_same(cuts: list[int], rate_hz: int) -> None:
     assert hear(pieces(HELLO, cuts), rate_hz) == hear([HELLO], rate_hz)
 
 
+@settings(deadline=None, max_examples=15)
+@given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 40))
+def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: int) -> None:
+    model, rng = load_model(), np.random.default_rng(seed)
+    frames = LogMel().accept_waveform(HELLO)
+    parts = [frames[start : start + 40] for start in rng.integers(0, 150, num_sessions)]
+    streams = [model.stream() for _ in parts]
+    found: list[list[np.ndarray]] = [[] for _ in parts]
+    at = [0] * num_sessions
+    while min(at) < 40:
+        work, who = [], []
+        for number, part in enumerate(parts):
+            step = int(rng.integers(13)) if at[number] < 40 else 0
+            if step:
+                work.append((streams[number], part[at[number] : at[number] + step]))
+                who.append(number)
+                at[number] += step
+        for number, rows in zip(who, model.score(work), strict=True):
+            found[number].append(rows)
+    for part, stream, scores in zip(parts, streams, found, strict=True):
+        alone = model.stream()
+        whole = np.concatenate([alone.accept(part), alone.finish()])
+        np.testing.assert_array_equal(np.concatenate([*scores, stream.finish()]), whole)
+
+
 @settings(deadline=None, max_examples=30)
 @given(cuts=CUTS, rate_hz=st.integers(8_000, 48_000))
 def test_resampling_in_any_chunks(cuts: list[int], rate_hz: int) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from services.offline_commands import PhoneFormat, align
 from services.recognizer.load import load_model
 from shared.audio_file import read_audio
 from shared.errors import UserError
@@ -90,6 +91,23 @@ def test_textgrid_covers_the_whole_time() -> None:
 def test_nothing_said_is_one_empty_interval() -> None:
     assert 'text = ""' in format_phones([], "textgrid", 1.0)
     assert format_phones([], "csv", 1.0).count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "beginning"),
+    [
+        ("said.TextGrid", None, "File type"),
+        ("said.csv", None, "index,unit"),
+        ("said.json", None, "{"),
+        ("said.txt", None, "  onset_s"),
+        ("said.txt", PhoneFormat.CSV, "index,unit"),
+    ],
+)
+def test_the_suffix_tells_the_form(
+    name: str, form: PhoneFormat | None, beginning: str, tmp_path: Path
+) -> None:
+    align(DEMO / "vowels-male.wav", "啊喔鹅衣乌迂", form=form, output=tmp_path / name)
+    assert (tmp_path / name).read_text().startswith(beginning)
 
 
 def test_unknown_style() -> None:

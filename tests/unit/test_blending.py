@@ -197,6 +197,7 @@ def test_parameters_round_trip(tmp_path: Path) -> None:
         ("faps", [1, 2]),
         ("silence", {}),
         ("visemes", []),
+        ("learnt_from", None),
     ],
 )
 def test_bad_parameters_are_refused(tmp_path: Path, key: str, value: object) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic_model import Topology
+from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
 from services.recognizer.decoder import NUM_UNITS, Decoder, Segment, segments_after
 from shared.phones import UNIT_INDEX
 
@@ -23,8 +23,8 @@ def topology(states_per_unit: int, rng: np.random.Generator, bigram_scale: float
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
         log_bigram=(bigram_scale * rng.normal(size=(NUM_UNITS, NUM_UNITS))).astype(np.float32),
-        duration_mean_s=np.full(NUM_UNITS, 0.1, np.float32),
-        duration_spread_s=np.full(NUM_UNITS, 0.1, np.float32),
+        duration_mean_s=np.full((NUM_POSITIONS, NUM_UNITS), 0.1, np.float32),
+        duration_spread_s=np.full((NUM_POSITIONS, NUM_UNITS), 0.1, np.float32),
     )
 
 

@@ -123,6 +123,7 @@ def test_outer_lips_follow_the_inner_ones_where_the_file_has_only_those(tmp_path
         (["2.1 x 25 many"], "line 1: 'many' is not a count"),
         (["2.1 x fast 1"], "line 1: frame rate 'fast'"),
         (["2.1 x nan 1"], "line 1: frame rate"),
+        (["2.1 x 0.0001 1"], "line 1: frame rate '0.0001' is not within 1 to 1000"),
         (["2.1 x 25 -1"], "line 1: -1 frames"),
         (["2.1 x 25 1"], "ends after 0 of 1 frames"),
         (["2.1 x 25 2", mask(3), "0 1"], "line 3: the file ends after 1 of 2 frames"),

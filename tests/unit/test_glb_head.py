@@ -255,6 +255,15 @@ def sparse(document: dict[str, Any]) -> None:
     }
 
 
+def many_targets(document: dict[str, Any]) -> None:
+    document["accessors"][0]["count"] = 200_000
+    document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}] * 101
+
+
+def many_primitives(document: dict[str, Any]) -> None:
+    document["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}}] * 3000
+
+
 def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
     return lambda document: document["meshes"][0]["primitives"][0].update(values)
 
@@ -262,7 +271,13 @@ def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (change("accessors", 0, count=10**9), "an accessor of 1000000000 elements"),
+        (change("accessors", 0, count=10**9), "more than 300000 vertices"),
+        (change("accessors", 1, count=10**9), "an accessor of 1000000000 elements"),
+        (many_primitives, "more than 2000 meshes"),
+        (many_targets, "more than 20000000 displacements"),
+        (change("nodes", 0, translation=[1e300, 0, 0]), "not finite, or very large"),
+        (change("nodes", 0, translation=[float("nan"), 0, 0]), "no intact glTF description"),
+        (change("nodes", 0, rotation=[0, 0.7, 0, 0.7]), "do not lie side by side"),
         (change("accessors", 0, count=5), "larger than its buffer view"),
         (change("accessors", 0, count=-1), "an accessor of -1"),
         (change("accessors", 0, byteOffset=-4), "larger than its buffer view"),
@@ -304,8 +319,8 @@ def test_broken_descriptions(
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
         (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "no glTF description"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "no glTF description"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "no intact glTF description"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "no intact glTF description"),
     ],
 )
 def test_broken_bytes(tmp_path: Path, data: bytes, said: str) -> None:
@@ -326,6 +341,24 @@ def test_every_flipped_byte_is_read_or_refused(small: Path) -> None:
         except UserError:
             continue
         assert np.isfinite(head.vertices).all()
+
+
+@pytest.mark.parametrize(
+    ("texture", "said"),
+    [
+        (b"#EXTM3U\n/etc/hostname\n", "neither PNG, JPEG nor WebP"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), "damaged"),
+        (
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">IIB", 30_000, 30_000, 8),
+            "million pixels",
+        ),
+    ],
+)
+def test_textures_that_are_none(tmp_path: Path, own: Head, texture: bytes, said: str) -> None:
+    parts = meshes(own, SHAPES)
+    parts[0].texture = texture
+    with pytest.raises(UserError, match=said):
+        read_glb(write_glb(tmp_path / "my.glb", parts))
 
 
 def test_too_few_names_are_told_with_what_there_is(tmp_path: Path, own: Head) -> None:

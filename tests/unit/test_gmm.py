@@ -1,4 +1,3 @@
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -6,13 +5,11 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from services.recognizer.acoustic_model import AcousticModel, Topology
-from services.recognizer.combined import save_combined
+from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
 from services.recognizer.features import NUM_FEATURES, NUM_STATIC, LogMel
 from services.recognizer.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
 from services.recognizer.load import MODEL_PATH, load_model
 from services.recognizer.model_file import read_archive, write_archive
-from services.recognizer.neural import NUM_INPUTS, NeuralModel
 from shared.errors import UserError
 from shared.phones import UNITS
 
@@ -28,8 +25,8 @@ def random_topology(rng: np.random.Generator) -> Topology:
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
         log_bigram=rng.normal(size=(len(UNITS), len(UNITS))).astype(np.float32),
-        duration_mean_s=np.full(len(UNITS), 0.1, np.float32),
-        duration_spread_s=np.full(len(UNITS), 0.1, np.float32),
+        duration_mean_s=np.full((NUM_POSITIONS, len(UNITS)), 0.1, np.float32),
+        duration_spread_s=np.full((NUM_POSITIONS, len(UNITS)), 0.1, np.float32),
     )
 
 
@@ -51,24 +48,6 @@ def random_gmm(seed: int = 0) -> GmmModel:
         rotation=np.eye(NUM_FEATURES, dtype=np.float32),
         prior_mean=np.zeros(NUM_STATIC, np.float32),
         half_width=2,
-    )
-
-
-def random_neural(seed: int = 0) -> NeuralModel:
-    rng = np.random.default_rng(seed)
-    widths = (3 * NUM_INPUTS, 16, NUM_STATES)
-    return NeuralModel(
-        topology=random_topology(rng),
-        weights=tuple(
-            rng.normal(0, 0.25, (a, b)).astype(np.float16).astype(np.float32)
-            for a, b in pairwise(widths)
-        ),
-        biases=tuple(rng.normal(size=b).astype(np.float32) for b in widths[1:]),
-        log_prior=np.log(rng.dirichlet(np.ones(NUM_STATES))).astype(np.float32),
-        frame_offsets=np.array([-2, 0, 3]),
-        prior_mean=rng.normal(10, 1, NUM_INPUTS).astype(np.float32),
-        spread=np.full(NUM_INPUTS, 3.0, np.float32),
-        kappa=0.5,
     )
 
 
@@ -97,9 +76,8 @@ def test_a_component_of_weight_zero_does_not_count() -> None:
     np.testing.assert_allclose(both, mixture_scores(x, alone.score_matrix(), 1), rtol=1e-5)
 
 
-@pytest.mark.parametrize("make", [random_gmm, random_neural])
-def test_saved_and_loaded_scores_are_the_same(make: type, tmp_path: Path) -> None:
-    model = make()
+def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
+    model = random_gmm()
     model.save(tmp_path / "model.npz")
     loaded = load_model(tmp_path / "model.npz")
     noise = np.random.default_rng(0).normal(0, 0.1, 4000).astype(np.float32)
@@ -112,65 +90,15 @@ def test_saved_and_loaded_scores_are_the_same(make: type, tmp_path: Path) -> Non
     np.testing.assert_allclose(found, expected, rtol=2e-2, atol=2e-2)
 
 
-@pytest.mark.parametrize("make", [random_gmm, random_neural])
-def test_a_stream_scores_the_same_in_any_pieces_and_after_reset(make: type) -> None:
+def test_a_stream_scores_the_same_in_any_pieces_and_after_reset() -> None:
     noise = np.random.default_rng(0).normal(0, 0.1, 6000).astype(np.float32)
     log_mel = LogMel().accept_waveform(noise)
-    stream = make().stream()
+    stream = random_gmm().stream()
     whole = np.concatenate([stream.accept(log_mel), stream.finish()])
     stream.reset()
     pieces = [stream.accept(piece) for piece in np.split(log_mel, [0, 1, 3, 10, 11, 30])]
     np.testing.assert_array_equal(np.concatenate([*pieces, stream.finish()]), whole)
     assert len(stream.finish()) == 0
-
-
-def combined_file(folder: Path, scales: tuple[float, float] = (0.5, 2.0)) -> Path:
-    random_gmm().save(folder / "gmm.npz")
-    random_neural().save(folder / "neural.npz")
-    path = folder / "combined.npz"
-    save_combined(path, random_gmm().topology, ["gmm.npz", "neural.npz"], scales)
-    return path
-
-
-def test_combined_scores_are_the_weighted_sum(tmp_path: Path) -> None:
-    combined = load_model(combined_file(tmp_path))
-    noise = np.random.default_rng(0).normal(0, 0.1, 6000).astype(np.float32)
-    log_mel = LogMel().accept_waveform(noise)
-
-    def scores(model: AcousticModel, pieces: list[np.ndarray]) -> np.ndarray:
-        stream = model.stream()
-        parts = [stream.accept(piece) for piece in pieces]
-        return np.concatenate([*parts, stream.finish()])
-
-    expected = 0.5 * scores(load_model(tmp_path / "gmm.npz"), [log_mel])
-    expected += 2.0 * scores(load_model(tmp_path / "neural.npz"), [log_mel])
-    whole = scores(combined, [log_mel])
-    np.testing.assert_allclose(whole, expected, rtol=1e-4)
-    np.testing.assert_array_equal(scores(combined, np.split(log_mel, [1, 2, 9, 30])), whole)
-    stream = combined.stream()
-    assert stream.look_ahead_frames == 4  # the slower part's
-    first = stream.accept(log_mel)
-    stream.reset()
-    np.testing.assert_array_equal(stream.accept(log_mel), first)
-
-
-def test_combined_files_are_checked(tmp_path: Path) -> None:
-    path = combined_file(tmp_path)
-    arrays = read_archive(path).arrays
-    for names, message in (
-        (["gmm.npz", "combined.npz"], "part of itself"),
-        (["gmm.npz", "../neural.npz"], "plain file names"),
-        (["gmm.npz", "none.npz"], "no acoustic model"),
-        (["gmm.npz"], "scales has shape"),
-    ):
-        write_archive(path, {**arrays, "part_files": np.array(names)})
-        with pytest.raises(UserError, match=message):
-            load_model(path)
-    other = {**arrays, "first_state": np.arange(len(UNITS) + 1)}
-    short = {name: other[name][: len(UNITS)] for name in ("log_stay", "log_leave")}
-    write_archive(path, {**other, **short})
-    with pytest.raises(UserError, match="other states"):
-        load_model(path)
 
 
 def test_the_model_that_ships_loads_and_fits() -> None:
@@ -218,26 +146,6 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
 def test_sizes_are_checked(change: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     random_gmm().save(path)
-    write_archive(path, {**read_archive(path).arrays, **change})
-    with pytest.raises(UserError, match=message):
-        load_model(path)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"frame_offsets": np.array([3, 2, 1])}, "upwards"),
-        ({"frame_offsets": np.array([1, 2, 3])}, "present frame"),
-        ({"weights_1": np.zeros((15, NUM_STATES), np.float16)}, "weights_1 has shape"),
-        ({"weights_1": np.zeros((16, 3)), "biases_1": np.zeros(3)}, "last layer"),
-        ({"spread": np.zeros(NUM_INPUTS, np.float32)}, "spread"),
-    ],
-)
-def test_sizes_of_networks_are_checked(
-    change: dict[str, np.ndarray], message: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "model.npz"
-    random_neural().save(path)
     write_archive(path, {**read_archive(path).arrays, **change})
     with pytest.raises(UserError, match=message):
         load_model(path)

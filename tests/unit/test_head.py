@@ -150,8 +150,12 @@ def test_unknown_head() -> None:
         Head.load("nobody")
 
 
-@pytest.mark.parametrize("damage", ["cut", "text", "format", "missing", "index"])
-def test_broken_asset(tmp_path: Path, damage: str) -> None:
+@pytest.mark.parametrize(
+    "damage",
+    ["cut", "text", "format", "missing", "index", "part_names", "part_vertices", "eye_centres",
+     "texture_skin", "huge"],
+)  # fmt: skip
+def test_broken_asset(tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch) -> None:
     good = ASSETS / f"{DEFAULT_HEAD}.npz"
     broken = tmp_path / "broken.npz"
     if damage == "cut":
@@ -165,6 +169,12 @@ def test_broken_asset(tmp_path: Path, damage: str) -> None:
             arrays["format"] = np.array("kouxing head 99")
         elif damage == "missing":
             del arrays["uv"]
+        elif damage == "texture_skin":
+            del arrays[damage]
+        elif damage == "huge":
+            monkeypatch.setattr("services.driver.head.MAX_BYTES", 100_000)
+        elif damage in arrays:
+            arrays[damage] = arrays[damage][:1]
         else:
             arrays["field_vertices"] = arrays["field_vertices"] + np.uint16(40_000)
         np.savez(broken, allow_pickle=False, **arrays)

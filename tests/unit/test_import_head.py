@@ -248,6 +248,12 @@ def too_large(folder: Path) -> Path:
     return write_glb(folder / "face.glb", [Mesh("a", grid, np.array([[0, 1, side]]))])
 
 
+def no_coordinate(folder: Path) -> Path:
+    path = folder / "face.OBJ"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nv 7 8\n", encoding="utf-8")
+    return path
+
+
 def other_form(folder: Path) -> Path:
     return folder / "face.fbx"
 
@@ -258,6 +264,7 @@ def other_form(folder: Path) -> Path:
         (no_faces, "has no faces"),
         (garbage, "no intact mesh"),
         (too_large, "67600 vertices; reduce it to 65535"),
+        (no_coordinate, "no (intact mesh|vertex)"),
         (other_form, "one of the forms .obj, .glb, .ply"),
         (lambda folder: folder / "absent.obj", "no such file"),
     ],

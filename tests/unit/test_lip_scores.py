@@ -1,11 +1,13 @@
 """Scores of lips, the fit report and the pictures, on made-up speakers."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from evaluation.figures import new_figure, save_figure
 from evaluation.lips import (
     ClipLips,
     acoustic_closures,
@@ -14,11 +16,12 @@ from evaluation.lips import (
     score_clips,
 )
 from evaluation.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
-from evaluation.viseme_plots import dominance_figure, faces_figure, new_figure, save_figure
+from evaluation.viseme_plots import dominance_figure, faces_figure, sentence_figure
 from services.synthesizer.blending import blend
 from services.synthesizer.parameters import clips_seen, load_parameters, save_parameters
 from services.synthesizer.timeline import EDGE_S, build_timeline
 from services.synthesizer.visemes import MOUTH_FAPS
+from shared.audio_file import read_audio
 from shared.errors import UserError
 from shared.faps import NUM_FAPS
 from tests.lips import clip_of, utterance
@@ -27,6 +30,7 @@ from training.viseme_start import starting_parameters
 
 pytestmark = pytest.mark.unit
 
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
 START = starting_parameters()
 
 
@@ -50,8 +54,9 @@ def test_late_lips_are_found_late_and_closures_met() -> None:
     late = {score.measure: score for score in scores if score.scheme == "late"}
     assert late["opening"].best_lag_ms == 50
     assert late["opening"].best_correlation == pytest.approx(1.0, abs=0.01)
+    assert late["opening"].correlation is not None
     assert late["opening"].correlation < 0.95
-    assert [score.correlation for score in scores if score.scheme == "still"] == [0.0, 0.0, 0.0]
+    assert [score.correlation for score in scores if score.scheme == "still"] == [None] * 3
     found = {score.scheme: score for score in scores if score.measure == "opening"}
     assert found["true"].closures >= 3
     assert found["true"].bpm == len(closures_s) >= 3
@@ -60,6 +65,17 @@ def test_late_lips_are_found_late_and_closures_met() -> None:
     # a mouth that never opens closes nothing
     assert found["still"].bpm_met == found["still"].closures_met == 0
     assert found["true"].rmse < 1e-6 < found["late"].rmse
+
+
+def test_what_a_clip_does_not_measure_is_not_scored() -> None:
+    time_s = np.arange(0.0, 1.0, 0.04)
+    jaw_only, all_faps = np.full((2, len(time_s), len(MOUTH_FAPS)), np.nan)
+    all_faps[:] = jaw_only[:, MOUTH_FAPS.index(3)] = 10.0
+    made = {"made": np.random.default_rng(0).normal(size=(51, NUM_FAPS))}
+    lips = [ClipLips(clip_of(time_s, faps), made, np.zeros(0)) for faps in (jaw_only, all_faps)]
+    found = {score.measure: score.num_clips for score in score_clips("all", lips)}
+    assert found == {"opening": 1, "width": 1, "jaw": 2}
+    assert [score.measure for score in score_clips("all", lips[:1])] == ["jaw"]
 
 
 def test_loudness_opens_the_mouth() -> None:
@@ -83,9 +99,9 @@ def test_acoustic_closures_are_where_the_unit_is_quietest() -> None:
     np.testing.assert_allclose(acoustic_closures(clip, phones), quiet_s, atol=0.011)
 
 
-def write_clip(folder: Path, name: str) -> None:
+def write_clip(folder: Path, name: str, column: str = "F3_open_jaw") -> None:
     (folder / f"{name}.json").write_text(json.dumps({"language": "zh", "licence": "MIT"}))
-    (folder / f"{name}.csv").write_text("t,F3_open_jaw\n0.0,1\n")
+    (folder / f"{name}.csv").write_text(f"t,{column}\n0.0,1\n")
     (folder / f"{name}.flac").write_bytes(b"")
 
 
@@ -101,6 +117,9 @@ def test_clips_that_were_learnt_from_are_not_scored(
     path = path.with_suffix(".text")
     monkeypatch.setattr("training.lip_clips.read_audio", lambda _path: np.zeros(1600, np.float32))
     with pytest.raises(UserError, match="give other clips"):
+        clips_to_score(tmp_path, path)
+    write_clip(tmp_path, "three", "F5_raise_b_midlip")
+    with pytest.raises(UserError, match="no clip measures"):
         clips_to_score(tmp_path, path)
     write_clip(tmp_path, "three")
     assert [clip.name for clip in clips_to_score(tmp_path, path)] == ["three"]
@@ -129,6 +148,9 @@ def test_the_fit_report_finds_who_made_the_curves() -> None:
     assert changed["a", 3].guessed["target"] == 450.0
     assert changed["a", 3].learnt["target"] != 450.0
     assert len(fit_figure(fitted).axes) == 8
+    clip.faps[:, MOUTH_FAPS.index(3)] = np.nan
+    assert "jaw" not in {error.measure for error in errors_of_visemes(fitted)}
+    assert len(fit_figure(fitted).axes) == 8
 
 
 def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
@@ -144,6 +166,16 @@ def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "dominance.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(UserError, match="cannot be written"):
         save_figure(figure, tmp_path / "no" / "such.png")
+
+
+def test_a_sentence_is_drawn_with_the_parameters_given() -> None:
+    samples, _ = read_audio(DEMO / "vowels-male.wav")
+    still = replace(START, target=np.zeros_like(START.target))
+    for parameters, moves in ((START, True), (still, False)):
+        jaw = sentence_figure(parameters, samples[:24_000, 0]).axes[1]
+        full, live = (np.asarray(line.get_ydata()) for line in jaw.get_lines()[:2])
+        assert (np.ptp(full) > 100.0, np.ptp(live) > 100.0) == (moves, moves)
+    assert len(sentence_figure(START, np.zeros(10, np.float32)).axes) == 6
 
 
 def test_pictures_without_matplotlib_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

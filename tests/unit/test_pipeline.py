@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from services.recognizer import decoder
+from services.recognizer.acoustic_model import FIRST, INSIDE
 from services.recognizer.load import load_model
 from services.recognizer.pipeline import Recognizer, recognize, warm_up
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.phones import Phone, SpeechChange
+from shared.phones import UNIT_INDEX, Phone, SpeechChange
 from shared.pinyin import pinyin_of_text, units_of_syllable
 
 pytestmark = pytest.mark.unit
@@ -103,6 +104,22 @@ def test_provisional_units_come_soon(hello: np.ndarray) -> None:
                 num_early += (start + 160) / 16_000 - event.onset_s < 0.25
     assert provisional > 40
     assert num_early > 0.8 * provisional
+
+
+def test_provisional_durations_are_the_mean_of_unit_and_position(hello: np.ndarray) -> None:
+    mean_s = load_model().topology.duration_mean_s
+    after_pause = True
+    positions = []
+    for event in run(hello):
+        if isinstance(event, SpeechChange):
+            after_pause = True
+        elif event.final:
+            after_pause = event.unit == "sil"
+        else:
+            positions.append(FIRST if after_pause else INSIDE)
+            wanted = mean_s[positions[-1], UNIT_INDEX[event.unit]]
+            assert event.duration_s == pytest.approx(float(wanted))
+    assert set(positions) == {FIRST, INSIDE}
 
 
 def test_time_goes_on_and_never_back(hello: np.ndarray) -> None:

@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,8 @@ from evaluation.recognizer import (
     matched_pairs,
     most_confused,
     mouth_shapes,
-    print_scores,
 )
+from evaluation.recognizer_report import draw_confusions, print_figures
 from services.recognizer.load import load_model
 from shared.errors import UserError
 from shared.phones import UNIT_INDEX, UNITS
@@ -73,8 +74,11 @@ def test_interval_holds_the_rate_and_closes_for_equal_speakers() -> None:
     same = [ErrorCounts(substitutions=3, reference=10)] * 5
     assert bootstrap_interval(same, rng) == (0.3, 0.3)
     mixed = [ErrorCounts(substitutions=k, reference=10) for k in range(10)]
-    low, high = bootstrap_interval(mixed, rng)
+    bounds = bootstrap_interval(mixed, rng)
+    assert bounds is not None
+    low, high = bounds
     assert 0.2 < low < 0.45 < high < 0.7
+    assert bootstrap_interval(mixed[:1], rng) is None  # one speaker says nothing about others
 
 
 def test_confusions_are_ranked() -> None:
@@ -85,20 +89,42 @@ def test_confusions_are_ranked() -> None:
     assert first == {"said": "in", "heard": "ing", "times": 4}
 
 
-def test_a_whole_evaluation(tmp_path: Path) -> None:
-    (tmp_path / "manifest.tsv").write_text(
-        "utt_id\tpath\tspeaker\tsplit\tseconds\ttext\tpinyin\n"
-        f"v\t{DEMO / 'vowels-male.wav'}\tm\ttest\t2.2\t啊喔鹅衣乌迂\t\n",
-        encoding="utf-8",
-    )
+def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
+    vowels = DEMO / "vowels-male.wav"
+    (tmp_path / "noise.wav").write_bytes(b"no sound")
+    rows = [
+        f"v\t{vowels}\tm\ttest\t2.2\t啊喔鹅衣乌迂\t",
+        "none\tnone.wav\tm\ttest\t2.2\t啊\ta1",
+        f"unknown\t{vowels}\tm\ttest\t2.2\t啊\txa1 kzo2",
+        f"long\t{vowels}\tm\ttest\t2.2\t啊\t" + "a1 " * 90,
+        f"lying\t{vowels}\tm\ttest\t60\t啊\t" + "bao1 " * 60,
+        "broken\tnoise.wav\tm\ttest\t2.2\t啊\ta1",
+        f"other\t{vowels}\tm\ttrain\t2.2\t啊\txa1",
+    ]
+    header = "utt_id\tpath\tspeaker\tsplit\tseconds\ttext\tpinyin"
+    (tmp_path / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    rules = [(3, 0.0), (1, 0.7)]
+    results = evaluate_recognizer(load_model(), tmp_path, "test", rules=rules)
+    assert results["recordings"] == 1
+    assert results["num_bad_rows"] == 5
+    json.dumps(results)  # everything is plain
     picture = tmp_path / "confusions.png"
-    results = evaluate_recognizer(
-        load_model(), tmp_path, "test", rules=[(3, 0.0)], confusion_picture=picture
-    )
+    draw_confusions(results, picture)
     assert picture.stat().st_size > 10_000
-    console = Console(width=160, record=True, file=(tmp_path / "out.txt").open("w"))
-    print_scores(results, console)
-    assert "full traceback" in console.export_text()
-    console.file.close()
+    with (tmp_path / "out.txt").open("w") as file:
+        console = Console(width=200, record=True, file=file)
+        print_figures({"one": results, "two": results}, console)
+    text = console.export_text()
+    reasons = (
+        "row 3 (none): no audio file",
+        "row 4 (unknown): unknown pinyin syllable",
+        "row 5 (long): 90 units cannot be said in 2.20 s",
+        "lying: 2.2",
+        "broken: cannot read",
+        "5 rows skipped",
+    )
+    for part in ("full traceback", "by speaker", "CPU seconds", "side by side", *reasons):
+        assert part in text, part
+    assert text.count("lying") == 1  # once, not once a model
     with pytest.raises(UserError, match="'nothing'"):
         evaluate_recognizer(load_model(), tmp_path, "nothing")

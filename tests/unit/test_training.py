@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from services.recognizer.acoustic_model import FIRST, INSIDE, LAST
 from services.recognizer.features import NUM_BANDS
 from services.recognizer.load import load_model
 from shared.errors import UserError
@@ -17,7 +18,8 @@ from training import feature_cache
 from training.align import align_text
 from training.augmentation import Augmentation
 from training.corpus import RowErrors, may_ship, read_corpus
-from training.examples import Example, load_examples, trim_silence
+from training.durations import AlignedUnit, UnitDurations, positions_of
+from training.examples import Example, load_examples, speech_span
 from training.gmm import (
     SIL,
     FrameSet,
@@ -26,14 +28,12 @@ from training.gmm import (
     first_estimate,
     flat_path,
     split,
-    topology_of,
     unit_bigram,
     units_of_path,
     utterance_graph,
     viterbi_path,
 )
-from training.neural import FRAME_OFFSETS, gradients_of, train_network
-from training.recipes import combine, train_gmm, train_neural
+from training.recipes import train_gmm
 
 pytestmark = pytest.mark.unit
 
@@ -124,6 +124,21 @@ def test_kaldi_folder(tmp_path: Path) -> None:
         ("u2", "bob", 6),
     ]
     assert rows[0].seconds == pytest.approx(1.25)
+    assert {u.split for u in rows} == {"train"}
+    (tmp_path / "wav.scp").write_text("u1 0.wav\nu2 sph2pipe 1.sph |\nu3 1.wav\n")
+    errors = RowErrors()
+    held_out = tmp_path.rename(tmp_path.with_name("test"))
+    rows = read_corpus(held_out, errors, split="test")
+    assert [u.utterance_id for u in rows] == ["u1"]
+    assert "line 2 (u2): no audio file" in errors.messages[0]
+    assert "line 3 (u3): no text" in errors.messages[1]
+    assert read_corpus(held_out, RowErrors(), split="train") == []
+    (held_out / "text").unlink()
+    with pytest.raises(UserError, match="text: cannot be read"):
+        read_corpus(held_out, RowErrors())
+    (held_out / "segments").write_text("u1-1 u1 0 1\n")
+    with pytest.raises(UserError, match="segments"):
+        read_corpus(held_out, RowErrors())
 
 
 def test_aishell_folder(tmp_path: Path) -> None:
@@ -134,7 +149,7 @@ def test_aishell_folder(tmp_path: Path) -> None:
     transcript = tmp_path / "transcript" / "aishell_transcript_v0.8.txt"
     transcript.write_text("BAC009S0002W0122 而 对\nBAC009S0002W0123 无声\n", encoding="utf-8")
     errors = RowErrors()
-    rows = read_corpus(tmp_path, errors)
+    rows = read_corpus(tmp_path, errors, split="train")
     assert [(u.speaker, u.split, u.licence) for u in rows] == [("S0002", "train", "Apache-2.0")]
     assert "BAC009S0002W0123" in errors.messages[0]
 
@@ -145,6 +160,33 @@ def test_no_corpus_and_no_columns(tmp_path: Path) -> None:
     (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
     with pytest.raises(UserError, match="lacks the columns pinyin"):
         read_corpus(tmp_path, RowErrors())
+    (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))
+    with pytest.raises(UserError, match="not UTF-8"):
+        read_corpus(tmp_path, RowErrors())
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "long"])
+def test_lengths_that_are_none_are_reported(seconds: str, tmp_path: Path) -> None:
+    write_corpus(tmp_path, [f"a\t0.wav\tA\tx\tMIT\ttrain\t{seconds}\t你\tni3"])
+    errors = RowErrors()
+    assert read_corpus(tmp_path, errors) == []
+    assert len(errors.messages) == 1
+
+
+def test_the_given_pinyin_counts(tmp_path: Path) -> None:
+    """Polyphones, er-hua, ü and syllables without an initial; the text is not asked."""
+    write_corpus(
+        tmp_path,
+        [
+            "a\t0.wav\tA\tx\tMIT\ttrain\t9\t银行行长\tyin2 hang2 hang2 zhang3",
+            "b\t1.wav\tA\tx\tMIT\ttrain\t9\t行\txing2",
+            "c\t2.wav\tA\tx\tMIT\ttrain\t9\t女儿花儿玩\tnv3 er2 huar1 hua1 er5 wan2 lü4",
+        ],
+    )
+    units = [
+        " ".join(UNITS[unit] for unit in row.units) for row in read_corpus(tmp_path, RowErrors())
+    ]
+    assert units == ["in h ang h ang zh ang", "x ing", "n v er h ua er h ua er uan l v"]
 
 
 @pytest.mark.parametrize(
@@ -209,7 +251,7 @@ def test_cache_is_used_and_unreadable_audio_is_noted(
 def test_long_silence_is_trimmed() -> None:
     log_mel = np.full((400, 41), 7.0, np.float16)
     log_mel[150:250] = 18.0
-    assert len(trim_silence(log_mel)) == 150
+    assert len(log_mel[speech_span(log_mel)]) == 150
 
 
 # --- augmentation
@@ -349,6 +391,32 @@ def test_decorrelating_raises_the_likelihood() -> None:
     assert frames.realign(hmm) + volume > before - 0.05
 
 
+def test_durations_by_position() -> None:
+    a, b, i = (UNIT_INDEX[unit] for unit in ("a", "b", "i"))
+    assert positions_of([SIL, b, a, b, i, SIL, a, SIL]) == [
+        FIRST, FIRST, INSIDE, INSIDE, LAST, INSIDE, LAST, LAST,
+    ]  # fmt: skip
+    assert positions_of([b, a]) == [FIRST, LAST]  # no pauses around
+    durations = UnitDurations()
+    for lengths in ((5, 7, 9, 20), (7, 9, 11, 24)) * 500:
+        ends = np.cumsum([*lengths, *lengths]).tolist()
+        units = [b, a, b, a, b, a, b, a]
+        starts = [0, *ends[:-1]]
+        aligned = [AlignedUnit(*unit) for unit in zip(units, starts, ends, strict=True)]
+        durations.add(aligned, 0.5)
+    durations.add([AlignedUnit(a, 0, 90)], 1.0)  # a vowel said alone hardly counts
+    mean_s, spread_s = durations.mean_and_spread_s()
+    assert mean_s.shape == spread_s.shape == (3, len(UNITS))
+    assert mean_s[FIRST, b] == pytest.approx(0.06, abs=0.002)
+    assert spread_s[FIRST, b] == pytest.approx(0.01, abs=0.003)
+    assert mean_s[LAST, a] == pytest.approx(0.22, abs=0.005)
+    assert mean_s[INSIDE, a] == pytest.approx((0.08 * 2 + 0.22) / 3, abs=0.003)
+    # b is never last: the mean of all b; i was never heard
+    assert mean_s[LAST, b] == pytest.approx(0.0825, abs=0.003)
+    assert mean_s[:, i] == pytest.approx(0.1, abs=1e-4)
+    assert (spread_s > 0).all()
+
+
 def test_bigram_rows_are_distributions() -> None:
     examples = made_up_speech(20)
     log_bigram = unit_bigram([example.units for example in examples])
@@ -356,45 +424,6 @@ def test_bigram_rows_are_distributions() -> None:
     t, i, a = (UNIT_INDEX[unit] for unit in ("t", "i", "a"))
     assert log_bigram[t, i] > log_bigram[t, a]
     assert log_bigram[i, SIL] > log_bigram[t, SIL]
-
-
-# --- the network
-
-
-def test_gradients_against_differences() -> None:
-    from tests.unit.test_gmm import random_neural  # noqa: PLC0415 (a small model is made there)
-
-    model = random_neural()
-    rng = np.random.default_rng(0)
-    inputs = rng.normal(size=(4, model.weights[0].shape[0])).astype(np.float32)
-    targets = rng.integers(0, model.topology.num_states, 4)
-    loss, _, gradients = gradients_of(model, inputs, targets)
-    parameters = [*model.weights, *model.biases]
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        at = np.unravel_index(np.abs(gradient).argmax(), gradient.shape)
-        step = 1e-2
-        parameter[at] += step
-        changed, _, _ = gradients_of(model, inputs, targets)
-        parameter[at] -= step
-        assert (changed - loss) / step == pytest.approx(gradient[at], rel=0.1)
-
-
-def test_a_network_learns_made_up_speech() -> None:
-    examples = made_up_speech(60)
-    frames = FrameSet.build(examples, FIRST_STATE, prior_mean(), 1)
-    hmm = first_estimate(frames, FIRST_STATE)
-    for _ in range(3):
-        frames.realign(hmm)
-        hmm = estimate(frames, hmm)
-    states = [frames.states[a:b] for a, b in itertools.pairwise(frames.bounds)]
-    lines: list[str] = []
-    model = train_network(
-        examples, states, topology_of(hmm, unit_bigram([(0,)]), frames), num_epochs=4, seed=0,
-        report=lines.append, hidden=(32,),
-    )  # fmt: skip
-    first, last = (float(line.split(": ")[1].split()[0]) for line in (lines[0], lines[-1]))
-    assert last < 0.7 * first
-    assert model.stream().look_ahead_frames == FRAME_OFFSETS[-1]
 
 
 # --- whole recipes
@@ -414,16 +443,6 @@ def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
     again = tmp_path / "again.npz"
     train_gmm([tmp_path / "corpus"], again, num_mixtures=2, report=lines.append)
     assert again.read_bytes() == gmm.read_bytes()  # the same seed, the same model
-    neural = tmp_path / "neural.npz"
-    train_neural([tmp_path / "corpus"], neural, aligner=gmm, num_epochs=1, report=lines.append)
-    assert "Neural" in neural.with_suffix(".md").read_text()
-    together = tmp_path / "together.npz"
-    combine([gmm, neural], together, [tmp_path / "corpus"], report=lines.append)
-    assert load_model(together).topology.num_states == 300
-    with pytest.raises(UserError, match="not in the folder"):
-        combine([gmm, neural], tmp_path / "corpus" / "x.npz", [tmp_path / "corpus"])
-    with pytest.raises(UserError, match="no Gaussian mixture model"):
-        train_neural([tmp_path / "corpus"], neural, aligner=neural)
     with pytest.raises(UserError, match="power of two"):
         train_gmm([tmp_path / "corpus"], gmm, num_mixtures=3)
 

@@ -81,7 +81,7 @@ def test_unwritable_path(tmp_path: Path, path: str) -> None:
     ("size", "frame_rate_hz", "sample_rate_hz", "said"),
     [
         ((63, 48), 25.0, 16000, "even"),
-        ((64, 48), 0.0, 16000, "frame rate"),
+        ((64, 48), 0.0001, 16000, "frame rate"),
         ((64, 48), 25.0, 17000, "sample rate"),
     ],
 )
@@ -90,6 +90,7 @@ def test_bad_values(
 ) -> None:
     with pytest.raises(UserError, match=said):
         VideoWriter(tmp_path / "out.mp4", *size, frame_rate_hz, sample_rate_hz)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_picture_of_a_wrong_size(tmp_path: Path) -> None:

@@ -53,6 +53,23 @@ def test_estimation_finds_what_made_the_curves() -> None:
     assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
 
 
+def test_short_clips_and_few_measures_are_learnt_from() -> None:
+    phones = utterance(0, 2)
+    time_s = np.arange(0.0, 1.5, 0.04)
+    curve = blend(replace(START, target=0.5 * START.target), build_timeline(phones), time_s)
+    faps = np.full_like(curve, np.nan)
+    faps[:, LOWER_LIP] = curve[:, LOWER_LIP]
+    clip = clip_of(time_s, faps)
+    frames = frames_of([clip, clip], [phones, []])  # nothing was heard in one of them
+    assert len(frames.faps) == len(time_s)
+    found = estimate(frames)
+    vowel = VISEME_INDEX[phones[1].unit]
+    assert abs(found.target[vowel, LOWER_LIP]) < 0.8 * abs(START.target[vowel, LOWER_LIP])
+    np.testing.assert_array_equal(found.target[:, JAW], START.target[:, JAW])
+    with pytest.raises(UserError, match="no speech"):
+        frames_of([clip], [[]])
+
+
 def test_usual_levels_tell_vowels_from_consonants() -> None:
     phones = utterance(2, 60)
     end_s = phones[-1].onset_s + phones[-1].duration_s + 0.3
@@ -100,6 +117,29 @@ def test_clips_of_both_kinds_are_read(tmp_path: Path) -> None:
     assert film.part == "held"
     assert film.faps[0, [JAW, LOWER_LIP]].tolist() == [10.0, -20.0]
     assert np.isnan(film.faps[0, WIDTH])
+
+
+@pytest.mark.parametrize(
+    ("about", "table", "message"),
+    [
+        ("[]", "t,F3_open_jaw\n0,1\n", "'list'"),
+        ("{", "t,F3_open_jaw\n0,1\n", "property name"),
+        ("{}", "", "no rows"),
+        ("{}", "t,F3_open_jaw\n0,1,2\n", "longer than its head"),
+        ("{}", "F3_open_jaw\n1\n", "it lacks 't'"),
+        ("{}", "t,F3_open_jaw\n0,x\n", "'x'"),
+        ("{}", "t,F3_open_jaw\n0,1\n0,1\n", "do not rise"),
+        ("{}", "t,F3_open_jaw\nnan,1\n", "do not rise"),
+        ("{}", "t,F1_viseme\n0,1\n", "no FAP of the mouth"),
+        ("{}", "t,mouth_stretch_c\n0,1\n", "it lacks 'mouth_lowerLipDepress'"),
+        ("{}", "t,F3_open_jaw\n0,1\n", "bad.flac"),
+    ],
+)
+def test_bad_clips_are_named(about: str, table: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.json").write_text(about)
+    (tmp_path / "bad.csv").write_text(table)
+    with pytest.raises(UserError, match=f"the clip bad: .*{message}"):
+        read_clips(tmp_path)
 
 
 def test_a_rule_says_what_clips_are_for(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from services.synthesizer.parameters import load_parameters
 from services.synthesizer.visemes import (
     CLOSURE_FAPS,
     MOUTH_FAPS,
@@ -13,7 +14,9 @@ from services.synthesizer.visemes import (
     shapes_of,
     static_targets,
 )
-from shared.phones import INITIALS, UNITS
+from shared.faps import NUM_FAPS
+from shared.phones import INITIALS, SILENCE, UNITS
+from tests import heads
 
 pytestmark = pytest.mark.unit
 
@@ -25,6 +28,21 @@ def test_every_unit_has_shapes_that_fill_it() -> None:
         assert all(shape in VISEME_INDEX for shape, _ in shapes)
         assert sum(share for _, share in shapes) == pytest.approx(1.0)
         assert len(shapes) <= 2
+
+
+def test_every_unit_moves_the_face_by_a_millimetre_or_is_silence() -> None:
+    head, target = heads.load("woman"), load_parameters().target
+    skin = head.part("skin").vertices
+
+    def moved_mm(shape: str) -> float:
+        faps = np.zeros(NUM_FAPS, dtype=np.float32)
+        faps[np.array(MOUTH_FAPS) - 1] = target[VISEME_INDEX[shape]]
+        return 1e3 * float(np.linalg.norm((head.deform(faps) - head.vertices)[skin], axis=1).max())
+
+    by_shape = {shape: moved_mm(shape) for shape in VISEMES}
+    for unit in UNITS:
+        moves = max(by_shape[shape] for shape, _ in SHAPES[unit])
+        assert moves == 0.0 if unit == SILENCE else moves > 1.0, unit
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,210 @@
+"""Other voices, hard augmentation, and the training of the network."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+import torch
+
+from services.recognizer.features import LOG_FLOOR
+from services.recognizer.load import load_model, model_path
+from services.recognizer.neural import NeuralModel
+from shared.audio_file import read_audio
+from shared.errors import UserError
+from training.augmentation import Augmentation
+from training.corpus import RowErrors, read_corpus
+from training.network import FRONT_FRAMES, NUM_INPUTS, Network, Shape
+from training.network_export import onnx_of
+from training.network_training import FrontEnd, Recording, Trainer
+from training.neural_recipe import train_neural
+from training.voice_change import Voice, VoiceChange, changed_voices
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
+SHAPE = Shape(num_states=9, look_aheads=(0, 3), num_second=4, front=16, hidden=24)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+# --- other voices
+
+
+def in_voice(voice: Voice, warp: float) -> Voice:
+    change = VoiceChange(
+        median_f0_hz=120.0, intonation=1.0, warp_low=warp, warp_high=warp, breath=1.0, tilt=0.0
+    )
+    changed = voice.changed(change)
+    assert changed.shape == HELLO.shape
+    return Voice.analyse(changed)
+
+
+def test_a_voice_is_moved_to_the_pitch_and_formants_asked_for() -> None:
+    voice = Voice.analyse(HELLO)
+    assert voice.median_f0_hz > 180
+    low, high = in_voice(voice, 0.8), in_voice(voice, 1.25)
+    assert [low.median_f0_hz, high.median_f0_hz] == pytest.approx([120, 120], rel=0.05)
+    bins = np.arange(voice.envelope.shape[1])
+    centres = []
+    for one in (low, high):
+        power = one.envelope[one.f0_hz > 0].mean(axis=0) ** 0.3
+        centres.append((bins * power).sum() / power.sum())
+    assert centres[1] > 1.1 * centres[0]
+
+
+def test_silence_stays_silence() -> None:
+    voice = Voice.analyse(np.zeros(8000, np.float32))
+    change = VoiceChange.draw(np.random.default_rng(0), voice.median_f0_hz)
+    assert np.abs(voice.changed(change)).max() < 1e-3
+
+
+def test_copies_have_the_frames_of_the_recording(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "a.wav", HELLO, 16_000)
+    (tmp_path / "b.wav").write_bytes(b"no sound")
+    rows = "".join(f"{n}\t{n}.wav\tS\tCC0\ttrain\t1.5\tni3\n" for n in "ab")
+    header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin\n"
+    (tmp_path / "manifest.tsv").write_text(header + rows, encoding="utf-8")
+    utterances = read_corpus(tmp_path, RowErrors())
+    first, unreadable = changed_voices(utterances, num_voices=2, seed=0)
+    assert [block.shape for block in first] == [(148, 41)] * 2
+    assert not np.array_equal(first[0], first[1])
+    assert [len(block) for block in unreadable] == [0, 0]
+    other, _ = changed_voices(utterances, num_voices=2, seed=1)
+    assert not np.array_equal(first[0], other[0])
+
+
+# --- augmentation
+
+
+def test_hard_augmentation_is_repeatable_and_finite() -> None:
+    rng = np.random.default_rng(0)
+    log_mel = rng.normal(14, 2, (80, 41)).astype(np.float32)
+    for _ in range(40):
+        change = Augmentation.draw_hard(rng)
+        out = change.apply(log_mel)
+        assert out.shape == (len(change.positions(80)), 41)
+        assert np.isfinite(out).all()
+        assert out.min() >= LOG_FLOOR
+        np.testing.assert_array_equal(out, change.apply(log_mel))
+
+
+def test_a_room_fills_the_pause_after_a_sound() -> None:
+    log_mel = np.full((60, 41), 8.0, np.float32)
+    log_mel[10:20] = 18.0
+    dry = Augmentation(
+        speed=1.0, warp=1.0, level=0.0, noise_below=30.0, noise_tilt=0.0,
+        colour=(0.0,) * 6, decay=0.0, narrow=False, seed=0,
+    )  # fmt: skip
+    wet = Augmentation(
+        speed=1.0, warp=1.0, level=0.0, noise_below=30.0, noise_tilt=0.0,
+        colour=(0.0,) * 6, decay=0.9, narrow=False, seed=0,
+    )  # fmt: skip
+    assert wet.apply(log_mel)[22:30].mean() > dry.apply(log_mel)[22:30].mean() + 3
+
+
+# --- the network
+
+
+def test_the_file_computes_what_the_network_does() -> None:
+    torch.manual_seed(0)
+    network = Network(SHAPE).eval()
+    frames = np.random.default_rng(0).normal(size=(20, NUM_INPUTS)).astype(np.float32)
+    with torch.no_grad():
+        hidden = network(torch.from_numpy(frames)[None])[0]
+        expected = [torch.log_softmax(head(hidden), -1).numpy() for head in network.heads]
+    shipped = load_model(model_path("neural"))
+    assert isinstance(shipped, NeuralModel)
+    model = NeuralModel(
+        topology=shipped.topology,
+        network=onnx_of(network),
+        look_aheads=np.array(SHAPE.look_aheads),
+        log_prior=shipped.log_prior,
+        prior_mean=shipped.prior_mean,
+        spread=shipped.spread,
+        kappa=1.0,
+    )
+    assert model.hidden_shape == (24, 24)
+    assert model.num_context == FRONT_FRAMES
+    padded = np.concatenate([np.repeat(frames[:1], FRONT_FRAMES - 1, axis=0), frames])
+    seen = np.stack([padded[at : at + FRONT_FRAMES].reshape(-1) for at in range(20)])
+    for head, shares in enumerate(expected):
+        found = model.session.run(
+            None,
+            {
+                "x": np.stack([seen, seen], axis=1),
+                "h1": np.zeros((1, 2, 24), np.float32),
+                "h2": np.zeros((1, 2, 24), np.float32),
+                "head": np.array(head),
+            },
+        )[0]
+        np.testing.assert_allclose(found[:, 0], shares, atol=2e-3)
+
+
+def test_the_network_learns_made_up_sounds_beside_a_second_task(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("training.network_training._BATCH_FRAMES", 500)
+    monkeypatch.setattr("training.network_training._AUGMENTED_SHARE", 0.2)
+    monkeypatch.setattr("training.network_training._WARM_UP_STEPS", 1)
+    monkeypatch.setattr("training.network_training._RATE", 1e-2)
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    patterns = rng.normal(14, 2, (SHAPE.num_states, NUM_INPUTS))
+
+    def recording(aligned: bool) -> Recording:
+        states = np.repeat(rng.integers(0, SHAPE.num_states, 8), 8)
+        log_mel = patterns[states] + rng.normal(0, 0.3, (len(states), NUM_INPUTS))
+        targets = states if aligned else 1 + states[::8] % 3
+        return Recording(
+            voices=(log_mel.astype(np.float16),), targets=targets, weight=1.0, aligned=aligned
+        )
+
+    recordings = [recording(True) for _ in range(30)]
+    second = [recording(False) for _ in range(10)]
+    trainer = Trainer(
+        Network(SHAPE), FrontEnd.measure(recordings), recordings, second, main_head=1, seed=0
+    )
+    losses: list[float] = []
+    trainer.train(40, lambda _, loss: losses.append(loss))
+    assert np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
+    assert trainer.mean is not trainer.network
+
+
+# --- the recipe
+
+
+def test_the_recipe_writes_model_card_and_curves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    corpus, second = tmp_path / "corpus", tmp_path / "second"
+    corpus.mkdir()
+    second.mkdir()
+    soundfile.write(corpus / "a.wav", HELLO, 16_000)
+    soundfile.write(second / "a.wav", HELLO, 16_000)
+    pinyin = "ni3 hao3 huan1 ying2 lai2 dao4"
+    header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin\n"
+    rows = [f"{n}\ta.wav\tS\tCC0-1.0\t{'dev' if n else 'train'}\t1.5\t{pinyin}\n" for n in range(2)]
+    (corpus / "manifest.tsv").write_text(header + "".join(rows), encoding="utf-8")
+    (second / "manifest.tsv").write_text(
+        "utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\tHH AH L OW\n", encoding="utf-8"
+    )
+    monkeypatch.setattr("training.network_training._BATCH_FRAMES", 300)
+    lines: list[str] = []
+    output = tmp_path / "neural.npz"
+    train_neural(
+        [corpus], output, aligner=model_path("gmm"), second_task=second,
+        num_steps=2, num_voices=1, report=lines.append,
+    )  # fmt: skip
+    model = load_model(output, look_ahead_ms=60.0)
+    assert model.topology.num_states == 3 * 60
+    assert "aligned anew" in "".join(lines)
+    assert "CC0-1.0" in output.with_suffix(".md").read_text()
+    assert output.with_suffix(".png").stat().st_size > 1000
+    (second / "manifest.tsv").write_text("utt_id\tpath\nx\ta.wav\n", encoding="utf-8")
+    with pytest.raises(UserError, match="is no list of utt_id"):
+        train_neural([corpus], output, aligner=model_path("gmm"), second_task=second)

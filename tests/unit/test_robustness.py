@@ -1,0 +1,101 @@
+"""What disturbs speech does so by the stated amount, and the figures count what was heard."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from evaluation import robustness
+from evaluation.disturbances import (
+    SOUNDS,
+    SPEECH_CONDITIONS,
+    faster,
+    louder,
+    pink_noise,
+    telephone,
+    with_noise,
+)
+from evaluation.robustness import evaluate_robustness, print_robustness
+from services.recognizer.load import load_model
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+RATE_HZ = 16_000
+
+
+def tone(frequency_hz: float) -> np.ndarray:
+    time_s = np.arange(RATE_HZ) / RATE_HZ
+    return (0.3 * np.sin(2 * np.pi * frequency_hz * time_s)).astype(np.float32)
+
+
+def level(samples: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(samples.astype(np.float64) ** 2)))
+
+
+@pytest.mark.parametrize("below_db", [20.0, 10.0, 5.0])
+def test_noise_is_as_loud_as_asked(below_db: float) -> None:
+    speech = tone(440)
+    noise = with_noise(speech, below_db) - speech
+    assert 20 * np.log10(level(speech) / level(noise)) == pytest.approx(below_db, abs=0.2)
+
+
+def test_pink_noise_has_equal_power_in_every_octave() -> None:
+    power = np.abs(np.fft.rfft(pink_noise(2**17, np.random.default_rng(0)))) ** 2
+    hz = np.fft.rfftfreq(2**17, 1 / RATE_HZ)
+    octaves = [power[(hz >= low) & (hz < 2 * low)].sum() for low in (125, 250, 500, 1000, 2000)]
+    assert np.ptp(10 * np.log10(octaves)) < 0.7
+
+
+@pytest.mark.parametrize(("frequency_hz", "passes"), [(1000, True), (100, False), (6000, False)])
+def test_a_telephone_lets_its_band_through(frequency_hz: float, passes: bool) -> None:
+    share = level(telephone(tone(frequency_hz))) / level(tone(frequency_hz))
+    assert share == pytest.approx(1.0, abs=0.05) if passes else share < 0.03
+
+
+def test_double_level_clips() -> None:
+    assert louder(tone(440), 4.0).max() == 1.0
+    np.testing.assert_array_equal(louder(tone(440), 0.5), tone(440) / 2)
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.3])
+def test_speed_changes_and_pitch_stays(factor: float) -> None:
+    changed = faster(tone(200), factor)
+    assert len(changed) == pytest.approx(RATE_HZ / factor, abs=200)
+    middle = changed[2000:10_000]
+    spectrum = np.abs(np.fft.rfft(middle * np.hanning(len(middle))))
+    assert np.fft.rfftfreq(len(middle), 1 / RATE_HZ)[spectrum.argmax()] == pytest.approx(200, abs=4)
+
+
+@pytest.mark.parametrize("name", SOUNDS)
+def test_sounds_are_the_same_every_time(name: str) -> None:
+    sound = SOUNDS[name](1.5)
+    assert sound.shape == (24_000,)
+    assert 0.02 < level(sound) <= 0.06
+    np.testing.assert_array_equal(sound, SOUNDS[name](1.5))
+
+
+def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = "utt_id\tpath\tspeaker\tsplit\tseconds\tpinyin\n"
+    (tmp_path / "manifest.tsv").write_text(
+        f"{rows}one\t{DEMO / 'hello-male.wav'}\tm\tdev\t3\tni3 hao3\n", encoding="utf-8"
+    )
+    conditions = {name: SPEECH_CONDITIONS[name] for name in ("as recorded", "half level")}
+    monkeypatch.setattr(robustness, "SPEECH_CONDITIONS", conditions)
+    monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
+    figures = evaluate_robustness(load_model(), tmp_path, "dev", other_language=DEMO)
+    assert set(figures["speech"]) == set(conditions)
+    assert figures["speech"]["as recorded"]["full"] > 0  # the text is too short
+    assert figures["sounds"]["noise"] == 0
+    assert figures["sounds"]["other language"] > 60
+    output = io.StringIO()
+    print_robustness({"a model": figures}, Console(file=output, width=120))
+    assert "half level" in output.getvalue()
+
+
+def test_a_folder_without_sound(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds no wav"):
+        robustness.recordings_in(tmp_path)

@@ -1,0 +1,21 @@
+"""What commands share."""
+
+from pathlib import Path
+
+import pytest
+
+from services.terminal import check_output
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+
+def test_outputs_are_checked_before_the_work_and_left_as_they_are(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.json", tmp_path / "folder" / "new.json"
+    old.write_text("kept")
+    check_output(None, old, new)
+    assert old.read_text() == "kept"
+    assert not new.exists()
+    for wrong in (tmp_path, old / "below.json"):
+        with pytest.raises(UserError, match="cannot be written"):
+            check_output(None, new, wrong)
