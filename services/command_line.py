@@ -131,13 +131,13 @@ def run(
     control_config = load("control", file=config)
     gateway_config = load("gateway", file=config)
     driver_config = load("driver", file=config)
-    if not isinstance(control_config, ControlConfig) or not isinstance(
-        gateway_config, GatewayConfig
+    if not (
+        isinstance(control_config, ControlConfig)
+        and isinstance(gateway_config, GatewayConfig)
+        and isinstance(driver_config, DriverConfig)
     ):
         raise TypeError("the sections have types of their own")
     arguments = ["--config", str(config)] if config else []
-    if not isinstance(driver_config, DriverConfig):
-        raise TypeError("the sections have types of their own")
     out = Path(driver_config.out)
     environment = _chosen_head(head or driver_config.head, out)
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment)
@@ -170,7 +170,7 @@ def run(
 def _chosen_head(name: str, out: Path) -> dict[str, str]:
     """Return the environment in which window, videos and page show a head."""
     if name == DriverConfig().head:
-        return {}
+        return {"KOUXING_DRIVER_HEAD": name}
     from services.driver.glb import export_glb
     from services.driver.scene import load_head
 

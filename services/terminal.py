@@ -36,6 +36,28 @@ def write_json(path: Path | None, figures: object) -> None:
         write_text(path, json.dumps(figures, indent=1, ensure_ascii=False, default=_plain))
 
 
+def check_output(*paths: Path | None) -> None:
+    """See that files can be written before long work begins; None stands for no file.
+
+    Raises
+    ------
+    UserError
+        If one of them cannot be written.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        is_new = not path.exists()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("a"):
+                pass
+            if is_new:
+                path.unlink()
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a file and the folders it lies in.
 

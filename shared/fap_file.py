@@ -26,6 +26,7 @@ from shared.errors import UserError
 from shared.faps import NUM_FAPS
 
 _VERSION = "2.1"
+MAX_BYTES = 256 * 1024 * 1024  # hours
 _GRETA_MASK_DIGITS = NUM_FAPS + 1
 # highest values of the numbers that a set FAP 1 and FAP 2 bring; the flags at their ends say
 # nothing to a head whose shapes are given, and programs write anything there
@@ -68,6 +69,8 @@ def read_fap(path: Path) -> FapAnimation:
         The file cannot be read or is no such file; the text names the line and the reason.
     """
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UserError(f"{path} is larger than {MAX_BYTES // 2**20} MiB; cut it into parts")
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}; give a .fap file") from error
@@ -115,11 +118,11 @@ def write_fap(
 
 def _parse(text: str) -> FapAnimation:
     lines = [
-        (number, line.split())
+        (number, line)
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
-    ] or [(1, [])]
-    name, frame_rate_hz, num_frames = _parse_header(*lines[0])
+    ] or [(1, "")]
+    name, frame_rate_hz, num_frames = _parse_header(lines[0][0], lines[0][1].split())
     complete = (len(lines) - 1) // 2
     if complete < num_frames:
         raise _BadFileError(lines[-1][0], f"the file ends after {complete} of {num_frames} frames")
@@ -134,7 +137,8 @@ def _parse(text: str) -> FapAnimation:
     first_number: int | None = None
     for frame in range(num_frames):
         mask = _parse_mask(*lines[1 + 2 * frame])
-        line_number, words = lines[2 + 2 * frame]
+        line_number, line = lines[2 + 2 * frame]
+        words = line.split()
         visemes[frame], expressions[frame], values = _parse_values(line_number, words, mask)
         faps[frame, 2:][mask[2:]] = values
         number = _parse_int(line_number, words[0], "a frame number")
@@ -169,8 +173,8 @@ def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
         frame_rate_hz = float(words[-2])
     except ValueError:
         frame_rate_hz = math.nan
-    if not 0.0 < frame_rate_hz <= 1000.0:
-        raise _BadFileError(line_number, f"frame rate '{words[-2]}' is not within 0 to 1000")
+    if not 1.0 <= frame_rate_hz <= 1000.0:
+        raise _BadFileError(line_number, f"frame rate '{words[-2]}' is not within 1 to 1000")
     num_frames = _parse_int(line_number, words[-1], "a count of frames")
     if num_frames < 0:
         raise _BadFileError(line_number, f"{num_frames} frames")
@@ -184,8 +188,8 @@ def _parse_int(line_number: int, word: str, what: str) -> int:
         raise _BadFileError(line_number, f"'{word}' is not {what}") from None
 
 
-def _parse_mask(line_number: int, words: list[str]) -> NDArray[np.bool_]:
-    digits = "".join(words)
+def _parse_mask(line_number: int, line: str) -> NDArray[np.bool_]:
+    digits = "".join(line.split())
     if len(digits) not in (NUM_FAPS, _GRETA_MASK_DIGITS) or set(digits) - {"0", "1"}:
         raise _BadFileError(
             line_number,

@@ -25,7 +25,7 @@ def shown(window: Window) -> np.ndarray:
 
 
 def draw_until(window: Window, size: tuple[int, int]) -> None:
-    for _ in range(100):
+    for _ in range(1000):
         assert window.draw(neutral_faps())
         if window._renderer.size == size:
             return

@@ -162,8 +162,10 @@ def export_glb(head: Head, path: str | Path) -> None:
     Raises
     ------
     UserError
-        If the file cannot be written.
+        If the name does not end in ``.glb``, or the file cannot be written.
     """
+    if Path(path).suffix.lower() != ".glb":
+        raise UserError(f"{path}: give a name that ends in .glb")
     document = _Document()
     sampler = document.add(
         "samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}

@@ -34,6 +34,10 @@ class BadGlbError(Exception):
     """What is wrong in the file."""
 
 
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no JSON")
+
+
 class Glb:
     """The two chunks of a file.
 
@@ -66,10 +70,10 @@ class Glb:
             chunks.setdefault(kind, data[at + 8 : at + 8 + size])
             at += 8 + size
         try:
-            self.json: dict[str, Any] = json.loads(chunks[b"JSON"])
+            self.json: dict[str, Any] = json.loads(chunks[b"JSON"], parse_constant=_no_number)
             missing = set(self.json.get("extensionsRequired", ())) - _UNDERSTOOD
         except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise BadGlbError("it has no glTF description") from error
+            raise BadGlbError("it has no intact glTF description") from error
         if missing:
             raise BadGlbError(f"it needs {', '.join(sorted(missing))}; save it uncompressed")
         self._binary = chunks.get(b"BIN\0", b"")

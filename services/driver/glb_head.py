@@ -60,10 +60,11 @@ def read_glb(path: Path) -> Head:
     """
     try:
         glb = Glb(path)
-        pieces = read_pieces(glb)
-        names = sorted({name for piece in pieces for name in piece.shapes})
-        known = recognise(names)
-        return _head(path.stem, glb, pieces, known)
+        with np.errstate(invalid="ignore", over="ignore"):  # what comes out is checked
+            pieces = read_pieces(glb)
+            names = sorted({name for piece in pieces for name in piece.shapes})
+            known = recognise(names)
+            return _head(path.stem, glb, pieces, known)
     except BadGlbError as error:
         raise UserError(f"{path}: {error}") from error
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as error:
@@ -137,6 +138,8 @@ def _head(name: str, glb: Glb, pieces: list[Piece], known: Names) -> Head:
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
         raise BadGlbError("its eyes, by their shapes or names, lie in one place")
+    if eyes[0, 0] - eyes[1, 0] < 0.5 * unit:
+        raise BadGlbError("its eyes do not lie side by side; let y be up and the face look along z")
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
     pivot = _pivot(glb, middle, unit)
     world = np.concatenate([piece.vertices for piece in pieces])

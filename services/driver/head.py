@@ -24,6 +24,7 @@ Axes: x to the subject's left, y up, z to the front; the origin is the pivot of 
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -38,6 +39,7 @@ from shared.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"
 DEFAULT_HEAD = "woman"
+MAX_BYTES = 512 * 1024 * 1024  # of an unpacked file
 
 Detail = Literal["fine", "coarse"]
 Float32 = NDArray[np.float32]
@@ -184,17 +186,21 @@ class Head:
         file = Path(path)
         if file.suffix != ".npz":
             file = ASSETS / f"{path}.npz"
-        if not file.is_file():
+        if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
             known = ", ".join(sorted(asset.stem for asset in ASSETS.glob("*.npz")))
             raise UserError(f"there is no head {str(path)!r}; give the path of an .npz or: {known}")
         try:
             with file.open("rb") as stream, np.load(stream, allow_pickle=False) as asset:
+                if sum(entry.file_size for entry in asset.zip.infolist()) > MAX_BYTES:
+                    raise ValueError(f"more than {MAX_BYTES // 2**20} MiB unpacked")
                 arrays = {key: asset[key] for key in asset.files}
             return assemble(file.stem, arrays, detail)
-        except (OSError, EOFError, ValueError, KeyError, IndexError, zipfile.BadZipFile) as error:
+        except (
+            OSError, EOFError, ValueError, TypeError, AttributeError, KeyError, IndexError,
+            MemoryError, RuntimeError, zlib.error, zipfile.BadZipFile,
+        ) as error:  # fmt: skip
             raise UserError(
-                f"{file} is no intact head ({error}); make one with python -m"
-                " services.driver.build_head"
+                f"{file} is no intact head ({error}); make one with kouxing head import"
             ) from error
 
     def part(self, name: str) -> Part:
@@ -292,6 +298,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
     """
     if str(arrays["format"]) != FORMAT:
         raise ValueError(f"format {arrays['format']}, expected {FORMAT}")
+    _check(arrays)
     coarse = detail == "coarse"
     # a part's coarse vertices come first, so that the coarse head is a selection of rows
     first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
@@ -360,6 +367,34 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
             if key.startswith("texture_")
         },
     )
+
+
+def _check(arrays: dict[str, NDArray[np.generic]]) -> None:
+    """See whether the arrays fit each other, as far as nothing else finds out."""
+    count, num_parts = len(arrays["vertices"]), len(arrays["part_names"])
+    for key, shape in (
+        ("vertices", (count, 3)), ("uv", (count, 2)), ("colors", (count, 3)),
+        ("head_weight", (count,)), ("eye_centres", (2, 3)), ("part_vertices", (num_parts, 3)),
+        ("part_triangles", (num_parts, 4)), ("part_textures", (num_parts,)),
+        ("triangles", (len(arrays["triangles"]), 3)),
+    ):  # fmt: skip
+        if arrays[key].shape != shape:
+            raise ValueError(f"{key} of shape {arrays[key].shape}, expected {shape}")
+    first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
+    if not (
+        np.array_equal(np.append(first, count), np.append(0, after))
+        and (first <= after_coarse).all()
+        and (after_coarse <= after).all()
+    ):
+        raise ValueError("the parts do not share out the vertices")
+    if len(set(arrays["part_names"].tolist())) < num_parts:
+        raise ValueError("two parts have one name")
+    missing = {f"texture_{name}" for name in arrays["part_textures"].tolist()} - arrays.keys()
+    if missing:
+        raise ValueError(f"{', '.join(sorted(missing))} is missing")
+    left, right = arrays["eye_centres"].astype(np.float64)
+    if not (np.isfinite(arrays["vertices"].astype(np.float32)).all() and left[0] > right[0]):
+        raise ValueError("a vertex is not finite, or the eyes are exchanged")
 
 
 def _basis(

@@ -70,6 +70,8 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
         with output.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
     except OSError as error:
+        if output.is_file():  # no half a head
+            output.unlink()
         raise UserError(f"{output} cannot be written: {error.strerror}") from error
     return remarks
 
@@ -94,14 +96,20 @@ def _places(mesh: Path, path: Path, pieces: list[Piece], points: Points) -> dict
 
 def _numbered(mesh: Path, pieces: list[Piece]) -> tuple[Float64, dict[str, Float64]]:
     """Vertices in the order of the file, all of them and by the name of their mesh."""
-    if mesh.suffix != ".obj":  # there, a vertex may come several times, once for each texture place
+    if (
+        mesh.suffix.lower() != ".obj"
+    ):  # there, a vertex may come several times, once for each texture place
         return np.concatenate([p.vertices for p in pieces]), {p.name: p.vertices for p in pieces}
     rows: list[list[float]] = []
     begins: dict[str, int] = {}
     for line in mesh.read_text(encoding="utf-8", errors="replace").splitlines():
         words = line.split()
         if words[:1] == ["v"]:
-            rows.append([float(word) for word in words[1:4]])
+            try:
+                x, y, z = map(float, words[1:4])
+            except ValueError:
+                raise UserError(f"{mesh}: {line.strip()!r} is no vertex") from None
+            rows.append([x, y, z])
         elif words[:1] in (["o"], ["g"]) and len(words) > 1:
             begins.setdefault(words[1], len(rows))
     vertices = np.array(rows)

@@ -12,16 +12,23 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from services.driver import picture
 from services.driver.glb_file import BadGlbError, Float64, Glb
 from services.driver.head import FORMAT
-from services.driver.video import encode_picture
 from shared.errors import UserError
 
 MAX_VERTICES = 300_000
+MAX_TRIANGLES = 1_000_000
+MAX_PIECES = 2_000
+MAX_SHIFTS = 20_000_000  # vertices that all morph targets together move
+MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # of all
+MAX_MESH_BYTES = 256 * 1024 * 1024  # of a file
+_LARGEST = 1e9  # coordinate
 MESH_SUFFIXES = (".obj", ".glb", ".ply")
 _FINEST_M = 2e-9  # smaller displacements by one FAP unit are left out
 _WHITE = np.full((2, 2, 3), 255, np.uint8)
 _NODES = ("kouxing", "body", "head")  # of an exported GLB
+_LONGEST_NAME = 60
 _NO_DIFFUSE = [102, 102, 102]  # what trimesh makes up
 _SKIN_COLOUR = (0.58, 0.40, 0.32)  # linear, where a file brings none
 
@@ -56,7 +63,8 @@ def read_pieces(glb: Glb) -> list[Piece]:
     nodes = glb.nodes()
     places = dict(nodes)
     followers = _followers(glb, places)
-    pieces = []
+    pieces: list[Piece] = []
+    num_vertices = num_triangles = num_shifts = 0
     for number, place in nodes:
         node = glb.item("nodes", number)
         if "mesh" not in node:
@@ -65,15 +73,44 @@ def read_pieces(glb: Glb) -> list[Piece]:
         for primitive in mesh["primitives"]:
             if primitive.get("mode", 4) != 4:
                 continue  # points and lines
-            piece = _piece(glb, node, mesh, primitive, places, place)
+            count = int(glb.item("accessors", primitive["attributes"]["POSITION"])["count"])
+            num_vertices += count
+            num_shifts += count * len(primitive.get("targets", []))
+            for limit, found, what in (  # a small file may name the same data many times
+                (MAX_VERTICES, num_vertices, "vertices; decimate it"),
+                (MAX_SHIFTS, num_shifts, "displacements; leave out morph targets"),
+                (MAX_TRIANGLES, num_triangles, "triangles; decimate it"),
+                (MAX_PIECES, len(pieces) + 1, "meshes; join them"),
+            ):
+                if found > limit:
+                    raise BadGlbError(f"it has more than {limit} {what}")
+            piece = _piece(glb, node, mesh, primitive, places, place, followers)
             if piece.head_weight is None and followers:
                 piece.head_weight = np.full(len(piece.vertices), followers.get(number, 0.0))
             pieces.append(piece)
-    if not pieces:
+            num_triangles += len(piece.triangles)
+    if not any(len(piece.triangles) for piece in pieces):
         raise BadGlbError("it has no triangles")
-    if sum(len(piece.vertices) for piece in pieces) > MAX_VERTICES:
-        raise BadGlbError(f"it has more than {MAX_VERTICES} vertices; decimate it")
+    _check_textures(pieces)
     return pieces
+
+
+def _check_textures(pieces: list[Piece]) -> None:
+    """Decode every texture once; one that glTF's core does not know becomes a PNG."""
+    known = {b"": b""}
+    num_pixels = 0
+    for piece in pieces:
+        if piece.texture not in known:
+            try:
+                pixels = picture.decode(piece.texture, piece.name)
+            except UserError as error:
+                raise BadGlbError(str(error)) from error
+            num_pixels += pixels.shape[0] * pixels.shape[1]
+            if num_pixels > MAX_TEXTURE_PIXELS:
+                raise BadGlbError(f"its textures have more than {MAX_TEXTURE_PIXELS} pixels")
+            standard = piece.texture.startswith((b"\x89PNG", b"\xff\xd8"))
+            known[piece.texture] = piece.texture if standard else picture.encode(pixels)
+        piece.texture = known[piece.texture]
 
 
 def _followers(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
@@ -96,6 +133,7 @@ def _piece(
     primitive: dict[str, Any],
     places: dict[int, Float64],
     place: Float64,
+    followers: dict[int, float],
 ) -> Piece:
     attributes = primitive["attributes"]
     points = glb.accessor(attributes["POSITION"])
@@ -122,7 +160,7 @@ def _piece(
     placed = np.broadcast_to(place, (count, 4, 4))
     weight = None
     if "skin" in node and "JOINTS_0" in attributes:
-        placed, weight = _skinned(glb, node["skin"], attributes, places)
+        placed, weight = _skinned(glb, node["skin"], attributes, places, followers)
     if not len(uv) == len(colors) == len(placed) == count:
         raise BadGlbError("the attributes of a mesh differ in length")
     shapes = {}
@@ -134,9 +172,13 @@ def _piece(
             if shift.shape != points.shape:
                 raise BadGlbError(f"morph target {name} does not fit its mesh")
             shapes[plain(str(name))] = np.einsum("vij,vj->vi", placed[:, :3, :3], shift)
+    vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
+    for values in (vertices, uv, colors, *shapes.values()):
+        if not (np.abs(values) < _LARGEST).all():
+            raise BadGlbError("a coordinate or colour is not finite, or very large")
     return Piece(
         name=str(node.get("name") or mesh.get("name") or "part"),
-        vertices=np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3],
+        vertices=vertices,
         triangles=index[: len(index) // 3 * 3].reshape(-1, 3),
         uv=uv[:, :2],
         colors=colors,
@@ -148,7 +190,11 @@ def _piece(
 
 
 def _skinned(
-    glb: Glb, skin: object, attributes: dict[str, Any], places: dict[int, Float64]
+    glb: Glb,
+    skin: object,
+    attributes: dict[str, Any],
+    places: dict[int, Float64],
+    followers: dict[int, float],
 ) -> tuple[Float64, Float64 | None]:
     """Matrix (V, 4, 4) of every vertex in the rest pose, and its share of the head's turn (V,)."""
     entry = glb.item("skins", skin)
@@ -162,7 +208,6 @@ def _skinned(
     if which.shape != weights.shape or (which.size and which.max() >= len(joints)):
         raise BadGlbError("a mesh hangs on a joint that does not exist")
     weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
-    followers = _followers(glb, places)
     share = np.array([followers.get(joint, 0.0) for joint in joints])
     placed = np.einsum("vk,vkij->vij", weights, bones[which])
     return placed, (weights * share[which]).sum(axis=1) if followers else None
@@ -189,17 +234,19 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
 def part_names(pieces: list[Piece]) -> list[str]:
     """Name every part differently, eyeballs as the rest of the program knows them."""
     names: list[str] = []
+    taken, last = set(_NODES), dict[str, int]()
     for piece in pieces:
         word = piece.name.lower()
-        name = re.sub(r"[^\w-]", "_", piece.name)
+        name = re.sub(r"[^\w-]", "_", piece.name)[:_LONGEST_NAME]
         if "eye" in word and not re.search("brow|lash|lid|wear|glass", word):
             for side, short in (("left", "l"), ("right", "r")):
                 if side in word or re.search(rf"(^|[_. ]){short}([_. ]|$)", word):
                     name = f"eye_{side}"
-        number = 2
         unique = name
-        while unique in names or unique in _NODES:
-            unique, number = f"{name}_{number}", number + 1
+        while unique in taken:
+            last[name] = last.get(name, 1) + 1
+            unique = f"{name}_{last[name]}"
+        taken.add(unique)
         names.append(unique)
     return names
 
@@ -212,16 +259,19 @@ def read_mesh(path: Path) -> list[Piece]:
     UserError
         If the file cannot be read, has no triangles, or is too large.
     """
-    if path.suffix not in MESH_SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
         raise UserError(f"{path}: give a mesh in one of the forms {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
+    if path.stat().st_size > MAX_MESH_BYTES:
+        raise UserError(f"{path} is larger than {MAX_MESH_BYTES // 2**20} MiB; decimate the mesh")
     try:
-        if path.suffix == ".glb":
+        if suffix == ".glb":
             pieces = read_pieces(Glb(path))
         else:
             with warnings.catch_warnings(action="ignore"):  # trimesh's, on its own guesses
-                options: dict[str, Any] = {"split_objects": True} if path.suffix == ".obj" else {}
+                options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
                 scene = trimesh.load_scene(path, process=False, **options)
             meshes: list[Any] = list(scene.dump())
             pieces = [_from_trimesh(mesh) for mesh in meshes if len(getattr(mesh, "faces", ()))]
@@ -245,7 +295,7 @@ def _from_trimesh(mesh: Any) -> Piece:
         image = getattr(visual.material, "image", None)
         diffuse = getattr(visual.material, "diffuse", None)
         if image is not None:
-            texture = encode_picture(np.asarray(image.convert("RGBA"), dtype=np.uint8))
+            texture = picture.encode(np.asarray(image.convert("RGBA"), dtype=np.uint8))
             colors[:] = 1.0
         elif diffuse is not None and list(diffuse)[:3] != _NO_DIFFUSE:
             colors[:] = (np.asarray(diffuse, dtype=np.float64)[:3] / 255) ** 2
@@ -299,7 +349,7 @@ def pack(
                 shifts.append(of_piece[fap][rows])
         faps.append(fap)
         ends.append(sum(map(len, moved)))
-    textures = {"plain": encode_picture(_WHITE)}
+    textures = {"plain": picture.encode(_WHITE)}
     names = []
     for piece in pieces:
         same = [name for name, data in textures.items() if data == piece.texture]
@@ -320,7 +370,7 @@ def pack(
         "triangles": np.concatenate(triangles).astype(np.uint32),
         "part_names": np.array(part_names(pieces)),
         "part_textures": np.array(names),
-        "part_roughness": np.array([float(s.get("roughnessFactor", 0.6)) for s in surfaces]),
+        "part_roughness": np.clip([float(s.get("roughnessFactor", 0.6)) for s in surfaces], 0, 1),
         "part_transparent": np.array(
             [piece.material.get("alphaMode", "OPAQUE") != "OPAQUE" for piece in pieces]
         ),

@@ -9,16 +9,15 @@ The highlights follow Blinn-Phong with Schlick's Fresnel factor.
 from __future__ import annotations
 
 import ctypes.util
-import io
 import time
 from dataclasses import dataclass
 from typing import Any
 
-import av
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from services.driver import picture
 from services.driver.head import Head, Part
 from shared.errors import UserError
 
@@ -201,13 +200,6 @@ def standalone_context() -> moderngl.Context:
         ) from error
 
 
-def decode_image(encoded: bytes) -> UInt8:
-    """Decode a JPEG or PNG into (H, W, 4)."""
-    with av.open(io.BytesIO(encoded), "r") as container:
-        frame = next(container.decode(video=0))
-        return np.asarray(frame.to_ndarray(format="rgba"), dtype=np.uint8)
-
-
 class Renderer:
     """Pictures of one head.
 
@@ -231,7 +223,7 @@ class Renderer:
     Raises
     ------
     UserError
-        If OpenGL cannot start or the size is not positive.
+        If OpenGL cannot start, the size is not positive, or a texture is damaged.
     """
 
     def __init__(
@@ -279,7 +271,7 @@ class Renderer:
         fixed_buffer = context.buffer(fixed.tobytes())
         self._textures: dict[str, Any] = {}
         for name, encoded in head.textures.items():
-            pixels = decode_image(encoded)
+            pixels = picture.decode(encoded, f"{head.name}: {name}")
             texture = context.texture(pixels.shape[1::-1], 4, pixels.tobytes())
             texture.build_mipmaps()
             texture.filter = (moderngl.LINEAR_MIPMAP_NEAREST, moderngl.LINEAR)

@@ -45,9 +45,9 @@ def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
         If there is no such head, or the file holds none.
     """
     path = Path(name)
-    if path.suffix == ".glb":
+    if path.suffix.lower() == ".glb":
         return read_glb(path)
-    if path.suffix in (".obj", ".gltf", ".stl", ".ply", ".fbx", ".wrl"):
+    if path.suffix.lower() in (".obj", ".gltf", ".stl", ".ply", ".fbx", ".wrl"):
         raise UserError(f"{path} has no shapes that move; see kouxing head import --help")
     return Head.load(path, detail)
 

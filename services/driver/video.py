@@ -30,6 +30,7 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
+from services.driver import picture
 from shared.errors import UserError
 
 Float32 = NDArray[np.float32]
@@ -38,7 +39,7 @@ UInt8 = NDArray[np.uint8]
 AAC_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 OPUS_RATES_HZ = (8000, 12000, 16000, 24000, 48000)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm")
-_NUMBER = re.compile(r"%0?\d*d")  # in the name of a sequence's pictures
+_NUMBER = re.compile(r"%0?\d?d")  # in the name of a sequence's pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,7 @@ class VideoWriter:
     width_px, height_px
         Even numbers.
     frame_rate_hz
-        Pictures a second.
+        Pictures a second, 1 to 1000.
     sample_rate_hz
         One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``; None for no sound.
     transparent
@@ -170,8 +171,8 @@ class VideoWriter:
             raise UserError(
                 f"a video of {width_px} x {height_px} pixels; give even, positive sizes"
             )
-        if not frame_rate_hz > 0:
-            raise UserError(f"a frame rate of {frame_rate_hz} Hz; give a positive one")
+        if not 1 <= frame_rate_hz <= 1000:
+            raise UserError(f"a frame rate of {frame_rate_hz} Hz; give one from 1 to 1000")
         if sample_rate_hz is not None and sample_rate_hz not in rates_hz:
             rates = ", ".join(str(rate) for rate in rates_hz)
             raise UserError(
@@ -327,19 +328,9 @@ def write_picture(path: Path, image: UInt8) -> None:
         If the file cannot be written.
     """
     try:
-        path.write_bytes(encode_picture(image))
+        path.write_bytes(picture.encode(image))
     except OSError as error:
         raise _unwritable(path, error) from error
-
-
-def encode_picture(image: UInt8) -> bytes:
-    """Encode a picture (H, W, 3), or (H, W, 4) with alpha, as PNG."""
-    kind = "rgba" if image.shape[2] == 4 else "rgb24"
-    encoder = av.CodecContext.create("png", "w")
-    encoder.height, encoder.width = image.shape[:2]
-    encoder.pix_fmt, encoder.time_base = kind, Fraction(1)
-    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=kind)
-    return b"".join(bytes(packet) for packet in [*encoder.encode(frame), *encoder.encode(None)])
 
 
 def _unwritable(path: Path, error: OSError) -> UserError:

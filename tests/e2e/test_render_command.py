@@ -94,7 +94,7 @@ def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
         ("a.mp4", {"at": 0.1}, "--at says when one picture"),
         ("a.mp4", {"size": "161x120"}, "even for a video"),
         ("a.avi", {}, "give a name that ends in .mp4, .mov, .webm"),
-        ("a.png", {"at": 9.0}, "lasts from 0 to 0.45 s"),
+        ("a.png", {"at": 9.0, "size": "64x48"}, "lasts from 0 to 0.45 s"),
         ("a.png", {"head": "nobody"}, "there is no head 'nobody'"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
         ("no/a.mp4", {}, "cannot be written"),
@@ -132,7 +132,8 @@ def test_an_imported_mesh_speaks(face: Path, tmp_path: Path) -> None:
 
 
 def test_the_page_gets_the_head_that_is_chosen(tmp_path: Path) -> None:
-    assert _chosen_head(DriverConfig().head, tmp_path) == {}
+    own = DriverConfig().head
+    assert _chosen_head(own, tmp_path) == {"KOUXING_DRIVER_HEAD": own}, "whatever a file says"
     export_glb(Head.load("child", "coarse"), tmp_path / "my.glb")
     chosen = _chosen_head(str(tmp_path / "my.glb"), tmp_path / "out")
     assert chosen["KOUXING_DRIVER_HEAD"] == str(tmp_path / "my.glb")

@@ -1,0 +1,52 @@
+"""Decode and encode single pictures. Textures come from strangers' files: see ``decode``."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+
+UInt8 = NDArray[np.uint8]
+
+MAX_PIXELS = 8192 * 8192
+# first bytes: decoder. FFmpeg is not left to guess: it would take playlists, which name other files
+_CODECS = {b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"RIFF": "webp"}
+
+
+def decode(encoded: bytes, name: str) -> UInt8:
+    """Decode a PNG, JPEG or WebP into (H, W, 4); the name is for what went wrong.
+
+    Raises
+    ------
+    UserError
+        If it is none, is damaged, or has more than ``MAX_PIXELS``.
+    """
+    codec = next((codec for magic, codec in _CODECS.items() if encoded.startswith(magic)), None)
+    if codec is None:
+        raise UserError(f"texture {name!r} is neither PNG, JPEG nor WebP")
+    decoder: Any = av.CodecContext.create(codec, "r")
+    decoder.options = {"max_pixels": str(MAX_PIXELS)}
+    decoder.thread_count = 1
+    try:
+        frames = [*decoder.decode(av.Packet(encoded)), *decoder.decode(None)]
+        pixels = np.asarray(frames[0].to_ndarray(format="rgba"), dtype=np.uint8)
+    except (av.FFmpegError, IndexError, ValueError, MemoryError) as error:
+        raise UserError(
+            f"texture {name!r} is damaged or has more than {MAX_PIXELS / 1e6:.0f} million pixels"
+        ) from error
+    return pixels
+
+
+def encode(image: UInt8) -> bytes:
+    """Encode a picture (H, W, 3), or (H, W, 4) with alpha, as PNG."""
+    kind = "rgba" if image.shape[2] == 4 else "rgb24"
+    encoder = av.CodecContext.create("png", "w")
+    encoder.height, encoder.width = image.shape[:2]
+    encoder.pix_fmt, encoder.time_base = kind, Fraction(1)
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=kind)
+    return b"".join(bytes(packet) for packet in [*encoder.encode(frame), *encoder.encode(None)])
