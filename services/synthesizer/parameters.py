@@ -154,6 +154,7 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
         data = _read(path)
         if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
             raise ValueError(f"not a file of '{FORMAT}'")
+        _clips_of(data)
         arrays = {
             name: np.array([data["visemes"][viseme][name] for viseme in VISEMES], dtype=float)
             for name in _PER_VISEME
@@ -177,7 +178,10 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
 
 def clips_seen(path: Path | None = None) -> frozenset[str]:
     """Return the names of the clips that parameters were learnt from or chosen with."""
-    data = _read(path)
+    return _clips_of(_read(path))
+
+
+def _clips_of(data: dict[str, Any]) -> frozenset[str]:
     return frozenset((*data["learnt_from"], *data["chosen_with"]))
 
 
