@@ -18,21 +18,17 @@ goes with formants about 1.2 times as high (Peterson and Barney 1952, table II).
 
 from __future__ import annotations
 
-import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pyworld
 from numpy.typing import NDArray
 
 from services.recognizer.features import SAMPLE_RATE_HZ, LogMel
 from training.corpus import Utterance
 from training.feature_cache import cached_blocks
-
-with warnings.catch_warnings():  # it asks setuptools for its own version
-    warnings.simplefilter("ignore")
-    import pyworld
 
 _FRAME_MS = 5.0
 _LOWEST_F0_HZ, _HIGHEST_F0_HZ = 80.0, 320.0  # of the new voices' medians
