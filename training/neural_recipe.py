@@ -11,13 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from evaluation.recognizer import ErrorCounts, count_errors
 from services.recognizer.acoustic_model import AcousticModel, Topology
-from services.recognizer.decoder import Decoder
 from services.recognizer.load import load_model
 from services.recognizer.neural import NeuralModel
 from shared.errors import UserError
-from shared.phones import SILENCE, UNITS
+from shared.phones import UNITS
 from training.corpus import RowErrors, Utterance, is_synthetic
 from training.durations import AlignedUnit, UnitDurations
 from training.examples import WORD_UNITS, Example, load_examples
@@ -26,7 +24,16 @@ from training.gmm import unit_bigram, units_of_path, utterance_graph, viterbi_pa
 from training.network import Network, Shape
 from training.network_export import onnx_of
 from training.network_training import FrontEnd, Recording, Trainer
-from training.recipes import UNCHOSEN, Report, choose_search, report_rows, with_penalty, write_card
+from training.recipes import (
+    UNCHOSEN,
+    Report,
+    all_scores,
+    choose_search,
+    error_rate,
+    report_rows,
+    with_penalty,
+    write_card,
+)
 
 STATES_PER_UNIT = 3
 LOOK_AHEADS = (0, 1, 3, 6)  # feature frames, of the output layers; the trunk forgets more
@@ -120,16 +127,19 @@ def train_neural(
             trainer.replace_recordings(_recordings(aligned))
             report(f"step {step}: aligned anew")
         if dev and step % max(1, round(_JUDGED_EVERY * num_steps)) == 0:
-            rates.append((step, _error_rate(_model(trainer, aligned), dev)))
+            judged = _model(trainer, aligned)
+            scores = [all_scores(judged, example) for example in dev]
+            rates.append((step, error_rate(judged.topology, scores, dev)))
             rate = 100 * rates[-1][1]
             report(f"step {step}: {loss:.3f} nats a frame, dev phone error {rate:.1f} %")
 
     trainer.train(num_steps, watch)
     model = _model(trainer, aligned)
-    choice = choose_search([model], corpora, scales=_SCALES, shipping=shipping, report=report)
+    unscaled = replace(model, kappa=1.0)
+    choice = choose_search(unscaled, corpora, scales=_SCALES, shipping=shipping, report=report)
     if choice is not None:
         topology = with_penalty(model.topology, choice.unit_penalty)
-        model = replace(model, topology=topology, kappa=choice.scales[0])
+        model = replace(model, topology=topology, kappa=choice.scale)
     model.save(output)
     draw_curves(losses, rates, output.with_suffix(".png"))
     write_card(
@@ -154,9 +164,7 @@ def _aligned(model: AcousticModel, examples: Sequence[Example]) -> list[_Aligned
     # middle of the n-th part of a unit, in parts of another size
     coarse = of_state * STATES_PER_UNIT + (2 * place + 1) * STATES_PER_UNIT // (2 * own[of_state])
     for example in examples:
-        stream = model.stream()
-        log_mel = example.log_mel.astype(np.float32)
-        scores = np.concatenate([stream.accept(log_mel), stream.finish()])
+        scores = all_scores(model, example)
         graph = utterance_graph(example.units, example.syllables, model.topology.first_state)
         path, _ = viterbi_path(
             scores[:, graph.states], graph, model.topology.log_stay, model.topology.log_leave
@@ -231,21 +239,6 @@ def _dev_examples(corpora: Sequence[Path], *, shipping: bool) -> list[Example]:
         return load_examples(corpora, RowErrors(), split="dev", shipping=shipping)
     except UserError:
         return []
-
-
-def _error_rate(model: NeuralModel, examples: Sequence[Example]) -> float:
-    decoder = Decoder(model.topology)
-    total = ErrorCounts()
-    for example in examples:
-        decoder.reset()
-        stream = model.stream()
-        for rows in (stream.accept(example.log_mel.astype(np.float32)), stream.finish()):
-            for row in rows:
-                decoder.accept(row)
-        heard = [UNITS[segment.unit] for segment in decoder.finish()]
-        said = [UNITS[unit] for unit in example.units]
-        total += count_errors(said, [unit for unit in heard if unit != SILENCE])
-    return total.rate
 
 
 def _second_task(folder: Path, errors: RowErrors) -> tuple[int, list[Recording]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -49,12 +48,12 @@ _UNIT_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)
 class Choice:
     """What was chosen on development data."""
 
-    scales: tuple[float, ...]  # of each model's log scores
+    scale: float  # of the log scores
     unit_penalty: float
     error_rate: float
 
 
-UNCHOSEN = Choice((0.2,), -1.0, 1.0)
+UNCHOSEN = Choice(0.2, -1.0, 1.0)
 
 
 def train_gmm(
@@ -126,9 +125,9 @@ def train_gmm(
         prior_mean=prior_mean,
         half_width=_HALF_WIDTH,
     )
-    choice = choose_search([model], corpora, shipping=shipping, report=report) or UNCHOSEN
+    choice = choose_search(model, corpora, shipping=shipping, report=report) or UNCHOSEN
     topology = with_penalty(model.topology, choice.unit_penalty)
-    replace(model, topology=topology, kappa=choice.scales[0]).save(output)
+    replace(model, topology=topology, kappa=choice.scale).save(output)
     write_card(
         output,
         title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
@@ -142,58 +141,58 @@ def train_gmm(
 
 
 def choose_search(
-    models: Sequence[AcousticModel],
+    model: AcousticModel,
     corpora: Sequence[Path],
     *,
     scales: Sequence[float] = _SCALES,
     shipping: bool = True,
     report: Report = print,
 ) -> Choice | None:
-    """Choose each model's scale and the unit penalty on the split ``dev``, if there is one.
+    """Choose scale and unit penalty on the split ``dev``, if there is one.
 
     Parameters
     ----------
-    models
-        Models that listen together; the first one's bigram is used.
+    model
+        A model whose own scale is 1.
     scales
-        Scales to try for each model.
+        Scales of its log scores to try.
     corpora, shipping, report
         As for :func:`train_gmm`.
     """
     try:
         dev = load_examples(corpora, RowErrors(), split="dev", shipping=shipping)
     except UserError:
-        report("no dev recordings: scales and unit penalty are not chosen")
+        report("no dev recordings: scale and unit penalty are not chosen")
         return None
-    scores = [[_all_scores(model, example) for example in dev] for model in models]
+    scores = [all_scores(model, example) for example in dev]
     best: Choice | None = None
-    for weights in product(scales, repeat=len(models)):
+    for scale in scales:
+        scaled = [np.float32(scale) * rows for rows in scores]
         for unit_penalty in _UNIT_PENALTIES:
-            decoder = Decoder(with_penalty(models[0].topology, unit_penalty))
-            total = ErrorCounts()
-            for number, example in enumerate(dev):
-                decoder.reset()
-                for row in _weighted([rows[number] for rows in scores], weights):
-                    decoder.accept(row)
-                units = [UNITS[segment.unit] for segment in decoder.finish()]
-                heard = [unit for unit in units if unit != SILENCE]
-                total += count_errors([UNITS[unit] for unit in example.units], heard)
-            if best is None or total.rate < best.error_rate:
-                best = Choice(weights, unit_penalty, total.rate)
+            rate = error_rate(with_penalty(model.topology, unit_penalty), scaled, dev)
+            if best is None or rate < best.error_rate:
+                best = Choice(scale, unit_penalty, rate)
                 report(
-                    f"dev phone error rate {100 * total.rate:.1f} % with scales {weights} and unit "
-                    f"penalty {unit_penalty}"
+                    f"dev phone error rate {100 * rate:.1f} % with scale {scale} and unit penalty "
+                    f"{unit_penalty}"
                 )
     return best
 
 
-def _weighted(
-    scores: Sequence[NDArray[np.float32]], scales: Sequence[float]
-) -> NDArray[np.float32]:
-    total = np.zeros_like(scores[0])
-    for rows, scale in zip(scores, scales, strict=True):
-        total += np.float32(scale) * rows
-    return total
+def error_rate(
+    topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
+) -> float:
+    """Phone error rate of the full traceback, from the examples' scores, (frames, states) each."""
+    decoder = Decoder(topology)
+    total = ErrorCounts()
+    for rows, example in zip(scores, examples, strict=True):
+        decoder.reset()
+        for row in rows:
+            decoder.accept(row)
+        units = [UNITS[segment.unit] for segment in decoder.finish()]
+        heard = [unit for unit in units if unit != SILENCE]
+        total += count_errors([UNITS[unit] for unit in example.units], heard)
+    return total.rate
 
 
 def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
@@ -201,7 +200,8 @@ def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
     return replace(topology, log_bigram=topology.log_bigram + np.float32(unit_penalty))
 
 
-def _all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
+def all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
+    """Scores of all frames of an unchanged recording, shape (frames, states)."""
     stream = model.stream()
     return np.concatenate([stream.accept(example.log_mel.astype(np.float32)), stream.finish()])
 
@@ -278,7 +278,7 @@ def write_card(
     if choice is not UNCHOSEN:
         lines += [
             "",
-            f"Chosen on dev: scale of the log scores {choice.scales[0]}, unit penalty "
+            f"Chosen on dev: scale of the log scores {choice.scale}, unit penalty "
             f"{choice.unit_penalty}; phone error rate there {100 * choice.error_rate:.1f} %.",
         ]
     output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
