@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head import ASSETS, Detail, Head
+from services.driver.head import ASSETS, Detail, Head, neutral_faps
 from shared.faps import FAPS, NUM_FAPS, Fap
 
 NAMES = sorted(path.stem for path in ASSETS.glob("*.npz"))
@@ -18,6 +18,11 @@ AXES = {
     "right": (0, -1.0),
     "forward": (2, 1.0),
 }
+OPEN = neutral_faps(
+    open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
+    lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,
+    raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
+)  # fmt: skip
 DISPLACING = [fap for fap in FAPS if fap.direction in AXES and fap.fapu != "AU"]
 
 

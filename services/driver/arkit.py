@@ -24,14 +24,12 @@ SIAM J. Imaging Sciences 2(1), 2009, whose shrinkage is here the clipping to 0 a
 
 from __future__ import annotations
 
-import csv
 import math
-from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.high_level import VISEMES
+from services.driver.high_level import VISEMES, fap_table
 from shared.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 
 Float32 = NDArray[np.float32]
@@ -45,13 +43,7 @@ _STEPS = 120  # of equation (2); then the weights are right to 0.02
 
 
 def _read() -> tuple[tuple[str, ...], Float32]:
-    text = resources.files("services.driver").joinpath("arkit.tsv").read_text("utf-8")
-    rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
-    values = np.zeros((len(rows), NUM_FAPS), np.float32)
-    for row, target in zip(rows, values, strict=True):
-        for column, value in row.items():
-            if column.startswith("fap"):
-                target[int(column.removeprefix("fap")) - 1] = float(value)
+    rows, values = fap_table("arkit.tsv")
     return tuple(row["shape"] for row in rows), values
 
 

@@ -25,15 +25,22 @@ Float32 = NDArray[np.float32]
 FULL = 63  # of viseme_blend and expression_intensity
 
 
-def _read(kind: str) -> tuple[tuple[str, ...], Float32]:
-    text = resources.files("services.driver").joinpath("high_level.tsv").read_text("utf-8")
-    rows = [row for row in csv.DictReader(text.splitlines(), delimiter="\t") if row["kind"] == kind]
+def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
+    """Read a table beside this module: its rows, and their columns ``fapN`` as FAPs (rows, 68)."""
+    text = resources.files("services.driver").joinpath(name).read_text("utf-8")
+    rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
     values = np.zeros((len(rows), NUM_FAPS), np.float32)
     for row, target in zip(rows, values, strict=True):
         for column, value in row.items():
             if column.startswith("fap"):
                 target[int(column.removeprefix("fap")) - 1] = float(value)
-    return tuple(row["name"] for row in rows), values
+    return rows, values
+
+
+def _read(kind: str) -> tuple[tuple[str, ...], Float32]:
+    rows, values = fap_table("high_level.tsv")
+    of_kind = [number for number, row in enumerate(rows) if row["kind"] == kind]
+    return tuple(rows[number]["name"] for number in of_kind), values[of_kind]
 
 
 VISEME_NAMES, VISEMES = _read("viseme")  # (15, 68), row 0 is "none"

@@ -22,14 +22,14 @@ INNER = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
 OUTER = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
 LOWER_LIP = ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8")
 UPPER_LIP = ("2.2", "2.6", "2.7", "8.1", "8.5", "8.6")
-_AXES = {
+AXES = {
     "down": (1, -1.0),
     "up": (1, 1.0),
     "left": (0, 1.0),
     "right": (0, -1.0),
     "forward": (2, 1.0),
 }
-_CORNER_SLOPE = 0.37  # of the lips' curve seen from above, near the corners
+CORNER_SLOPE = 0.37  # of the lips' curve seen from above, near the corners
 _LID_SLOPE = 0.15  # a closing lid comes forward round the eyeball
 _HINGE = 1.34  # eye distances from the chin back to the jaw's axis
 # FAP, its point, core that moves as a whole and reach, in eye distances
@@ -125,7 +125,7 @@ class FaceFields:
     def _along(self, fap: int, weight: Float) -> Float:
         """Field (V, 3) that moves along the axis of a FAP."""
         entry = FAPS[fap - 1]
-        axis, sign = _AXES[entry.direction]
+        axis, sign = AXES[entry.direction]
         field = np.zeros((len(weight), 3))
         field[:, axis] = sign * weight * self._fapu[entry.fapu] / FAP_UNITS_PER_FAPU
         return field
@@ -165,7 +165,7 @@ class FaceFields:
             self._add(fap_x, self._lip_x[name])
             # a corner slides along the curve of the lips: outwards is backwards
             self.fields[fap_x][:, 2] = (
-                -_CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
+                -CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
             )
         pushed = self._smoothest(self._all("2.3", "2.2", *corners), fixed)[:, :2]
         self._lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))

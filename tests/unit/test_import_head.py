@@ -14,17 +14,13 @@ from services.driver.import_head import import_head
 from shared.errors import UserError
 from shared.faps import FAPS, NUM_FAPS
 from tests.glb_writer import Mesh, write_glb
+from tests.heads import OPEN
 from tests.meshes import meshes, write_obj
 
 pytestmark = pytest.mark.unit
 
 AXES = {"down": (1, -1), "up": (1, 1), "left": (0, 1), "right": (0, -1), "forward": (2, 1)}
 TURN = np.array([-1.0, 1.0, -1.0])  # by 180 degrees about y
-OPEN = neutral_faps(
-    open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
-    lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,
-    raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -13,14 +13,9 @@ from services.driver.head import Head, neutral_faps
 from services.driver.render import Renderer
 from services.driver.window import Window
 from shared.errors import UserError
+from tests.heads import OPEN
 
 pytestmark = pytest.mark.unit
-
-OPEN = neutral_faps(
-    open_jaw=450, lower_t_midlip=-280, raise_b_midlip=-600, lower_t_lip_lm=-220,
-    lower_t_lip_rm=-220, raise_b_lip_lm=-520, raise_b_lip_rm=-520, raise_b_midlip_o=-510,
-    raise_b_lip_lm_o=-520, raise_b_lip_rm_o=-520,
-)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

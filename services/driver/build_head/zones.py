@@ -24,28 +24,19 @@ from scipy import sparse
 
 from services.driver.build_head import surface
 from services.driver.build_head.feature_points import FEATURE_POINTS
+from services.driver.import_fields import AXES, CORNER_SLOPE, INNER, OUTER
 from shared.faps import FAPS
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 Fields = dict[int, Float]  # FAP number -> (V, 3)
 
-_AXES = {
-    "down": (1, -1.0),
-    "up": (1, 1.0),
-    "left": (0, 1.0),
-    "right": (0, -1.0),
-    "forward": (2, 1.0),
-}
-_INNER = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
-_OUTER = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
 # the ring of vertices along which the lips meet, from 2.2 over 2.4 and 2.3 to 2.5
 LIP_RING = (
     520, 7267, 7268, 7261, 7262, 11962, 7263, 7181, 7180, 7196, 10399, 7194, 7195, 10376, 7205,
     7206, 7266, 7265, 7264, 523, 517, 518, 519, 446, 445, 3708, 435, 434, 3731, 436, 420, 421, 516,
     5360, 515, 514, 522, 521,
 )  # fmt: skip
-_CORNER_SLOPE = 0.37  # of the lips' curve seen from above, near the corners
 _HINGE_Z = 0.35  # dm; the jaw turns about an axis here
 
 
@@ -113,7 +104,7 @@ def close_lips(skin: Skin, overlap: float = 0.002) -> None:
 
 def axis_of(fap: int) -> tuple[int, float]:
     """Axis (0 x, 1 y, 2 z) and sign of a displacement FAP."""
-    return _AXES[FAPS[fap - 1].direction]
+    return AXES[FAPS[fap - 1].direction]
 
 
 def smoothest(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
@@ -174,9 +165,9 @@ class FaceFields:
         skin = self.skin
         x, y, z = skin.vertices.T
         nose = (y > 5.325) & (np.abs(x) < 0.28) & ~self.cavity
-        around = self._far(_INNER + _OUTER, 0.34) | nose | ((y < 4.87) & ~self.cavity)
+        around = self._far(INNER + OUTER, 0.34) | nose | ((y < 4.87) & ~self.cavity)
         fixed = np.flatnonzero(around | (self.cavity & (z < 1.08)))
-        names = _INNER + _OUTER
+        names = INNER + OUTER
         points = skin.points(*names)
         fixed = np.setdiff1d(fixed, points)
         self.lip_y = dict(zip(names, smoothest(skin, points, fixed).T, strict=True))
@@ -198,7 +189,7 @@ class FaceFields:
             self.lip_x[name] = single[:, row] + 0.45 * half
             self._add(fap, self.lip_x[name])
             # a corner slides along the curve of the lips: outwards is backwards
-            self.fields[fap][:, 2] = -_CORNER_SLOPE * self.lip_x[name] * self.fapu["MW"]
+            self.fields[fap][:, 2] = -CORNER_SLOPE * self.lip_x[name] * self.fapu["MW"]
         pushed = smoothest(skin, skin.points("2.3", "2.2", *corners), fixed)[:, :2]
         self.lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
         self._add(16, self.lip_z["2.3"])
@@ -262,7 +253,7 @@ class FaceFields:
     def _zones(self) -> None:
         chin = self.skin.points("2.1", "8.2", "8.7", "8.8")
         nose = self.skin.points("9.1", "9.2", "9.3", "9.4", "9.5", "9.15")
-        lips = np.concatenate([self.skin.points(*_INNER), self.skin.points(*_OUTER)])
+        lips = np.concatenate([self.skin.points(*INNER), self.skin.points(*OUTER)])
         self._zone(18, "2.10", 0.02, 0.26, chin)
         # a puffed cheek comes forward, too, and a lifted one swells
         for fap, name, reach, forward in (
@@ -290,7 +281,7 @@ class FaceFields:
         lids = ("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
         held = self._far((name,), reach) | self.cavity | (y > 5.80)
         for others, margin in (
-            (_INNER + _OUTER, 0.07),
+            (INNER + OUTER, 0.07),
             (("9.1", "9.2", "9.15"), 0.10),
             (lids, 0.07),
         ):
