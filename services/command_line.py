@@ -222,7 +222,7 @@ def speak(
     elif source == "-":
         audio = raw_audio(sys.stdin.buffer, rate, channels)
     else:
-        audio = open_audio(Path(source), block_s=0.1 if fast else 0.02)
+        audio = open_audio(Path(source))
     spoken = stream(
         audio, _control(control), CONSOLE, session=session, record=record, paced=not fast
     )

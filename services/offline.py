@@ -18,7 +18,8 @@ from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler
 from services.synthesizer.live import REST_S, LiveSynthesizer
 from services.synthesizer.parameters import load_parameters
-from shared.audio_file import open_audio
+from services.terminal import say
+from shared.audio_file import clipping_remarks, num_clipped, open_audio
 from shared.config import RecognizerConfig, SynthesizerConfig
 from shared.messages import MEDIA_RATE_HZ
 from shared.phones import Phone, SpeechChange
@@ -30,6 +31,8 @@ Frame = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 def mono_16k(path: Path) -> NDArray[np.float32]:
     """Return a file's samples as the recognizer hears them: 16 kHz mono, shape ``(n,)``.
 
+    Tells the user if the file is cut off or clipped.
+
     Raises
     ------
     UserError
@@ -37,7 +40,14 @@ def mono_16k(path: Path) -> NDArray[np.float32]:
     """
     source = open_audio(path, block_s=1.0)
     resampler = Resampler(source.sample_rate_hz, source.num_channels)
-    parts = [resampler.accept_waveform(block) for block in source.blocks]
+    parts = []
+    num_samples = clipped = 0
+    for block in source.blocks:
+        parts.append(resampler.accept_waveform(block))
+        num_samples += block.size
+        clipped += num_clipped(block)
+    for remark in (*source.remarks, *clipping_remarks(str(path), clipped / max(1, num_samples))):
+        say(remark)
     return np.concatenate([*parts, resampler.finish()])
 
 

@@ -163,7 +163,8 @@ def phones(
     from shared.phone_files import format_phones
 
     samples = offline.mono_16k(audio)
-    found = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
+    with CONSOLE.status(f"recognising {len(samples) / MEDIA_RATE_HZ:.0f} s"):
+        found = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
     if not found:
         say(f"{audio}: no speech was heard")
     show(format_phones(found, _form(form, output), len(samples) / MEDIA_RATE_HZ), output)

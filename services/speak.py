@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from shared.audio_file import AudioSource
+from shared.audio_file import AudioSource, clipping_remarks, num_clipped
 from shared.bus import Socket
 from shared.client import Client, Session
 from shared.errors import UserError
@@ -23,7 +23,6 @@ QUEUE_WAIT_S = 0.005
 END_LIMIT_S = 30.0  # for the last frames after the last sample
 VIDEO_LIMIT_S = 3600.0
 QUIET_PEAK = 1e-3  # below this (-60 dBFS) a file is called silent
-CLIPPED_SHARE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +73,11 @@ def speak(
             with contextlib.suppress(UserError):  # closed already, or control is gone
                 opened.close()
         video = _wait_for_video(events, console) if record else ""
-    _comment(console, source.name, num_phones, clipped, peak)
+    if num_phones == 0:
+        reason = "it is silent" if peak < QUIET_PEAK else "is there a voice in it?"
+        _warn(console, f"{source.name}: no speech was heard; {reason}")
+    for remark in (*source.remarks, *clipping_remarks(source.name, clipped)):
+        _warn(console, remark)
     return Spoken(opened.name, duration_s, num_phones, video)
 
 
@@ -82,7 +85,7 @@ def _stream(
     source: AudioSource, session: Session, events: Socket, console: Console, *, paced: bool
 ) -> tuple[float, float, float]:
     """Send everything; return seconds sent, the share of clipped samples and the peak."""
-    num_sent = num_clipped = 0
+    num_sent = clipped = 0
     peak = 0.0
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
@@ -92,7 +95,7 @@ def _stream(
             for block in source.blocks:
                 _patiently(functools.partial(session.send, block))
                 num_sent += len(block)
-                num_clipped += int(np.count_nonzero(np.abs(block) >= 0.999).item())
+                clipped += num_clipped(block)
                 peak = max(peak, float(np.abs(block).max()))
                 sent_s = num_sent / source.sample_rate_hz
                 progress.update(task, completed=sent_s)
@@ -102,7 +105,7 @@ def _stream(
         except KeyboardInterrupt:
             console.print("stopping")
     duration_s = num_sent / source.sample_rate_hz
-    return duration_s, num_clipped / max(1, num_sent * source.num_channels), peak
+    return duration_s, clipped / max(1, num_sent * source.num_channels), peak
 
 
 def _patiently(send: Callable[[], bool]) -> None:
@@ -168,17 +171,6 @@ def _wait_for_video(events: Socket, console: Console) -> str:
                     _warn(console, event.detail)
                     return ""
     raise UserError("the driver wrote no video; see 'kouxing status'")
-
-
-def _comment(console: Console, name: str, num_phones: int, clipped: float, peak: float) -> None:
-    if num_phones == 0:
-        reason = "it is silent" if peak < QUIET_PEAK else "is there a voice in it?"
-        _warn(console, f"{name}: no speech was heard; {reason}")
-    if clipped > CLIPPED_SHARE:
-        _warn(
-            console,
-            f"{name}: {clipped:.0%} of the samples are clipped; record at a lower level",
-        )
 
 
 def _warn(console: Console, text: str) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import queue
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
@@ -17,7 +18,12 @@ from shared.errors import UserError
 
 LOWEST_RATE_HZ = 8_000
 HIGHEST_RATE_HZ = 48_000  # what the wire carries; files above are resampled to it
+CLIPPED_LEVEL = 0.999
+CLIPPED_SHARE = 0.01  # of the samples; above it a user is told
 Samples = NDArray[np.float32]  # (n, channels), in [-1, 1]
+LEAST_MISSING_S = 0.05  # of a file that is called cut off
+_MISSING = re.compile(r"^data : (\d+) \(should be (\d+)\)", re.MULTILINE)
+_NO_LENGTH = 2**31 - 2**16  # a writer to a pipe says so much or more
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +35,7 @@ class AudioSource:
     num_channels: int
     duration_s: float | None  # None where the end is not known
     blocks: Iterator[Samples]
+    remarks: list[str] = field(default_factory=list)  # what is wrong; complete after the last block
 
 
 def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
@@ -45,8 +52,10 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
     try:
         file = soundfile.SoundFile(path)
     except (soundfile.LibsndfileError, OSError) as error:
-        if not path.is_file():
+        if not path.exists():
             raise UserError(f"{path}: there is no such file") from None
+        if path.is_dir():
+            raise UserError(f"{path}: this is a folder; give an audio file") from None
         if path.stat().st_size == 0:
             raise UserError(f"{path}: the file is empty") from None
         raise UserError(
@@ -59,12 +68,14 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
             f"{path}: {file.samplerate} Hz is too low for speech; give {LOWEST_RATE_HZ} Hz or more"
         )
     rate_hz = min(file.samplerate, HIGHEST_RATE_HZ)
+    remarks: list[str] = []
     return AudioSource(
         name=path.name,
         sample_rate_hz=rate_hz,
         num_channels=min(2, file.channels),
         duration_s=file.frames / file.samplerate,
-        blocks=_file_blocks(file, path, rate_hz, block_s),
+        blocks=_file_blocks(file, path, rate_hz, block_s, remarks),
+        remarks=remarks,
     )
 
 
@@ -78,6 +89,18 @@ def read_audio(path: Path) -> tuple[Samples, int]:
     """
     source = open_audio(path, block_s=1.0)
     return np.concatenate(list(source.blocks)), source.sample_rate_hz
+
+
+def num_clipped(samples: Samples) -> int:
+    """Return how many samples are at full scale."""
+    return int(np.count_nonzero(np.abs(samples) >= CLIPPED_LEVEL))
+
+
+def clipping_remarks(name: str, share: float) -> list[str]:
+    """Return what to tell the user if so large a share of the samples is clipped."""
+    if share <= CLIPPED_SHARE:
+        return []
+    return [f"{name}: {share:.0%} of the samples are clipped; record at a lower level"]
 
 
 def raw_audio(stream: IO[bytes], sample_rate_hz: int, num_channels: int) -> AudioSource:
@@ -131,7 +154,7 @@ def microphone(sample_rate_hz: int = 16_000) -> AudioSource:
 
 
 def _file_blocks(
-    file: soundfile.SoundFile, path: Path, rate_hz: int, block_s: float
+    file: soundfile.SoundFile, path: Path, rate_hz: int, block_s: float, remarks: list[str]
 ) -> Iterator[Samples]:
     num_channels = min(2, file.channels)
     resampler = (
@@ -162,4 +185,16 @@ def _file_blocks(
             if len(samples):
                 yield np.ascontiguousarray(samples, np.float32)
             if len(block) == 0:
+                remarks += _cut_off(file, path, num_read)
                 return
+
+
+def _cut_off(file: soundfile.SoundFile, path: Path, num_read: int) -> list[str]:
+    """Return a remark if the file says that it is longer than it is."""
+    num_stated = file.frames
+    if (match := _MISSING.search(file.extra_info)) and int(match[1]) < _NO_LENGTH:
+        num_stated = int(match[1]) * num_read // int(match[2])
+    read_s, stated_s = num_read / file.samplerate, num_stated / file.samplerate
+    if stated_s < read_s + LEAST_MISSING_S:
+        return []
+    return [f"{path}: the file is cut off: {read_s:.1f} s of {stated_s:.1f} s are there"]

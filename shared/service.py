@@ -165,6 +165,11 @@ class Service:
         if now_s >= self._tick_due_s:
             self._tick_due_s = now_s + TICK_S
             self.on_tick(now_s)
+        self.beat_if_due()
+
+    def beat_if_due(self) -> None:
+        """Say that this loop is alive; for the midst of long work, too."""
+        now_s = time.monotonic()
         if now_s >= self._beat_due_s:
             self._beat_due_s = now_s + HEARTBEAT_S
             self._beat()

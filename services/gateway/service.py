@@ -13,6 +13,7 @@ import contextlib
 import errno
 import gc
 import hashlib
+import logging
 import os
 import re
 import secrets
@@ -26,6 +27,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler as WebHandler
 
 from services.gateway import wire
@@ -148,7 +150,11 @@ class GatewayService(Service):
             self._loop.add_signal_handler(number, self._on_signal, number)
         for descriptor in self.file_descriptors:
             self._watch(descriptor)
-        runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=0.5)
+        log = LOG.getChild("http")
+        log.addFilter(self._is_of_note)
+        runner = web.AppRunner(
+            self._application(), access_log=None, logger=log, shutdown_timeout=0.5
+        )
         await runner.setup()
         await web.SockSite(runner, self._listener).start()
         gc.collect()
@@ -162,6 +168,13 @@ class GatewayService(Service):
         for descriptor in self.file_descriptors:
             self._loop.remove_reader(descriptor)
         self.drain()
+
+    def _is_of_note(self, record: logging.LogRecord) -> bool:
+        """Keep what is no HTTP, and was answered so, from filling the log with tracebacks."""
+        if record.exc_info and isinstance(record.exc_info[1], HttpProcessingError):
+            self.warn("bad-http", "dropped a request: it is no HTTP")
+            return False
+        return True
 
     async def _turn(self) -> None:
         # The descriptors are edge-triggered: what a full batch left behind waits for the tick.

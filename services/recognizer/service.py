@@ -46,7 +46,7 @@ GAP = MEDIA_RATE_HZ // 10  # a jump of media time by more than this is a pause, 
 LAST_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 BACKLOG_LIMIT = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 BACKLOG_LIMIT_S = 5.0  # for so long; then the session's link is given up for the others' sake
-MOST_WAITING = 64  # chunks that are heard together; more wait for the next turn
+MOST_WAITING_S = 0.3  # of audio, all sessions', that is heard together
 
 Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
 
@@ -176,7 +176,7 @@ class RecognizerService(Service):
         self._rule = (config.agreement, config.least_confidence)
         self._streams: dict[str, _Stream] = {}
         self._waiting: dict[str, list[Chunk]] = {}  # to be heard, by session
-        self._num_waiting = 0
+        self._waiting_s = 0.0
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(
             config.audio, "recognizer.audio", queue_length=AUDIO_QUEUE_LENGTH
@@ -268,10 +268,16 @@ class RecognizerService(Service):
         except BadAudio as error:
             self._refuse(chunk, sender, "bad-audio", str(error))
             return
-        self._waiting.setdefault(chunk.session, []).append((chunk.media_time, samples))
-        self._num_waiting += 1
-        if self._num_waiting == MOST_WAITING:
-            self._hear_waiting()
+        rate_hz = stream.start.sample_rate_hz
+        piece = round(MOST_WAITING_S * rate_hz)
+        for begin in range(0, max(1, len(samples)), piece):  # long chunks keep nobody waiting long
+            part = samples[begin : begin + piece]
+            media_time = chunk.media_time + begin * MEDIA_RATE_HZ // rate_hz
+            self._waiting.setdefault(chunk.session, []).append((media_time, part))
+            self._waiting_s += len(part) / rate_hz
+            if self._waiting_s >= MOST_WAITING_S:
+                self._hear_waiting()
+                self.beat_if_due()
 
     def _hear_waiting(self) -> None:
         """Hear the chunks that wait; the network scores all sessions' frames in one go."""
@@ -283,7 +289,7 @@ class RecognizerService(Service):
             stream.hear_chunks(chunks)
             for stream, chunks in zip(streams, self._waiting.values(), strict=True)
         ]
-        self._waiting, self._num_waiting = {}, 0
+        self._waiting, self._waiting_s = {}, 0.0
         for stream, said in zip(streams, listen(self._model, listenings), strict=True):
             self._say(stream, said)
             self.metrics.count("audio_gaps", stream.num_gaps)

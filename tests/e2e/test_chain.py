@@ -74,7 +74,10 @@ def test_frames_do_not_depend_on_the_chunks(system: System, heard: Heard, chunk:
 
 def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
     samples = samples_of_file(DEMO / "vowels-male.wav")
-    live = stream(system.control, samples, paced=True)
+    for _ in range(3):  # a machine that stalls for 0.2 s gets frames of rest in between
+        live = stream(system.control, samples, paced=True)
+        if (np.diff([frame.media_time for frame in live.frames]) > 0).all():
+            break
     fast = stream(system.control, samples)
     np.testing.assert_allclose(live.faps[: len(fast.faps)], fast.faps, atol=1e-3)
 

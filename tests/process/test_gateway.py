@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import aiohttp
 import pytest
@@ -329,6 +330,19 @@ def test_writing_to_a_browser_that_is_gone_is_no_end(gateway: GatewayProcess) ->
 
     with pytest.raises(subprocess.TimeoutExpired):
         gateway.process.wait(0.3)
+
+
+def test_what_is_no_http_is_one_line_in_the_log(own_gateway: GatewayProcess) -> None:
+    address = urlsplit(own_gateway.page)
+    for garbage in (b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01" * 100, b"\xff\x00" * 5000):
+        with socket.create_connection((address.hostname, address.port), 5) as stranger:
+            stranger.sendall(garbage)
+            assert b" 400 " in stranger.recv(100)
+    own_gateway.process.terminate()
+    assert own_gateway.process.stderr is not None
+    log = own_gateway.process.stderr.read()
+    assert log.count("no HTTP") == 1
+    assert "raceback" not in log
 
 
 def test_viewers_hear_what_is_missing(system: ScriptedSystem, gateway: GatewayProcess) -> None:

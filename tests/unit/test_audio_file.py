@@ -61,6 +61,40 @@ def test_nan_is_named_with_its_place(tmp_path: Path) -> None:
         read_audio(tmp_path / "a.wav")
 
 
+@pytest.mark.parametrize("suffix", ["wav", "mp3"])
+def test_a_file_that_is_cut_off_is_remarked_on(tmp_path: Path, suffix: str) -> None:
+    sine = 0.5 * np.sin(2 * np.pi * 440 * np.arange(32000) / 16000)
+    whole, cut = tmp_path / f"whole.{suffix}", tmp_path / f"cut.{suffix}"
+    soundfile.write(whole, sine, 16000)
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) // 2 + 1])
+    remarks = {}
+    for path in (whole, cut):
+        source = open_audio(path)
+        assert sum(len(block) for block in source.blocks) > 0
+        remarks[path] = source.remarks
+    assert remarks[whole] == []
+    (remark,) = remarks[cut]
+    assert "cut off" in remark
+    assert "of 2.0 s" in remark
+
+
+def test_a_length_that_a_pipe_could_not_know_is_no_cut(tmp_path: Path) -> None:
+    path = tmp_path / "piped.wav"
+    soundfile.write(path, np.zeros(1600, np.float32), 16000)
+    data = bytearray(path.read_bytes())
+    data[4:8] = data[40:44] = b"\xff\xff\xff\xff"  # as written to a pipe
+    path.write_bytes(data)
+    source = open_audio(path)
+    assert sum(len(block) for block in source.blocks) == 1600
+    assert source.remarks == []
+
+
+def test_a_folder_is_called_one(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="folder"):
+        open_audio(tmp_path)
+
+
 def test_raw_sound_may_come_in_odd_pieces() -> None:
     values = np.arange(-1000, 1000, dtype="<i2")
     source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), 16000, 2)
