@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from evaluation.recognizer import is_put_out
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.load import load_model
 from services.recognizer.pipeline import Recognizer, recognize
@@ -127,10 +129,10 @@ def live_frames(
     live = LiveSynthesizer(parameters, frame_rate_hz=FRAME_RATE_HZ, look_ahead_s=look_ahead_s)
     frames = []
     for time_s, level, results in heard:
-        for said in results:
+        for said, after in zip_longest(results, results[1:]):
             if not isinstance(said, Phone):
                 live.accept_speech(said)
-            elif said.final or not wait_for_next:
+            elif not (wait_for_next and is_put_out(said, after)):
                 live.accept_phone(said)
         live.accept_level(time_s, level)
         frames += live.advance(time_s)

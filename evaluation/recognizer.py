@@ -6,9 +6,11 @@ Measured for the full traceback and for the live output rule, N = 1 to 6 (Li et 
   counted), by speaker, with a bootstrap interval over speakers;
 - viseme error rate: units as mouth shapes (Li 2011, table 1), compound finals split, equal
   neighbours counted once because the mouth does not move between them;
-- output delay: media time when a unit is put out, minus its true onset by forced alignment;
+- output delay: media time when a unit is first said, minus its true onset by forced alignment;
 - CPU seconds per second of sound, by stage.
 
+Live, the errors are those of what was first said: the units that the rule put out and, unlike in
+the paper, those that it passed over and that are said along with the next; then those once final.
 Every recording is a session of its own, so the live mean starts from the prior each time.
 """
 
@@ -17,7 +19,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +34,7 @@ from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from services.synthesizer.visemes import SHAPES
 from shared.errors import UserError
-from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone
+from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 from training.align import align_units, spoken
 from training.corpus import RowErrors, Utterance, read_corpus
 from training.feature_cache import read_audio
@@ -230,11 +232,11 @@ def evaluate_recognizer(
         full.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
         _confuse(confusion, truth, heard)
         for score, rule in zip(live, rules, strict=True):
-            phones, put_out_s, finals = _live(model, samples, rule)
+            phones, said_s, finals = _live(model, samples, rule)
             _count(score.phones, utterance.speaker, _units(truth), _units(phones))
             _count(score.visemes, utterance.speaker, _shapes(truth), _shapes(phones))
             _count(score.corrected, utterance.speaker, _units(truth), _units(finals))
-            score.delays_s += _delays(truth, phones, put_out_s)
+            score.delays_s += _delays(truth, phones, said_s)
     if not used:
         raise UserError(
             f"{corpus} has no usable recordings in the split {split!r}; name another split"
@@ -265,28 +267,52 @@ def _truth(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float
 def _live(
     model: AcousticModel, samples: NDArray[np.float32], rule: tuple[int, float]
 ) -> tuple[list[Phone], list[float], list[Phone]]:
-    """Units as they were put out, the media time heard by then, and the units once final."""
+    """Units as they were first said, the media time heard by then, and the units once final."""
     agreement, confidence = rule
     recognizer = Recognizer(
         model, sample_rate_hz=SAMPLE_RATE_HZ, agreement=agreement, least_confidence=confidence
     )
-    put_out: list[Phone] = []
-    put_out_s: list[float] = []
+    first: list[Phone] = []
+    said_s: list[float] = []
     finals: list[Phone] = []
+    known: set[int] = set()
     starts = range(0, len(samples), _CHUNK_SAMPLES)
     chunks = [samples[start : start + _CHUNK_SAMPLES] for start in starts]
     for number in range(len(chunks) + 1):
         done = number == len(chunks)
         events = recognizer.input_finished() if done else recognizer.accept_waveform(chunks[number])
-        for event in events:
-            if not isinstance(event, Phone) or event.unit == SILENCE:
-                continue
-            if event.final:
-                finals.append(event)
-            else:
-                put_out.append(event)
-                put_out_s.append(min((number + 1) * _CHUNK_SAMPLES, len(samples)) / SAMPLE_RATE_HZ)
-    return put_out, put_out_s, finals
+        finals += spoken([event for event in events if isinstance(event, Phone) and event.final])
+        new = spoken(first_said(events, known))
+        first += new
+        said_s += [min((number + 1) * _CHUNK_SAMPLES, len(samples)) / SAMPLE_RATE_HZ] * len(new)
+    return first, said_s, finals
+
+
+def is_put_out(said: Phone, after: Phone | SpeechChange | None) -> bool:
+    """Tell whether the output rule has put out a unit, by what was said next.
+
+    What the rule puts out comes after the revisions of all units before it.
+    """
+    return not said.final and not (isinstance(after, Phone) and after.index > said.index)
+
+
+def first_said(events: Sequence[Phone | SpeechChange], known: set[int]) -> list[Phone]:
+    """Pick what the output rule put out and what it passed over, which is said along with that.
+
+    Parameters
+    ----------
+    events
+        What a live recognizer said, in order.
+    known
+        Indices of units said before; those of ``events`` are added.
+    """
+    first = []
+    for event, after in zip_longest(events, events[1:]):
+        if isinstance(event, Phone):
+            if event.index not in known or is_put_out(event, after):
+                first.append(event)
+            known.add(event.index)
+    return first
 
 
 def _units(phones: Iterable[Phone]) -> list[str]:
@@ -304,13 +330,11 @@ def _count(
     by_speaker[speaker] = before + count_errors(said, heard)
 
 
-def _delays(
-    truth: Sequence[Phone], heard: Sequence[Phone], put_out_s: Sequence[float]
-) -> list[float]:
+def _delays(truth: Sequence[Phone], heard: Sequence[Phone], said_s: Sequence[float]) -> list[float]:
     """Delays of the units that were heard right."""
     pairs = matched_pairs([phone.unit for phone in truth], [phone.unit for phone in heard])
     return [
-        put_out_s[j] - truth[i].onset_s
+        said_s[j] - truth[i].onset_s
         for i, j in pairs
         if i is not None and j is not None and truth[i].unit == heard[j].unit
     ]

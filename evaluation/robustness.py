@@ -17,12 +17,12 @@ from rich.progress import track
 from rich.table import Table
 
 from evaluation.disturbances import SOUNDS, SPEECH_CONDITIONS
-from evaluation.recognizer import ErrorCounts, count_errors
+from evaluation.recognizer import ErrorCounts, count_errors, first_said
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.features import SAMPLE_RATE_HZ
 from services.recognizer.pipeline import Recognizer, recognize
 from shared.errors import UserError
-from shared.phones import SILENCE, UNITS, Phone
+from shared.phones import SILENCE, UNITS, Phone, SpeechChange
 from training.corpus import RowErrors, read_corpus
 from training.feature_cache import read_audio
 
@@ -49,8 +49,8 @@ def evaluate_robustness(
     Returns
     -------
     dict
-        ``speech``: by condition the phone error rates of the full traceback, of the units as put
-        out first and of those once final; ``sounds``: units a minute by sound.
+        ``speech``: by condition the phone error rates of the full traceback, of the units as
+        first said and of those once final; ``sounds``: units a minute by sound.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def evaluate_robustness(
 def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> None:
     """Print the figures of several models as two tables."""
     for name, figures in results.items():
-        columns = ("phone error %", "full traceback", "as put out", "once final")
+        columns = ("phone error %", "full traceback", "as first said", "once final")
         table = Table(*columns, title=f"{name}, {figures['split']}")
         for condition, rates in figures["speech"].items():
             cells = (f"{100 * rates[output]:.1f}" for output in ("full", "first", "final"))
@@ -91,19 +91,22 @@ def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> No
 
 
 def _outputs(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, list[str]]:
-    """Units by the full traceback, as put out first, and once final."""
+    """Units by the full traceback, as first said, and once final."""
     live = _live(model, samples)
     return {
         "full": _spoken(recognize(model, samples, SAMPLE_RATE_HZ)),
-        "first": _spoken(phone for phone in live if not phone.final),
-        "final": _spoken(phone for phone in live if phone.final),
+        "first": _spoken(first_said(live, set())),
+        "final": _spoken(_final(live)),
     }
 
 
-def _live(model: AcousticModel, samples: NDArray[np.float32]) -> list[Phone]:
+def _live(model: AcousticModel, samples: NDArray[np.float32]) -> list[Phone | SpeechChange]:
     recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
-    events = [*recognizer.accept_waveform(samples), *recognizer.input_finished()]
-    return [event for event in events if isinstance(event, Phone)]
+    return [*recognizer.accept_waveform(samples), *recognizer.input_finished()]
+
+
+def _final(events: Iterable[Phone | SpeechChange]) -> list[Phone]:
+    return [event for event in events if isinstance(event, Phone) and event.final]
 
 
 def _spoken(phones: Iterable[Phone]) -> list[str]:
@@ -112,7 +115,7 @@ def _spoken(phones: Iterable[Phone]) -> list[str]:
 
 def _units_a_minute(model: AcousticModel, sounds: Sequence[NDArray[np.float32]]) -> float:
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
-    heard = [_spoken(phone for phone in _live(model, samples) if phone.final) for samples in sounds]
+    heard = [_spoken(_final(_live(model, samples))) for samples in sounds]
     return sum(map(len, heard)) / minutes
 
 

@@ -24,7 +24,8 @@ class Topology:
     first_state: NDArray[np.int64]  # (61,) unit u has the states first_state[u] to [u + 1]
     log_stay: NDArray[np.float32]  # (states,) log probability of a state's loop
     log_leave: NDArray[np.float32]  # (states,) log probability of going on
-    log_bigram: NDArray[np.float32]  # (60, 60) score of unit (column) after unit (row)
+    # (60, 60) score of unit (column) after unit (row), or (60, 60, 60) of a unit after two
+    log_bigram: NDArray[np.float32]
     duration_mean_s: NDArray[np.float32]  # (3, 60) of each unit by position, seconds
     duration_spread_s: NDArray[np.float32]  # (3, 60) standard deviation, seconds
 

@@ -3,18 +3,23 @@
 Source: Li et al. 2011, section 2.2, eq. 1-3: after every feature frame the best unit string so
 far; section 3.1: any unit may follow any unit. Token passing is Young, Russell and Thornton 1989.
 
-======== ==================================================== ==============
+Deviation: what a unit costs depends on the two units before it, so there is a best path for every
+last unit and every unit before that one, a pair; pairs far behind the best one are given up (beam).
+
+======== ==================================================== =====================
 symbol   meaning                                              shape
-======== ==================================================== ==============
-score    log score of the best path that ends in a state      (states,)
-link     where that path's last unit began, as a record       (states,)
-record   (frame, unit): a unit that ended there, and the      (frames, 60)
-         record before it
-======== ==================================================== ==============
+======== ==================================================== =====================
+score    log score of the best path that ends in a state,     (60 units, states)
+         by the unit before the state's unit
+top      the best of a pair's states                          (60 units, 60 units)
+link     the record of the unit before                        (60 units, states)
+record   (end, unit, before): a unit that ended there, and    (records, 3)
+         the record of the unit before it
+======== ==================================================== =====================
 
 The string "so far" may change in the future, but not the past that all live paths share: that part
-is settled from time to time and its records are dropped (partial traceback), so endless speech
-needs no endless memory.
+is settled from time to time and records that no path needs are dropped (partial traceback), so
+endless speech needs no endless memory.
 """
 
 from __future__ import annotations
@@ -31,8 +36,10 @@ from shared.phones import UNIT_INDEX, UNITS
 NUM_UNITS = len(UNITS)
 _SIL = UNIT_INDEX["sil"]
 _NO_RECORD = -1
-_IMPOSSIBLE = -1e30
-_ROOM_FRAMES = 256
+_IMPOSSIBLE = np.float32(-1e30)
+_BEAM = np.float32(20.0)  # of log scores; twice as much changes nothing on development data
+_MOST_ENDS = NUM_UNITS * NUM_UNITS  # records of one frame
+_ROOM = 2 * _MOST_ENDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,19 +62,21 @@ class Decoder:
 
     def __init__(self, topology: Topology) -> None:
         self._topology = topology
-        self._arcs = np.ascontiguousarray(topology.log_bigram.T)  # (to, from)
+        shape = (NUM_UNITS, NUM_UNITS, NUM_UNITS)
+        self._log_next = np.ascontiguousarray(np.broadcast_to(topology.log_bigram, shape))
         self.reset()
 
     def reset(self) -> None:
         """Begin a new piece of speech at frame 0."""
-        self._frame = 0
+        self.num_frames = 0
         self._settled: list[Segment] = []
         self._settled_until = _NO_RECORD  # the record that ends them
-        self._best_state = 0
-        self._base = 0  # frame of the first row of records
-        self._records = np.full((_ROOM_FRAMES, NUM_UNITS), _NO_RECORD, dtype=np.int64)
-        self._score = np.full(self._topology.num_states, _IMPOSSIBLE, dtype=np.float32)
-        self._link = np.full(self._topology.num_states, _NO_RECORD, dtype=np.int64)
+        self._best = (0, 0)  # unit before and state
+        self._records = np.empty((_ROOM, 3), dtype=np.int32)
+        self._num_records = 0
+        self._top = np.full((NUM_UNITS, NUM_UNITS), _IMPOSSIBLE, dtype=np.float32)
+        self._score = np.full((NUM_UNITS, self._topology.num_states), _IMPOSSIBLE, np.float32)
+        self._link = np.full(self._score.shape, _NO_RECORD, dtype=np.int32)
 
     def accept(self, scores: NDArray[np.float32]) -> tuple[int, int, float]:
         """Take the state scores of one frame, shape (states,).
@@ -76,26 +85,28 @@ class Decoder:
         -------
         tuple
             Last unit of the best string so far, the frame where it began, and a confidence in
-            0 to 1 (share of the unit among all units' best paths).
+            0 to 1: the share, among the best paths of all pairs, of those in which the unit is
+            the last or the one before.
         """
-        if self._frame - self._base == len(self._records):
+        if self._num_records + _MOST_ENDS > len(self._records):
             self._settle()
-        row = self._frame - self._base
         topology = self._topology
-        unit, state, confidence = _step(
-            self._frame,
+        self._num_records, before, unit, state, confidence = _step(
+            self.num_frames,
             scores,
             self._score,
             self._link,
-            self._records[row],
+            self._top,
+            self._records,
+            self._num_records,
             topology.first_state,
             topology.log_stay,
             topology.log_leave,
-            self._arcs,
+            self._log_next,
         )
-        self._frame += 1
-        self._best_state = state
-        return unit, _frame_after(self._link[state]), confidence
+        self.num_frames += 1
+        self._best = (before, state)
+        return unit, self._end(self._link[before, state]), confidence
 
     def path_since(self, frame: int) -> list[Segment]:
         """Units of the best string so far that end after a frame, without its last unit.
@@ -104,39 +115,50 @@ class Decoder:
         frame are forgotten: they are not in later answers.
         """
         self._settled = segments_after(self._settled, frame)
-        path = self._trace(int(self._link[self._best_state]))
+        path = self._trace(int(self._link[self._best]))
         return [*self._settled, *segments_after(path, frame)]
 
     def _settle(self) -> None:
         """Take the units that no later frame can change; make room for new records."""
-        shared = _common_record(self._link, self._records, self._base)
+        live = self._score > _IMPOSSIBLE
+        links = self._link[live]
+        paths = _paths_through(links, self._records[: self._num_records, 2])
+        shared = int(np.flatnonzero(paths == len(links)).max(initial=_NO_RECORD))
         self._settled += self._trace(shared)
-        self._settled_until = shared
-        if shared != _NO_RECORD:
-            row = shared // NUM_UNITS - self._base
-            self._records, self._base = self._records[row:], self._base + row
-        room = np.full((_ROOM_FRAMES, NUM_UNITS), _NO_RECORD, dtype=np.int64)
-        self._records = np.concatenate([self._records, room])
+        kept = np.flatnonzero(paths)
+        kept = kept[kept >= shared]
+        new = np.full(self._num_records + 1, _NO_RECORD, dtype=np.int32)  # the last: of no record
+        new[kept] = np.arange(len(kept))
+        records = np.empty((len(kept) + _ROOM, 3), dtype=np.int32)
+        records[: len(kept)] = self._records[kept]
+        records[: len(kept), 2] = new[records[: len(kept), 2]]
+        self._records, self._num_records = records, len(kept)
+        self._link[live] = new[links]
+        self._settled_until = int(new[shared])
 
     def finish(self) -> list[Segment]:
         """End the speech: the best string of all frames."""
-        if self._frame == 0:
+        if self.num_frames == 0:
             return []
         last_states = self._topology.first_state[1:] - 1
-        ends = self._score[last_states] + self._topology.log_leave[last_states]
-        unit = int(ends.argmax())
-        link = int(self._link[last_states[unit]])
-        return [*self._settled, *self._trace(link), Segment(unit, _frame_after(link), self._frame)]
+        ends = self._score[:, last_states] + self._topology.log_leave[last_states]
+        before, unit = divmod(int(ends.argmax()), NUM_UNITS)
+        link = int(self._link[before, last_states[unit]])
+        last = Segment(unit, self._end(link), self.num_frames)
+        return [*self._settled, *self._trace(link), last]
 
     def _trace(self, record: int) -> list[Segment]:
         """Units from the last settled record to this one."""
         segments: list[Segment] = []
         while record not in (_NO_RECORD, self._settled_until):
-            frame, unit = divmod(record, NUM_UNITS)
-            before = int(self._records[frame - self._base, unit])
-            segments.append(Segment(unit, _frame_after(before), frame + 1))
+            end, unit, before = self._records[record].tolist()
+            segments.append(Segment(unit, self._end(before), end))
             record = before
         return segments[::-1]
+
+    def _end(self, record: int) -> int:
+        """First frame after the unit of a record."""
+        return 0 if record == _NO_RECORD else int(self._records[record, 0])
 
 
 def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
@@ -148,82 +170,98 @@ def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
     ]
 
 
-def _frame_after(record: int) -> int:
-    """First frame after the unit that a record ends."""
-    return 0 if record == _NO_RECORD else int(record) // NUM_UNITS + 1
-
-
 @numba.njit(cache=True, nogil=True)
-def _step(  # noqa: PLR0912 (one pass over the states; numba takes positions)
+def _step(  # noqa: PLR0912, PLR0915 (one pass over the states; numba takes positions)
     frame: int,
     observed: NDArray[np.float32],
     score: NDArray[np.float32],
-    link: NDArray[np.int64],
-    records: NDArray[np.int64],
+    link: NDArray[np.int32],
+    top: NDArray[np.float32],
+    records: NDArray[np.int32],
+    num_records: int,
     first_state: NDArray[np.int64],
     log_stay: NDArray[np.float32],
     log_leave: NDArray[np.float32],
-    arcs: NDArray[np.float32],
-) -> tuple[int, int, float]:
-    """Advance all paths by one frame; return the best unit, its best state and a confidence.
+    log_next: NDArray[np.float32],
+) -> tuple[int, int, int, int, float]:
+    """Advance all paths by one frame; add records of the units that end before it.
 
-    ``records`` is the row of this frame: it receives, per unit, the record before the unit if the
-    unit ends here.
+    Returns
+    -------
+    tuple
+        Number of records; of the best path the unit before the last, the last and its state; the
+        confidence.
     """
-    num_units = len(first_state) - 1
-    leaving = np.empty(num_units, dtype=np.float32)
-    for unit in range(num_units):
-        last = first_state[unit + 1] - 1
-        leaving[unit] = score[last] + log_leave[last]
-    best_unit, best_state, best = 0, 0, np.float32(-np.inf)
-    unit_best = np.empty(num_units, dtype=np.float32)
-    for unit in range(num_units):
-        if frame == 0:
-            entry, entry_link = arcs[unit, _SIL], _NO_RECORD
-        else:
-            before = 0
-            entry = np.float32(-np.inf)
-            for other in range(num_units):
-                candidate = leaving[other] + arcs[unit, other]
-                if candidate > entry:
-                    entry, before = candidate, other
-            entry_link = (frame - 1) * num_units + before
-        first, end = first_state[unit], first_state[unit + 1]
-        top = np.float32(-np.inf)
-        for state in range(end - 1, first - 1, -1):
-            value, from_link = score[state] + log_stay[state], link[state]
-            if state > first:
-                moved, moved_link = score[state - 1] + log_leave[state - 1], link[state - 1]
-            else:
-                moved, moved_link = entry, entry_link
-            if moved > value:
-                value, from_link = moved, moved_link
-            score[state] = value + observed[state]
-            link[state] = from_link
-            if score[state] > top:
-                top = score[state]
-                if top > best:
-                    best, best_unit, best_state = top, unit, state
-        unit_best[unit] = top
-        records[unit] = link[end - 1]
-    total = 0.0
-    for unit in range(num_units):
-        total += np.exp(unit_best[unit] - best)
-    for state in range(len(score)):  # keep numbers small in endless speech
-        score[state] -= best
-        score[state] = max(score[state], np.float32(_IMPOSSIBLE))
-    return best_unit, best_state, 1.0 / total
+    num_units = len(top)
+    entry = np.full((num_units, num_units), _IMPOSSIBLE)  # into a unit (second) after a unit
+    entry_link = np.full((num_units, num_units), np.int32(_NO_RECORD))
+    if frame == 0:
+        entry[_SIL] = log_next[_SIL, _SIL]
+    for before in range(num_units):
+        for unit in range(num_units):
+            state = first_state[unit + 1] - 1
+            leaving = score[before, state] + log_leave[state]
+            if top[before, unit] < -_BEAM or leaving < -_BEAM:
+                continue
+            records[num_records, 0] = frame
+            records[num_records, 1] = unit
+            records[num_records, 2] = link[before, state]
+            for following in range(num_units):
+                candidate = leaving + log_next[before, unit, following]
+                if candidate > entry[unit, following]:
+                    entry[unit, following] = candidate
+                    entry_link[unit, following] = num_records
+            num_records += 1
+    best, best_before, best_unit, best_state = _IMPOSSIBLE, 0, 0, 0
+    for before in range(num_units):
+        for unit in range(num_units):
+            first, end = first_state[unit], first_state[unit + 1]
+            if top[before, unit] < -_BEAM:
+                if top[before, unit] > _IMPOSSIBLE:
+                    score[before, first:end] = _IMPOSSIBLE
+                    top[before, unit] = _IMPOSSIBLE
+                if entry[before, unit] < -2 * _BEAM:
+                    continue
+            top[before, unit] = _IMPOSSIBLE
+            for state in range(end - 1, first - 1, -1):
+                value, from_link = score[before, state] + log_stay[state], link[before, state]
+                if state > first:
+                    moved = score[before, state - 1] + log_leave[state - 1]
+                    moved_link = link[before, state - 1]
+                else:
+                    moved, moved_link = entry[before, unit], entry_link[before, unit]
+                if moved > value:
+                    value, from_link = moved, moved_link
+                score[before, state] = max(value + observed[state], _IMPOSSIBLE)
+                link[before, state] = from_link
+                if score[before, state] > top[before, unit]:
+                    top[before, unit] = score[before, state]
+                    if top[before, unit] > best:
+                        best = top[before, unit]
+                        best_before, best_unit, best_state = before, unit, state
+    share, total = 0.0, 0.0
+    for before in range(num_units):
+        for unit in range(num_units):
+            if top[before, unit] > _IMPOSSIBLE:
+                top[before, unit] -= best  # keeps numbers small in endless speech
+                for state in range(first_state[unit], first_state[unit + 1]):
+                    if score[before, state] > _IMPOSSIBLE:
+                        score[before, state] -= best
+                if top[before, unit] > -_BEAM:
+                    total += np.exp(top[before, unit])
+                    if best_unit in (before, unit):
+                        share += np.exp(top[before, unit])
+    return num_records, best_before, best_unit, best_state, share / total
 
 
 @numba.njit(cache=True)
-def _common_record(links: NDArray[np.int64], records: NDArray[np.int64], base: int) -> int:
-    """Newest record that every path goes through, or -1."""
-    paths = np.unique(links)
-    while len(paths) > 1:
-        newest = paths[-1]
-        row = newest // NUM_UNITS - base
-        if newest < 0 or row < 0:
-            return _NO_RECORD
-        paths[-1] = records[row, newest % NUM_UNITS]
-        paths = np.unique(paths)
-    return int(paths[0])
+def _paths_through(links: NDArray[np.int32], before: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Count the paths, given by their links, that go through each record."""
+    paths = np.zeros(len(before), dtype=np.int64)
+    for link in links:
+        if link != _NO_RECORD:
+            paths[link] += 1
+    for record in range(len(before) - 1, -1, -1):  # a record comes after the one before it
+        if paths[record] and before[record] != _NO_RECORD:
+            paths[before[record]] += paths[record]
+    return paths

@@ -94,11 +94,12 @@ def topology_from(archive: Archive) -> Topology:
     if first_state[0] != 0 or (np.diff(first_state) < 1).any() or first_state[-1] > _MOST_STATES:
         raise ValueError("its states are not numbered upwards")
     num_states = int(first_state[-1])
+    after_two = archive.array("log_bigram", None).ndim == 3
     return Topology(
         first_state=first_state,
         log_stay=archive.floats("log_stay", num_states),
         log_leave=archive.floats("log_leave", num_states),
-        log_bigram=archive.floats("log_bigram", num_units, num_units),
+        log_bigram=archive.floats("log_bigram", *[num_units] * (3 if after_two else 2)),
         duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_units),
         duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_units),
     )

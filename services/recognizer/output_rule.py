@@ -4,7 +4,7 @@ Source: Li et al. 2011, section 2.2, eq. 4 and fig. 3: the last unit of the best
 put out when the last N feature frames agree on it and it differs from the unit put out before.
 
 Deviation: a frame in which the search is not sure of its last unit can be made not to count as
-agreeing. On development data that halves the wrong units at the price of 10 ms.
+agreeing. On development data one sure frame gives fewer wrong units, and sooner, than any N alone.
 """
 
 from __future__ import annotations

@@ -9,16 +9,16 @@ Time is media time: seconds from the session's first sample. Feature frame ``t``
 cutting of the same sound: every step works on whole frames and whole detector blocks, in order.
 
 Least delay of a unit after its onset, with ``L`` the frames that the acoustic model looks ahead (1,
-unless another look-ahead is set) and ``N`` the agreement (3): 25 ms window + L * 10 ms +
-(N - 1) * 10 ms = 55 ms. The paper, whose differences look 40 ms ahead, leaves those out: 45 ms, in
-truth 85. At the beginning of speech the voice detector adds its own 32 to 64 ms; above 16 kHz the
-resampler adds about 10 ms.
+unless another look-ahead is set) and ``N`` the agreement (1): 25 ms window + L * 10 ms +
+(N - 1) * 10 ms = 35 ms. The paper, with N = 3 and differences that look 40 ms ahead, leaves those
+out: 45 ms, in truth 85. At the beginning of speech the voice detector adds its own 32 to 64 ms;
+above 16 kHz the resampler adds about 10 ms.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,9 @@ from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
-DEFAULT_RULE = (3, 0.75)  # N as in the paper, and the confidence that each frame needs
+DEFAULT_RULE = (1, 0.9)  # N (the paper's is 3) and the confidence that each frame needs
+SETTLED_S = 0.2  # a unit that ended so long ago is final; waiting longer corrects nothing more
+_SETTLED_FRAMES = round(SETTLED_S / HOP_S)
 _SIL = UNIT_INDEX[SILENCE]
 _WARM_UP_S = 6  # long enough that the search also forgets once, which is code of its own
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
@@ -158,14 +160,13 @@ class Recognizer:
 
     A unit is put out with ``final`` false and the unit's mean duration as soon as the output rule
     allows (Li 2011, eq. 4). The mean is that of a unit after a pause or of one inside a phrase;
-    that a unit is the last before a pause, and longer, nobody can know yet. When the next unit is
-    put out or speech ends, the same ``index`` follows with ``final`` true, its onset and its
-    measured duration.
+    that a unit is the last before a pause, and longer, nobody can know yet.
 
-    The paper leaves what was put out as it is. Here the best string may correct it: a unit that the
-    search has given up for another comes again under its ``index`` with the other unit, and units
-    that the rule passed over are added, ``final`` at once. ``sil`` within speech is a unit like any
-    other.
+    The paper leaves what was put out as it is. Here the best string corrects it whenever a unit is
+    put out: the ``index`` comes again with the unit's measured onset and duration, or with another
+    unit if the search has changed its mind. Units that the rule passed over are said along with
+    the next one. A unit that ended ``SETTLED_S`` ago, or all when speech ends, come for the last
+    time, with ``final`` true. ``sil`` within speech is a unit like any other.
 
     Parameters
     ----------
@@ -206,7 +207,7 @@ class Recognizer:
         self._scores = SpeechScores(model, sample_rate_hz, num_channels)
         self._decoder = Decoder(model.topology)
         self._rule = OutputRule(agreement, least_confidence, last_output=_SIL)
-        self._num_phones = 0
+        self._num_final = 0
         self._begin(0)
 
     @property
@@ -254,15 +255,15 @@ class Recognizer:
         """Start a new session: the clock at 0, the speaker unknown."""
         self._scores.reset()
         self._begin(0)
-        self._num_phones = 0
+        self._num_final = 0
 
     def _begin(self, frame: int) -> None:
         self._start_frame = frame
         self._done = 0  # frame of the decoder up to which units are final
         self._decoder.reset()
         self._rule.reset()
-        self._after_pause = True
-        self._open: Phone | None = None  # put out, not yet final
+        self._before = _SIL  # the last final unit
+        self._open: list[Phone] = []  # said, not yet final
 
     def _follow(self, events: list[ScoreEvent]) -> list[Phone | SpeechChange]:
         out: list[Phone | SpeechChange] = []
@@ -272,9 +273,9 @@ class Recognizer:
                 out.append(SpeechChange(active=True, time_s=frame_time_s(event.frame)))
             elif isinstance(event, VoiceEnds):
                 rest = segments_after(self._decoder.finish(), self._done)
-                if rest and rest[-1].unit == _SIL and self._open is not None and len(rest) > 1:
+                if self._open and len(rest) > 1 and rest[-1].unit == _SIL:
                     rest.pop()  # the end of speech says it
-                out += self._settle(rest)
+                out += self._revise(rest, num_following=0)
                 out.append(SpeechChange(active=False, time_s=frame_time_s(event.frame)))
             else:
                 for row in event:
@@ -285,47 +286,64 @@ class Recognizer:
         unit, start, confidence = self._decoder.accept(scores)
         if not self._rule.accept(unit, confidence):
             return []
-        settled = self._settle(self._decoder.path_since(self._done))
-        position = FIRST if self._after_pause else INSIDE
-        self._open = Phone(
-            index=self._take_index(),
+        revised = self._revise(self._decoder.path_since(self._done), num_following=1)
+        before = UNIT_INDEX[self._open[-1].unit] if self._open else self._before
+        new = Phone(
+            index=self._num_final + len(self._open),
             unit=UNITS[unit],
-            onset_s=frame_time_s(self._start_frame + max(start, self._done)),
-            duration_s=float(self._durations_s[position, unit]),
+            onset_s=self._time_s(max(start, self._done)),
+            duration_s=float(self._durations_s[FIRST if before == _SIL else INSIDE, unit]),
             confidence=confidence,
             final=False,
         )
-        return [*settled, self._open]
+        self._open.append(new)
+        return [*revised, new]
 
-    def _settle(self, segments: list[Segment]) -> list[Phone | SpeechChange]:
-        """Put out units as final; the first takes the place of the open one."""
-        phones: list[Phone | SpeechChange] = []
-        for segment in segments:
-            self._done = segment.end
-            self._after_pause = segment.unit == _SIL
-            if self._open is None and not phones and segment.unit == _SIL:
-                continue  # before the first unit nothing but silence was said
-            onset_s = frame_time_s(self._start_frame + segment.start)
-            confidence = self._open.confidence if self._open else _UNSEEN_CONFIDENCE
-            phones.append(
-                Phone(
-                    index=self._take_index(),
-                    unit=UNITS[segment.unit],
-                    onset_s=onset_s,
-                    duration_s=frame_time_s(self._start_frame + segment.end) - onset_s,
-                    confidence=confidence,
-                    final=True,
-                )
+    def _revise(self, segments: list[Segment], num_following: int) -> list[Phone]:
+        """Put the units of the best string in the place of the open ones; say what is new of them.
+
+        ``num_following`` units come after these: the last one, unless speech has ended.
+        """
+        num_before = len(self._open) - num_following
+        if self._done == 0 and len(segments) > max(0, num_before) and segments[0].unit == _SIL:
+            segments = segments[1:]  # before the first unit nothing but silence was said
+        said: list[Phone] = []
+        while len(segments) < num_before:  # one said too many: it stays
+            said.append(replace(self._open.pop(0), final=True))
+            self._settle(said[-1])
+            segments, num_before = segments_after(segments, self._done), num_before - 1
+        settled = self._decoder.num_frames - (_SETTLED_FRAMES if num_following else 0)
+        known = dict(enumerate(self._open))
+        self._open = []
+        first_index = self._num_final
+        for number, segment in enumerate(segments):
+            onset_s = self._time_s(segment.start)
+            phone = Phone(
+                index=first_index + number,
+                unit=UNITS[segment.unit],
+                onset_s=onset_s,
+                duration_s=self._time_s(segment.end) - onset_s,
+                confidence=known[number].confidence if number in known else _UNSEEN_CONFIDENCE,
+                final=segment.end <= settled,
             )
-            self._open = None
-        return phones
+            if phone != known.get(number):
+                said.append(phone)
+            if phone.final:
+                self._settle(phone)
+            else:
+                self._open.append(phone)
+        return said
 
-    def _take_index(self) -> int:
-        """Return the open unit's index, or the next one if no unit is open."""
-        if self._open is not None:
-            return self._open.index
-        self._num_phones += 1
-        return self._num_phones - 1
+    def _settle(self, phone: Phone) -> None:
+        """Take a unit as final."""
+        self._num_final += 1
+        self._before = UNIT_INDEX[phone.unit]
+        end_s = phone.onset_s + phone.duration_s - self._time_s(0)
+        self._done = round(end_s / HOP_S)
+
+    def _time_s(self, frame: int) -> float:
+        """Media time of a frame of the decoder."""
+        return frame_time_s(self._start_frame + frame)
 
 
 def warm_up(model: AcousticModel) -> None:

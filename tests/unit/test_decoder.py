@@ -15,14 +15,21 @@ pytestmark = pytest.mark.unit
 SIL = UNIT_INDEX["sil"]
 
 
-def topology(states_per_unit: int, rng: np.random.Generator, bigram_scale: float = 1.0) -> Topology:
+def topology(
+    states_per_unit: int,
+    rng: np.random.Generator,
+    bigram_scale: float = 1.0,
+    units_before: int = 1,
+) -> Topology:
     num_states = NUM_UNITS * states_per_unit
     stay = rng.uniform(0.2, 0.8, num_states)
     return Topology(
         first_state=np.arange(NUM_UNITS + 1) * states_per_unit,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        log_bigram=(bigram_scale * rng.normal(size=(NUM_UNITS, NUM_UNITS))).astype(np.float32),
+        log_bigram=(bigram_scale * rng.normal(size=(NUM_UNITS,) * (units_before + 1))).astype(
+            np.float32
+        ),
         duration_mean_s=np.full((NUM_POSITIONS, NUM_UNITS), 0.1, np.float32),
         duration_spread_s=np.full((NUM_POSITIONS, NUM_UNITS), 0.1, np.float32),
     )
@@ -39,13 +46,15 @@ def brute_force(
     model: Topology, scores: NDArray[np.float32], units: list[int], states_per_unit: int
 ) -> tuple[float, list[Segment]]:
     """Score every sequence of states that the loop allows."""
+    log_next = np.broadcast_to(model.log_bigram, (NUM_UNITS,) * 3)
     states = [u * states_per_unit + k for u in units for k in range(states_per_unit)]
     best = -np.inf
     path: tuple[int, ...] = ()
     for sequence in itertools.product(states, repeat=len(scores)):
         if sequence[0] % states_per_unit or sequence[-1] % states_per_unit != states_per_unit - 1:
             continue
-        total = model.log_bigram[SIL, sequence[0] // states_per_unit] + scores[0, sequence[0]]
+        before, unit = SIL, sequence[0] // states_per_unit
+        total = log_next[SIL, SIL, unit] + scores[0, sequence[0]]
         for t in range(1, len(scores)):
             a, b = sequence[t - 1], sequence[t]
             if a == b:
@@ -55,7 +64,8 @@ def brute_force(
                 total += model.log_leave[a]
             elif a % states_per_unit == states_per_unit - 1 and b % states_per_unit == 0:
                 total += model.log_leave[a]
-                total += model.log_bigram[a // states_per_unit, b // states_per_unit]
+                total += log_next[before, unit, b // states_per_unit]
+                before, unit = unit, b // states_per_unit
             else:
                 total = -np.inf
                 break
@@ -72,11 +82,15 @@ def brute_force(
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("states_per_unit", "num_frames"), [(2, 5), (3, 5)])
-def test_same_as_trying_every_path(seed: int, states_per_unit: int, num_frames: int) -> None:
+@pytest.mark.parametrize(
+    ("states_per_unit", "num_frames", "units_before"), [(2, 5, 1), (3, 5, 1), (2, 7, 2)]
+)
+def test_same_as_trying_every_path(
+    seed: int, states_per_unit: int, num_frames: int, units_before: int
+) -> None:
     rng = np.random.default_rng(seed)
-    units = [0, 7, SIL] if states_per_unit == 2 else [3, 40]
-    model = topology(states_per_unit, rng)
+    units = [0, 7, SIL] if (states_per_unit, num_frames) == (2, 5) else [3, 40]
+    model = topology(states_per_unit, rng, bigram_scale=units_before, units_before=units_before)
     scores = rng.normal(size=(num_frames, model.num_states)).astype(np.float32)
     only(units, states_per_unit, scores)
     decoder = Decoder(model)
@@ -120,7 +134,7 @@ def test_endless_speech_keeps_its_memory_and_its_result() -> None:
     decoder = Decoder(model)
     for row in clear_scores(sequence, model, frames_per_state=2):
         decoder.accept(row)
-    assert len(decoder._records) < 1000
+    assert len(decoder._records) < 3 * NUM_UNITS**2
     assert [segment.unit for segment in decoder.finish()] == sequence
 
 

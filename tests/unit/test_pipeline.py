@@ -1,12 +1,14 @@
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from evaluation.recognizer import first_said, is_put_out
 from services.recognizer import decoder
 from services.recognizer.acoustic_model import FIRST, INSIDE
+from services.recognizer.decoder import Segment
 from services.recognizer.load import load_model
 from services.recognizer.pipeline import Recognizer, recognize, warm_up
 from shared.audio_file import read_audio
@@ -77,15 +79,18 @@ def test_order_and_times_of_what_is_put_out(hello: np.ndarray) -> None:
     assert isinstance(events[-1], SpeechChange)
     assert not events[-1].active
     phones = [event for event in events if isinstance(event, Phone)]
+    known: set[int] = set()
     closed: set[int] = set()
     for phone in phones:
         assert phone.index not in closed  # nothing is said of a unit once it is final
-        assert phone.index <= len(closed)  # one unit is open at a time
+        assert phone.index <= max(known, default=-1) + 1
+        known.add(phone.index)
         assert 0 <= phone.confidence <= 1
         assert phone.duration_s > 0
         if phone.final:
+            assert phone.index == len(closed)
             closed.add(phone.index)
-    assert closed == set(range(len(closed)))
+    assert closed == known
     done = finals(events)
     for one, two in pairwise(done):
         assert one.onset_s + one.duration_s <= two.onset_s + 1e-9
@@ -108,18 +113,44 @@ def test_provisional_units_come_soon(hello: np.ndarray) -> None:
 
 def test_provisional_durations_are_the_mean_of_unit_and_position(hello: np.ndarray) -> None:
     mean_s = load_model().topology.duration_mean_s
-    after_pause = True
     positions = []
-    for event in run(hello):
+    said: dict[int, str] = {}
+    events = run(hello)
+    for event, after in zip_longest(events, events[1:]):
         if isinstance(event, SpeechChange):
-            after_pause = True
-        elif event.final:
-            after_pause = event.unit == "sil"
-        else:
+            said.clear()
+            continue
+        said[event.index] = event.unit
+        if is_put_out(event, after):
+            after_pause = said.get(event.index - 1, "sil") == "sil"
             positions.append(FIRST if after_pause else INSIDE)
             wanted = mean_s[positions[-1], UNIT_INDEX[event.unit]]
             assert event.duration_s == pytest.approx(float(wanted))
     assert set(positions) == {FIRST, INSIDE}
+
+
+def test_units_are_corrected_until_nothing_more_changes(hello: np.ndarray) -> None:
+    whole = [phone.unit for phone in recognize(load_model(), hello, 16_000)]
+    events = run(hello)
+    first = [phone.unit for phone in first_said(events, set())]
+    last = [phone.unit for phone in finals(events)]
+    right = [share_found(whole, units) for units in (first, last)]
+    assert right[1] > 0.95
+    assert right[1] > right[0]
+    assert abs(len(last) - len(whole)) <= 2
+
+
+def test_what_the_search_inserts_or_gives_up_keeps_the_indices_in_order() -> None:
+    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
+    a, b, x = Segment(30, 0, 10), Segment(3, 10, 20), Segment(31, 12, 15)
+    said = [phone.index for phone in recognizer._revise([a, b], num_following=1)]
+    assert said == [0, 1]
+    assert recognizer._revise([a, b], num_following=1) == []  # nothing new
+    inserted = recognizer._revise([a, Segment(3, 10, 12), x, Segment(30, 15, 20)], num_following=1)
+    assert [(phone.index, phone.unit) for phone in inserted] == [(1, "f"), (2, "ei"), (3, "ai")]
+    rest = recognizer._revise([Segment(30, 0, 18), Segment(5, 18, 22)], num_following=0)
+    assert [phone.index for phone in rest] == [0, 1, 2, 3]
+    assert all(one.onset_s + one.duration_s <= two.onset_s + 1e-9 for one, two in pairwise(rest))
 
 
 def test_time_goes_on_and_never_back(hello: np.ndarray) -> None:
@@ -195,4 +226,4 @@ def test_warm_up_leaves_nothing_behind(hello: np.ndarray) -> None:
 def test_warming_up_leaves_nothing_to_compile() -> None:
     warm_up(load_model())
     assert decoder._step.signatures
-    assert decoder._common_record.signatures
+    assert decoder._paths_through.signatures

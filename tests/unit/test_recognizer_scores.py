@@ -10,6 +10,7 @@ from evaluation.recognizer import (
     bootstrap_interval,
     count_errors,
     evaluate_recognizer,
+    first_said,
     matched_pairs,
     most_confused,
     mouth_shapes,
@@ -17,7 +18,7 @@ from evaluation.recognizer import (
 from evaluation.recognizer_report import draw_confusions, print_figures
 from services.recognizer.load import load_model
 from shared.errors import UserError
-from shared.phones import UNIT_INDEX, UNITS
+from shared.phones import UNIT_INDEX, UNITS, Phone, SpeechChange
 
 pytestmark = pytest.mark.unit
 
@@ -38,6 +39,24 @@ DEMO = Path(__file__).parents[2] / "shared" / "demo"
 def test_errors(said: str, heard: str, errors: tuple[int, int, int]) -> None:
     counts = count_errors(said.split(), heard.split())
     assert (counts.insertions, counts.deletions, counts.substitutions) == errors
+
+
+def test_what_is_said_first_and_what_revises_it() -> None:
+    def say(index: int, unit: str, final: bool = False) -> Phone:
+        return Phone(
+            index=index, unit=unit, onset_s=0.0, duration_s=0.1, confidence=1.0, final=final
+        )
+
+    known: set[int] = set()
+    chunks: list[list[Phone | SpeechChange]] = [
+        [SpeechChange(active=True, time_s=0.0), say(0, "n")],
+        [say(0, "l")],  # put out in the place of the one before
+        [say(0, "n"), say(1, "i"), say(2, "h")],  # a correction, one passed over, one put out
+        [say(0, "n", True), say(2, "x"), say(3, "ao"), say(3, "ou", True)],
+    ]
+    heard = [[phone.unit for phone in first_said(chunk, known)] for chunk in chunks]
+    assert heard == [["n"], ["l"], ["i", "h"], ["ao"]]
+    assert known == {0, 1, 2, 3}
 
 
 def test_rate_and_sum() -> None:
