@@ -26,10 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from services.recognizer.acoustic_model import AcousticModel
+from services.recognizer.acoustic_model import AcousticModel, listen
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import SAMPLE_RATE_HZ, LogMel
-from services.recognizer.pipeline import DEFAULT_RULE, Recognizer, recognize
+from services.recognizer.pipeline import (
+    DEFAULT_RULE,
+    Recognizer,
+    ScoreEvent,
+    SpeechScores,
+    recognize,
+)
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
 from services.synthesizer.visemes import SHAPES
@@ -76,14 +82,20 @@ class Score:
     name: str
     phones: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
     visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
-    corrected: dict[str, ErrorCounts] = field(default_factory=dict)  # units once final, by speaker
+    final_phones: dict[str, ErrorCounts] = field(default_factory=dict)  # once final, by speaker
+    final_visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # likewise
     delays_s: list[float] = field(default_factory=list)
 
     def summary(self, rng: np.random.Generator) -> dict[str, object]:
         """Rates, intervals and delay percentiles."""
         out: dict[str, object] = {"output": self.name}
-        measures = (("phone", self.phones), ("viseme", self.visemes), ("final", self.corrected))
-        for measure, by_speaker in measures:
+        measures = {
+            "phone": self.phones,
+            "viseme": self.visemes,
+            "final_phone": self.final_phones,
+            "final_viseme": self.final_visemes,
+        }
+        for measure, by_speaker in measures.items():
             if not by_speaker:
                 continue
             total = sum(by_speaker.values(), ErrorCounts())
@@ -231,11 +243,13 @@ def evaluate_recognizer(
         # The full traceback says everything when the recording ends.
         full.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
         _confuse(confusion, truth, heard)
+        scored = _scored(model, samples)
         for score, rule in zip(live, rules, strict=True):
-            phones, said_s, finals = _live(model, samples, rule)
+            phones, said_s, finals = _live(model, scored, rule)
             _count(score.phones, utterance.speaker, _units(truth), _units(phones))
             _count(score.visemes, utterance.speaker, _shapes(truth), _shapes(phones))
-            _count(score.corrected, utterance.speaker, _units(truth), _units(finals))
+            _count(score.final_phones, utterance.speaker, _units(truth), _units(finals))
+            _count(score.final_visemes, utterance.speaker, _shapes(truth), _shapes(finals))
             score.delays_s += _delays(truth, phones, said_s)
     if not used:
         raise UserError(
@@ -264,8 +278,22 @@ def _truth(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float
     return spoken(align_units(model, samples, SAMPLE_RATE_HZ, syllables))
 
 
+def _scored(
+    model: AcousticModel, samples: NDArray[np.float32]
+) -> list[tuple[float, list[ScoreEvent]]]:
+    """Scores as they come with the sound: the media time heard by then, and what is new."""
+    scores = SpeechScores(model, SAMPLE_RATE_HZ)
+    scored = []
+    for start in range(0, len(samples), _CHUNK_SAMPLES):
+        chunk = samples[start : start + _CHUNK_SAMPLES]
+        (events,) = listen(model, [scores.hear(chunk)])
+        scored.append(((start + len(chunk)) / SAMPLE_RATE_HZ, events))
+    (rest,) = listen(model, [scores.finish()])
+    return [*scored, (len(samples) / SAMPLE_RATE_HZ, rest)]
+
+
 def _live(
-    model: AcousticModel, samples: NDArray[np.float32], rule: tuple[int, float]
+    model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: tuple[int, float]
 ) -> tuple[list[Phone], list[float], list[Phone]]:
     """Units as they were first said, the media time heard by then, and the units once final."""
     agreement, confidence = rule
@@ -276,15 +304,12 @@ def _live(
     said_s: list[float] = []
     finals: list[Phone] = []
     known: set[int] = set()
-    starts = range(0, len(samples), _CHUNK_SAMPLES)
-    chunks = [samples[start : start + _CHUNK_SAMPLES] for start in starts]
-    for number in range(len(chunks) + 1):
-        done = number == len(chunks)
-        events = recognizer.input_finished() if done else recognizer.accept_waveform(chunks[number])
+    for heard_s, scores in scored:
+        events = recognizer.follow(scores)
         finals += spoken([event for event in events if isinstance(event, Phone) and event.final])
         new = spoken(first_said(events, known))
         first += new
-        said_s += [min((number + 1) * _CHUNK_SAMPLES, len(samples)) / SAMPLE_RATE_HZ] * len(new)
+        said_s += [heard_s] * len(new)
     return first, said_s, finals
 
 

@@ -47,7 +47,7 @@ def _outputs(figures: Figures) -> Table:
     columns = ("output", "phone error %", "95 %", "ins / del / sub %", "viseme error %", "95 %")
     table = _table(
         f"{figures['split']}: {figures['recordings']} recordings, {figures['speakers']} speakers",
-        (*columns, "phone error % once final", "delay p50 / p95 ms"),
+        (*columns, "once final, phones / visemes", "delay p50 / p95 ms"),
     )
     for score in figures["scores"]:
         table.add_row(
@@ -57,7 +57,7 @@ def _outputs(figures: Figures) -> Table:
             _kinds(score["phone_errors"]),
             _percent(score["viseme_error_rate"]),
             _interval(score["viseme_interval_95"]),
-            _percent(score["final_error_rate"]) if "final_error_rate" in score else "",
+            _once_final(score),
             _delay(score),
         )
     return table
@@ -76,7 +76,7 @@ def _speakers(figures: Figures) -> Table:
             _kinds(errors),
             _percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
             _percent(live["phone_errors_by_speaker"][speaker]["rate"]),
-            _percent(live["final_errors_by_speaker"][speaker]["rate"]),
+            _percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
         )
     return table
 
@@ -102,6 +102,12 @@ def _table(title: str, columns: Iterable[str]) -> Table:
 
 def _percent(rate: float) -> str:
     return f"{100 * rate:.1f}"
+
+
+def _once_final(score: Figures) -> str:
+    if "final_phone_error_rate" not in score:
+        return ""
+    return " / ".join(_percent(score[f"final_{kind}_error_rate"]) for kind in ("phone", "viseme"))
 
 
 def _interval(bounds: tuple[float, float] | None) -> str:

@@ -18,6 +18,7 @@ above 16 kHz the resampler adds about 10 ms.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -237,7 +238,7 @@ class Recognizer:
 
     def hear(self, samples: NDArray[np.float32]) -> Listening[list[Phone | SpeechChange]]:
         """Like :meth:`accept_waveform`, for :func:`listen` beside other sessions."""
-        return self._follow((yield from self._scores.hear(samples)))
+        return self.follow((yield from self._scores.hear(samples)))
 
     def input_finished(self) -> list[Phone | SpeechChange]:
         """No more sound will come: return all that is still owed."""
@@ -245,11 +246,11 @@ class Recognizer:
 
     def hear_end(self) -> Listening[list[Phone | SpeechChange]]:
         """Like :meth:`input_finished`, for :func:`listen` beside other sessions."""
-        return self._follow((yield from self._scores.finish()))
+        return self.follow((yield from self._scores.finish()))
 
     def flush(self) -> list[Phone | SpeechChange]:
         """End the speech now (an interruption); the clock and the speaker's mean go on."""
-        return self._follow(listen(self._model, [self._scores.end_speech()])[0])
+        return self.follow(listen(self._model, [self._scores.end_speech()])[0])
 
     def reset(self) -> None:
         """Start a new session: the clock at 0, the speaker unknown."""
@@ -265,7 +266,8 @@ class Recognizer:
         self._before = _SIL  # the last final unit
         self._open: list[Phone] = []  # said, not yet final
 
-    def _follow(self, events: list[ScoreEvent]) -> list[Phone | SpeechChange]:
+    def follow(self, events: Sequence[ScoreEvent]) -> list[Phone | SpeechChange]:
+        """Take scores that :class:`SpeechScores` has computed, in order; return what they say."""
         out: list[Phone | SpeechChange] = []
         for event in events:
             if isinstance(event, VoiceBegins):
