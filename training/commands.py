@@ -57,8 +57,14 @@ def neural(
         Path | None, typer.Option(help="Folder of speech in another language, with its phones.")
     ] = None,
     seed: Seed = 0,
+    look_ahead_ms: Annotated[
+        float, typer.Option(help="The look-ahead to train for, in steps of 10 ms.")
+    ] = 10.0,
     steps: Annotated[int, typer.Option(help="Batches of 50 s of sound.")] = 4000,
-    voices: Annotated[int, typer.Option(help="Other voices for each real sentence.")] = 4,
+    networks: Annotated[
+        int, typer.Option(help="How many learn, a core each; their mean counts.")
+    ] = 2,
+    voices: Annotated[int, typer.Option(help="Other voices for each real sentence.")] = 6,
     any_licence: AnyLicence = False,
 ) -> None:
     """Train the neural model; a model card and the training curves are written beside it."""
@@ -75,8 +81,10 @@ def neural(
         output,
         aligner=aligner,
         second_task=second_task,
+        look_ahead_ms=look_ahead_ms,
         seed=seed,
         num_steps=steps,
+        num_networks=networks,
         num_voices=voices,
         shipping=not any_licence,
     )

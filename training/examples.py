@@ -50,7 +50,6 @@ def load_examples(
     shipping: bool = True,
     synthetic_weight: float = SYNTHETIC_WEIGHT,
     num_voices: int = 0,
-    voice_seed: int = 0,
 ) -> list[Example]:
     """Read corpora, compute or fetch their log-mel features, and weigh the utterances.
 
@@ -66,8 +65,8 @@ def load_examples(
         Leave out rows whose licence forbids giving the model away.
     synthetic_weight
         Weight of rows whose licence says they are synthetic.
-    num_voices, voice_seed
-        Other voices for each real sentence, see :mod:`training.voice_change`.
+    num_voices
+        Other voices for each real sentence, see :mod:`training.voice_change`; one for each word.
 
     Raises
     ------
@@ -85,7 +84,7 @@ def load_examples(
             rows = [row for row in rows if may_ship(row.licence)]
         utterances += rows
         log_mels += log_mel_of(rows, errors)
-    voices = _voices_of(utterances, num_voices, voice_seed)
+    voices = _voices_of(utterances, num_voices)
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60
@@ -122,22 +121,21 @@ def load_examples(
 
 
 def _voices_of(
-    utterances: Sequence[Utterance], num_voices: int, seed: int
+    utterances: Sequence[Utterance], num_voices: int
 ) -> dict[str, list[NDArray[np.float16]]]:
-    """Other voices of the real sentences, by utterance."""
-    sentences = [
-        utterance
-        for utterance in utterances
-        if len(utterance.units) > WORD_UNITS and not is_synthetic(utterance.licence)
-    ]
-    if not (num_voices and sentences):
+    """Other voices of the real recordings, by utterance: one of each word, more of a sentence."""
+    real = [utterance for utterance in utterances if not is_synthetic(utterance.licence)]
+    if not (num_voices and real):
         return {}
     from training.voice_change import changed_voices  # noqa: PLC0415 (needs an extra of its own)
 
-    voices = changed_voices(sentences, num_voices=num_voices, seed=seed)
-    return {
-        utterance.utterance_id: blocks for utterance, blocks in zip(sentences, voices, strict=True)
-    }
+    sentences = [utterance for utterance in real if len(utterance.units) > WORD_UNITS]
+    words = [utterance for utterance in real if len(utterance.units) <= WORD_UNITS]
+    voices = [
+        *zip(sentences, changed_voices(sentences, num_voices=num_voices), strict=True),
+        *zip(words, changed_voices(words, num_voices=1), strict=True),
+    ]
+    return {utterance.utterance_id: blocks for utterance, blocks in voices}
 
 
 def speech_span(log_mel: NDArray[np.float16]) -> slice:

@@ -13,7 +13,8 @@ y_d      log share of each state at frame t - d, known at frame t    (batch, fra
 ======== =========================================================== ====================
 
 One trunk serves every look-ahead d: each has an output layer of its own. The trunk sees nothing
-but the past and the present, so its delay is that of the output layer in use.
+but the past and the present, so its delay is that of the output layer in use. The second task,
+phones of another language, has as many outputs, of which it uses some.
 """
 
 from __future__ import annotations
@@ -35,7 +36,6 @@ class Shape:
 
     num_states: int
     look_aheads: tuple[int, ...]  # feature frames
-    num_second: int = 0  # outputs of the second task, 0 if there is none
     front: int = 256  # width of the convolution
     hidden: int = 256  # H, of each recurrent layer
 
@@ -52,7 +52,7 @@ class Network(nn.Module):
         self.heads = nn.ModuleList(
             nn.Linear(2 * shape.hidden, shape.num_states) for _ in shape.look_aheads
         )
-        self.second_task = nn.Linear(2 * shape.hidden, max(1, shape.num_second))
+        self.second_task = nn.Linear(2 * shape.hidden, shape.num_states)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, frames: Tensor) -> Tensor:

@@ -1,11 +1,15 @@
-"""Write a trained network as ONNX, the form in which the recognizer runs it.
+"""Write trained networks as ONNX, the form in which the recognizer runs them.
 
 The graph is what :class:`training.network.Network` computes, a chunk of frames at a time with the
-recurrent layers' states coming in and going out, and the output layer chosen by its number.
-Weights are kept as 16-bit floats, which halves the file; the sums are in 32 bits.
+recurrent layers' states coming in and going out, and the output layer chosen by its number. Several
+networks become one: side by side, the logits' mean in the end (Hansen and Salamon 1990, "Neural
+network ensembles"). Weights are kept as 16-bit floats, which halves the file; the sums are in 32
+bits.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import onnx
@@ -16,46 +20,69 @@ from training.network import FRONT_FRAMES, NUM_INPUTS, Network
 
 _OPERATORS = 17  # version of the ONNX operator set
 _FORMAT = 8  # version of the ONNX file format
+_LARGEST_INTEGER = 127
+_LEAST_SCALE = 1e-12
 
 
-def onnx_of(network: Network) -> NDArray[np.uint8]:
+def onnx_of(networks: Sequence[Network], *, second_task: bool = False) -> NDArray[np.uint8]:
     """Return the bytes of an ONNX file.
 
     Its inputs are ``x`` (frames, batch, 205), the last five frames, oldest first; ``h1`` and ``h2``
-    (1, batch, H), the states of the recurrent layers; and ``head``, the number of the output
-    layer. Its outputs are log shares (frames, batch, states) and the new states.
+    (1, batch, networks H), the states of the recurrent layers; and ``head``, the number of the
+    output layer. Its outputs are log shares (frames, batch, states) and the new states.
+
+    Parameters
+    ----------
+    networks
+        Networks of one shape.
+    second_task
+        Offer the output layer of the second task instead of the others.
     """
-    shape = network.shape
-    parameters = {
-        name: tensor.numpy().astype(np.float16) for name, tensor in network.state_dict().items()
-    }
-    front = parameters["front.weight"].transpose(2, 1, 0)  # (5, 41, width)
-    heads = range(len(shape.look_aheads))
+    shape = networks[0].shape
+    parameters = [
+        {name: tensor.numpy() for name, tensor in one.state_dict().items()} for one in networks
+    ]
+    heads = [f"heads.{head}" for head in range(len(shape.look_aheads))]
+    if second_task:
+        heads = ["second_task"]
+    fronts = [one["front.weight"].transpose(2, 1, 0) for one in parameters]
     weights = {
-        "front_weight": front.reshape(FRONT_FRAMES * NUM_INPUTS, shape.front),
-        "front_bias": parameters["front.bias"],
-        **_recurrent("first", parameters),
-        **_recurrent("second", parameters),
-        "head_weight": np.stack([parameters[f"heads.{head}.weight"].T for head in heads]),
-        "head_bias": np.stack([parameters[f"heads.{head}.bias"] for head in heads]),
+        "front_weight": _beside([front.reshape(-1, shape.front) for front in fronts]),
+        "front_bias": _beside([one["front.bias"] for one in parameters]),
+        "head_weight": np.stack(
+            [np.concatenate([one[f"{head}.weight"].T for one in parameters]) for head in heads]
+        ),
+        "head_bias": np.stack(
+            [np.sum([one[f"{head}.bias"] for one in parameters], axis=0) for head in heads]
+        ),
     }
-    half = [numpy_helper.from_array(array, f"{name}_16") for name, array in weights.items()]
-    axis = numpy_helper.from_array(np.array([1]), "axis")
+    for number, one in enumerate(parameters):
+        weights |= _recurrent("first", number, one) | _recurrent("second", number, one)
+    stored = [_stored(name, array) for name, array in weights.items()]
+    constants = [
+        numpy_helper.from_array(np.array([1]), "axis"),
+        numpy_helper.from_array(np.array(len(networks), np.float32), "networks"),
+    ]
+    numbers = range(len(networks))
     nodes = [
-        *(helper.make_node("Cast", [f"{n}_16"], [n], to=TensorProto.FLOAT) for n in weights),
+        *(node for _, made in stored for node in made),
         helper.make_node("MatMul", ["x", "front_weight"], ["front_product"]),
         helper.make_node("Add", ["front_product", "front_bias"], ["front_sum"]),
         helper.make_node("Relu", ["front_sum"], ["front"]),
-        *_layer("first", "front", "h1", shape.hidden),
-        *_layer("second", "first", "h2", shape.hidden),
-        helper.make_node("Concat", ["first", "second"], ["both"], axis=2),
+        *(_split(name, numbers) for name in ("front", "h1", "h2")),
+        *(node for number in numbers for node in _layers(number, shape.hidden)),
+        *(_joined(f"h{layer}_after", numbers) for layer in (1, 2)),
+        helper.make_node(
+            "Concat", [f"{n}_{k}" for k in numbers for n in ("first", "second")], ["both"], axis=2
+        ),
         helper.make_node("Gather", ["head_weight", "head"], ["weight"], axis=0),
         helper.make_node("Gather", ["head_bias", "head"], ["bias"], axis=0),
         helper.make_node("MatMul", ["both", "weight"], ["product"]),
-        helper.make_node("Add", ["product", "bias"], ["logits"]),
+        helper.make_node("Add", ["product", "bias"], ["sum"]),
+        helper.make_node("Div", ["sum", "networks"], ["logits"]),
         helper.make_node("LogSoftmax", ["logits"], ["log_share"], axis=-1),
     ]
-    state: list[int | str] = [1, "batch", shape.hidden]
+    state: list[int | str] = [1, "batch", len(networks) * shape.hidden]
     graph = helper.make_graph(
         nodes,
         "recurrent acoustic model",
@@ -70,7 +97,7 @@ def onnx_of(network: Network) -> NDArray[np.uint8]:
             _value("h1_after", state),
             _value("h2_after", state),
         ],
-        initializer=[*half, axis],
+        initializer=[*(tensor for tensors, _ in stored for tensor in tensors), *constants],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPERATORS)])
     model.ir_version = _FORMAT
@@ -78,30 +105,71 @@ def onnx_of(network: Network) -> NDArray[np.uint8]:
     return np.frombuffer(model.SerializeToString(), dtype=np.uint8)
 
 
+def _beside(arrays: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    return np.concatenate(arrays, axis=-1)
+
+
+def _stored(
+    name: str, array: NDArray[np.float32]
+) -> tuple[list[onnx.TensorProto], list[onnx.NodeProto]]:
+    """Keep weights in 8 bits: return what stands in the file, and what makes floats of it.
+
+    onnxruntime does this once, when it loads the file.
+    """
+    if "bias" in name:
+        return [numpy_helper.from_array(array, name)], []
+    summed = -1 if name.startswith(("first", "second")) else -2  # axis that a product sums over
+    scale = np.abs(array).max(axis=summed, keepdims=True) / _LARGEST_INTEGER
+    integers = np.rint(array / np.maximum(scale, _LEAST_SCALE)).astype(np.int8)
+    tensors = [
+        numpy_helper.from_array(integers, f"{name}_8"),
+        numpy_helper.from_array(scale, f"{name}_scale"),
+    ]
+    nodes = [
+        helper.make_node("Cast", [f"{name}_8"], [f"{name}_whole"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", [f"{name}_whole", f"{name}_scale"], [name]),
+    ]
+    return tensors, nodes
+
+
 def _value(name: str, shape: list[int | str]) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
 
 
+def _split(name: str, numbers: Sequence[int]) -> onnx.NodeProto:
+    """Give every network its part of what stands side by side."""
+    return helper.make_node("Split", [name], [f"{name}_{number}" for number in numbers], axis=2)
+
+
+def _joined(name: str, numbers: Sequence[int]) -> onnx.NodeProto:
+    return helper.make_node("Concat", [f"{name}_{number}" for number in numbers], [name], axis=2)
+
+
 def _recurrent(
-    name: str, parameters: dict[str, NDArray[np.float16]]
-) -> dict[str, NDArray[np.float16]]:
+    name: str, number: int, parameters: dict[str, NDArray[np.float32]]
+) -> dict[str, NDArray[np.float32]]:
     """Weights in ONNX's order of the gates: update, reset, new; PyTorch has reset first."""
 
-    def swapped(kind: str) -> NDArray[np.float16]:
+    def swapped(kind: str) -> NDArray[np.float32]:
         reset, update, new = np.split(parameters[f"{name}.{kind}_l0"], 3)
         return np.concatenate([update, reset, new])[None]
 
     return {
-        f"{name}_input": swapped("weight_ih"),
-        f"{name}_state": swapped("weight_hh"),
-        f"{name}_bias": np.concatenate([swapped("bias_ih"), swapped("bias_hh")], axis=1),
+        f"{name}_input_{number}": swapped("weight_ih"),
+        f"{name}_state_{number}": swapped("weight_hh"),
+        f"{name}_bias_{number}": np.concatenate([swapped("bias_ih"), swapped("bias_hh")], axis=1),
     }
 
 
-def _layer(name: str, below: str, state: str, hidden: int) -> list[onnx.NodeProto]:
-    inputs = [below, f"{name}_input", f"{name}_state", f"{name}_bias", "", state]
-    outputs = [f"{name}_directions", f"{state}_after"]
-    return [
-        helper.make_node("GRU", inputs, outputs, hidden_size=hidden, linear_before_reset=1),
-        helper.make_node("Squeeze", [outputs[0], "axis"], [name]),
-    ]
+def _layers(number: int, hidden: int) -> list[onnx.NodeProto]:
+    """Both recurrent layers of a network."""
+    nodes = []
+    for name, below, state in (("first", "front", "h1"), ("second", "first", "h2")):
+        weights = [f"{name}_{kind}_{number}" for kind in ("input", "state", "bias")]
+        inputs = [f"{below}_{number}", *weights, "", f"{state}_{number}"]
+        outputs = [f"{name}_directions_{number}", f"{state}_after_{number}"]
+        nodes += [
+            helper.make_node("GRU", inputs, outputs, hidden_size=hidden, linear_before_reset=1),
+            helper.make_node("Squeeze", [outputs[0], "axis"], [f"{name}_{number}"]),
+        ]
+    return nodes

@@ -1,9 +1,10 @@
 """Train the recurrent network on aligned frames, with a second language as a second task.
 
 Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition"
-(cross-entropy on the states of a forced alignment); Graves et al. 2006, "Connectionist temporal
-classification" (the second task, whose phones have no times); Park et al. 2019, "SpecAugment"
-(masks); Kingma and Ba 2015, "Adam"; Polyak and Juditsky 1992 (running mean of the weights).
+(cross-entropy on the states of a forced alignment); Huang et al. 2013, "Cross-language knowledge
+transfer using multilingual deep neural network with shared hidden layers" (the second task); Park
+et al. 2019, "SpecAugment" (masks); Kingma and Ba 2015, "Adam"; Polyak and Juditsky 1992 (running
+mean of the weights).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy, ctc_loss, log_softmax
+from torch.nn.functional import log_softmax
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from services.recognizer.features import LiveMean
@@ -34,10 +35,9 @@ _LONGEST_GRADIENT = 2.0
 _MEMORY = 0.998  # of the running mean of the weights, per step
 _AUGMENTED_SHARE = 0.85
 _KNOWN_SPEAKER_SHARE = 0.4  # of the recordings, heard as if the speaker had spoken before
-_SECOND_EVERY = 8  # steps
-_SECOND_WEIGHT = 0.3
+_OTHERS_WEIGHT = 0.5  # of the losses of other output layers than the main one
 _MOST_MASKED_FRAMES, _MOST_MASKED_BANDS = 12, 7
-NO_TARGET = -100  # what cross-entropy leaves out
+NO_TARGET = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,9 +45,8 @@ class Recording:
     """What the network hears: one sentence in one or several voices."""
 
     voices: tuple[NDArray[np.float16], ...]  # (frames, 41) each
-    targets: NDArray[np.int64]  # (frames,) states, or the string of the second task
+    targets: NDArray[np.int64]  # (frames,) states; those of the second task follow the others
     weight: float  # how often it is heard against the others
-    aligned: bool = True  # whether the targets are states
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,8 +86,6 @@ class Trainer:
         Normalisation.
     recordings
         With the states of their frames.
-    second
-        Recordings of the second task, with phone strings; symbol 0 is the blank.
     main_head
         Output layer that learns in every step; each step another one learns besides.
     seed
@@ -100,7 +97,6 @@ class Trainer:
         network: Network,
         front_end: FrontEnd,
         recordings: Sequence[Recording],
-        second: Sequence[Recording],
         *,
         main_head: int,
         seed: int,
@@ -110,8 +106,7 @@ class Trainer:
         self._averaged = AveragedModel(network, multi_avg_fn=average)
         self.front_end = front_end
         self._rng = np.random.default_rng(seed)
-        self._main_head = main_head
-        self._second = self._batches_of(second) if second else None
+        self.main_head = main_head
         self.replace_recordings(recordings)
         self._optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=0.01)
 
@@ -145,27 +140,41 @@ class Trainer:
     def _step(self, number: int, rate: float) -> float:
         """Learn from one batch; return the mean cross-entropy of the main output layer."""
         self.network.train()
-        frames, targets, _ = next(self._batches)
+        frames, targets = next(self._batches)
         hidden = self.network(frames)
-        loss = self._loss(hidden, targets, self._main_head)
+        loss = _cross_entropy(*self._log_shares(hidden, targets, self.main_head))
         main_loss = float(loss.detach())
-        others = [head for head in range(len(self.network.heads)) if head != self._main_head]
+        others = [head for head in range(len(self.network.heads)) if head != self.main_head]
         if others:
-            loss = loss + 0.5 * self._loss(hidden, targets, others[number % len(others)])
-        if self._second is not None and number % _SECOND_EVERY == 0:
-            loss = loss + _SECOND_WEIGHT * self._second_loss(*next(self._second))
+            other = self._log_shares(hidden, targets, others[number % len(others)])
+            loss = loss + _OTHERS_WEIGHT * _cross_entropy(*other)
+        second = targets - self.network.shape.num_states
+        if (second >= 0).any():
+            delay = self.network.shape.look_aheads[self.main_head]
+            log_shares = log_softmax(self.network.second_task(hidden[:, delay:]), dim=-1)
+            due = second[:, : hidden.shape[1] - delay]
+            loss = loss + _OTHERS_WEIGHT * _cross_entropy(log_shares, due)
         self._learn(loss, rate)
         return main_loss
 
     def _step_of_heads(self, rate: float) -> float:
         self.network.train()
-        frames, targets, _ = next(self._batches)
+        frames, targets = next(self._batches)
         with torch.no_grad():
             hidden = self.network(frames)
-        heads = range(len(self.network.heads))
-        losses = [self._loss(hidden, targets, head) for head in heads]
+        losses = [
+            _cross_entropy(*self._log_shares(hidden, targets, head))
+            for head in range(len(self.network.heads))
+        ]
         self._learn(torch.stack(losses).sum(), rate)
-        return float(losses[self._main_head].detach())
+        return float(losses[self.main_head].detach())
+
+    def _log_shares(self, hidden: Tensor, targets: Tensor, head: int) -> tuple[Tensor, Tensor]:
+        """Return what an output layer says, and the states it ought to say."""
+        delay = self.network.shape.look_aheads[head]
+        log_shares = log_softmax(self.network.heads[head](hidden[:, delay:]), dim=-1)
+        due = targets[:, : hidden.shape[1] - delay]
+        return log_shares, torch.where(due < self.network.shape.num_states, due, NO_TARGET)
 
     def _learn(self, loss: Tensor, rate: float) -> None:
         for group in self._optimizer.param_groups:
@@ -176,26 +185,8 @@ class Trainer:
         self._optimizer.step()
         self._averaged.update_parameters(self.network)
 
-    def _loss(self, hidden: Tensor, targets: Tensor, head: int) -> Tensor:
-        delay = self.network.shape.look_aheads[head]
-        end = hidden.shape[1] - delay
-        logits = self.network.heads[head](hidden[:, delay:])
-        return cross_entropy(logits.flatten(0, 1), targets[:, :end].flatten())
-
-    def _second_loss(self, frames: Tensor, strings: Tensor, lengths: list[int]) -> Tensor:
-        log_share = log_softmax(self.network.second_task(self.network(frames)), dim=-1)
-        return ctc_loss(
-            log_share.transpose(0, 1),
-            strings,
-            torch.tensor(lengths),
-            (strings != NO_TARGET).sum(dim=1),
-            zero_infinity=True,
-        )
-
-    def _batches_of(
-        self, recordings: Sequence[Recording]
-    ) -> Iterator[tuple[Tensor, Tensor, list[int]]]:
-        """Batches without end: frames (batch, longest, 41), targets (batch, longest), lengths."""
+    def _batches_of(self, recordings: Sequence[Recording]) -> Iterator[tuple[Tensor, Tensor]]:
+        """Batches without end: frames (batch, longest, 41), targets (batch, longest)."""
         share = np.array([recording.weight for recording in recordings])
         share /= share.sum()
         while True:
@@ -220,11 +211,10 @@ class Trainer:
         targets = recording.targets
         if rng.random() < _AUGMENTED_SHARE:
             augmentation = Augmentation.draw_hard(rng)
-            if recording.aligned:
-                targets = targets[np.rint(augmentation.positions(len(voice))).astype(int)]
+            targets = targets[np.rint(augmentation.positions(len(voice))).astype(int)]
             voice = augmentation.apply(voice)
         frames = self.front_end.normalise(voice, known=rng.random() < _KNOWN_SPEAKER_SHARE)
-        if recording.aligned and len(frames) > _MOST_FRAMES:
+        if len(frames) > _MOST_FRAMES:
             start = int(rng.integers(len(frames) - _MOST_FRAMES + 1))
             frames = frames[start : start + _MOST_FRAMES]
             targets = targets[start : start + _MOST_FRAMES]
@@ -237,14 +227,20 @@ class Trainer:
         return frames, targets
 
 
+def _cross_entropy(log_shares: Tensor, targets: Tensor) -> Tensor:
+    """Nats a frame that has a target."""
+    known = targets >= 0
+    said = log_shares.gather(-1, targets.clamp(min=0)[..., None])[..., 0]
+    return -(said * known).sum() / max(1, int(known.sum()))
+
+
 def _padded(
     group: list[tuple[NDArray[np.float32], NDArray[np.int64]]],
-) -> tuple[Tensor, Tensor, list[int]]:
+) -> tuple[Tensor, Tensor]:
     longest = max(len(frames) for frames, _ in group)
-    most_targets = max(len(targets) for _, targets in group)
     frames = np.zeros((len(group), longest, NUM_INPUTS), dtype=np.float32)
-    targets = np.full((len(group), most_targets), NO_TARGET, dtype=np.int64)
+    targets = np.full((len(group), longest), NO_TARGET, dtype=np.int64)
     for row, (one, of_one) in enumerate(group):
         frames[row, : len(one)] = one
         targets[row, : len(of_one)] = of_one
-    return torch.from_numpy(frames), torch.from_numpy(targets), [len(one) for one, _ in group]
+    return torch.from_numpy(frames), torch.from_numpy(targets)

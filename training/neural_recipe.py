@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +14,15 @@ import torch
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import AcousticModel, Topology
+from services.recognizer.features import HOP_S
 from services.recognizer.load import load_model
 from services.recognizer.neural import NeuralModel
 from shared.errors import UserError
 from shared.phones import UNITS
-from training.corpus import RowErrors, Utterance, is_synthetic
+from training.corpus import RowErrors, is_synthetic
 from training.durations import AlignedUnit, UnitDurations
 from training.examples import WORD_UNITS, Example, load_examples
-from training.feature_cache import log_mel_of
-from training.gmm import unit_bigram, units_of_path, utterance_graph, viterbi_path
+from training.gmm import SIL, units_of_path, utterance_graph, viterbi_path
 from training.network import Network, Shape
 from training.network_export import onnx_of
 from training.network_training import FrontEnd, Recording, Trainer
@@ -34,20 +36,25 @@ from training.recipes import (
     with_penalty,
     write_card,
 )
+from training.second_language import as_nearest_units, load_second_language
+from training.unit_trigram import unit_trigram
 
 STATES_PER_UNIT = 3
-LOOK_AHEADS = (0, 1, 3, 6)  # feature frames, of the output layers; the trunk forgets more
-MAIN_HEAD = 1  # 10 ms: with N = 3 a unit is put out 55 ms after its first window begins
-_SHARES = {"sentence": 0.5, "word": 0.17, "synthetic": 0.33}  # of the frames heard
-_ALIGNING_HEAD = 3  # 60 ms: a unit's beginning is plainer with what follows
-_REALIGNED_AT = 0.5  # of the steps: from there on the network's own alignment counts
+NUM_STATES = STATES_PER_UNIT * len(UNITS)
+LOOK_AHEADS_MS = (0, 10, 30, 60, 100, 200)  # of the output layers
+LOOK_AHEAD_MS = 10  # of the main one: with N = 3 a unit is put out 55 ms after its window begins
+_SHARES = {"sentence": 0.5, "word": 0.17, "synthetic": 0.33}  # of the Mandarin frames heard
+_SECOND_SHARE = 0.35  # of the second task, against 1 for all Mandarin
+_ALIGNING_FRAMES = 6  # look-ahead: a unit's beginning is plainer with what follows
+_REALIGNED_AT = 0.3  # of the steps: from there on the network's own alignment counts
 _JUDGED_EVERY = 0.05  # of the steps: dev is recognised
-_JUDGED_SCALE = 0.5
-_BIGRAM_SCALE = 1.5  # of the unit bigram's log probabilities; chosen on development data
+_SCALE = 0.5  # of the log scores, until it is chosen
+_UNIT_PENALTY = 1.0  # likewise
+_TRIGRAM_SCALE = 1.5  # of the unit trigram's log probabilities; chosen on development data
 _PRIOR_SCALE = 0.5  # of the states' log shares; chosen on development data
-_SCALES = (0.3, 0.4, 0.5, 0.6, 0.8)
+_SCALES = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 _LEAST_STAY, _MOST_STAY = 0.05, 0.98
-_SECOND_FRAMES_A_PHONE = 3  # a recording of the second task with fewer is left out
+_SMOOTHED = 20  # steps, in the curves
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,15 +66,40 @@ class _Aligned:
     units: list[AlignedUnit]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Lessons:
+    """What one network learns from, in which order."""
+
+    corpora: Sequence[Path]
+    aligner: Path
+    second_task: Path | None
+    look_ahead_ms: float
+    num_steps: int
+    num_voices: int
+    shipping: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Trained:
+    """A network and how it came about."""
+
+    network: Network
+    model: NeuralModel
+    losses: list[tuple[int, float]]
+    rates: list[tuple[int, float]]
+
+
 def train_neural(
     corpora: Sequence[Path],
     output: Path,
     *,
     aligner: Path,
     second_task: Path | None = None,
+    look_ahead_ms: float = LOOK_AHEAD_MS,
     seed: int = 0,
     num_steps: int = 4000,
-    num_voices: int = 4,
+    num_networks: int = 2,
+    num_voices: int = 6,
     shipping: bool = True,
     report: Report = print,
 ) -> None:
@@ -83,71 +115,58 @@ def train_neural(
     aligner
         A model that aligns the first time, such as :func:`training.recipes.train_gmm` writes.
     second_task
-        Folder with a ``manifest.tsv`` of speech in another language (``utt_id``, ``path``,
-        ``seconds`` and ``arpabet``, phones separated by spaces).
+        Folder of speech in English, see :func:`training.second_language.load_second_language`.
+    look_ahead_ms
+        Of the output layer that counts most and is in use, in whole frames of 10 ms.
     seed
-        Of weights, voices, order and augmentation.
+        Of weights, order and augmentation of the first network; the others' are the next ones.
     num_steps
         Batches of 50 s of sound.
+    num_networks
+        Networks that learn side by side, each in a process of its own, and whose mean counts.
     num_voices
         Other voices for each real sentence.
     shipping
         Leave out rows whose licence forbids giving the model away.
     report
-        Receives lines of progress.
+        Receives lines of progress; those of several networks are printed.
 
     Raises
     ------
     UserError
         If there is nothing to train on, or a file cannot be read.
     """
-    torch.manual_seed(seed)
     errors = RowErrors()
-    examples = load_examples(
-        corpora, errors, shipping=shipping, num_voices=num_voices, voice_seed=seed
+    examples = load_examples(corpora, errors, shipping=shipping, num_voices=num_voices)
+    if second_task:
+        load_second_language(second_task, errors)  # finds mistakes and fills the cache for all
+    lessons = _Lessons(
+        corpora=corpora,
+        aligner=aligner,
+        second_task=second_task,
+        look_ahead_ms=look_ahead_ms,
+        num_steps=num_steps,
+        num_voices=num_voices,
+        shipping=shipping,
     )
-    phones, second = _second_task(second_task, errors) if second_task else (0, [])
-    aligned = _aligned(load_model(aligner), examples)
-    report(f"{len(aligned)} recordings aligned, {len(second)} of the second task")
-    recordings = _recordings(aligned)
-    front_end = FrontEnd.measure(recordings)
-    num_states = STATES_PER_UNIT * len(UNITS)
-    shape = Shape(num_states=num_states, look_aheads=LOOK_AHEADS, num_second=phones)
-    trainer = Trainer(Network(shape), front_end, recordings, second, main_head=MAIN_HEAD, seed=seed)
-    dev = _dev_examples(corpora, shipping=shipping)
-    losses: list[tuple[int, float]] = []
-    rates: list[tuple[int, float]] = []
-
-    def watch(step: int, loss: float) -> None:
-        nonlocal aligned
-        losses.append((step, loss))
-        if step == round(_REALIGNED_AT * num_steps):
-            anew = replace(_model(trainer, aligned), head=_ALIGNING_HEAD, kappa=1.0)
-            aligned = _aligned(anew, examples)
-            trainer.replace_recordings(_recordings(aligned))
-            report(f"step {step}: aligned anew")
-        if dev and step % max(1, round(_JUDGED_EVERY * num_steps)) == 0:
-            judged = _model(trainer, aligned)
-            scores = [all_scores(judged, example) for example in dev]
-            rates.append((step, error_rate(judged.topology, scores, dev)))
-            rate = 100 * rates[-1][1]
-            report(f"step {step}: {loss:.3f} nats a frame, dev phone error {rate:.1f} %")
-
-    trainer.train(num_steps, watch)
-    model = _model(trainer, aligned)
-    unscaled = replace(model, kappa=1.0)
+    if num_networks == 1:
+        trained = [_train_one(lessons, seed, report)]
+    else:
+        with ProcessPoolExecutor(num_networks, mp_context=get_context("spawn")) as processes:
+            seeds = range(seed, seed + num_networks)
+            trained = list(processes.map(partial(_train_one, lessons), seeds))
+    unscaled = replace(
+        trained[0].model, network=onnx_of([one.network for one in trained]), kappa=1.0
+    )
     choice = choose_search(unscaled, corpora, scales=_SCALES, shipping=shipping, report=report)
-    if choice is not None:
-        topology = with_penalty(model.topology, choice.unit_penalty)
-        model = replace(model, topology=topology, kappa=choice.scale)
-    model.save(output)
-    draw_curves(losses, rates, output.with_suffix(".png"))
+    scale, penalty = (choice.scale, choice.unit_penalty) if choice else (_SCALE, _UNIT_PENALTY)
+    replace(unscaled, topology=with_penalty(unscaled.topology, penalty), kappa=scale).save(output)
+    draw_curves(trained, output.with_suffix(".png"))
     write_card(
         output,
-        title=f"Neural recognizer, two recurrent layers of {shape.hidden} units",
+        title=f"Neural recognizer, the mean of {num_networks} recurrent networks",
         details=f"seed {seed}, {num_steps} steps, {num_voices} other voices for each sentence, "
-        f"aligned first by `{aligner.name}`"
-        + (f", with {len(second)} recordings in another language" if second else ""),
+        f"aligned first by `{aligner.name}`" + (", with a second language" if second_task else ""),
         examples=examples,
         errors=errors,
         choice=choice or UNCHOSEN,
@@ -155,40 +174,122 @@ def train_neural(
     report_rows(errors, report)
 
 
-def _aligned(model: AcousticModel, examples: Sequence[Example]) -> list[_Aligned]:
-    """Find the states of all frames, ``STATES_PER_UNIT`` for each unit; drop what does not fit."""
+def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained:
+    torch.set_num_threads(1)  # the networks share the cores; and sums come out the same everywhere
+    torch.manual_seed(seed)
+
+    def tell(line: str) -> None:
+        report(f"network {seed}: {line}")
+
+    examples = load_examples(
+        lessons.corpora, RowErrors(), shipping=lessons.shipping, num_voices=lessons.num_voices
+    )
+    second: list[Example] = []
+    if lessons.second_task:
+        second = load_second_language(lessons.second_task, RowErrors())
+    aligner = _aligner(load_model(lessons.aligner))
+    aligned = _aligned(aligner, examples)
+    of_second = _aligned(aligner, second, as_nearest_units(second)) if second else []
+    tell(f"{len(aligned)} recordings aligned, {len(of_second)} of the second task")
+    look_aheads = sorted({*LOOK_AHEADS_MS, lessons.look_ahead_ms})
+    shape = Shape(
+        num_states=NUM_STATES, look_aheads=tuple(round(ms / 1000 / HOP_S) for ms in look_aheads)
+    )
+    trainer = Trainer(
+        Network(shape),
+        FrontEnd.measure(_recordings(aligned, [])),
+        _recordings(aligned, of_second),
+        main_head=look_aheads.index(lessons.look_ahead_ms),
+        seed=seed,
+    )
+    dev = _dev_examples(lessons.corpora, shipping=lessons.shipping)
+    losses: list[tuple[int, float]] = []
+    rates: list[tuple[int, float]] = []
+
+    def watch(step: int, loss: float) -> None:
+        nonlocal aligned, of_second
+        losses.append((step, loss))
+        if step == round(_REALIGNED_AT * lessons.num_steps):
+            aligned = _aligned(_aligner(_model(trainer, aligned)), examples)
+            if second:
+                heard = _model(trainer, of_second, second_task=True)
+                of_second = _aligned(_aligner(heard), second)
+            trainer.replace_recordings(_recordings(aligned, of_second))
+            tell(f"step {step}: aligned anew")
+        if dev and step % max(1, round(_JUDGED_EVERY * lessons.num_steps)) == 0:
+            judged = _model(trainer, aligned)
+            scores = list(all_scores(judged, dev))
+            topology = with_penalty(judged.topology, _UNIT_PENALTY)
+            rates.append((step, error_rate(topology, scores, dev)))
+            rate = 100 * rates[-1][1]
+            tell(f"step {step}: {loss:.3f} nats a frame, dev phone error {rate:.1f} %")
+
+    trainer.train(lessons.num_steps, watch)
+    return _Trained(trainer.mean, _model(trainer, aligned), losses, rates)
+
+
+def _aligner(model: AcousticModel) -> AcousticModel:
+    """Take a network's output layer that is best for alignment."""
+    if not isinstance(model, NeuralModel):
+        return model
+    distance = np.abs(model.look_aheads - _ALIGNING_FRAMES)
+    return replace(model, head=int(distance.argmin()), kappa=1.0)
+
+
+def _aligned(
+    model: AcousticModel, examples: Sequence[Example], heard_as: Sequence[Example] | None = None
+) -> list[_Aligned]:
+    """Find the states of all frames, ``STATES_PER_UNIT`` for each unit; drop what does not fit.
+
+    ``heard_as`` holds the same with the units that the model takes theirs for.
+    """
     aligned = []
     own = np.diff(model.topology.first_state)
     of_state = np.repeat(np.arange(len(UNITS)), own)
     place = np.arange(len(of_state)) - model.topology.first_state[of_state]
     # middle of the n-th part of a unit, in parts of another size
-    coarse = of_state * STATES_PER_UNIT + (2 * place + 1) * STATES_PER_UNIT // (2 * own[of_state])
-    for example in examples:
-        scores = all_scores(model, example)
-        graph = utterance_graph(example.units, example.syllables, model.topology.first_state)
+    part = (2 * place + 1) * STATES_PER_UNIT // (2 * own[of_state])
+    rows = all_scores(model, examples)
+    for scores, example, heard in zip(rows, examples, heard_as or examples, strict=True):
+        graph = utterance_graph(heard.units, heard.syllables, model.topology.first_state)
         path, _ = viterbi_path(
             scores[:, graph.states], graph, model.topology.log_stay, model.topology.log_leave
         )
         if len(path):
-            units = units_of_path(path, graph)
-            aligned.append(_Aligned(example, coarse[graph.states[path]], units))
+            graph.units[graph.units != SIL] = example.units
+            states = graph.units[graph.unit_of[path]] * STATES_PER_UNIT + part[graph.states[path]]
+            aligned.append(_Aligned(example, states, units_of_path(path, graph)))
     if not aligned:
         raise UserError("no recording fits its text; is the aligner trained?")
     return aligned
 
 
-def _recordings(aligned: Sequence[_Aligned]) -> list[Recording]:
-    """Weigh what the network hears: each kind of speech has its share, rare speakers count more."""
+def _recordings(aligned: Sequence[_Aligned], of_second: Sequence[_Aligned]) -> list[Recording]:
+    """Weigh what the network hears; states of the second task follow the others."""
+    second_frames = sum(len(one.states) for one in of_second)
+    return [
+        Recording(
+            voices=(one.example.log_mel, *one.example.voices), targets=one.states, weight=weight
+        )
+        for one, weight in zip(aligned, _weights(aligned), strict=True)
+    ] + [
+        Recording(
+            voices=(one.example.log_mel,),
+            targets=NUM_STATES + one.states,
+            weight=_SECOND_SHARE / second_frames,
+        )
+        for one in of_second
+    ]
+
+
+def _weights(aligned: Sequence[_Aligned]) -> list[float]:
+    """Each kind of speech has its share, rare speakers count more."""
     kinds = [_kind(one.example) for one in aligned]
     frames = dict.fromkeys(_SHARES, 0.0)
     for kind, one in zip(kinds, aligned, strict=True):
         frames[kind] += one.example.weight * len(one.states)
     return [
-        Recording(
-            voices=(one.example.log_mel, *one.example.voices),
-            targets=one.states,
-            weight=_SHARES[kind] * one.example.weight / frames[kind],
-        )
+        _SHARES[kind] * one.example.weight / frames[kind]
         for kind, one in zip(kinds, aligned, strict=True)
     ]
 
@@ -199,15 +300,16 @@ def _kind(example: Example) -> str:
     return "sentence" if len(example.units) > WORD_UNITS else "word"
 
 
-def _model(trainer: Trainer, aligned: Sequence[_Aligned]) -> NeuralModel:
+def _model(
+    trainer: Trainer, aligned: Sequence[_Aligned], *, second_task: bool = False
+) -> NeuralModel:
     """Make the recognizer's model of the running mean of the weights."""
-    num_states = STATES_PER_UNIT * len(UNITS)
-    counts = np.ones(num_states)
-    occupied, left = np.full(num_states, 2.0), np.ones(num_states)
+    counts = np.ones(NUM_STATES)
+    occupied, left = np.full(NUM_STATES, 2.0), np.ones(NUM_STATES)
     durations = UnitDurations()
-    for one, recording in zip(aligned, _recordings(aligned), strict=True):
-        of_states = np.bincount(one.states, minlength=num_states)
-        counts += recording.weight * len(aligned) * of_states
+    for one, weight in zip(aligned, _weights(aligned), strict=True):
+        of_states = np.bincount(one.states, minlength=NUM_STATES)
+        counts += weight * len(aligned) * of_states
         occupied += of_states
         ends = np.append(np.flatnonzero(np.diff(one.states)), len(one.states) - 1)
         np.add.at(left, one.states[ends], 1.0)
@@ -218,19 +320,22 @@ def _model(trainer: Trainer, aligned: Sequence[_Aligned]) -> NeuralModel:
         first_state=np.arange(len(UNITS) + 1) * STATES_PER_UNIT,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        log_bigram=np.float32(_BIGRAM_SCALE) * unit_bigram([one.example.units for one in aligned]),
+        log_bigram=np.float32(_TRIGRAM_SCALE)
+        * unit_trigram([one.example.units for one in aligned]),
         duration_mean_s=mean_s,
         duration_spread_s=spread_s,
     )
+    shape = trainer.network.shape
+    main_look_ahead = shape.look_aheads[trainer.main_head]
     return NeuralModel(
         topology=topology,
-        network=onnx_of(trainer.mean),
-        look_aheads=np.array(LOOK_AHEADS),
+        network=onnx_of([trainer.mean], second_task=second_task),
+        look_aheads=np.array([main_look_ahead] if second_task else shape.look_aheads),
         log_prior=(_PRIOR_SCALE * np.log(counts / counts.sum())).astype(np.float32),
         prior_mean=trainer.front_end.prior_mean,
         spread=trainer.front_end.spread,
-        kappa=_JUDGED_SCALE,
-        head=MAIN_HEAD,
+        kappa=_SCALE,
+        head=0 if second_task else trainer.main_head,
     )
 
 
@@ -241,56 +346,7 @@ def _dev_examples(corpora: Sequence[Path], *, shipping: bool) -> list[Example]:
         return []
 
 
-def _second_task(folder: Path, errors: RowErrors) -> tuple[int, list[Recording]]:
-    """Return the number of phones with the blank, which is 0, and recordings with their phones."""
-    manifest = folder / "manifest.tsv"
-    try:
-        with manifest.open(encoding="utf-8", newline="") as lines:
-            rows = list(csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE))
-        strings = [row["arpabet"].split() for row in rows]
-        utterances = [_of_second_task(folder, row) for row in rows]
-    except (OSError, KeyError, ValueError) as error:
-        raise UserError(
-            f"{manifest} is no list of utt_id, path, seconds and arpabet ({error!r})"
-        ) from error
-    number = {
-        phone: at
-        for at, phone in enumerate(
-            sorted({phone for string in strings for phone in string}), start=1
-        )
-    }
-    recordings = [
-        Recording(
-            voices=(log_mel,),
-            targets=np.array([number[phone] for phone in string]),
-            weight=1.0,
-            aligned=False,
-        )
-        for string, log_mel in zip(strings, log_mel_of(utterances, errors), strict=True)
-        if log_mel is not None and len(log_mel) > _SECOND_FRAMES_A_PHONE * len(string) > 0
-    ]
-    if not recordings:
-        raise UserError(f"{manifest} lists no recording that is long enough for its phones")
-    return len(number) + 1, recordings
-
-
-def _of_second_task(folder: Path, row: dict[str, str]) -> Utterance:
-    return Utterance(
-        utterance_id=row["utt_id"],
-        path=folder / row["path"],
-        speaker=row.get("speaker", ""),
-        source="",
-        licence="",
-        split="train",
-        seconds=float(row["seconds"]),
-        units=(),
-        syllables=(),
-    )
-
-
-def draw_curves(
-    losses: Sequence[tuple[int, float]], rates: Sequence[tuple[int, float]], path: Path
-) -> None:
+def draw_curves(trained: Sequence[_Trained], path: Path) -> None:
     """Draw cross-entropy and dev phone error over the steps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (slow to load)
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -298,12 +354,18 @@ def draw_curves(
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     FigureCanvasAgg(figure)
     left = figure.add_subplot()
-    left.plot(*zip(*losses, strict=True), color="tab:blue", linewidth=0.8)
+    right = left.twinx()
+    for number, one in enumerate(trained):
+        steps, losses = np.array(one.losses).T
+        width = min(_SMOOTHED, len(steps))
+        smooth = np.convolve(losses, np.ones(width) / width, "valid")
+        left.plot(steps[width - 1 :], smooth, f"C{number}", linewidth=0.8)
+        if one.rates:
+            right.plot(
+                *zip(*((step, 100 * rate) for step, rate in one.rates), strict=True), f"o:C{number}"
+            )
     left.set_xlabel("steps")
-    left.set_ylabel("nats a frame", color="tab:blue")
-    if rates:
-        right = left.twinx()
-        right.plot(*zip(*((step, 100 * rate) for step, rate in rates), strict=True), "o-C1")
-        right.set_ylabel("dev phone error %", color="C1")
-        right.set_ylim(bottom=0)
+    left.set_ylabel("nats a frame (line)")
+    right.set_ylabel("dev phone error % (dots)")
+    right.set_ylim(bottom=0)
     figure.savefig(path, dpi=90)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,6 +39,7 @@ _ROTATED_AT = 8  # mixtures per state when the features are decorrelated
 _SENTENCE_SYLLABLES = 4  # real recordings of so many count as connected speech
 _SENTENCE_COPIES = 3
 _WORD_WEIGHT = 0.3  # of isolated words and syllables
+_SCORED_TOGETHER = 16  # recordings
 _SELDOM = 0.5  # recordings of less weight are thinned out
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)  # of the log scores of a model alone
 _UNIT_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)
@@ -164,7 +165,7 @@ def choose_search(
     except UserError:
         report("no dev recordings: scale and unit penalty are not chosen")
         return None
-    scores = [all_scores(model, example) for example in dev]
+    scores = list(all_scores(model, dev))
     best: Choice | None = None
     for scale in scales:
         scaled = [np.float32(scale) * rows for rows in scores]
@@ -200,10 +201,16 @@ def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
     return replace(topology, log_bigram=topology.log_bigram + np.float32(unit_penalty))
 
 
-def all_scores(model: AcousticModel, example: Example) -> NDArray[np.float32]:
-    """Scores of all frames of an unchanged recording, shape (frames, states)."""
-    stream = model.stream()
-    return np.concatenate([stream.accept(example.log_mel.astype(np.float32)), stream.finish()])
+def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
+    """Scores of all frames of unchanged recordings, shape (frames, states) each."""
+    for start in range(0, len(examples), _SCORED_TOGETHER):
+        some = examples[start : start + _SCORED_TOGETHER]
+        streams = [model.stream() for _ in some]
+        log_mels = [example.log_mel.astype(np.float32) for example in some]
+        begun = model.score(list(zip(streams, log_mels, strict=True)))
+        ended = model.score([(stream, None) for stream in streams])
+        for pair in zip(begun, ended, strict=True):
+            yield np.concatenate(pair)
 
 
 def _copies(example: Example, rng: np.random.Generator) -> list[Example]:

@@ -1,4 +1,4 @@
-"""Other voices, hard augmentation, and the training of the network."""
+"""Other voices and the training of the network."""
 
 from pathlib import Path
 
@@ -7,24 +7,24 @@ import pytest
 import soundfile
 import torch
 
-from services.recognizer.features import LOG_FLOOR
 from services.recognizer.load import load_model, model_path
 from services.recognizer.neural import NeuralModel
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from training.augmentation import Augmentation
+from shared.phones import UNITS
 from training.corpus import RowErrors, read_corpus
 from training.network import FRONT_FRAMES, NUM_INPUTS, Network, Shape
 from training.network_export import onnx_of
 from training.network_training import FrontEnd, Recording, Trainer
 from training.neural_recipe import train_neural
+from training.second_language import as_nearest_units, load_second_language
 from training.voice_change import Voice, VoiceChange, changed_voices
 
 pytestmark = pytest.mark.unit
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
-SHAPE = Shape(num_states=9, look_aheads=(0, 3), num_second=4, front=16, hidden=24)
+SHAPE = Shape(num_states=9, look_aheads=(0, 3), front=16, hidden=24)
 
 
 @pytest.fixture(autouse=True)
@@ -78,57 +78,33 @@ def test_copies_have_the_frames_of_the_recording(tmp_path: Path) -> None:
     assert not np.array_equal(first[0], other[0])
 
 
-# --- augmentation
-
-
-def test_hard_augmentation_is_repeatable_and_finite() -> None:
-    rng = np.random.default_rng(0)
-    log_mel = rng.normal(14, 2, (80, 41)).astype(np.float32)
-    for _ in range(40):
-        change = Augmentation.draw_hard(rng)
-        out = change.apply(log_mel)
-        assert out.shape == (len(change.positions(80)), 41)
-        assert np.isfinite(out).all()
-        assert out.min() >= LOG_FLOOR
-        np.testing.assert_array_equal(out, change.apply(log_mel))
-
-
-def test_a_room_fills_the_pause_after_a_sound() -> None:
-    log_mel = np.full((60, 41), 8.0, np.float32)
-    log_mel[10:20] = 18.0
-    dry = Augmentation(
-        speed=1.0, warp=1.0, level=0.0, noise_below=30.0, noise_tilt=0.0,
-        colour=(0.0,) * 6, decay=0.0, narrow=False, seed=0,
-    )  # fmt: skip
-    wet = Augmentation(
-        speed=1.0, warp=1.0, level=0.0, noise_below=30.0, noise_tilt=0.0,
-        colour=(0.0,) * 6, decay=0.9, narrow=False, seed=0,
-    )  # fmt: skip
-    assert wet.apply(log_mel)[22:30].mean() > dry.apply(log_mel)[22:30].mean() + 3
-
-
 # --- the network
 
 
-def test_the_file_computes_what_the_network_does() -> None:
+@pytest.mark.parametrize("num_networks", [1, 2])
+def test_the_file_computes_what_the_networks_do(num_networks: int) -> None:
     torch.manual_seed(0)
-    network = Network(SHAPE).eval()
+    networks = [Network(SHAPE).eval() for _ in range(num_networks)]
     frames = np.random.default_rng(0).normal(size=(20, NUM_INPUTS)).astype(np.float32)
+    expected = []
     with torch.no_grad():
-        hidden = network(torch.from_numpy(frames)[None])[0]
-        expected = [torch.log_softmax(head(hidden), -1).numpy() for head in network.heads]
+        hidden = [network(torch.from_numpy(frames)[None])[0] for network in networks]
+        for head in range(len(SHAPE.look_aheads)):
+            logits = [n.heads[head](h) for n, h in zip(networks, hidden, strict=True)]
+            expected.append(torch.log_softmax(sum(logits) / num_networks, -1).numpy())
     shipped = load_model(model_path("neural"))
     assert isinstance(shipped, NeuralModel)
     model = NeuralModel(
         topology=shipped.topology,
-        network=onnx_of(network),
+        network=onnx_of(networks),
         look_aheads=np.array(SHAPE.look_aheads),
         log_prior=shipped.log_prior,
         prior_mean=shipped.prior_mean,
         spread=shipped.spread,
         kappa=1.0,
     )
-    assert model.hidden_shape == (24, 24)
+    width = 24 * num_networks
+    assert model.hidden_shape == (width, width)
     assert model.num_context == FRONT_FRAMES
     padded = np.concatenate([np.repeat(frames[:1], FRONT_FRAMES - 1, axis=0), frames])
     seen = np.stack([padded[at : at + FRONT_FRAMES].reshape(-1) for at in range(20)])
@@ -137,8 +113,8 @@ def test_the_file_computes_what_the_network_does() -> None:
             None,
             {
                 "x": np.stack([seen, seen], axis=1),
-                "h1": np.zeros((1, 2, 24), np.float32),
-                "h2": np.zeros((1, 2, 24), np.float32),
+                "h1": np.zeros((1, 2, width), np.float32),
+                "h2": np.zeros((1, 2, width), np.float32),
                 "head": np.array(head),
             },
         )[0]
@@ -156,31 +132,28 @@ def test_the_network_learns_made_up_sounds_beside_a_second_task(
     rng = np.random.default_rng(0)
     patterns = rng.normal(14, 2, (SHAPE.num_states, NUM_INPUTS))
 
-    def recording(aligned: bool) -> Recording:
+    def recording(first_target: int) -> Recording:
         states = np.repeat(rng.integers(0, SHAPE.num_states, 8), 8)
         log_mel = patterns[states] + rng.normal(0, 0.3, (len(states), NUM_INPUTS))
-        targets = states if aligned else 1 + states[::8] % 3
-        return Recording(
-            voices=(log_mel.astype(np.float16),), targets=targets, weight=1.0, aligned=aligned
-        )
+        targets = first_target + states
+        return Recording(voices=(log_mel.astype(np.float16),), targets=targets, weight=1.0)
 
-    recordings = [recording(True) for _ in range(30)]
-    second = [recording(False) for _ in range(10)]
-    trainer = Trainer(
-        Network(SHAPE), FrontEnd.measure(recordings), recordings, second, main_head=1, seed=0
-    )
+    recordings = [recording(first) for first in (0, 0, SHAPE.num_states) for _ in range(15)]
+    trainer = Trainer(Network(SHAPE), FrontEnd.measure(recordings), recordings, main_head=1, seed=0)
+    untrained = trainer.network.second_task.bias.detach().clone()
     losses: list[float] = []
     trainer.train(40, lambda _, loss: losses.append(loss))
     assert np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
+    assert not torch.equal(trainer.network.second_task.bias, untrained)
     assert trainer.mean is not trainer.network
 
 
 # --- the recipe
 
 
-def test_the_recipe_writes_model_card_and_curves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def corpora(tmp_path: Path) -> tuple[Path, Path]:
+    """Two sentences in Mandarin, one for dev, and one said to be English."""
     corpus, second = tmp_path / "corpus", tmp_path / "second"
     corpus.mkdir()
     second.mkdir()
@@ -193,18 +166,62 @@ def test_the_recipe_writes_model_card_and_curves(
     (second / "manifest.tsv").write_text(
         "utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\tHH AH L OW\n", encoding="utf-8"
     )
+    return corpus, second
+
+
+def test_the_recipe_writes_model_card_and_curves(
+    corpora: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    corpus, second = corpora
     monkeypatch.setattr("training.network_training._BATCH_FRAMES", 300)
     lines: list[str] = []
     output = tmp_path / "neural.npz"
     train_neural(
         [corpus], output, aligner=model_path("gmm"), second_task=second,
-        num_steps=2, num_voices=1, report=lines.append,
+        look_ahead_ms=150.0, num_steps=10, num_networks=1, num_voices=1, report=lines.append,
     )  # fmt: skip
-    model = load_model(output, look_ahead_ms=60.0)
+    model = load_model(output)
+    assert isinstance(model, NeuralModel)
     assert model.topology.num_states == 3 * 60
+    assert model.look_ahead_frames == 15
+    assert load_model(output, look_ahead_ms=60.0).topology.num_states == 3 * 60
     assert "aligned anew" in "".join(lines)
     assert "CC0-1.0" in output.with_suffix(".md").read_text()
     assert output.with_suffix(".png").stat().st_size > 1000
-    (second / "manifest.tsv").write_text("utt_id\tpath\nx\ta.wav\n", encoding="utf-8")
-    with pytest.raises(UserError, match="is no list of utt_id"):
-        train_neural([corpus], output, aligner=model_path("gmm"), second_task=second)
+
+
+def test_networks_that_learn_side_by_side_become_one_model(
+    corpora: tuple[Path, Path], tmp_path: Path
+) -> None:
+    output = tmp_path / "neural.npz"
+    train_neural(
+        [corpora[0]], output, aligner=model_path("gmm"),
+        num_steps=1, num_networks=2, num_voices=0, report=lambda _: None,
+    )  # fmt: skip
+    model = load_model(output)
+    assert isinstance(model, NeuralModel)
+    assert model.hidden_shape == (512, 512)
+
+
+@pytest.mark.parametrize(
+    ("manifest", "message"),
+    [
+        ("utt_id\tpath\nx\ta.wav\n", "is no list of utt_id"),
+        ("utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\tHH QQ\n", "QQ"),
+        ("utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\t" + 90 * "HH " + "\n", "long enough"),
+    ],
+)
+def test_mistakes_in_the_second_language_are_named(
+    corpora: tuple[Path, Path], manifest: str, message: str
+) -> None:
+    second = corpora[1]
+    (second / "manifest.tsv").write_text(manifest, encoding="utf-8")
+    with pytest.raises(UserError, match=message):
+        load_second_language(second, RowErrors())
+
+
+def test_phones_are_taken_for_the_units_that_sound_like_them(corpora: tuple[Path, Path]) -> None:
+    (example,) = load_second_language(corpora[1], RowErrors())
+    (heard,) = as_nearest_units([example])
+    assert [UNITS[unit] for unit in heard.units] == ["h", "e", "l", "ou"]
+    assert len(example.units) == len(example.syllables) == 4
