@@ -10,7 +10,7 @@ HMMs, search and output rule stay those of Li et al. 2011.
 symbol   meaning                                                        shape
 ======== ============================================================== ===================
 x        normalised log energy and log-mel bands of the last frames     (frames, batch, 205)
-h1, h2   state of the two recurrent layers                              (1, batch, H)
+h1, h2   states of both recurrent layers, all networks side by side     (1, batch, H)
 p        log share of each state d frames ago                           (frames, batch, states)
 d        look-ahead                                                     1
 prior    share of a state in the training data, to a power below one    (states,)
