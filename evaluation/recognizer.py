@@ -34,7 +34,7 @@ from services.recognizer.pipeline import (
     Recognizer,
     ScoreEvent,
     SpeechScores,
-    recognize,
+    full_traceback,
 )
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
@@ -237,13 +237,13 @@ def evaluate_recognizer(
             continue
         used.append(utterance)
         seconds += len(samples) / SAMPLE_RATE_HZ
-        heard = spoken(recognize(model, samples, SAMPLE_RATE_HZ))
+        scored = _scored(model, samples)
+        heard = spoken(full_traceback(model, (event for _, new in scored for event in new)))
         _count(full.phones, utterance.speaker, _units(truth), _units(heard))
         _count(full.visemes, utterance.speaker, _shapes(truth), _shapes(heard))
         # The full traceback says everything when the recording ends.
         full.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
         _confuse(confusion, truth, heard)
-        scored = _scored(model, samples)
         for score, rule in zip(live, rules, strict=True):
             phones, said_s, finals = _live(model, scored, rule)
             _count(score.phones, utterance.speaker, _units(truth), _units(phones))
@@ -306,7 +306,7 @@ def _live(
     known: set[int] = set()
     for heard_s, scores in scored:
         events = recognizer.follow(scores)
-        finals += spoken([event for event in events if isinstance(event, Phone) and event.final])
+        finals += spoken(once_final(events))
         new = spoken(first_said(events, known))
         first += new
         said_s += [heard_s] * len(new)
@@ -338,6 +338,11 @@ def first_said(events: Sequence[Phone | SpeechChange], known: set[int]) -> list[
                 first.append(event)
             known.add(event.index)
     return first
+
+
+def once_final(events: Iterable[Phone | SpeechChange]) -> list[Phone]:
+    """Pick the units that will not change any more from what a live recognizer said."""
+    return [event for event in events if isinstance(event, Phone) and event.final]
 
 
 def _units(phones: Iterable[Phone]) -> list[str]:

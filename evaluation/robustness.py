@@ -6,7 +6,7 @@ minute it hears in sounds that hold no Mandarin.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,13 @@ from rich.progress import track
 from rich.table import Table
 
 from evaluation.disturbances import SOUNDS, SPEECH_CONDITIONS
-from evaluation.recognizer import ErrorCounts, count_errors, first_said
+from evaluation.recognizer import ErrorCounts, count_errors, first_said, once_final
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.features import SAMPLE_RATE_HZ
-from services.recognizer.pipeline import Recognizer, recognize
+from services.recognizer.pipeline import Recognizer, ScoreEvent, full_traceback, scores_of
 from shared.errors import UserError
-from shared.phones import SILENCE, UNITS, Phone, SpeechChange
+from shared.phones import UNITS, Phone, SpeechChange
+from training.align import spoken
 from training.corpus import RowErrors, read_corpus
 from training.feature_cache import read_audio
 
@@ -92,31 +93,24 @@ def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> No
 
 def _outputs(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, list[str]]:
     """Units by the full traceback, as first said, and once final."""
-    live = _live(model, samples)
-    return {
-        "full": _spoken(recognize(model, samples, SAMPLE_RATE_HZ)),
-        "first": _spoken(first_said(live, set())),
-        "final": _spoken(_final(live)),
+    scores = scores_of(model, samples, SAMPLE_RATE_HZ)
+    live = _live(model, scores)
+    outputs = {
+        "full": full_traceback(model, scores),
+        "first": first_said(live, set()),
+        "final": once_final(live),
     }
+    return {name: [phone.unit for phone in spoken(phones)] for name, phones in outputs.items()}
 
 
-def _live(model: AcousticModel, samples: NDArray[np.float32]) -> list[Phone | SpeechChange]:
-    recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
-    return [*recognizer.accept_waveform(samples), *recognizer.input_finished()]
-
-
-def _final(events: Iterable[Phone | SpeechChange]) -> list[Phone]:
-    return [event for event in events if isinstance(event, Phone) and event.final]
-
-
-def _spoken(phones: Iterable[Phone]) -> list[str]:
-    return [phone.unit for phone in phones if phone.unit != SILENCE]
+def _live(model: AcousticModel, scores: Sequence[ScoreEvent]) -> list[Phone | SpeechChange]:
+    return Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ).follow(scores)
 
 
 def _units_a_minute(model: AcousticModel, sounds: Sequence[NDArray[np.float32]]) -> float:
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
-    heard = [_spoken(_final(_live(model, samples))) for samples in sounds]
-    return sum(map(len, heard)) / minutes
+    heard = [_live(model, scores_of(model, samples, SAMPLE_RATE_HZ)) for samples in sounds]
+    return sum(len(spoken(once_final(said))) for said in heard) / minutes
 
 
 def recordings_in(folder: Path) -> list[NDArray[np.float32]]:

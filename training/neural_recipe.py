@@ -42,7 +42,7 @@ from training.unit_trigram import unit_trigram
 STATES_PER_UNIT = 3
 NUM_STATES = STATES_PER_UNIT * len(UNITS)
 LOOK_AHEADS_MS = (0, 10, 30, 60, 100, 200)  # of the output layers
-LOOK_AHEAD_MS = 10  # of the main one: with N = 3 a unit is put out 55 ms after its window begins
+LOOK_AHEAD_MS = 10  # of the main one: 35 ms after its onset a unit may be known
 _SHARES = {"sentence": 0.5, "word": 0.17, "synthetic": 0.33}  # of the Mandarin frames heard
 _SECOND_SHARE = 0.35  # of the second task, against 1 for all Mandarin
 _ALIGNING_FRAMES = 6  # look-ahead: a unit's beginning is plainer with what follows
@@ -64,6 +64,14 @@ class _Aligned:
     example: Example
     states: NDArray[np.int64]  # (frames,)
     units: list[AlignedUnit]
+
+
+@dataclass(frozen=True, slots=True)
+class _Statistics:
+    """What an alignment says beside the network."""
+
+    topology: Topology
+    log_prior: NDArray[np.float32]  # (states,)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,22 +210,25 @@ def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained
         main_head=look_aheads.index(lessons.look_ahead_ms),
         seed=seed,
     )
+    statistics = _statistics(aligned)
     dev = _dev_examples(lessons.corpora, shipping=lessons.shipping)
     losses: list[tuple[int, float]] = []
     rates: list[tuple[int, float]] = []
 
     def watch(step: int, loss: float) -> None:
-        nonlocal aligned, of_second
+        nonlocal statistics
         losses.append((step, loss))
         if step == round(_REALIGNED_AT * lessons.num_steps):
-            aligned = _aligned(_aligner(_model(trainer, aligned)), examples)
+            anew = _aligned(_aligner(_model(trainer, statistics)), examples)
+            second_anew = []
             if second:
-                heard = _model(trainer, of_second, second_task=True)
-                of_second = _aligned(_aligner(heard), second)
-            trainer.replace_recordings(_recordings(aligned, of_second))
+                heard = _model(trainer, _statistics(of_second), second_task=True)
+                second_anew = _aligned(_aligner(heard), second)
+            trainer.replace_recordings(_recordings(anew, second_anew))
+            statistics = _statistics(anew)
             tell(f"step {step}: aligned anew")
         if dev and step % max(1, round(_JUDGED_EVERY * lessons.num_steps)) == 0:
-            judged = _model(trainer, aligned)
+            judged = _model(trainer, statistics)
             scores = list(all_scores(judged, dev))
             topology = with_penalty(judged.topology, _UNIT_PENALTY)
             rates.append((step, error_rate(topology, scores, dev)))
@@ -225,7 +236,7 @@ def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained
             tell(f"step {step}: {loss:.3f} nats a frame, dev phone error {rate:.1f} %")
 
     trainer.train(lessons.num_steps, watch)
-    return _Trained(trainer.mean, _model(trainer, aligned), losses, rates)
+    return _Trained(trainer.mean, _model(trainer, statistics), losses, rates)
 
 
 def _aligner(model: AcousticModel) -> AcousticModel:
@@ -300,10 +311,8 @@ def _kind(example: Example) -> str:
     return "sentence" if len(example.units) > WORD_UNITS else "word"
 
 
-def _model(
-    trainer: Trainer, aligned: Sequence[_Aligned], *, second_task: bool = False
-) -> NeuralModel:
-    """Make the recognizer's model of the running mean of the weights."""
+def _statistics(aligned: Sequence[_Aligned]) -> _Statistics:
+    """Count states, transitions, durations and what follows what."""
     counts = np.ones(NUM_STATES)
     occupied, left = np.full(NUM_STATES, 2.0), np.ones(NUM_STATES)
     durations = UnitDurations()
@@ -316,22 +325,28 @@ def _model(
         durations.add(one.units, one.example.weight)
     stay = np.clip(1 - left / occupied, _LEAST_STAY, _MOST_STAY)
     mean_s, spread_s = durations.mean_and_spread_s()
+    log_trigram = unit_trigram([one.example.units for one in aligned])
     topology = Topology(
         first_state=np.arange(len(UNITS) + 1) * STATES_PER_UNIT,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        log_bigram=np.float32(_TRIGRAM_SCALE)
-        * unit_trigram([one.example.units for one in aligned]),
+        log_bigram=np.float32(_TRIGRAM_SCALE) * log_trigram,
         duration_mean_s=mean_s,
         duration_spread_s=spread_s,
     )
+    log_prior = _PRIOR_SCALE * np.log(counts / counts.sum())
+    return _Statistics(topology, log_prior.astype(np.float32))
+
+
+def _model(trainer: Trainer, statistics: _Statistics, *, second_task: bool = False) -> NeuralModel:
+    """Make the recognizer's model of the running mean of the weights."""
     shape = trainer.network.shape
     main_look_ahead = shape.look_aheads[trainer.main_head]
     return NeuralModel(
-        topology=topology,
+        topology=statistics.topology,
         network=onnx_of([trainer.mean], second_task=second_task),
         look_aheads=np.array([main_look_ahead] if second_task else shape.look_aheads),
-        log_prior=(_PRIOR_SCALE * np.log(counts / counts.sum())).astype(np.float32),
+        log_prior=statistics.log_prior,
         prior_mean=trainer.front_end.prior_mean,
         spread=trainer.front_end.spread,
         kappa=_SCALE,

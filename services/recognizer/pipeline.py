@@ -18,7 +18,7 @@ above 16 kHz the resampler adds about 10 ms.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -378,13 +378,25 @@ def recognize(
     list of Phone
         Units of all stretches of speech with their onsets and durations, ``sil`` included.
     """
+    return full_traceback(model, scores_of(model, samples, sample_rate_hz))
+
+
+def scores_of(
+    model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int
+) -> list[ScoreEvent]:
+    """Score a whole recording, of shape (n,) or (n, channels)."""
     num_channels = 1 if samples.ndim == 1 else samples.shape[1]
     scores = SpeechScores(model, sample_rate_hz, num_channels)
+    return listen(model, [scores.hear(samples)])[0] + listen(model, [scores.finish()])[0]
+
+
+def full_traceback(model: AcousticModel, events: Iterable[ScoreEvent]) -> list[Phone]:
+    """Like :func:`recognize`, from all scores of a recording."""
     decoder = Decoder(model.topology)
     phones: list[Phone] = []
     offset = 0
     sureness: list[float] = []
-    for event in listen(model, [scores.hear(samples)])[0] + listen(model, [scores.finish()])[0]:
+    for event in events:
         if isinstance(event, VoiceBegins):
             offset = event.frame
             decoder.reset()
