@@ -38,6 +38,7 @@ from services.recognizer.pipeline import (
 )
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from services.recognizer.voice_warp import PitchTracker, VoiceWarp
 from services.synthesizer.visemes import SHAPES
 from shared.errors import UserError
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
@@ -397,11 +398,14 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
     ]
     log_mel_stage, stream, decoder = LogMel(), model.stream(), Decoder(model.topology)
+    tracker, warp = PitchTracker(), VoiceWarp()
     detector, resampler = VoiceActivityDetector(), Resampler(48_000)
     at_48_khz = np.repeat(samples, 3)
-    log_mel = LogMel().accept_waveform(samples)
-    scores = model.stream().accept(log_mel)
-    decoder.accept(scores[0])  # compiled before the clock starts
+    log_mel, pitch = LogMel().accept_waveform(samples), PitchTracker().accept_waveform(samples)
+    warped = VoiceWarp().accept(log_mel, *pitch)  # compiled before the clock starts
+    frames = np.column_stack([log_mel, *pitch])
+    scores = model.stream().accept(warped)
+    decoder.accept(scores[0])
     decoder.reset()
 
     def run(
@@ -418,7 +422,12 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         ),
         "voice_activity": run(detector.accept_block, blocks),
         "log_mel": run(log_mel_stage.accept_waveform, chunks),
-        "acoustic_model": run(stream.accept, (log_mel[t : t + 1] for t in range(len(log_mel)))),
+        "pitch": run(tracker.accept_waveform, chunks),
+        "voice_warp": run(
+            lambda row: warp.accept(row[:, :-2], row[:, -2], row[:, -1]),
+            np.split(frames, len(frames)),
+        ),
+        "acoustic_model": run(stream.accept, np.split(warped, len(warped))),
         "decoder": run(decoder.accept, scores),
     }
 
@@ -437,4 +446,5 @@ def sessions_a_core(
     for frame in range(len(log_mel)):
         model.score([(stream, log_mel[frame : frame + 1]) for stream in streams])
     together = (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples) / _SESSIONS_TOGETHER
-    return 1 / (together + cost["voice_activity"] + cost["log_mel"] + cost["decoder"])
+    own = ("voice_activity", "log_mel", "pitch", "voice_warp", "decoder")
+    return 1 / (together + sum(cost[stage] for stage in own))

@@ -20,15 +20,53 @@ Corpora = Annotated[
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
 SyntheticWeight = Annotated[float, typer.Option(help="Of synthetic against real speech.")]
+Language = Annotated[
+    Path | None,
+    typer.Option(help="From `kouxing train language`, or a model whose language to use."),
+]
 AnyLicence = Annotated[
     bool, typer.Option("--any-licence", help="Also take rows that forbid giving the model away.")
 ]
 
 
 @app.command()
+def language(
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write (.npz).")],
+    corpus: Annotated[
+        list[Path] | None, typer.Option("--corpus", help="Its sentences count; repeat for several.")
+    ] = None,
+    text: Annotated[
+        list[Path] | None, typer.Option("--text", help="Chinese text, UTF-8; repeat for several.")
+    ] = None,
+    ngrams: Annotated[
+        Path | None, typer.Option(help="Output of `tslminfo -v`: words are drawn from it.")
+    ] = None,
+    dictionary: Annotated[
+        Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, the words of the n-grams.")
+    ] = None,
+    words: Annotated[int, typer.Option(min=1, help="Words to draw.")] = 30_000_000,
+    order: Annotated[int, typer.Option(min=2, max=10, help="Units in the longest n-grams.")] = 6,
+    most: Annotated[int, typer.Option(min=1000, help="N-grams to keep, about.")] = 1_000_000,
+    seed: Seed = 0,
+) -> None:
+    """Count what follows what in texts, for the recognizers' search."""
+    from training.open_gram import drawn_units
+    from training.unit_language import train_language
+
+    check_output(output)
+    if (ngrams is None) != (dictionary is None):
+        raise UserError("--ngrams and --dictionary belong together; give both or neither")
+    drawn = None
+    if ngrams and dictionary:
+        drawn = drawn_units(ngrams, dictionary, num_words=words, seed=seed)
+    train_language(corpus or [], text or [], output, drawn=drawn, order=order, most=most)
+
+
+@app.command()
 def gmm(
     corpus: Corpora,
     output: Model,
+    language: Language = None,
     seed: Seed = 0,
     mixtures: Annotated[int, typer.Option(help="Gaussians a state, a power of two.")] = 32,
     synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
@@ -41,6 +79,7 @@ def gmm(
     train_gmm(
         corpus,
         output,
+        language=language,
         seed=seed,
         num_mixtures=mixtures,
         synthetic_weight=synthetic_weight,
@@ -56,6 +95,10 @@ def neural(
     second_task: Annotated[
         Path | None, typer.Option(help="Folder of speech in another language, with its phones.")
     ] = None,
+    start_from: Annotated[
+        Path | None, typer.Option(help="A neural model whose networks learn further.")
+    ] = None,
+    language: Language = None,
     seed: Seed = 0,
     look_ahead_ms: Annotated[
         float, typer.Option(help="The look-ahead to train for, in steps of 10 ms.")
@@ -81,6 +124,8 @@ def neural(
         output,
         aligner=aligner,
         second_task=second_task,
+        start=start_from,
+        language=language,
         look_ahead_ms=look_ahead_ms,
         seed=seed,
         num_steps=steps,

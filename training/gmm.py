@@ -35,7 +35,8 @@ from services.recognizer.features import (
     with_differences,
 )
 from services.recognizer.gmm import GaussianMixtures, mixture_scores
-from shared.phones import SILENCE, UNIT_INDEX, UNITS
+from services.recognizer.unit_language import UnitLanguage
+from shared.phones import SILENCE, UNIT_INDEX
 from training.durations import AlignedUnit, UnitDurations
 from training.examples import Example
 
@@ -413,7 +414,7 @@ def _drop_light(weights: NDArray[np.float32], count: float) -> None:
     weights /= weights.sum()
 
 
-def topology_of(hmm: Hmm, log_bigram: NDArray[np.float32], frames: FrameSet) -> Topology:
+def topology_of(hmm: Hmm, language: UnitLanguage, frames: FrameSet) -> Topology:
     """Make the search part of the model, with unit durations measured on the alignment."""
     durations = UnitDurations()
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
@@ -425,35 +426,10 @@ def topology_of(hmm: Hmm, log_bigram: NDArray[np.float32], frames: FrameSet) -> 
         first_state=hmm.first_state,
         log_stay=hmm.log_stay,
         log_leave=hmm.log_leave,
-        log_bigram=log_bigram,
+        language=language,
         duration_mean_s=mean_s,
         duration_spread_s=spread_s,
     )
-
-
-def unit_bigram(
-    sentences: Sequence[Sequence[int]], *, pause_share: float = 0.05, smoothing: float = 0.5
-) -> NDArray[np.float32]:
-    """Log probabilities of a unit after a unit, shape (60, 60), row before column.
-
-    ``sil`` stands at both ends of each sentence and, for ``pause_share`` of them, after a final.
-    """
-    num_units = len(UNITS)
-    counts = np.zeros((num_units, num_units))
-    for units in sentences:
-        np.add.at(counts, ([SIL, *units], [*units, SIL]), 1.0)
-    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    starts = counts[SIL] / counts[SIL].sum()
-    finals = np.arange(num_units) >= UNIT_INDEX["a"]
-    finals[SIL] = False
-    share[finals] *= 1 - pause_share
-    share[finals, SIL] += pause_share
-    share[SIL] = starts
-    unigram = counts.sum(axis=0) / counts.sum()
-    total = counts.sum(axis=1, keepdims=True)
-    smooth = (share * total + smoothing * num_units * unigram) / (total + smoothing * num_units)
-    log_bigram: NDArray[np.float32] = np.log(np.maximum(smooth, 1e-7)).astype(np.float32)
-    return log_bigram
 
 
 def decorrelate(

@@ -1,4 +1,4 @@
-"""Write trained networks as ONNX, the form in which the recognizer runs them.
+"""Write trained networks as ONNX, the form in which the recognizer runs them; read them again.
 
 The graph is what :class:`training.network.Network` computes, a chunk of frames at a time with the
 recurrent layers' states coming in and going out, and the output layer chosen by its number. Several
@@ -13,10 +13,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import onnx
+import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from training.network import FRONT_FRAMES, NUM_INPUTS, Network
+from training.network import FRONT_FRAMES, NUM_INPUTS, Network, Shape
 
 _OPERATORS = 17  # version of the ONNX operator set
 _FORMAT = 8  # version of the ONNX file format
@@ -105,6 +106,65 @@ def onnx_of(networks: Sequence[Network], *, second_task: bool = False) -> NDArra
     return np.frombuffer(model.SerializeToString(), dtype=np.uint8)
 
 
+def networks_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> list[Network]:
+    """Return the networks in an ONNX file that :func:`onnx_of` has made, to train them further.
+
+    The output layer of a second task is not in the file: it begins anew.
+
+    Parameters
+    ----------
+    file
+        Its bytes.
+    look_aheads
+        Of its output layers, feature frames.
+
+    Raises
+    ------
+    KeyError
+        If the file is none of these.
+    """
+    stored = {
+        tensor.name: numpy_helper.to_array(tensor)
+        for tensor in onnx.load_model_from_string(file.tobytes()).graph.initializer
+    }
+    weights = {name: array for name, array in stored.items() if "bias" in name} | {
+        name.removesuffix("_8"): array * stored[f"{name.removesuffix('_8')}_scale"]
+        for name, array in stored.items()
+        if name.endswith("_8")
+    }
+    num_networks = int(stored["networks"])
+    fronts = np.split(weights["front_weight"], num_networks, axis=-1)
+    front_biases = np.split(weights["front_bias"], num_networks)
+    heads = np.split(weights["head_weight"], num_networks, axis=1)
+    head_biases = weights["head_bias"] / num_networks
+    networks = []
+    for number in range(num_networks):
+        front = fronts[number].reshape(FRONT_FRAMES, NUM_INPUTS, -1).transpose(2, 1, 0)
+        shape = Shape(
+            num_states=head_biases.shape[1],
+            look_aheads=tuple(look_aheads),
+            front=len(front),
+            hidden=heads[number].shape[1] // 2,
+        )
+        parameters = {"front.weight": front, "front.bias": front_biases[number]}
+        for layer in ("first", "second"):
+            parameters[f"{layer}.weight_ih_l0"] = _swapped(weights[f"{layer}_input_{number}"][0])
+            parameters[f"{layer}.weight_hh_l0"] = _swapped(weights[f"{layer}_state_{number}"][0])
+            of_input, of_state = np.split(weights[f"{layer}_bias_{number}"][0], 2)
+            parameters[f"{layer}.bias_ih_l0"] = _swapped(of_input)
+            parameters[f"{layer}.bias_hh_l0"] = _swapped(of_state)
+        for head in range(len(look_aheads)):
+            parameters[f"heads.{head}.weight"] = heads[number][head].T
+            parameters[f"heads.{head}.bias"] = head_biases[head]
+        network = Network(shape)
+        network.load_state_dict(
+            {name: torch.from_numpy(array.copy()) for name, array in parameters.items()}
+            | {f"second_task.{k}": v for k, v in network.second_task.state_dict().items()}
+        )
+        networks.append(network)
+    return networks
+
+
 def _beside(arrays: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     return np.concatenate(arrays, axis=-1)
 
@@ -148,17 +208,21 @@ def _joined(name: str, numbers: Sequence[int]) -> onnx.NodeProto:
 def _recurrent(
     name: str, number: int, parameters: dict[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[np.float32]]:
-    """Weights in ONNX's order of the gates: update, reset, new; PyTorch has reset first."""
 
     def swapped(kind: str) -> NDArray[np.float32]:
-        reset, update, new = np.split(parameters[f"{name}.{kind}_l0"], 3)
-        return np.concatenate([update, reset, new])[None]
+        return _swapped(parameters[f"{name}.{kind}_l0"])[None]
 
     return {
         f"{name}_input_{number}": swapped("weight_ih"),
         f"{name}_state_{number}": swapped("weight_hh"),
         f"{name}_bias_{number}": np.concatenate([swapped("bias_ih"), swapped("bias_hh")], axis=1),
     }
+
+
+def _swapped(gates: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Change between ONNX's order of the gates (update, reset, new) and PyTorch's (reset first)."""
+    first, second, new = np.split(gates, 3)
+    return np.concatenate([second, first, new])
 
 
 def _layers(number: int, hidden: int) -> list[onnx.NodeProto]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -17,6 +18,7 @@ from services.recognizer.acoustic_model import AcousticModel, Topology
 from services.recognizer.features import HOP_S
 from services.recognizer.load import load_model
 from services.recognizer.neural import NeuralModel
+from services.recognizer.unit_language import UnitLanguage
 from shared.errors import UserError
 from shared.phones import UNITS
 from training.corpus import RowErrors, is_synthetic
@@ -24,7 +26,7 @@ from training.durations import AlignedUnit, UnitDurations
 from training.examples import WORD_UNITS, Example, load_examples
 from training.gmm import SIL, units_of_path, utterance_graph, viterbi_path
 from training.network import Network, Shape
-from training.network_export import onnx_of
+from training.network_export import networks_of, onnx_of
 from training.network_training import FrontEnd, Recording, Trainer
 from training.recipes import (
     UNCHOSEN,
@@ -37,7 +39,7 @@ from training.recipes import (
     write_card,
 )
 from training.second_language import as_nearest_units, load_second_language
-from training.unit_trigram import unit_trigram
+from training.unit_language import language_of_corpora, load_language
 
 STATES_PER_UNIT = 3
 NUM_STATES = STATES_PER_UNIT * len(UNITS)
@@ -50,7 +52,7 @@ _REALIGNED_AT = 0.3  # of the steps: from there on the network's own alignment c
 _JUDGED_EVERY = 0.05  # of the steps: dev is recognised
 _SCALE = 0.5  # of the log scores, until it is chosen
 _UNIT_PENALTY = 1.0  # likewise
-_TRIGRAM_SCALE = 1.5  # of the unit trigram's log probabilities; chosen on development data
+_LANGUAGE_SCALE = 2.0  # of the language's log shares; chosen on development data
 _PRIOR_SCALE = 0.5  # of the states' log shares; chosen on development data
 _SCALES = (0.3, 0.4, 0.5, 0.6, 0.8, 1.0)
 _LEAST_STAY, _MOST_STAY = 0.05, 0.98
@@ -81,6 +83,8 @@ class _Lessons:
     corpora: Sequence[Path]
     aligner: Path
     second_task: Path | None
+    start: Path | None
+    language: Path | None
     look_ahead_ms: float
     num_steps: int
     num_voices: int
@@ -103,6 +107,8 @@ def train_neural(
     *,
     aligner: Path,
     second_task: Path | None = None,
+    start: Path | None = None,
+    language: Path | None = None,
     look_ahead_ms: float = LOOK_AHEAD_MS,
     seed: int = 0,
     num_steps: int = 4000,
@@ -124,6 +130,12 @@ def train_neural(
         A model that aligns the first time, such as :func:`training.recipes.train_gmm` writes.
     second_task
         Folder of speech in English, see :func:`training.second_language.load_second_language`.
+    start
+        A model that this function has written, whose networks learn further, such as to know
+        one's own speakers; else they begin anew.
+    language
+        What :func:`training.unit_language.train_language` has written; else the language is that
+        of the corpora.
     look_ahead_ms
         Of the output layer that counts most and is in use, in whole frames of 10 ms.
     seed
@@ -144,6 +156,8 @@ def train_neural(
     UserError
         If there is nothing to train on, or a file cannot be read.
     """
+    if start:
+        _begun(start, look_ahead_ms)  # finds mistakes before the long work
     errors = RowErrors()
     examples = load_examples(corpora, errors, shipping=shipping, num_voices=num_voices)
     if second_task:
@@ -152,6 +166,8 @@ def train_neural(
         corpora=corpora,
         aligner=aligner,
         second_task=second_task,
+        start=start,
+        language=language,
         look_ahead_ms=look_ahead_ms,
         num_steps=num_steps,
         num_voices=num_voices,
@@ -199,18 +215,25 @@ def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained
     aligned = _aligned(aligner, examples)
     of_second = _aligned(aligner, second, as_nearest_units(second)) if second else []
     tell(f"{len(aligned)} recordings aligned, {len(of_second)} of the second task")
-    look_aheads = sorted({*LOOK_AHEADS_MS, lessons.look_ahead_ms})
-    shape = Shape(
-        num_states=NUM_STATES, look_aheads=tuple(round(ms / 1000 / HOP_S) for ms in look_aheads)
-    )
+    look_aheads = _look_aheads(lessons.look_ahead_ms)
+    if lessons.start:
+        begun, front_end = _begun(lessons.start, lessons.look_ahead_ms)
+        network = begun[seed % len(begun)]
+    else:
+        network = Network(Shape(num_states=NUM_STATES, look_aheads=look_aheads))
+        front_end = FrontEnd.measure(_recordings(aligned, []))
     trainer = Trainer(
-        Network(shape),
-        FrontEnd.measure(_recordings(aligned, [])),
+        network,
+        front_end,
         _recordings(aligned, of_second),
-        main_head=look_aheads.index(lessons.look_ahead_ms),
+        main_head=look_aheads.index(round(lessons.look_ahead_ms / 1000 / HOP_S)),
         seed=seed,
     )
-    statistics = _statistics(aligned)
+    if lessons.language:
+        language = load_language(lessons.language)
+    else:
+        language = language_of_corpora(examples)
+    statistics = _statistics(aligned, language)
     dev = _dev_examples(lessons.corpora, shipping=lessons.shipping)
     losses: list[tuple[int, float]] = []
     rates: list[tuple[int, float]] = []
@@ -222,10 +245,10 @@ def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained
             anew = _aligned(_aligner(_model(trainer, statistics)), examples)
             second_anew = []
             if second:
-                heard = _model(trainer, _statistics(of_second), second_task=True)
+                heard = _model(trainer, _statistics(of_second, language), second_task=True)
                 second_anew = _aligned(_aligner(heard), second)
             trainer.replace_recordings(_recordings(anew, second_anew))
-            statistics = _statistics(anew)
+            statistics = _statistics(anew, language)
             tell(f"step {step}: aligned anew")
         if dev and step % max(1, round(_JUDGED_EVERY * lessons.num_steps)) == 0:
             judged = _model(trainer, statistics)
@@ -237,6 +260,24 @@ def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained
 
     trainer.train(lessons.num_steps, watch)
     return _Trained(trainer.mean, _model(trainer, statistics), losses, rates)
+
+
+def _begun(path: Path, look_ahead_ms: float) -> tuple[list[Network], FrontEnd]:
+    """Take the networks of a model to train them further, and how their input is normalised."""
+    model = load_model(path)
+    if isinstance(model, NeuralModel) and tuple(model.look_aheads) == _look_aheads(look_ahead_ms):
+        front_end = FrontEnd(prior_mean=model.prior_mean, spread=model.spread)
+        with suppress(KeyError):  # another network that runs in the same way
+            return networks_of(model.network, model.look_aheads.tolist()), front_end
+    raise UserError(
+        f"{path} was not written by this command with a look-ahead of {look_ahead_ms:g} ms; begin "
+        "with a model that was"
+    )
+
+
+def _look_aheads(main_ms: float) -> tuple[int, ...]:
+    """Look-aheads of all output layers, feature frames."""
+    return tuple(round(ms / 1000 / HOP_S) for ms in sorted({*LOOK_AHEADS_MS, main_ms}))
 
 
 def _aligner(model: AcousticModel) -> AcousticModel:
@@ -311,8 +352,8 @@ def _kind(example: Example) -> str:
     return "sentence" if len(example.units) > WORD_UNITS else "word"
 
 
-def _statistics(aligned: Sequence[_Aligned]) -> _Statistics:
-    """Count states, transitions, durations and what follows what."""
+def _statistics(aligned: Sequence[_Aligned], language: UnitLanguage) -> _Statistics:
+    """Count states, transitions and durations."""
     counts = np.ones(NUM_STATES)
     occupied, left = np.full(NUM_STATES, 2.0), np.ones(NUM_STATES)
     durations = UnitDurations()
@@ -325,12 +366,12 @@ def _statistics(aligned: Sequence[_Aligned]) -> _Statistics:
         durations.add(one.units, one.example.weight)
     stay = np.clip(1 - left / occupied, _LEAST_STAY, _MOST_STAY)
     mean_s, spread_s = durations.mean_and_spread_s()
-    log_trigram = unit_trigram([one.example.units for one in aligned])
     topology = Topology(
         first_state=np.arange(len(UNITS) + 1) * STATES_PER_UNIT,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        log_bigram=np.float32(_TRIGRAM_SCALE) * log_trigram,
+        language=language,
+        language_scale=_LANGUAGE_SCALE,
         duration_mean_s=mean_s,
         duration_spread_s=spread_s,
     )

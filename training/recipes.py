@@ -27,8 +27,8 @@ from training.gmm import (
     first_estimate,
     split,
     topology_of,
-    unit_bigram,
 )
+from training.unit_language import language_of_corpora, load_language
 
 Report = Callable[[str], None]
 
@@ -62,6 +62,7 @@ def train_gmm(
     output: Path,
     *,
     seed: int = 0,
+    language: Path | None = None,
     num_mixtures: int = 32,
     synthetic_weight: float = SYNTHETIC_WEIGHT,
     shipping: bool = True,
@@ -77,6 +78,9 @@ def train_gmm(
         The ``.npz`` file to write; the card is written beside it as ``.md``.
     seed
         Of the augmentation.
+    language
+        What :func:`training.unit_language.train_language` has written; else the language is that
+        of the corpora.
     num_mixtures
         Gaussians per state, a power of two.
     synthetic_weight
@@ -118,9 +122,9 @@ def train_gmm(
             hmm = estimate(frames, hmm, 3)
             report(f"{size} mixtures: log likelihood {frames.realign(hmm):.3f} per frame")
             hmm = estimate(frames, hmm, 3)
-    log_bigram = unit_bigram([example.units for example in heard])
+    known = load_language(language) if language else language_of_corpora(heard)
     model = GmmModel(
-        topology=topology_of(hmm, log_bigram, frames),
+        topology=topology_of(hmm, known, frames),
         mixtures=hmm.mixtures,
         rotation=rotation,
         prior_mean=prior_mean,
@@ -197,8 +201,8 @@ def error_rate(
 
 
 def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
-    """Add a penalty for every unit to the bigram."""
-    return replace(topology, log_bigram=topology.log_bigram + np.float32(unit_penalty))
+    """Let every unit cost or earn something."""
+    return replace(topology, unit_penalty=unit_penalty)
 
 
 def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:

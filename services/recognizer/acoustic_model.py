@@ -9,6 +9,8 @@ from typing import Protocol, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from services.recognizer.unit_language import UnitLanguage
+
 # Where a unit stands between two pauses; the last one is lengthened. One alone counts as last.
 FIRST, INSIDE, LAST = range(3)
 NUM_POSITIONS = 3
@@ -24,8 +26,9 @@ class Topology:
     first_state: NDArray[np.int64]  # (61,) unit u has the states first_state[u] to [u + 1]
     log_stay: NDArray[np.float32]  # (states,) log probability of a state's loop
     log_leave: NDArray[np.float32]  # (states,) log probability of going on
-    # (60, 60) score of unit (column) after unit (row), or (60, 60, 60) of a unit after two
-    log_bigram: NDArray[np.float32]
+    language: UnitLanguage  # what follows what
+    language_scale: float = 1.0  # of its log shares
+    unit_penalty: float = 0.0  # added for every unit
     duration_mean_s: NDArray[np.float32]  # (3, 60) of each unit by position, seconds
     duration_spread_s: NDArray[np.float32]  # (3, 60) standard deviation, seconds
 

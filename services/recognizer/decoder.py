@@ -3,19 +3,19 @@
 Source: Li et al. 2011, section 2.2, eq. 1-3: after every feature frame the best unit string so
 far; section 3.1: any unit may follow any unit. Token passing is Young, Russell and Thornton 1989.
 
-Deviation: what a unit costs depends on the two units before it, so there is a best path for every
-last unit and every unit before that one, a pair; pairs far behind the best one are given up (beam).
+Deviation: what a unit costs depends on the units before it, as many as the language knows. So
+there is a best path, a token, for every such context, with the unit being said as its last; tokens
+far behind the best one are given up (beam).
 
-======== ==================================================== =====================
-symbol   meaning                                              shape
-======== ==================================================== =====================
-score    log score of the best path that ends in a state,     (60 units, states)
-         by the unit before the state's unit
-top      the best of a pair's states                          (60 units, 60 units)
-link     the record of the unit before                        (60 units, states)
-record   (end, unit, before): a unit that ended there, and    (records, 3)
+======== ===================================================== =====================
+symbol   meaning                                               shape
+======== ===================================================== =====================
+score    log score of the best path that ends in a state       (tokens, states)
+top      the best of a token's states                          (tokens,)
+link     the record of the unit before                         (tokens, states)
+record   (end, unit, before): a unit that ended there, and     (records, 3)
          the record of the unit before it
-======== ==================================================== =====================
+======== ===================================================== =====================
 
 The string "so far" may change in the future, but not the past that all live paths share: that part
 is settled from time to time and records that no path needs are dropped (partial traceback), so
@@ -31,15 +31,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import Topology
+from services.recognizer.unit_language import MOST_UNITS
 from shared.phones import UNIT_INDEX, UNITS
 
 NUM_UNITS = len(UNITS)
 _SIL = UNIT_INDEX["sil"]
 _NO_RECORD = -1
+_NOWHERE = -1
 _IMPOSSIBLE = np.float32(-1e30)
-_BEAM = np.float32(20.0)  # of log scores; twice as much changes nothing on development data
-_MOST_ENDS = NUM_UNITS * NUM_UNITS  # records of one frame
-_ROOM = 2 * _MOST_ENDS
+_BEAM = np.float32(20.0)  # of log scores; more changes nothing on development data
+_MOST_TOKENS = 4096  # more than speech ever needs; without sense in the sound there might be more
+_ROOM = 4 * _MOST_TOKENS  # records
+_MOST_CHAIN = MOST_UNITS + 1  # contexts from the longest to the empty one
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +65,8 @@ class Decoder:
 
     def __init__(self, topology: Topology) -> None:
         self._topology = topology
-        shape = (NUM_UNITS, NUM_UNITS, NUM_UNITS)
-        self._log_next = np.ascontiguousarray(np.broadcast_to(topology.log_bigram, shape))
+        self._graph = topology.language.graph
+        self._most_states = int(np.diff(topology.first_state).max())
         self.reset()
 
     def reset(self) -> None:
@@ -71,11 +74,14 @@ class Decoder:
         self.num_frames = 0
         self._settled: list[Segment] = []
         self._settled_until = _NO_RECORD  # the record that ends them
-        self._best = (0, 0)  # unit before and state
+        self._best = (0, 0)  # token and state of its unit
         self._records = np.empty((_ROOM, 3), dtype=np.int32)
         self._num_records = 0
-        self._top = np.full((NUM_UNITS, NUM_UNITS), _IMPOSSIBLE, dtype=np.float32)
-        self._score = np.full((NUM_UNITS, self._topology.num_states), _IMPOSSIBLE, np.float32)
+        self._context = np.zeros(_MOST_TOKENS, dtype=np.int32)  # of each token
+        self._token_of = np.full(len(self._graph.last_unit), _NOWHERE, dtype=np.int16)
+        self._num_tokens = 0
+        self._top = np.full(_MOST_TOKENS, _IMPOSSIBLE, dtype=np.float32)
+        self._score = np.full((_MOST_TOKENS, self._most_states), _IMPOSSIBLE, dtype=np.float32)
         self._link = np.full(self._score.shape, _NO_RECORD, dtype=np.int32)
 
     def accept(self, scores: NDArray[np.float32]) -> tuple[int, int, float]:
@@ -85,28 +91,40 @@ class Decoder:
         -------
         tuple
             Last unit of the best string so far, the frame where it began, and a confidence in
-            0 to 1: the share, among the best paths of all pairs, of those in which the unit is
+            0 to 1: the share, among the best paths of all contexts, of those in which the unit is
             the last or the one before.
         """
-        if self._num_records + _MOST_ENDS > len(self._records):
+        if self._num_records + _MOST_TOKENS > len(self._records):
             self._settle()
-        topology = self._topology
-        self._num_records, before, unit, state, confidence = _step(
+        topology, graph = self._topology, self._graph
+        self._num_tokens, self._num_records, token, state, confidence = _step(
             self.num_frames,
             scores,
+            self._num_tokens,
+            self._context,
+            self._token_of,
+            self._top,
             self._score,
             self._link,
-            self._top,
             self._records,
             self._num_records,
             topology.first_state,
             topology.log_stay,
             topology.log_leave,
-            self._log_next,
+            np.float32(topology.language_scale),
+            np.float32(topology.unit_penalty),
+            graph.first_arc,
+            graph.arc_unit,
+            graph.arc_log_share,
+            graph.arc_context,
+            graph.shorter,
+            graph.log_back_off,
+            graph.last_unit,
         )
         self.num_frames += 1
-        self._best = (before, state)
-        return unit, self._end(self._link[before, state]), confidence
+        self._best = (token, state)
+        unit = int(graph.last_unit[self._context[token]])
+        return unit, self._end(self._link[token, state]), confidence
 
     def path_since(self, frame: int) -> list[Segment]:
         """Units of the best string so far that end after a frame, without its last unit.
@@ -120,8 +138,8 @@ class Decoder:
 
     def _settle(self) -> None:
         """Take the units that no later frame can change; make room for new records."""
-        live = self._score > _IMPOSSIBLE
-        links = self._link[live]
+        live = self._score[: self._num_tokens] > _IMPOSSIBLE
+        links = self._link[: self._num_tokens][live]
         paths = _paths_through(links, self._records[: self._num_records, 2])
         shared = int(np.flatnonzero(paths == len(links)).max(initial=_NO_RECORD))
         self._settled += self._trace(shared)
@@ -133,18 +151,23 @@ class Decoder:
         records[: len(kept)] = self._records[kept]
         records[: len(kept), 2] = new[records[: len(kept), 2]]
         self._records, self._num_records = records, len(kept)
-        self._link[live] = new[links]
+        self._link[: self._num_tokens][live] = new[links]
         self._settled_until = int(new[shared])
 
     def finish(self) -> list[Segment]:
         """End the speech: the best string of all frames."""
         if self.num_frames == 0:
             return []
-        last_states = self._topology.first_state[1:] - 1
-        ends = self._score[:, last_states] + self._topology.log_leave[last_states]
-        before, unit = divmod(int(ends.argmax()), NUM_UNITS)
-        link = int(self._link[before, last_states[unit]])
-        last = Segment(unit, self._end(link), self.num_frames)
+        tokens = np.arange(self._num_tokens)
+        units = self._graph.last_unit[self._context[tokens]].astype(np.int64)
+        first, end = self._topology.first_state[units], self._topology.first_state[units + 1]
+        ends = self._score[tokens, end - first - 1] + self._topology.log_leave[end - 1]
+        best = int(ends.argmax())
+        state = int((end - first - 1)[best])
+        if ends[best] <= _IMPOSSIBLE:  # no unit has come to its last state
+            best, state = self._best
+        link = int(self._link[best, state])
+        last = Segment(int(units[best]), self._end(link), self.num_frames)
         return [*self._settled, *self._trace(link), last]
 
     def _trace(self, record: int) -> list[Segment]:
@@ -171,87 +194,136 @@ def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _step(  # noqa: PLR0912, PLR0915 (one pass over the states; numba takes positions)
+def _step(  # noqa: PLR0912, PLR0915 (one pass over the tokens; numba takes positions)
     frame: int,
     observed: NDArray[np.float32],
+    num_tokens: int,
+    context: NDArray[np.int32],
+    token_of: NDArray[np.int16],
+    top: NDArray[np.float32],
     score: NDArray[np.float32],
     link: NDArray[np.int32],
-    top: NDArray[np.float32],
     records: NDArray[np.int32],
     num_records: int,
     first_state: NDArray[np.int64],
     log_stay: NDArray[np.float32],
     log_leave: NDArray[np.float32],
-    log_next: NDArray[np.float32],
+    scale: np.float32,
+    penalty: np.float32,
+    first_arc: NDArray[np.int32],
+    arc_unit: NDArray[np.uint8],
+    arc_log_share: NDArray[np.float32],
+    arc_context: NDArray[np.int32],
+    shorter: NDArray[np.int32],
+    log_back_off: NDArray[np.float32],
+    last_unit: NDArray[np.uint8],
 ) -> tuple[int, int, int, int, float]:
     """Advance all paths by one frame; add records of the units that end before it.
 
     Returns
     -------
     tuple
-        Number of records; of the best path the unit before the last, the last and its state; the
-        confidence.
+        Numbers of tokens and of records; the best token and state of its unit; the confidence.
     """
-    num_units = len(top)
-    entry = np.full((num_units, num_units), _IMPOSSIBLE)  # into a unit (second) after a unit
-    entry_link = np.full((num_units, num_units), np.int32(_NO_RECORD))
-    if frame == 0:
-        entry[_SIL] = log_next[_SIL, _SIL]
-    for before in range(num_units):
-        for unit in range(num_units):
-            state = first_state[unit + 1] - 1
-            leaving = score[before, state] + log_leave[state]
-            if top[before, unit] < -_BEAM or leaving < -_BEAM:
+    num_units, most_tokens, most_states = len(first_state) - 1, len(context), score.shape[1]
+    token = 0
+    while token < num_tokens:  # the last token takes the place of one that is given up
+        if top[token] >= -_BEAM:
+            token += 1
+            continue
+        token_of[context[token]] = _NOWHERE
+        num_tokens -= 1
+        if token < num_tokens:
+            context[token], top[token] = context[num_tokens], top[num_tokens]
+            score[token], link[token] = score[num_tokens], link[num_tokens]
+            token_of[context[token]] = token
+    entry = np.full(most_tokens, _IMPOSSIBLE)
+    entry_link = np.full(most_tokens, np.int32(_NO_RECORD))
+    log_share = np.empty(num_units, np.float32)
+    next_context = np.empty(num_units, np.int32)
+    chain = np.empty(_MOST_CHAIN, np.int32)
+    for token in range(num_tokens if frame else 1):
+        if frame:
+            here = context[token]
+            unit = last_unit[here]
+            last = first_state[unit + 1] - first_state[unit] - 1
+            leaving = score[token, last] + log_leave[first_state[unit + 1] - 1]
+            if leaving < -_BEAM:
                 continue
-            records[num_records, 0] = frame
-            records[num_records, 1] = unit
-            records[num_records, 2] = link[before, state]
-            for following in range(num_units):
-                candidate = leaving + log_next[before, unit, following]
-                if candidate > entry[unit, following]:
-                    entry[unit, following] = candidate
-                    entry_link[unit, following] = num_records
+            record = num_records
+            records[record, 0] = frame
+            records[record, 1] = unit
+            records[record, 2] = link[token, last]
             num_records += 1
-    best, best_before, best_unit, best_state = _IMPOSSIBLE, 0, 0, 0
-    for before in range(num_units):
+        else:  # as after a pause
+            here, leaving, record = arc_context[_SIL], np.float32(0.0), _NO_RECORD
+        length = 0
+        while True:
+            chain[length] = here
+            length += 1
+            if here == 0:
+                break
+            here = shorter[here]
+        for place in range(length - 1, -1, -1):  # what a longer context knows replaces the rest
+            here = chain[place]
+            log_share += log_back_off[here] if here else np.float32(0.0)
+            for arc in range(first_arc[here], first_arc[here + 1]):
+                log_share[arc_unit[arc]] = arc_log_share[arc]
+                next_context[arc_unit[arc]] = arc_context[arc]
+        if frame == 0:  # before speech there is silence
+            log_share[_SIL] = 0.0
         for unit in range(num_units):
-            first, end = first_state[unit], first_state[unit + 1]
-            if top[before, unit] < -_BEAM:
-                if top[before, unit] > _IMPOSSIBLE:
-                    score[before, first:end] = _IMPOSSIBLE
-                    top[before, unit] = _IMPOSSIBLE
-                if entry[before, unit] < -2 * _BEAM:
+            candidate = leaving + scale * log_share[unit] + penalty
+            if candidate < -_BEAM:
+                continue
+            following = token_of[next_context[unit]]
+            if following == _NOWHERE:
+                if num_tokens == most_tokens:
                     continue
-            top[before, unit] = _IMPOSSIBLE
-            for state in range(end - 1, first - 1, -1):
-                value, from_link = score[before, state] + log_stay[state], link[before, state]
-                if state > first:
-                    moved = score[before, state - 1] + log_leave[state - 1]
-                    moved_link = link[before, state - 1]
-                else:
-                    moved, moved_link = entry[before, unit], entry_link[before, unit]
-                if moved > value:
-                    value, from_link = moved, moved_link
-                score[before, state] = max(value + observed[state], _IMPOSSIBLE)
-                link[before, state] = from_link
-                if score[before, state] > top[before, unit]:
-                    top[before, unit] = score[before, state]
-                    if top[before, unit] > best:
-                        best = top[before, unit]
-                        best_before, best_unit, best_state = before, unit, state
+                following = num_tokens
+                num_tokens += 1
+                context[following], token_of[next_context[unit]] = next_context[unit], following
+                score[following], link[following] = _IMPOSSIBLE, _NO_RECORD
+            if candidate > entry[following]:
+                entry[following] = candidate
+                entry_link[following] = record
+    best, best_token, best_state = _IMPOSSIBLE, 0, 0
+    for token in range(num_tokens):
+        unit = last_unit[context[token]]
+        first = first_state[unit]
+        top[token] = _IMPOSSIBLE
+        for state in range(first_state[unit + 1] - first - 1, -1, -1):
+            value, from_link = score[token, state] + log_stay[first + state], link[token, state]
+            if state:
+                moved = score[token, state - 1] + log_leave[first + state - 1]
+                moved_link = link[token, state - 1]
+            else:
+                moved, moved_link = entry[token], entry_link[token]
+            if moved > value:
+                value, from_link = moved, moved_link
+            score[token, state] = max(value + observed[first + state], _IMPOSSIBLE)
+            link[token, state] = from_link
+            if score[token, state] > top[token]:
+                top[token] = score[token, state]
+                if top[token] > best:
+                    best, best_token, best_state = top[token], token, state
+    best_unit = last_unit[context[best_token]]
     share, total = 0.0, 0.0
-    for before in range(num_units):
-        for unit in range(num_units):
-            if top[before, unit] > _IMPOSSIBLE:
-                top[before, unit] -= best  # keeps numbers small in endless speech
-                for state in range(first_state[unit], first_state[unit + 1]):
-                    if score[before, state] > _IMPOSSIBLE:
-                        score[before, state] -= best
-                if top[before, unit] > -_BEAM:
-                    total += np.exp(top[before, unit])
-                    if best_unit in (before, unit):
-                        share += np.exp(top[before, unit])
-    return num_records, best_before, best_unit, best_state, share / total
+    for token in range(num_tokens):
+        before = _NO_RECORD
+        for state in range(most_states):
+            if score[token, state] == top[token]:
+                before = link[token, state]
+            if score[token, state] > _IMPOSSIBLE:
+                score[token, state] -= best  # keeps numbers small in endless speech
+        top[token] -= best
+        if top[token] > -_BEAM:
+            total += np.exp(top[token])
+            if last_unit[context[token]] == best_unit or (
+                before != _NO_RECORD and records[before, 1] == best_unit
+            ):
+                share += np.exp(top[token])
+    return num_tokens, num_records, best_token, best_state, share / total
 
 
 @numba.njit(cache=True)

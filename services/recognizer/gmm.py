@@ -44,7 +44,7 @@ from services.recognizer.model_file import (
     write_archive,
 )
 
-FORMAT = "gmm 1"
+FORMAT = "gmm 2"
 _MOST_MIXTURES = 1024
 _WIDEST = 4  # half width of the differences, feature frames
 

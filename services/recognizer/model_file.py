@@ -14,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
+from services.recognizer.unit_language import MOST_UNITS, UnitLanguage
 from shared.errors import UserError
 from shared.phones import UNITS
 
 _MOST_STATES = 10_000
+_MOST_NODES = 10_000_000
+_MOST_WEIGHT = 10.0
+_STEP = np.float32(0.05)  # nats; the logs of a language are kept in whole steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +83,9 @@ def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
         "first_state": topology.first_state,
         "log_stay": topology.log_stay,
         "log_leave": topology.log_leave,
-        "log_bigram": topology.log_bigram,
+        **language_arrays(topology.language),
+        "language_scale": np.array(topology.language_scale, np.float32),
+        "unit_penalty": np.array(topology.unit_penalty, np.float32),
         "duration_mean_s": topology.duration_mean_s,
         "duration_spread_s": topology.duration_spread_s,
     }
@@ -94,12 +100,59 @@ def topology_from(archive: Archive) -> Topology:
     if first_state[0] != 0 or (np.diff(first_state) < 1).any() or first_state[-1] > _MOST_STATES:
         raise ValueError("its states are not numbered upwards")
     num_states = int(first_state[-1])
-    after_two = archive.array("log_bigram", None).ndim == 3
+    language_scale = float(archive.floats("language_scale"))
+    unit_penalty = float(archive.floats("unit_penalty"))
+    if not 0 <= language_scale <= _MOST_WEIGHT or abs(unit_penalty) > _MOST_WEIGHT:
+        raise ValueError(f"language scale {language_scale:g}, unit penalty {unit_penalty:g}")
     return Topology(
         first_state=first_state,
         log_stay=archive.floats("log_stay", num_states),
         log_leave=archive.floats("log_leave", num_states),
-        log_bigram=archive.floats("log_bigram", *[num_units] * (3 if after_two else 2)),
+        language=language_from(archive),
+        language_scale=language_scale,
+        unit_penalty=unit_penalty,
         duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_units),
         duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_units),
     )
+
+
+def language_arrays(language: UnitLanguage) -> dict[str, NDArray[Any]]:
+    """Arrays of the language of units."""
+    share, back_off = (np.rint(log / _STEP) for log in (language.log_share, language.log_back_off))
+    return {
+        "language_children": language.num_children,
+        "language_unit": language.unit,
+        "language_share": np.clip(-share, 0, 255).astype(np.uint8),
+        "language_back_off": np.clip(back_off, -127, 127).astype(np.int8),
+    }
+
+
+def language_from(archive: Archive) -> UnitLanguage:
+    """Build the language of units after checking every number."""
+    num_units = len(UNITS)
+    children = archive.array("language_children", None).astype(np.int64)
+    if children.ndim != 1 or not 1 + num_units <= len(children) <= _MOST_NODES:
+        raise ValueError(f"its language is of shape {children.shape}")
+    at = np.arange(len(children))
+    first_child = 1 + np.cumsum(children) - children
+    if (
+        children.min() < 0
+        or children[0] != num_units
+        or children.sum() != len(children) - 1
+        or (first_child <= at)[children > 0].any()
+    ):
+        raise ValueError("its language is no tree")
+    unit = archive.array("language_unit", children.shape).astype(np.int64)
+    is_first = np.zeros(len(unit) + 1, dtype=bool)
+    is_first[first_child] = True
+    if unit.min() < 0 or unit.max() >= num_units or (np.diff(unit) < 1)[~is_first[1:-1]].any():
+        raise ValueError("the units of its language are not in order")
+    language = UnitLanguage(
+        num_children=children.astype(np.uint8),
+        unit=unit.astype(np.uint8),
+        log_share=-_STEP * archive.floats("language_share", len(unit)),
+        log_back_off=_STEP * archive.floats("language_back_off", len(unit)),
+    )
+    if len(language.levels) > MOST_UNITS + 2:
+        raise ValueError(f"its language counts more than {MOST_UNITS} units together")
+    return language

@@ -47,7 +47,7 @@ from services.recognizer.model_file import (
 )
 from shared.errors import UserError
 
-FORMAT = "neural 2"
+FORMAT = "neural 3"
 NUM_INPUTS = 1 + NUM_BANDS
 _LEAST_BATCH = 2
 _MOST_LOOK_AHEAD = 100  # feature frames

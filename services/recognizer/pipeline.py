@@ -1,6 +1,7 @@
 """Sound in, units out: the recognizer without sockets.
 
-    samples -> resampler -> log-mel -> [in speech] acoustic model -> Viterbi -> output rule
+    samples -> resampler -> log-mel, pitch -> [in speech] warp -> acoustic model -> Viterbi ->
+    output rule
 
 Source: Li et al. 2011, sections 1 and 2.2.
 
@@ -30,6 +31,7 @@ from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S, LogMel
 from services.recognizer.output_rule import OutputRule
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from services.recognizer.voice_warp import PitchTracker, VoiceWarp
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
@@ -81,10 +83,12 @@ class SpeechScores:
         self._stream = model.stream()
         self._resampler = Resampler(sample_rate_hz, num_channels)
         self._detector = VoiceActivityDetector()
+        self._warp = VoiceWarp()
         self._reset_frames()
 
     def _reset_frames(self) -> None:
         self._log_mel = LogMel()
+        self._pitch = PitchTracker()
         self._block = np.empty(0, dtype=np.float32)
         self._recent: deque[NDArray[np.float32]] = deque(maxlen=_PRE_ROLL_FRAMES)
         self._num_frames = 0
@@ -114,6 +118,7 @@ class SpeechScores:
         self._stream.reset()
         self._resampler.reset()
         self._detector.reset()
+        self._warp.reset()
         self._reset_frames()
 
     def _hear(self, samples: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
@@ -122,18 +127,26 @@ class SpeechScores:
             piece = samples[: BLOCK_SAMPLES - len(self._block)]
             samples = samples[len(piece) :]
             self._block = np.concatenate([self._block, piece])
-            events += yield from self._frames(self._log_mel.accept_waveform(piece))
+            log_mel, pitch = (
+                self._log_mel.accept_waveform(piece),
+                self._pitch.accept_waveform(piece),
+            )
+            events += yield from self._frames(np.column_stack([log_mel, *pitch]))
             if len(self._block) == BLOCK_SAMPLES:
                 events += yield from self._judge()
                 self._block = self._block[:0]
         return events
 
-    def _frames(self, log_mel: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
-        self._num_frames += len(log_mel)
+    def _frames(self, frames: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
+        """Take log-mel frames with their pitch and its strength, shape (n, 43)."""
+        self._num_frames += len(frames)
         if not self._speaking:
-            self._recent.extend(log_mel)
+            self._recent.extend(frames)
             return []
-        return _if_any((yield self._stream, log_mel))
+        return _if_any((yield self._stream, self._warped(frames)))
+
+    def _warped(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
+        return self._warp.accept(frames[:, :-2], frames[:, -2], frames[:, -1])
 
     def _judge(self) -> Listening[list[ScoreEvent]]:
         speech = self._detector.accept_block(self._block).is_speech
@@ -142,7 +155,7 @@ class SpeechScores:
             begin = VoiceBegins(self._num_frames - len(self._recent))
             pre_roll = np.array(self._recent)
             self._recent.clear()
-            return [begin, *_if_any((yield self._stream, pre_roll))]
+            return [begin, *_if_any((yield self._stream, self._warped(pre_roll)))]
         if self._speaking and not speech:
             return (yield from self._end())
         return []
@@ -352,8 +365,9 @@ def warm_up(model: AcousticModel) -> None:
     """Run everything once, so that the first chunk of a session waits for no compiler."""
     stream, decoder = model.stream(), Decoder(model.topology)
     num_samples = _WARM_UP_S * SAMPLE_RATE_HZ
-    log_mel = LogMel().accept_waveform(np.zeros(num_samples, dtype=np.float32))
-    for row in (*stream.accept(log_mel), *stream.finish()):
+    silence = np.zeros(num_samples, dtype=np.float32)
+    log_mel, pitch = LogMel().accept_waveform(silence), PitchTracker().accept_waveform(silence)
+    for row in (*stream.accept(VoiceWarp().accept(log_mel, *pitch)), *stream.finish()):
         decoder.accept(row)
     decoder.finish()
     VoiceActivityDetector().accept_block(np.zeros(BLOCK_SAMPLES, dtype=np.float32))

@@ -12,6 +12,7 @@ from services.recognizer.load import MODEL_PATH, load_model
 from services.recognizer.model_file import read_archive, write_archive
 from shared.errors import UserError
 from shared.phones import UNITS
+from tests.languages import random_language
 
 pytestmark = pytest.mark.unit
 
@@ -24,7 +25,9 @@ def random_topology(rng: np.random.Generator) -> Topology:
         first_state=np.arange(len(UNITS) + 1) * 2,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        log_bigram=rng.normal(size=(len(UNITS), len(UNITS))).astype(np.float32),
+        language=random_language(rng),
+        language_scale=1.5,
+        unit_penalty=-0.25,
         duration_mean_s=np.full((NUM_POSITIONS, len(UNITS)), 0.1, np.float32),
         duration_spread_s=np.full((NUM_POSITIONS, len(UNITS)), 0.1, np.float32),
     )
@@ -88,6 +91,9 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     found = np.concatenate([second.accept(log_mel), second.finish()])
     assert expected.shape == (len(log_mel), NUM_STATES)
     np.testing.assert_allclose(found, expected, rtol=2e-2, atol=2e-2)
+    again = loaded.topology
+    assert (again.language_scale, again.unit_penalty) == (1.5, -0.25)
+    np.testing.assert_array_equal(again.language.unit, model.topology.language.unit)
 
 
 def test_a_stream_scores_the_same_in_any_pieces_and_after_reset() -> None:
@@ -138,6 +144,10 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
         ({"first_state": np.zeros(len(UNITS) + 1, np.int64)}, "not numbered upwards"),
         ({"means": np.zeros((3, 3, 3), np.float32)}, r"means has shape \(3, 3, 3\)"),
         ({"log_stay": np.full(NUM_STATES, np.nan, np.float32)}, "no numbers"),
+        ({"language_children": np.zeros(99, np.uint8)}, "its language is no tree"),
+        ({"language_unit": np.zeros(3, np.uint8)}, r"language_unit has shape \(3,\)"),
+        ({"language_scale": np.array(np.inf)}, "language_scale holds values that are no numbers"),
+        ({"unit_penalty": np.zeros(2)}, r"unit_penalty has shape \(2,\)"),
         ({"covars": np.zeros((NUM_STATES, 3, NUM_FEATURES), np.float32)}, "negative"),
         ({"weights": np.zeros((NUM_STATES, 0), np.float32)}, "0 mixture components"),
         ({"half_width": np.array(9)}, "half width"),

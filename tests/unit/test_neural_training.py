@@ -14,7 +14,7 @@ from shared.errors import UserError
 from shared.phones import UNITS
 from training.corpus import RowErrors, read_corpus
 from training.network import FRONT_FRAMES, NUM_INPUTS, Network, Shape
-from training.network_export import onnx_of
+from training.network_export import networks_of, onnx_of
 from training.network_training import FrontEnd, Recording, Trainer
 from training.neural_recipe import train_neural
 from training.second_language import as_nearest_units, load_second_language
@@ -121,6 +121,34 @@ def test_the_file_computes_what_the_networks_do(num_networks: int) -> None:
         np.testing.assert_allclose(found[:, 0], shares, atol=2e-3)
 
 
+@pytest.mark.parametrize("num_networks", [1, 2])
+def test_networks_come_back_from_their_file(num_networks: int) -> None:
+    torch.manual_seed(0)
+    networks = [Network(SHAPE) for _ in range(num_networks)]
+    file = onnx_of(networks)
+    again = networks_of(file, SHAPE.look_aheads)
+    assert [network.shape for network in again] == [SHAPE] * num_networks
+    np.testing.assert_array_equal(onnx_of(again), file)
+    for wanted, found in zip(networks, again, strict=True):
+        found_state = found.state_dict()
+        for name, tensor in wanted.state_dict().items():
+            if name.startswith("second_task") or (name.startswith("heads") and "bias" in name):
+                continue  # the one is not in the file, of the other only the mean
+            largest = float(tensor.abs().max())
+            torch.testing.assert_close(found_state[name], tensor, atol=largest / 127, rtol=0)
+    for head in range(len(SHAPE.look_aheads)):
+        biases = [
+            torch.stack([one.state_dict()[f"heads.{head}.bias"] for one in side]).mean(0)
+            for side in (networks, again)
+        ]
+        torch.testing.assert_close(biases[0], biases[1])
+
+
+def test_a_file_without_networks_is_refused() -> None:
+    with pytest.raises(KeyError):
+        networks_of(np.zeros(0, np.uint8), SHAPE.look_aheads)
+
+
 def test_the_network_learns_made_up_sounds_beside_a_second_task(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -188,6 +216,36 @@ def test_the_recipe_writes_model_card_and_curves(
     assert "aligned anew" in "".join(lines)
     assert "CC0-1.0" in output.with_suffix(".md").read_text()
     assert output.with_suffix(".png").stat().st_size > 1000
+    # and learns further, with nothing to judge it by
+    further = tmp_path / "further.npz"
+    manifest = corpus / "manifest.tsv"
+    manifest.write_text(manifest.read_text().replace("\tdev\t", "\ttest\t"))
+    train_neural(
+        [corpus], further, aligner=model_path("gmm"), start=output, language=model_path("gmm"),
+        look_ahead_ms=150.0, num_steps=1, num_networks=1, num_voices=0, report=lines.append,
+    )  # fmt: skip
+    learnt = load_model(further)
+    assert isinstance(learnt, NeuralModel)
+    np.testing.assert_array_equal(learnt.prior_mean, model.prior_mean)
+    np.testing.assert_array_equal(learnt.spread, model.spread)
+    (before,), (after,) = (networks_of(m.network, m.look_aheads.tolist()) for m in (model, learnt))
+    for name, weights in before.state_dict().items():
+        if not name.startswith("second_task"):
+            torch.testing.assert_close(after.state_dict()[name], weights, atol=0.01, rtol=0.05)
+    shipped = load_model(model_path("gmm")).topology.language
+    np.testing.assert_array_equal(learnt.topology.language.unit, shipped.unit)
+
+
+@pytest.mark.parametrize("start", ["gmm", "neural"])
+def test_what_cannot_learn_further_is_refused(
+    start: str, corpora: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """A Gaussian mixture model, and networks without an output layer for 150 ms."""
+    with pytest.raises(UserError, match="not written by this command with a look-ahead of 150 ms"):
+        train_neural(
+            [corpora[0]], tmp_path / "n.npz", aligner=model_path("gmm"), start=model_path(start),
+            look_ahead_ms=150.0, num_steps=1, num_networks=1, num_voices=0,
+        )  # fmt: skip
 
 
 def test_networks_that_learn_side_by_side_become_one_model(

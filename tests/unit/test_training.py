@@ -28,12 +28,12 @@ from training.gmm import (
     first_estimate,
     flat_path,
     split,
-    unit_bigram,
     units_of_path,
     utterance_graph,
     viterbi_path,
 )
 from training.recipes import train_gmm
+from training.unit_language import load_language, train_language
 
 pytestmark = pytest.mark.unit
 
@@ -417,15 +417,6 @@ def test_durations_by_position() -> None:
     assert (spread_s > 0).all()
 
 
-def test_bigram_rows_are_distributions() -> None:
-    examples = made_up_speech(20)
-    log_bigram = unit_bigram([example.units for example in examples])
-    np.testing.assert_allclose(np.exp(log_bigram).sum(axis=1), 1, atol=0.02)
-    t, i, a = (UNIT_INDEX[unit] for unit in ("t", "i", "a"))
-    assert log_bigram[t, i] > log_bigram[t, a]
-    assert log_bigram[i, SIL] > log_bigram[t, SIL]
-
-
 # --- whole recipes
 
 
@@ -443,6 +434,18 @@ def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
     again = tmp_path / "again.npz"
     train_gmm([tmp_path / "corpus"], again, num_mixtures=2, report=lines.append)
     assert again.read_bytes() == gmm.read_bytes()  # the same seed, the same model
+    text = tmp_path / "text.txt"
+    text.write_text("欢迎来到口型。\n" * 3, encoding="utf-8")
+    train_language([], [text], tmp_path / "language.npz", report=lines.append)
+    train_gmm(
+        [tmp_path / "corpus"], again, language=tmp_path / "language.npz",
+        num_mixtures=1, report=lines.append,
+    )  # fmt: skip
+    welcome = load_language(tmp_path / "language.npz")
+    known = {path: load_model(path).topology.language for path in (gmm, again)}
+    np.testing.assert_array_equal(known[again].unit, welcome.unit)
+    np.testing.assert_array_equal(known[again].log_share, welcome.log_share)
+    assert len(known[gmm].unit) < len(welcome.unit)
     with pytest.raises(UserError, match="power of two"):
         train_gmm([tmp_path / "corpus"], gmm, num_mixtures=3)
 
