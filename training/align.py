@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import AcousticModel
-from services.recognizer.features import LogMel
 from services.recognizer.pipeline import frame_time_s
 from services.recognizer.resample import to_16_khz
-from services.recognizer.voice_warp import PitchTracker, VoiceWarp
+from services.recognizer.voice_warp import warped_log_mel
 from shared.errors import UserError
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone
 from shared.pinyin import pinyin_of_text, units_of_syllable
@@ -63,9 +62,7 @@ def align_units(
 ) -> list[Phone]:
     """Like :func:`align_text`, for units already known, one tuple per syllable."""
     stream = model.stream()
-    samples = to_16_khz(samples, sample_rate_hz)
-    log_mel, pitch = LogMel().accept_waveform(samples), PitchTracker().accept_waveform(samples)
-    log_mel = VoiceWarp().accept(log_mel, *pitch)
+    log_mel = warped_log_mel(to_16_khz(samples, sample_rate_hz))
     scores = np.concatenate([stream.accept(log_mel), stream.finish()])
     topology = model.topology
     graph = utterance_graph(

@@ -33,9 +33,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from services.recognizer.features import LOG_FLOOR, NUM_BANDS, SAMPLE_RATE_HZ
+from services.recognizer.features import (
+    BAND_HZ,
+    BAND_MEL,
+    HIGHEST_HZ,
+    LOG_FLOOR,
+    LOWEST_HZ,
+    NUM_BANDS,
+    SAMPLE_RATE_HZ,
+    mel_of,
+)
 
-_LOWEST_HZ, _HIGHEST_HZ = 40.0, 7600.0
 _WET = 0.5  # energy of a room's tail against the direct sound
 _BANDS_TO_ENERGY = 97.0  # c: 512 points / 2, times the window's mean square of 0.38
 _PAIR_HZ = 45.0  # bandwidth of one independent pair under the window
@@ -45,25 +53,14 @@ _LEAST_ROOT = 0.2  # of a scattered energy
 _TELEPHONE_SHARE, _CODEC_SHARE, _NOISY_SHARE = 0.14, 0.25, 0.6
 
 
-def _mel(hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    return 1127.0 * np.log1p(hz / 700.0)
-
-
-def _hz(mel: NDArray[np.float64]) -> NDArray[np.float64]:
-    return 700.0 * np.expm1(mel / 1127.0)
-
-
 def _over_bands(values: tuple[float, ...]) -> NDArray[np.float32]:
     """Values at equal mel distances, interpolated to all bands, shape (40,)."""
     at = np.linspace(0, NUM_BANDS - 1, len(values))
     return np.interp(np.arange(NUM_BANDS), at, values).astype(np.float32)
 
 
-_LOWEST_MEL, _HIGHEST_MEL = _mel(np.array([_LOWEST_HZ, _HIGHEST_HZ]))
-_BAND_MEL = np.linspace(_LOWEST_MEL, _HIGHEST_MEL, NUM_BANDS + 2)[1:-1]
-_BAND_HZ = _hz(_BAND_MEL)
-_WIDTH_HZ = np.gradient(_BAND_HZ)
-_EMPHASIS = 1.9409 - 1.94 * np.cos(2 * np.pi * _BAND_HZ / SAMPLE_RATE_HZ)  # |1 - 0.97/z|^2
+_WIDTH_HZ = np.gradient(BAND_HZ)
+_EMPHASIS = 1.9409 - 1.94 * np.cos(2 * np.pi * BAND_HZ / SAMPLE_RATE_HZ)  # |1 - 0.97/z|^2
 _FROM_ENERGY = _BANDS_TO_ENERGY * _EMPHASIS * _WIDTH_HZ  # band over energy, of a sound in one band
 _PAIRS = np.concatenate([[_PAIRS_OF_ENERGY], np.maximum(1.4, _WIDTH_HZ / _PAIR_HZ)]).astype(
     np.float32
@@ -159,11 +156,11 @@ class Augmentation:
             power += self._noise(power, rng)
         else:
             power = self._in_noise(power, self.noise_slope, rng)
-        if self.lowest_hz > _LOWEST_HZ or self.highest_hz < _HIGHEST_HZ:
+        if self.lowest_hz > LOWEST_HZ or self.highest_hz < HIGHEST_HZ:
             self._send(power)
         out = np.log(power) + self.level
         if self.narrow:
-            outside = (_BAND_HZ < 300.0) | (_BAND_HZ > 3400.0)
+            outside = (BAND_HZ < 300.0) | (BAND_HZ > 3400.0)
             out[:, 1:][:, outside] -= 8.0
         floored: NDArray[np.float32] = np.maximum(out, LOG_FLOOR).astype(np.float32)
         return floored
@@ -181,7 +178,7 @@ class Augmentation:
         self, power: NDArray[np.float32], slope: float, rng: np.random.Generator
     ) -> NDArray[np.float32]:
         """Energies of the recording in a noise that is a sound, shape (frames, 41)."""
-        density = (_BAND_HZ / 1000.0) ** slope
+        density = (BAND_HZ / 1000.0) ** slope
         if self.noise_peaks:
             density = density * np.exp(_over_bands(self.noise_peaks))
         shares = _FROM_ENERGY * density / np.sum(density * _WIDTH_HZ)
@@ -212,8 +209,8 @@ class Augmentation:
 
     def _send(self, power: NDArray[np.float32]) -> None:
         """Take off what does not pass the line, from the log energy too."""
-        below = np.log2(np.maximum(1.0, self.lowest_hz / _BAND_HZ))
-        above = np.log2(np.maximum(1.0, _BAND_HZ / self.highest_hz))
+        below = np.log2(np.maximum(1.0, self.lowest_hz / BAND_HZ))
+        above = np.log2(np.maximum(1.0, BAND_HZ / self.highest_hz))
         passes = np.exp(-np.minimum(self.stop, self.skirt * (below + above))).astype(np.float32)
         of_sound = (1 / _FROM_ENERGY).astype(np.float32)
         before = power[:, 1:] @ of_sound
@@ -221,8 +218,8 @@ class Augmentation:
         power[:, 0] *= power[:, 1:] @ of_sound / before
 
     def _warped(self, bands: NDArray[np.float32]) -> NDArray[np.float32]:
-        source = _mel(np.minimum(_BAND_HZ / self.warp, _HIGHEST_HZ))
-        at = np.clip(np.interp(source, _BAND_MEL, np.arange(NUM_BANDS)), 0, NUM_BANDS - 1)
+        source = mel_of(np.minimum(BAND_HZ / self.warp, HIGHEST_HZ))
+        at = np.clip(np.interp(source, BAND_MEL, np.arange(NUM_BANDS)), 0, NUM_BANDS - 1)
         low = np.minimum(at.astype(int), NUM_BANDS - 2)
         share = (at - low).astype(np.float32)
         warped: NDArray[np.float32] = (1 - share) * bands[:, low] + share * bands[:, low + 1]

@@ -34,14 +34,13 @@ from services.recognizer.model_file import (
     read_archive,
     write_archive,
 )
-from services.recognizer.unit_language import UnitLanguage
+from services.recognizer.unit_language import NUM_UNITS, UnitLanguage
 from shared.errors import UserError
-from shared.phones import SILENCE, UNIT_INDEX, UNITS
+from shared.phones import SILENCE, UNIT_INDEX
 from shared.pinyin import pinyin_of_text, units_of_pinyin
 from training.corpus import RowErrors, is_synthetic, read_corpus
 from training.examples import WORD_UNITS, Example
 
-NUM_UNITS = len(UNITS)
 HANZI = re.compile(r"[\u3007\u4e00-\u9fff]+")
 _SPOKEN_SHARE = 0.012  # of the sentences of the corpora, against other texts
 _SIL = UNIT_INDEX[SILENCE]

@@ -32,9 +32,8 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import Topology
 from services.recognizer.unit_language import MOST_UNITS
-from shared.phones import UNIT_INDEX, UNITS
+from shared.phones import UNIT_INDEX
 
-NUM_UNITS = len(UNITS)
 _SIL = UNIT_INDEX["sil"]
 _NO_RECORD = -1
 _NOWHERE = -1

@@ -37,6 +37,9 @@ NUM_BANDS = 40
 NUM_STATIC = 13  # log energy, then cepstra 1 to 12
 NUM_FEATURES = 3 * NUM_STATIC
 
+LOWEST_HZ, HIGHEST_HZ = 40.0, 7600.0  # edges of the filter bank
+MELS, MEL_KNEE_HZ = 1127.0, 700.0  # mel = 1127 ln(1 + f / 700)
+
 _HOP_SAMPLES = 160
 _FULL_SCALE = 32768.0  # the filter bank's energies are those of 16-bit samples
 LOG_FLOOR = 6.0  # some decibels above the noise of one least significant bit
@@ -47,6 +50,21 @@ _PEAK_DECAY = 0.005  # per frame, natural log of power: 2 dB a second
 _SPEECH_BELOW_PEAK = 6.9  # natural log of power (30 dB): quieter frames do not move the mean
 
 
+def mel_of(hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Place of a frequency on the mel scale."""
+    return MELS * np.log1p(hz / MEL_KNEE_HZ)
+
+
+def hz_of(mel: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Frequency of a place on the mel scale."""
+    return MEL_KNEE_HZ * np.expm1(mel / MELS)
+
+
+LOWEST_MEL, HIGHEST_MEL = mel_of(np.array([LOWEST_HZ, HIGHEST_HZ]))
+BAND_MEL = np.linspace(LOWEST_MEL, HIGHEST_MEL, NUM_BANDS + 2)[1:-1]  # centres of the bands
+BAND_HZ = hz_of(BAND_MEL)
+
+
 def _filter_bank() -> knf.OnlineFbank:
     options = knf.FbankOptions()
     options.frame_opts.samp_freq = SAMPLE_RATE_HZ
@@ -55,8 +73,8 @@ def _filter_bank() -> knf.OnlineFbank:
     options.frame_opts.dither = 0.0  # the same sound gives the same features
     options.frame_opts.snip_edges = True
     options.mel_opts.num_bins = NUM_BANDS
-    options.mel_opts.low_freq = 40.0
-    options.mel_opts.high_freq = 7600.0
+    options.mel_opts.low_freq = LOWEST_HZ
+    options.mel_opts.high_freq = HIGHEST_HZ
     options.use_energy = True
     options.energy_floor = 1.0
     return knf.OnlineFbank(options)

@@ -31,7 +31,7 @@ from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S, LogMel
 from services.recognizer.output_rule import OutputRule
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
-from services.recognizer.voice_warp import PitchTracker, VoiceWarp
+from services.recognizer.voice_warp import PitchTracker, VoiceWarp, warped_log_mel
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
@@ -365,9 +365,8 @@ def warm_up(model: AcousticModel) -> None:
     """Run everything once, so that the first chunk of a session waits for no compiler."""
     stream, decoder = model.stream(), Decoder(model.topology)
     num_samples = _WARM_UP_S * SAMPLE_RATE_HZ
-    silence = np.zeros(num_samples, dtype=np.float32)
-    log_mel, pitch = LogMel().accept_waveform(silence), PitchTracker().accept_waveform(silence)
-    for row in (*stream.accept(VoiceWarp().accept(log_mel, *pitch)), *stream.finish()):
+    log_mel = warped_log_mel(np.zeros(num_samples, dtype=np.float32))
+    for row in (*stream.accept(log_mel), *stream.finish()):
         decoder.accept(row)
     decoder.finish()
     VoiceActivityDetector().accept_block(np.zeros(BLOCK_SAMPLES, dtype=np.float32))

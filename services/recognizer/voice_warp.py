@@ -47,7 +47,18 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.features import HOP_S, NUM_BANDS, SAMPLE_RATE_HZ, WINDOW_S
+from services.recognizer.features import (
+    BAND_HZ,
+    HIGHEST_MEL,
+    HOP_S,
+    LOWEST_MEL,
+    MEL_KNEE_HZ,
+    MELS,
+    NUM_BANDS,
+    SAMPLE_RATE_HZ,
+    WINDOW_S,
+    LogMel,
+)
 
 _DECIMATION = 4
 _RATE_HZ = SAMPLE_RATE_HZ / _DECIMATION
@@ -69,12 +80,8 @@ _EXPONENT = 0.2
 _PRIOR_FRAMES = 20.0  # weight of the reference
 _MEMORY_FRAMES = 1500.0  # as the live mean of the features
 
-_MEL = 1127.0  # mel = 1127 ln(1 + f / 700), as in the filter bank
-_MEL_HZ = 700.0
-_LOW_HZ, _HIGH_HZ = 40.0, 7600.0  # edges of the filter bank
-_LOW_MEL = _MEL * math.log1p(_LOW_HZ / _MEL_HZ)
-_STEP_MEL = (_MEL * math.log1p(_HIGH_HZ / _MEL_HZ) - _LOW_MEL) / (NUM_BANDS + 1)
-_CENTRES_HZ = _MEL_HZ * np.expm1((_LOW_MEL + _STEP_MEL * np.arange(1, NUM_BANDS + 1)) / _MEL)
+_STEP_MEL = float(HIGHEST_MEL - LOWEST_MEL) / (NUM_BANDS + 1)
+_LOWEST_MEL = float(LOWEST_MEL)
 
 
 def _low_pass_taps() -> NDArray[np.float64]:
@@ -183,12 +190,18 @@ class VoiceWarp:
         frames = np.array(log_mel, dtype=np.float32, order="C")
         voice = np.empty((num_frames, 2), dtype=np.float32)
         voice[:, 0], voice[:, 1] = pitch_hz, strength
-        _warp(frames, voice, _CENTRES_HZ, self._state)
+        _warp(frames, voice, BAND_HZ, self._state)
         return frames
 
     def reset(self) -> None:
         """Forget the speaker."""
         self._state = np.zeros(2)  # sum of ln(f_ref / pitch) of voiced frames, their number
+
+
+def warped_log_mel(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Log-mel frames of a whole recording, as they come live, shape (n,) to (frames, 41)."""
+    pitch = PitchTracker().accept_waveform(samples)
+    return VoiceWarp().accept(LogMel().accept_waveform(samples), *pitch)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -267,8 +280,8 @@ def _warp(
             continue
         # From the top down: a band is made of bands at and below it, which are still as they were.
         for k in range(num_bands - 1, -1, -1):
-            mel = _MEL * math.log1p(centres_hz[k] / factor / _MEL_HZ)
-            place = max((mel - _LOW_MEL) / _STEP_MEL - 1.0, 0.0)
+            mel = MELS * math.log1p(centres_hz[k] / factor / MEL_KNEE_HZ)
+            place = max((mel - _LOWEST_MEL) / _STEP_MEL - 1.0, 0.0)
             below = min(int(place), num_bands - 2)
             share = np.float32(place - below)
             band = frames[row, 1 + below : 3 + below]

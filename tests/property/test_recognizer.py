@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.recognizer.decoder import NUM_UNITS, Decoder
+from services.recognizer.decoder import Decoder
 from services.recognizer.features import Differences, LogMel, cepstra, with_differences
 from services.recognizer.load import load_model
 from services.recognizer.output_rule import OutputRule
 from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler, to_16_khz
+from services.recognizer.unit_language import NUM_UNITS
 from shared.audio_file import read_audio
 from shared.phones import Phone, SpeechChange
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from services.recognizer import decoder as search
 from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.decoder import NUM_UNITS, Decoder, Segment, segments_after
-from services.recognizer.unit_language import UnitLanguage
+from services.recognizer.decoder import Decoder, Segment, segments_after
+from services.recognizer.unit_language import NUM_UNITS, UnitLanguage
 from tests.languages import SIL, Gram, Table, flat_language
 
 pytestmark = pytest.mark.unit
