@@ -28,7 +28,7 @@ from rich.progress import track
 
 from services.recognizer.acoustic_model import AcousticModel, listen
 from services.recognizer.decoder import Decoder
-from services.recognizer.features import SAMPLE_RATE_HZ, LogMel
+from services.recognizer.features import SAMPLE_RATE_HZ
 from services.recognizer.pipeline import (
     DEFAULT_RULE,
     Recognizer,
@@ -38,7 +38,6 @@ from services.recognizer.pipeline import (
 )
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
-from services.recognizer.voice_warp import PitchTracker, VoiceWarp
 from services.synthesizer.visemes import SHAPES
 from shared.errors import UserError
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
@@ -397,14 +396,11 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         samples[at : at + BLOCK_SAMPLES]
         for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
     ]
-    log_mel_stage, stream, decoder = LogMel(), model.stream(), Decoder(model.topology)
-    tracker, warp = PitchTracker(), VoiceWarp()
+    front_end, stream, decoder = model.front_end(), model.stream(), Decoder(model.topology)
     detector, resampler = VoiceActivityDetector(), Resampler(48_000)
     at_48_khz = np.repeat(samples, 3)
-    log_mel, pitch = LogMel().accept_waveform(samples), PitchTracker().accept_waveform(samples)
-    warped = VoiceWarp().accept(log_mel, *pitch)  # compiled before the clock starts
-    frames = np.column_stack([log_mel, *pitch])
-    scores = model.stream().accept(warped)
+    frames = model.front_end().accept_waveform(samples)
+    scores = model.stream().accept(frames)  # compiled before the clock starts
     decoder.accept(scores[0])
     decoder.reset()
 
@@ -421,13 +417,8 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
             resampler.accept_waveform, np.array_split(at_48_khz, len(chunks))
         ),
         "voice_activity": run(detector.accept_block, blocks),
-        "log_mel": run(log_mel_stage.accept_waveform, chunks),
-        "pitch": run(tracker.accept_waveform, chunks),
-        "voice_warp": run(
-            lambda row: warp.accept(row[:, :-2], row[:, -2], row[:, -1]),
-            np.split(frames, len(frames)),
-        ),
-        "acoustic_model": run(stream.accept, np.split(warped, len(warped))),
+        "front_end": run(front_end.accept_waveform, chunks),
+        "acoustic_model": run(stream.accept, np.split(frames, len(frames))),
         "decoder": run(decoder.accept, scores),
     }
 
@@ -440,11 +431,11 @@ def sessions_a_core(
     ``cost`` is what :func:`cpu_by_stage` measured for one; the resampler, which sound at 16 kHz
     does not need, is left out.
     """
-    log_mel = LogMel().accept_waveform(samples)
+    frames = model.front_end().accept_waveform(samples)
     streams = [model.stream() for _ in range(_SESSIONS_TOGETHER)]
     begin = time.process_time()
-    for frame in range(len(log_mel)):
-        model.score([(stream, log_mel[frame : frame + 1]) for stream in streams])
+    for frame in range(len(frames)):
+        model.score([(stream, frames[frame : frame + 1]) for stream in streams])
     together = (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples) / _SESSIONS_TOGETHER
-    own = ("voice_activity", "log_mel", "pitch", "voice_warp", "decoder")
+    own = ("voice_activity", "front_end", "decoder")
     return 1 / (together + sum(cost[stage] for stage in own))

@@ -52,7 +52,7 @@ class RecognizerConfig(Config):
     audio: str = "tcp://127.0.0.1:5560"
     phones: str = "tcp://127.0.0.1:5561"
     acoustic: str = "neural"  # model: neural, gmm, or a file
-    look_ahead_ms: float = 10.0  # of the neural model: 0, 10, 30, 60, 100 or 200
+    look_ahead_ms: float = 10.0  # of the neural model: 10, 30, 60, 100 or 200
     agreement: int = 1  # frames that must agree before a unit is put out (N of Li 2011, who has 3)
     least_confidence: float = 0.9  # of each of those frames; 0 is the paper's rule
 

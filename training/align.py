@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.pipeline import frame_time_s
 from services.recognizer.resample import to_16_khz
-from services.recognizer.voice_warp import warped_log_mel
 from shared.errors import UserError
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone
 from shared.pinyin import pinyin_of_text, units_of_syllable
@@ -62,8 +61,8 @@ def align_units(
 ) -> list[Phone]:
     """Like :func:`align_text`, for units already known, one tuple per syllable."""
     stream = model.stream()
-    log_mel = warped_log_mel(to_16_khz(samples, sample_rate_hz))
-    scores = np.concatenate([stream.accept(log_mel), stream.finish()])
+    frames = model.front_end().accept_waveform(to_16_khz(samples, sample_rate_hz))
+    scores = np.concatenate([stream.accept(frames), stream.finish()])
     topology = model.topology
     graph = utterance_graph(
         [UNIT_INDEX[unit] for syllable in syllables for unit in syllable],
@@ -77,7 +76,7 @@ def align_units(
     if len(path) == 0:
         num_units = sum(len(syllable) for syllable in syllables)
         raise UserError(
-            f"{len(log_mel) * 0.01:.2f} s of sound are too short for {num_units} units; "
+            f"{len(frames) * 0.01:.2f} s of sound are too short for {num_units} units; "
             "check that text and recording belong together"
         )
     best_of_units = np.maximum.reduceat(scores, topology.first_state[:-1], axis=1)

@@ -92,22 +92,18 @@ def neural(
     corpus: Corpora,
     output: Model,
     aligner: Annotated[Path, typer.Option(help="A model file that aligns the first time.")],
-    second_task: Annotated[
-        Path | None, typer.Option(help="Folder of speech in another language, with its phones.")
+    whisper: Annotated[
+        Path | None, typer.Option(help="Folder of Whisper base for faster-whisper, to begin with.")
     ] = None,
     start_from: Annotated[
-        Path | None, typer.Option(help="A neural model whose networks learn further.")
+        Path | None, typer.Option(help="A neural model whose network learns further.")
     ] = None,
     language: Language = None,
     seed: Seed = 0,
     look_ahead_ms: Annotated[
         float, typer.Option(help="The look-ahead to train for, in steps of 10 ms.")
     ] = 10.0,
-    steps: Annotated[int, typer.Option(help="Batches of 50 s of sound.")] = 4000,
-    networks: Annotated[
-        int, typer.Option(help="How many learn, a core each; their mean counts.")
-    ] = 2,
-    voices: Annotated[int, typer.Option(help="Other voices for each real sentence.")] = 6,
+    steps: Annotated[int, typer.Option(min=1, help="Batches of 30 s of sound.")] = 800,
     any_licence: AnyLicence = False,
 ) -> None:
     """Train the neural model; a model card and the training curves are written beside it."""
@@ -123,14 +119,12 @@ def neural(
         corpus,
         output,
         aligner=aligner,
-        second_task=second_task,
+        whisper=whisper,
         start=start_from,
         language=language,
         look_ahead_ms=look_ahead_ms,
         seed=seed,
         num_steps=steps,
-        num_networks=networks,
-        num_voices=voices,
         shipping=not any_licence,
     )
 

@@ -20,12 +20,14 @@ from shared.errors import UserError
 from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
 from training.corpus import RowErrors, Utterance, is_synthetic, may_ship, read_corpus
-from training.feature_cache import log_mel_of
+from training.feature_cache import log_mel_of, samples_of
 
 _EVEN_MINUTES = 30.0
 _LEAST_WEIGHT, _MOST_WEIGHT = 0.3, 3.0
 WORD_UNITS = 8  # a recording of at most so many units is a word, not connected speech
 _MARGIN_FRAMES = 25  # of silence left at both ends
+_HOP_SAMPLES = 160
+_WINDOW_SAMPLES = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +41,7 @@ class Example:
     licence: str = ""
     speaker: str = ""
     augmentation: Augmentation | None = None
-    voices: tuple[NDArray[np.float16], ...] = ()  # the same in other voices, (frames, 41) each
+    samples: NDArray[np.int16] | None = None  # (n,) 16 kHz, those of the frames
 
 
 def load_examples(
@@ -49,7 +51,7 @@ def load_examples(
     split: str = "train",
     shipping: bool = True,
     synthetic_weight: float = SYNTHETIC_WEIGHT,
-    num_voices: int = 0,
+    with_samples: bool = False,
 ) -> list[Example]:
     """Read corpora, compute or fetch their log-mel features, and weigh the utterances.
 
@@ -65,8 +67,8 @@ def load_examples(
         Leave out rows whose licence forbids giving the model away.
     synthetic_weight
         Weight of rows whose licence says they are synthetic.
-    num_voices
-        Other voices for each real sentence, see :mod:`training.voice_change`; one for each word.
+    with_samples
+        Give the examples their samples too.
 
     Raises
     ------
@@ -75,6 +77,7 @@ def load_examples(
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
+    sounds: list[NDArray[np.int16] | None] = []
     for corpus in corpora:
         rows = read_corpus(corpus, errors, split=split)
         if shipping:
@@ -84,12 +87,12 @@ def load_examples(
             rows = [row for row in rows if may_ship(row.licence)]
         utterances += rows
         log_mels += log_mel_of(rows, errors)
-    voices = _voices_of(utterances, num_voices)
+        sounds += samples_of(rows) if with_samples else [None] * len(rows)
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60
     examples = []
-    for utterance, log_mel in zip(utterances, log_mels, strict=True):
+    for utterance, log_mel, sound in zip(utterances, log_mels, sounds, strict=True):
         if log_mel is None:
             continue
         span = speech_span(log_mel)
@@ -109,7 +112,7 @@ def load_examples(
                 weight=weight,
                 licence=utterance.licence,
                 speaker=utterance.speaker,
-                voices=tuple(np.asarray(v[span]) for v in voices.get(utterance.utterance_id, ())),
+                samples=None if sound is None else sound[_samples_of(span, len(trimmed))],
             )
         )
     if not examples:
@@ -120,27 +123,15 @@ def load_examples(
     return examples
 
 
-def _voices_of(
-    utterances: Sequence[Utterance], num_voices: int
-) -> dict[str, list[NDArray[np.float16]]]:
-    """Other voices of the real recordings, by utterance: one of each word, more of a sentence."""
-    real = [utterance for utterance in utterances if not is_synthetic(utterance.licence)]
-    if not (num_voices and real):
-        return {}
-    from training.voice_change import changed_voices  # noqa: PLC0415 (needs an extra of its own)
-
-    sentences = [utterance for utterance in real if len(utterance.units) > WORD_UNITS]
-    words = [utterance for utterance in real if len(utterance.units) <= WORD_UNITS]
-    voices = [
-        *zip(sentences, changed_voices(sentences, num_voices=num_voices), strict=True),
-        *zip(words, changed_voices(words, num_voices=1), strict=True),
-    ]
-    return {utterance.utterance_id: blocks for utterance, blocks in voices}
-
-
 def speech_span(log_mel: NDArray[np.float16]) -> slice:
     """Frames without the long silence at both ends, of which a quarter of a second is left."""
     log_energy = np.asarray(log_mel[:, 0], dtype=np.float32)
     low, high = np.percentile(log_energy, [5, 95])
     loud = np.flatnonzero(log_energy >= low + 0.3 * (high - low))
     return slice(max(0, int(loud[0]) - _MARGIN_FRAMES), int(loud[-1]) + 1 + _MARGIN_FRAMES)
+
+
+def _samples_of(span: slice, num_frames: int) -> slice:
+    """Find the samples that so many frames from the beginning of a span are computed from."""
+    first = _HOP_SAMPLES * span.start
+    return slice(first, first + _HOP_SAMPLES * (num_frames - 1) + _WINDOW_SAMPLES)

@@ -1,26 +1,29 @@
-"""Log-mel features of corpora, kept on disk so that a second training run starts at once.
+"""Log-mel features and samples of corpora, kept on disk so that a second run starts at once.
 
-One file of 16-bit floats per corpus and way of computing, in the user's cache folder
-(``$XDG_CACHE_HOME/kouxing`` or ``~/.cache/kouxing``). Deleting it is always safe.
+One file per corpus and kind, of 16-bit floats or integers, in the user's cache folder
+(``$XDG_CACHE_HOME/kouxing`` or ``~/.cache/kouxing``). It is read where it lies, so that it may be
+larger than the memory. Deleting it is always safe.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import soundfile
 from numpy.typing import NDArray
 from rich.progress import track
 
-from services.recognizer.features import LogMel
+from services.recognizer.features import NUM_BANDS, LogMel
 from services.recognizer.resample import to_16_khz
 from training.corpus import RowErrors, Utterance
 
 _FORMAT = "3"  # raise when the front end's log-mel stage changes
+_FULL_SCALE = 32768.0  # samples are kept as 16-bit sound files keep them
 
 
 def cache_folder() -> Path:
@@ -57,74 +60,116 @@ def log_mel_of(
         Shape (frames, 41) each; None where the audio cannot be read (noted in ``errors``).
     """
     out: list[NDArray[np.float16] | None] = []
-    blocks = cached_blocks(utterances, "", 1, lambda _, samples: [_log_mel(samples)])
-    for utterance, block in zip(utterances, blocks, strict=True):
+    none = np.empty((0, 1 + NUM_BANDS), dtype=np.float16)
+    for utterance, block in zip(
+        utterances, _cached(utterances, "log_mel", none, _log_mel), strict=True
+    ):
         if len(block) == 0:
             errors.add(utterance.utterance_id, f"no audio in {utterance.path}")
         out.append(block if len(block) else None)
     return out
 
 
-def _log_mel(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    return LogMel().accept_waveform(samples)
+def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
+    """Fetch the samples of every utterance, 16 kHz; none where the audio cannot be read."""
+    return _cached(utterances, "samples", np.empty(0, dtype=np.int16), _as_integers)
 
 
-def cached_blocks(
+def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
+    """Return samples of the cache as numbers in [-1, 1]."""
+    return samples.astype(np.float32) / np.float32(_FULL_SCALE)
+
+
+def _log_mel(samples: NDArray[np.float32]) -> NDArray[np.float16]:
+    return LogMel().accept_waveform(samples).astype(np.float16)
+
+
+def _as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
+    whole = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
+    integers: NDArray[np.int16] = whole.astype(np.int16)
+    return integers
+
+
+def _cached(
     utterances: Sequence[Utterance],
-    way: str,
-    num_blocks: int,
-    blocks_of: Callable[[Utterance, NDArray[np.float32]], list[NDArray[np.float32]]],
-) -> list[NDArray[np.float16]]:
-    """Blocks of log-mel frames of every utterance, from the cache or computed.
+    kind: str,
+    none: NDArray[Any],
+    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+) -> list[NDArray[Any]]:
+    """Blocks of every utterance, from the cache or computed.
 
     Parameters
     ----------
     utterances
         Recordings; the cache knows them by path, size and time.
-    way
-        How the blocks are computed, in words: another way, another file.
-    num_blocks
-        Blocks of each recording.
-    blocks_of
-        Computes them from the utterance and its samples at 16 kHz, shape (n,).
+    kind
+        Of what is kept: another kind, another file.
+    none
+        A block of no rows, for a recording that cannot be read.
+    block_of
+        Computes a block from the samples at 16 kHz, shape (n,).
 
     Returns
     -------
     list
-        Shape (frames, 41) each, ``num_blocks`` per utterance in order; empty blocks where the
-        audio cannot be read.
+        A block per utterance, rows of the shape and the kind of ``none``; it stays on disk.
     """
     if not utterances:
         return []
-    key = hashlib.sha256((_FORMAT + way).encode())
+    key = hashlib.sha256(_FORMAT.encode())
     for utterance in utterances:
         state = utterance.path.stat()
         key.update(f"{utterance.path}|{state.st_size}|{state.st_mtime_ns}\n".encode())
-    stem = cache_folder() / f"log_mel_{key.hexdigest()[:20]}"
+    stem = cache_folder() / f"{kind}_{key.hexdigest()[:20]}"
     rows, bounds = stem.with_suffix(".npy"), stem.with_suffix(".bounds.npy")
     if not (rows.is_file() and bounds.is_file()):
-        blocks = [
-            block
-            for u in track(utterances, description="features")
-            for block in _computed(u, num_blocks, blocks_of)
-        ]
-        np.save(rows, np.concatenate(blocks))
-        np.save(bounds, np.cumsum([len(block) for block in blocks], dtype=np.int64))
+        _write(rows, bounds, utterances, none, block_of)
     ends = np.load(bounds, allow_pickle=False)
-    log_mel = np.load(rows, mmap_mode="r", allow_pickle=False)
     starts = np.concatenate([[0], ends[:-1]])
-    return [log_mel[start:end] for start, end in zip(starts, ends, strict=True)]
+    if not ends[-1]:
+        return [none] * len(ends)
+    kept = np.load(rows, mmap_mode="r", allow_pickle=False)
+    return [kept[start:end] for start, end in zip(starts, ends, strict=True)]
+
+
+def _write(
+    rows: Path,
+    bounds: Path,
+    utterances: Sequence[Utterance],
+    none: NDArray[Any],
+    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+) -> None:
+    """Write all blocks one after the other, and where each of them ends."""
+    ends = []
+    num_rows = 0
+    with rows.open("wb") as file:
+        _write_header(file, none, 0)  # numpy leaves room in it for any number of rows
+        for utterance in track(utterances, description=rows.stem.rpartition("_")[0]):
+            block = _computed(utterance, none, block_of)
+            file.write(np.ascontiguousarray(block).tobytes())
+            num_rows += len(block)
+            ends.append(num_rows)
+        file.seek(0)
+        _write_header(file, none, num_rows)
+    np.save(bounds, np.array(ends, dtype=np.int64))
+
+
+def _write_header(file: BinaryIO, none: NDArray[Any], num_rows: int) -> None:
+    header = {
+        "descr": np.lib.format.dtype_to_descr(none.dtype),
+        "fortran_order": False,
+        "shape": (num_rows, *none.shape[1:]),
+    }
+    np.lib.format.write_array_header_1_0(file, header)
 
 
 def _computed(
     utterance: Utterance,
-    num_blocks: int,
-    blocks_of: Callable[[Utterance, NDArray[np.float32]], list[NDArray[np.float32]]],
-) -> Iterator[NDArray[np.float16]]:
+    none: NDArray[Any],
+    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+) -> NDArray[Any]:
     try:
         samples = read_audio(utterance.path)
     except ValueError:
-        yield from [np.empty((0, 41), dtype=np.float16)] * num_blocks
-        return
-    for block in blocks_of(utterance, samples):
-        yield block.astype(np.float16)
+        return none
+    return block_of(samples)

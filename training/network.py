@@ -1,20 +1,22 @@
-"""The recurrent network of the neural recognizer, in PyTorch.
+"""The neural recognizer's network, in PyTorch: a transformer encoder that hears only the past.
 
-Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
-recurrent units); Sak et al. 2015, "Fast and accurate recurrent neural network acoustic models for
-speech recognition" (targets delayed against the input instead of future input).
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (Whisper:
+the encoder's layers, and the weights that training begins with); Vaswani et al. 2017, "Attention is
+all you need" (sinusoidal positions). The layers and the weights are those of Whisper's encoder;
+here a position attends to itself and to the ``WINDOW - 1`` positions before it instead of the whole
+recording, so that it can run live.
 
-======== =========================================================== ====================
+======== =========================================================== ============================
 symbol   meaning                                                     shape
-======== =========================================================== ====================
-x        normalised log energy and log-mel bands                     (batch, frames, 41)
-h        outputs of both recurrent layers                            (batch, frames, 2 H)
-y_d      log share of each state at frame t - d, known at frame t    (batch, frames, states)
-======== =========================================================== ====================
+======== =========================================================== ============================
+x        log-mel frames, two of zeros before the first               (batch, frames, 80)
+h        hidden positions, every other frame                         (batch, positions, width)
+y_d      log share of each state at two frames, known at position p  (batch, positions, 2, states)
+======== =========================================================== ============================
 
-One trunk serves every look-ahead d: each has an output layer of its own. The trunk sees nothing
-but the past and the present, so its delay is that of the output layer in use. The second task,
-phones of another language, has as many outputs, of which it uses some.
+Position ``p`` has heard the frames up to ``2 p + 2``. With a look-ahead of ``d`` frames it says the
+states of frames ``2 p + 2 - d`` and ``2 p + 3 - d``: the second of the two is heard a frame less
+ahead. One trunk serves every look-ahead: each has an output layer of its own.
 """
 
 from __future__ import annotations
@@ -23,47 +25,102 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import gelu, log_softmax, scaled_dot_product_attention
 
-from services.recognizer.features import NUM_BANDS
+from services.recognizer.neural import NUM_INPUTS, WINDOW, positions_of
 
-NUM_INPUTS = 1 + NUM_BANDS
-FRONT_FRAMES = 5  # that the first layer sees: the present and four before it
+FRAMES_BEFORE = 2  # of zeros, before a segment's first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shape:
-    """Sizes of a network."""
+    """Sizes of a network; the defaults are those of Whisper base."""
 
     num_states: int
-    look_aheads: tuple[int, ...]  # feature frames
-    front: int = 256  # width of the convolution
-    hidden: int = 256  # H, of each recurrent layer
+    look_aheads: tuple[int, ...]  # feature frames, 1 or more
+    width: int = 512
+    heads: int = 8
+    layers: int = 4
+    inner: int = 2048  # width inside a layer's second half
+
+
+class Layer(nn.Module):
+    """Attention to the past, then two products position by position; each adds to what comes in."""
+
+    def __init__(self, shape: Shape, dropout: float) -> None:
+        super().__init__()
+        self.heads = shape.heads
+        self.attention_norm = nn.LayerNorm(shape.width)
+        self.query_key_value = nn.Linear(shape.width, 3 * shape.width)
+        self.attended = nn.Linear(shape.width, shape.width)
+        self.inner_norm = nn.LayerNorm(shape.width)
+        self.inner = nn.Linear(shape.width, shape.inner)
+        self.outer = nn.Linear(shape.inner, shape.width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, hidden: Tensor, may_attend: Tensor) -> Tensor:
+        """(batch, positions, width) to the same; ``may_attend`` is (positions, positions)."""
+        batch, num_positions, width = hidden.shape
+        query, key, value = (
+            self.query_key_value(self.attention_norm(hidden))
+            .view(batch, num_positions, 3, self.heads, width // self.heads)
+            .permute(2, 0, 3, 1, 4)
+        )
+        seen = scaled_dot_product_attention(query, key, value, attn_mask=may_attend)
+        seen = seen.transpose(1, 2).reshape(batch, num_positions, width)
+        hidden = hidden + self.dropout(self.attended(seen))
+        inner = gelu(self.inner(self.inner_norm(hidden)))
+        out: Tensor = hidden + self.dropout(self.outer(inner))
+        return out
 
 
 class Network(nn.Module):
-    """Convolution over the last frames, two recurrent layers, an output layer per look-ahead."""
+    """Two convolutions, layers of attention to the past, an output layer per look-ahead."""
 
-    def __init__(self, shape: Shape, dropout: float = 0.15) -> None:
+    positions: Tensor  # (1500, width)
+
+    def __init__(self, shape: Shape, dropout: float = 0.1) -> None:
         super().__init__()
         self.shape = shape
-        self.front = nn.Conv1d(NUM_INPUTS, shape.front, FRONT_FRAMES)
-        self.first = nn.GRU(shape.front, shape.hidden, batch_first=True)
-        self.second = nn.GRU(shape.hidden, shape.hidden, batch_first=True)
-        self.heads = nn.ModuleList(
-            nn.Linear(2 * shape.hidden, shape.num_states) for _ in shape.look_aheads
+        self.first = nn.Conv1d(NUM_INPUTS, shape.width, 3)
+        self.second = nn.Conv1d(shape.width, shape.width, 3, stride=2)
+        self.register_buffer(
+            "positions", torch.from_numpy(positions_of(shape.width)), persistent=False
         )
-        self.second_task = nn.Linear(2 * shape.hidden, shape.num_states)
+        self.layers = nn.ModuleList(Layer(shape, dropout) for _ in range(shape.layers))
+        self.norm = nn.LayerNorm(shape.width)
+        self.outputs = nn.ModuleList(
+            nn.Linear(shape.width, 2 * shape.num_states) for _ in shape.look_aheads
+        )
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """Run the trunk from rest: (batch, frames, 41) to (batch, frames, 2 H).
+    def forward(self, frames: Tensor, start: int = 0) -> Tensor:
+        """Run the trunk on a segment: (batch, frames, 80) to (batch, positions, width).
 
-        Before the first frame stands that frame again.
+        There are ``(frames - 1) // 2`` positions.
+
+        ``start`` is the place of the first position, below ``MOST_POSITIONS`` with all that follow.
         """
-        past = frames[:, :1].expand(-1, FRONT_FRAMES - 1, -1)
-        seen = torch.cat([past, frames], dim=1).transpose(1, 2)
-        front = torch.relu(self.front(seen)).transpose(1, 2)
-        first, _ = self.first(self.dropout(front))
-        second, _ = self.second(self.dropout(first))
-        hidden: Tensor = self.dropout(torch.cat([first, second], dim=-1))
-        return hidden
+        before = frames.new_zeros((len(frames), FRAMES_BEFORE, NUM_INPUTS))
+        seen = torch.cat([before, frames], dim=1).transpose(1, 2)
+        hidden = gelu(self.second(gelu(self.first(seen)))).transpose(1, 2)
+        places = torch.arange(hidden.shape[1])
+        hidden = hidden + self.positions[start + places]
+        back = places[:, None] - places
+        may_attend = (back >= 0) & (back < WINDOW)
+        for layer in self.layers:
+            hidden = layer(hidden, may_attend)
+        out: Tensor = self.norm(hidden)
+        return out
+
+    def log_shares(self, hidden: Tensor, look_ahead: int) -> Tensor:
+        """(batch, positions, width) to (batch, positions, 2, states), of an output layer."""
+        batch, num_positions, _ = hidden.shape
+        logits = self.outputs[look_ahead](self.dropout(hidden))
+        return log_softmax(logits.view(batch, num_positions, 2, -1), dim=-1)
+
+
+def said_frames(num_positions: int, look_ahead_frames: int) -> Tensor:
+    """Numbers of the frames whose states each position says, (positions, 2); some before 0."""
+    first = 2 * torch.arange(num_positions) + 2 - look_ahead_frames
+    return torch.stack([first, first + 1], dim=1)

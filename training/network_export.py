@@ -1,15 +1,39 @@
-"""Write trained networks as ONNX, the form in which the recognizer runs them; read them again.
+"""Write a trained network as ONNX, the form in which the recognizer runs it; read it again.
 
-The graph is what :class:`training.network.Network` computes, a chunk of frames at a time with the
-recurrent layers' states coming in and going out, and the output layer chosen by its number. Several
-networks become one: side by side, the logits' mean in the end (Hansen and Salamon 1990, "Neural
-network ensembles"). Weights are kept as 16-bit floats, which halves the file; the sums are in 32
-bits.
+The graph is what :class:`training.network.Network` computes at one position, for any number of
+sessions at once: the keys and values of earlier positions come in, those of this one go out.
+
+======== ================================================================ ======================
+symbol   meaning                                                          shape
+======== ================================================================ ======================
+frames   the five frames that a position sees, oldest first               (rows, 400)
+place    its row of the sinusoidal table                                  (rows, width)
+head     number of the output layer                                       1
+past     0 where an earlier position stands and in the last place;        (sessions, 1, 1, 128)
+         elsewhere minus infinity
+keys_l   keys of earlier positions in layer l, in any order; zeros in     (sessions, heads, size,
+         the last place, which the position itself takes                  128)
+values_l their values                                                     (sessions, heads, 128,
+                                                                          size)
+shares   log shares of the states at two frames                           (rows, 2, states)
+keys     keys of this position                                            (rows, layers, heads,
+                                                                          size)
+values   its values                                                       (rows, layers, heads,
+                                                                          size)
+======== ================================================================ ======================
+
+There are as many rows as sessions, or two rows of a single session: then both are the same.
+
+Weights are kept in 8 bits with a scale for each output, and onnxruntime multiplies with them as
+they are (its operator MatMulNBits), after it has rounded what comes in to 8 bits too, with a scale
+for every 32 numbers: a network that runs a position at a time is as slow as its weights are long,
+since all of them pass through the processor for a few products each. Norms and biases are floats.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import onnx
@@ -17,99 +41,47 @@ import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from training.network import FRONT_FRAMES, NUM_INPUTS, Network, Shape
+from services.recognizer.neural import NUM_INPUTS, SEEN_FRAMES, WINDOW
+from training.network import Network, Shape
 
-_OPERATORS = 17  # version of the ONNX operator set
-_FORMAT = 8  # version of the ONNX file format
+_OPERATORS = 20  # version of the ONNX operator set
+_FORMAT = 9  # version of the ONNX file format
+_OWN_DOMAIN = "com.microsoft"  # of onnxruntime's own operators
+_BITS = 8
+_ZERO = 128  # the integer that stands for a weight of 0
 _LARGEST_INTEGER = 127
 _LEAST_SCALE = 1e-12
+_BLOCK = 32  # inputs that are rounded together
+_IN_INTEGERS = 4  # the operator's accuracy level at which it multiplies integers
+_EPSILON = 1e-5  # of the norms, as PyTorch's
+
+Floats = NDArray[np.float32]
 
 
-def onnx_of(networks: Sequence[Network], *, second_task: bool = False) -> NDArray[np.uint8]:
-    """Return the bytes of an ONNX file.
-
-    Its inputs are ``x`` (frames, batch, 205), the last five frames, oldest first; ``h1`` and ``h2``
-    (1, batch, networks H), the states of the recurrent layers; and ``head``, the number of the
-    output layer. Its outputs are log shares (frames, batch, states) and the new states.
+def onnx_of(network: Network, *, exact: bool = False) -> NDArray[np.uint8]:
+    """Return the bytes of an ONNX file, with inputs and outputs as in the table above.
 
     Parameters
     ----------
-    networks
-        Networks of one shape.
-    second_task
-        Offer the output layer of the second task instead of the others.
+    network
+        A network.
+    exact
+        Keep the weights as floats: the file is four times as long, and slower.
     """
-    shape = networks[0].shape
-    parameters = [
-        {name: tensor.numpy() for name, tensor in one.state_dict().items()} for one in networks
-    ]
-    heads = [f"heads.{head}" for head in range(len(shape.look_aheads))]
-    if second_task:
-        heads = ["second_task"]
-    fronts = [one["front.weight"].transpose(2, 1, 0) for one in parameters]
-    weights = {
-        "front_weight": _beside([front.reshape(-1, shape.front) for front in fronts]),
-        "front_bias": _beside([one["front.bias"] for one in parameters]),
-        "head_weight": np.stack(
-            [np.concatenate([one[f"{head}.weight"].T for one in parameters]) for head in heads]
-        ),
-        "head_bias": np.stack(
-            [np.sum([one[f"{head}.bias"] for one in parameters], axis=0) for head in heads]
-        ),
-    }
-    for number, one in enumerate(parameters):
-        weights |= _recurrent("first", number, one) | _recurrent("second", number, one)
-    stored = [_stored(name, array) for name, array in weights.items()]
-    constants = [
-        numpy_helper.from_array(np.array([1]), "axis"),
-        numpy_helper.from_array(np.array(len(networks), np.float32), "networks"),
-    ]
-    numbers = range(len(networks))
-    nodes = [
-        *(node for _, made in stored for node in made),
-        helper.make_node("MatMul", ["x", "front_weight"], ["front_product"]),
-        helper.make_node("Add", ["front_product", "front_bias"], ["front_sum"]),
-        helper.make_node("Relu", ["front_sum"], ["front"]),
-        *(_split(name, numbers) for name in ("front", "h1", "h2")),
-        *(node for number in numbers for node in _layers(number, shape.hidden)),
-        *(_joined(f"h{layer}_after", numbers) for layer in (1, 2)),
-        helper.make_node(
-            "Concat", [f"{n}_{k}" for k in numbers for n in ("first", "second")], ["both"], axis=2
-        ),
-        helper.make_node("Gather", ["head_weight", "head"], ["weight"], axis=0),
-        helper.make_node("Gather", ["head_bias", "head"], ["bias"], axis=0),
-        helper.make_node("MatMul", ["both", "weight"], ["product"]),
-        helper.make_node("Add", ["product", "bias"], ["sum"]),
-        helper.make_node("Div", ["sum", "networks"], ["logits"]),
-        helper.make_node("LogSoftmax", ["logits"], ["log_share"], axis=-1),
-    ]
-    state: list[int | str] = [1, "batch", len(networks) * shape.hidden]
-    graph = helper.make_graph(
-        nodes,
-        "recurrent acoustic model",
-        inputs=[
-            _value("x", ["frames", "batch", FRONT_FRAMES * NUM_INPUTS]),
-            _value("h1", state),
-            _value("h2", state),
-            helper.make_tensor_value_info("head", TensorProto.INT64, []),
-        ],
-        outputs=[
-            _value("log_share", ["frames", "batch", shape.num_states]),
-            _value("h1_after", state),
-            _value("h2_after", state),
-        ],
-        initializer=[*(tensor for tensors, _ in stored for tensor in tensors), *constants],
+    parameters = {name: tensor.cpu().numpy() for name, tensor in network.state_dict().items()}
+    graph = _Graph(network.shape, parameters, exact=exact)
+    graph.write()
+    model = helper.make_model(
+        graph.proto(),
+        opset_imports=[helper.make_opsetid("", _OPERATORS), helper.make_opsetid(_OWN_DOMAIN, 1)],
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPERATORS)])
     model.ir_version = _FORMAT
     onnx.checker.check_model(model)
     return np.frombuffer(model.SerializeToString(), dtype=np.uint8)
 
 
-def networks_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> list[Network]:
-    """Return the networks in an ONNX file that :func:`onnx_of` has made, to train them further.
-
-    The output layer of a second task is not in the file: it begins anew.
+def network_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> Network:
+    """Return the network in an ONNX file that :func:`onnx_of` has made, to train it further.
 
     Parameters
     ----------
@@ -127,113 +99,239 @@ def networks_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> list[Net
         tensor.name: numpy_helper.to_array(tensor)
         for tensor in onnx.load_model_from_string(file.tobytes()).graph.initializer
     }
-    weights = {name: array for name, array in stored.items() if "bias" in name} | {
-        name.removesuffix("_8"): array * stored[f"{name.removesuffix('_8')}_scale"]
-        for name, array in stored.items()
-        if name.endswith("_8")
-    }
-    num_networks = int(stored["networks"])
-    fronts = np.split(weights["front_weight"], num_networks, axis=-1)
-    front_biases = np.split(weights["front_bias"], num_networks)
-    heads = np.split(weights["head_weight"], num_networks, axis=1)
-    head_biases = weights["head_bias"] / num_networks
-    networks = []
-    for number in range(num_networks):
-        front = fronts[number].reshape(FRONT_FRAMES, NUM_INPUTS, -1).transpose(2, 1, 0)
-        shape = Shape(
-            num_states=head_biases.shape[1],
-            look_aheads=tuple(look_aheads),
-            front=len(front),
-            hidden=heads[number].shape[1] // 2,
-        )
-        parameters = {"front.weight": front, "front.bias": front_biases[number]}
-        for layer in ("first", "second"):
-            parameters[f"{layer}.weight_ih_l0"] = _swapped(weights[f"{layer}_input_{number}"][0])
-            parameters[f"{layer}.weight_hh_l0"] = _swapped(weights[f"{layer}_state_{number}"][0])
-            of_input, of_state = np.split(weights[f"{layer}_bias_{number}"][0], 2)
-            parameters[f"{layer}.bias_ih_l0"] = _swapped(of_input)
-            parameters[f"{layer}.bias_hh_l0"] = _swapped(of_state)
-        for head in range(len(look_aheads)):
-            parameters[f"heads.{head}.weight"] = heads[number][head].T
-            parameters[f"heads.{head}.bias"] = head_biases[head]
-        network = Network(shape)
-        network.load_state_dict(
-            {name: torch.from_numpy(array.copy()) for name, array in parameters.items()}
-            | {f"second_task.{k}": v for k, v in network.second_task.state_dict().items()}
-        )
-        networks.append(network)
-    return networks
+    biases = {name: array for name, array in stored.items() if name.endswith(".bias")}
+    shape = Shape(
+        num_states=len(biases["outputs.0.bias"]) // 2,
+        look_aheads=tuple(look_aheads),
+        width=len(biases["second.bias"]),
+        heads=int(stored["by_head"][1]) // 3,
+        layers=sum(name.endswith(".outer.bias") for name in biases),
+        inner=len(biases["layers.0.inner.bias"]),
+    )
+    network = Network(shape)
+    scale = 1 / _query_scale(shape)
+    parameters = {}
+    for name, of_network in network.state_dict().items():
+        num_inputs = of_network.numel() // len(of_network)
+        array = biases[name] if name in biases else _read_weight(stored, name, num_inputs)
+        if ".query_key_value." in name:
+            array = _scaled_query(array, scale)
+        if of_network.dim() == 3:  # a convolution: the numbers of each frame stand together
+            array = array.reshape(len(array), 3, -1).transpose(0, 2, 1)
+        parameters[name] = torch.from_numpy(array.copy())
+    network.load_state_dict(parameters)
+    return network
 
 
-def _beside(arrays: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    return np.concatenate(arrays, axis=-1)
+def _query_scale(shape: Shape) -> float:
+    """Scale of the products of queries and keys in attention; here it is in the weights."""
+    return float((shape.width // shape.heads) ** -0.5)
 
 
-def _stored(
-    name: str, array: NDArray[np.float32]
-) -> tuple[list[onnx.TensorProto], list[onnx.NodeProto]]:
-    """Keep weights in 8 bits: return what stands in the file, and what makes floats of it.
-
-    onnxruntime does this once, when it loads the file.
-    """
-    if "bias" in name:
-        return [numpy_helper.from_array(array, name)], []
-    summed = -1 if name.startswith(("first", "second")) else -2  # axis that a product sums over
-    scale = np.abs(array).max(axis=summed, keepdims=True) / _LARGEST_INTEGER
-    integers = np.rint(array / np.maximum(scale, _LEAST_SCALE)).astype(np.int8)
-    tensors = [
-        numpy_helper.from_array(integers, f"{name}_8"),
-        numpy_helper.from_array(scale, f"{name}_scale"),
-    ]
-    nodes = [
-        helper.make_node("Cast", [f"{name}_8"], [f"{name}_whole"], to=TensorProto.FLOAT),
-        helper.make_node("Mul", [f"{name}_whole", f"{name}_scale"], [name]),
-    ]
-    return tensors, nodes
+def _scaled_query(array: Floats, scale: float) -> Floats:
+    """Scale the queries' third of weights or biases, (3 width, ...)."""
+    query, rest = np.split(array, [len(array) // 3])
+    return np.concatenate([query * np.float32(scale), rest])
 
 
-def _value(name: str, shape: list[int | str]) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+def _read_weight(stored: Mapping[str, NDArray[Any]], name: str, num_inputs: int) -> Floats:
+    if name in stored:
+        return np.asarray(stored[name], dtype=np.float32)
+    if f"{name}.turned" in stored:
+        return np.asarray(stored[f"{name}.turned"].T, dtype=np.float32)
+    integers, scales = stored[f"{name}.integers"], stored[f"{name}.scales"]
+    blocks = (integers.astype(np.float32) - _ZERO) * scales[..., None]
+    return np.asarray(blocks.reshape(len(blocks), -1)[:, :num_inputs])
 
 
-def _split(name: str, numbers: Sequence[int]) -> onnx.NodeProto:
-    """Give every network its part of what stands side by side."""
-    return helper.make_node("Split", [name], [f"{name}_{number}" for number in numbers], axis=2)
+class _Graph:
+    """The nodes and tensors of a network, in the order in which they are computed."""
 
+    def __init__(self, shape: Shape, parameters: Mapping[str, Floats], *, exact: bool) -> None:
+        self._shape = shape
+        self._parameters = parameters
+        self._exact = exact
+        self._nodes: list[onnx.NodeProto] = []
+        self._num_nodes = 0
+        self._tensors: list[onnx.TensorProto] = []
 
-def _joined(name: str, numbers: Sequence[int]) -> onnx.NodeProto:
-    return helper.make_node("Concat", [f"{name}_{number}" for number in numbers], [name], axis=2)
+    def write(self) -> None:
+        """Write the whole network."""
+        shape = self._shape
+        size = shape.width // shape.heads
+        self._constant("by_head", np.array([-1, 3 * shape.heads, 1, size]))
+        self._constant("in_a_row", np.array([-1, shape.width]))
+        self._constant("of_layer", np.array([-1, 1, shape.heads, size]))
+        self._constant("by_frame", np.array([-1, 2, shape.num_states]))
+        self._constant("thirds", np.full(3, shape.heads))
+        self._constant("own_place", (np.arange(WINDOW) == WINDOW - 1).astype(np.float32))
+        self._constant("before_last", np.array([WINDOW - 1]))
+        self._constant("after_last", np.array([WINDOW]))
+        self._constant("last_axis", np.array([-1]))
+        hidden = self._front()
+        for number in range(shape.layers):
+            hidden = self._layer(f"layers.{number}", hidden, number)
+        hidden = self._norm("norm", hidden)
+        self._node("Identity", [self._outputs(hidden, 0)], "shares")
+        for kind in ("keys", "values"):
+            news = [f"{kind}_{number}_own" for number in range(shape.layers)]
+            self._node("Concat", news, kind, axis=1)
 
-
-def _recurrent(
-    name: str, number: int, parameters: dict[str, NDArray[np.float32]]
-) -> dict[str, NDArray[np.float32]]:
-
-    def swapped(kind: str) -> NDArray[np.float32]:
-        return _swapped(parameters[f"{name}.{kind}_l0"])[None]
-
-    return {
-        f"{name}_input_{number}": swapped("weight_ih"),
-        f"{name}_state_{number}": swapped("weight_hh"),
-        f"{name}_bias_{number}": np.concatenate([swapped("bias_ih"), swapped("bias_hh")], axis=1),
-    }
-
-
-def _swapped(gates: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Change between ONNX's order of the gates (update, reset, new) and PyTorch's (reset first)."""
-    first, second, new = np.split(gates, 3)
-    return np.concatenate([second, first, new])
-
-
-def _layers(number: int, hidden: int) -> list[onnx.NodeProto]:
-    """Both recurrent layers of a network."""
-    nodes = []
-    for name, below, state in (("first", "front", "h1"), ("second", "first", "h2")):
-        weights = [f"{name}_{kind}_{number}" for kind in ("input", "state", "bias")]
-        inputs = [f"{below}_{number}", *weights, "", f"{state}_{number}"]
-        outputs = [f"{name}_directions_{number}", f"{state}_after_{number}"]
-        nodes += [
-            helper.make_node("GRU", inputs, outputs, hidden_size=hidden, linear_before_reset=1),
-            helper.make_node("Squeeze", [outputs[0], "axis"], [f"{name}_{number}"]),
+    def proto(self) -> onnx.GraphProto:
+        """Return the graph."""
+        shape = self._shape
+        size = shape.width // shape.heads
+        sizes: dict[str, list[int | str]] = {"keys": [size, WINDOW], "values": [WINDOW, size]}
+        caches = [
+            _value(f"{kind}_{number}", ["sessions", shape.heads, *sizes[kind]])
+            for kind in sizes
+            for number in range(shape.layers)
         ]
-    return nodes
+        shares = _value("shares", ["rows", 2, shape.num_states])
+        own: list[int | str] = ["rows", shape.layers, shape.heads, size]
+        return helper.make_graph(
+            self._nodes,
+            "transformer acoustic model",
+            inputs=[
+                _value("frames", ["rows", SEEN_FRAMES * NUM_INPUTS]),
+                _value("place", ["rows", shape.width]),
+                helper.make_tensor_value_info("head", TensorProto.INT64, []),
+                _value("past", ["sessions", 1, 1, WINDOW]),
+                *caches,
+            ],
+            outputs=[shares, _value("keys", own), _value("values", own)],
+            initializer=self._tensors,
+        )
+
+    def _front(self) -> str:
+        """Both convolutions: the first at three places, which the second joins."""
+        self._constant("frame_axis", np.array([1]))
+        pieces = []
+        for place in range(3):
+            start, end = f"start_{place}", f"end_{place}"
+            self._constant(start, np.array([place * NUM_INPUTS]))
+            self._constant(end, np.array([(place + 3) * NUM_INPUTS]))
+            pieces.append(self._node("Slice", ["frames", start, end, "frame_axis"]))
+        self._constant("at_places", np.array([-1, 3 * NUM_INPUTS]))
+        self._constant("of_places", np.array([-1, 3 * self._shape.width]))
+        seen = self._node("Concat", pieces, axis=1)
+        seen = self._node("Reshape", [seen, "at_places"])
+        first = self._node("Gelu", [self._product("first", seen)])
+        first = self._node("Reshape", [first, "of_places"])
+        second = self._node("Gelu", [self._product("second", first)])
+        return self._node("Add", [second, "place"])
+
+    def _layer(self, name: str, hidden: str, number: int) -> str:
+        joint = self._product(
+            f"{name}.query_key_value", self._norm(f"{name}.attention_norm", hidden)
+        )
+        joint = self._node("Reshape", [joint, "by_head"])
+        query, key, value = (f"{name}.{kind}" for kind in ("query", "key", "value"))
+        self._nodes.append(
+            helper.make_node("Split", [joint, "thirds"], [query, key, value], axis=1)
+        )
+        seen = self._node("Reshape", [self._attention(query, key, value, number), "in_a_row"])
+        hidden = self._node("Add", [hidden, self._product(f"{name}.attended", seen)])
+        for kind, own in (("keys", key), ("values", value)):
+            self._node("Reshape", [own, "of_layer"], f"{kind}_{number}_own")
+        inner = self._product(f"{name}.inner", self._norm(f"{name}.inner_norm", hidden))
+        outer = self._product(f"{name}.outer", self._node("Gelu", [inner]))
+        return self._node("Add", [hidden, outer])
+
+    def _attention(self, query: str, key: str, value: str, number: int) -> str:
+        """Attend to the past and to the position itself, (rows, heads, 1, size)."""
+        past = self._node("MatMul", [query, f"keys_{number}"])
+        past = self._node("Add", [past, "past"])
+        own = self._node("ReduceSum", [self._node("Mul", [query, key]), "last_axis"], keepdims=1)
+        own = self._node("Mul", [own, "own_place"])
+        weights = self._node("Softmax", [self._node("Add", [past, own])], axis=-1)
+        seen = self._node("MatMul", [weights, f"values_{number}"])
+        own = self._node("Slice", [weights, "before_last", "after_last", "last_axis"])
+        return self._node("Add", [seen, self._node("Mul", [own, value])])
+
+    def _outputs(self, hidden: str, number: int) -> str:
+        """Compute the output layer that is asked for, of those from a number on; or nothing."""
+        shape = self._shape
+        if number == len(shape.look_aheads):
+            nothing = numpy_helper.from_array(np.zeros((0, 2, shape.num_states), np.float32))
+            return self._node("Constant", [], value=nothing)
+        self._constant(f"number_{number}", np.array(number))
+        asked = self._node("Equal", ["head", f"number_{number}"])
+
+        def this() -> str:
+            logits = self._node("Reshape", [self._product(f"outputs.{number}", hidden), "by_frame"])
+            return self._node("LogSoftmax", [logits], axis=-1)
+
+        branches = {
+            "then_branch": self._branch(f"output_{number}", this),
+            "else_branch": self._branch(f"not_{number}", lambda: self._outputs(hidden, number + 1)),
+        }
+        return self._node("If", [asked], **branches)
+
+    def _branch(self, name: str, write: Callable[[], str]) -> onnx.GraphProto:
+        """Write nodes as a graph of their own; its tensors stand with all others."""
+        outside, self._nodes = self._nodes, []
+        output = write()
+        result = _value(output, ["some_rows", 2, self._shape.num_states])
+        graph = helper.make_graph(self._nodes, name, [], [result])
+        self._nodes = outside
+        return graph
+
+    def _norm(self, name: str, hidden: str) -> str:
+        for kind in ("weight", "bias"):
+            self._constant(f"{name}.{kind}", self._parameters[f"{name}.{kind}"])
+        inputs = [hidden, f"{name}.weight", f"{name}.bias"]
+        return self._node("LayerNormalization", inputs, epsilon=_EPSILON)
+
+    def _product(self, name: str, inputs: str) -> str:
+        """Multiply rows with a weight and add a bias."""
+        weight, bias = (self._parameters[f"{name}.{kind}"] for kind in ("weight", "bias"))
+        if weight.ndim == 3:  # a convolution: the numbers of each frame together
+            weight = weight.transpose(0, 2, 1).reshape(len(weight), -1)
+        if name.endswith(".query_key_value"):
+            scale = _query_scale(self._shape)
+            weight, bias = _scaled_query(weight, scale), _scaled_query(bias, scale)
+        self._constant(f"{name}.bias", bias)
+        name, added = f"{name}.weight", f"{name}.bias"
+        if self._exact:
+            self._constant(f"{name}.turned", weight.T)
+            return self._node("Add", [self._node("MatMul", [inputs, f"{name}.turned"]), added])
+        integers, scales = _in_integers(weight)
+        self._constant(f"{name}.integers", integers)
+        self._constant(f"{name}.scales", scales)
+        return self._node(
+            "MatMulNBits",
+            [inputs, f"{name}.integers", f"{name}.scales", "", "", added],
+            domain=_OWN_DOMAIN,
+            K=weight.shape[1],
+            N=len(weight),
+            bits=_BITS,
+            block_size=_BLOCK,
+            accuracy_level=_IN_INTEGERS,
+        )
+
+    def _constant(self, name: str, array: NDArray[Any]) -> None:
+        self._tensors.append(numpy_helper.from_array(array.copy(order="C"), name))
+
+    def _node(self, kind: str, inputs: Sequence[str], output: str = "", **settings: Any) -> str:
+        self._num_nodes += 1
+        output = output or f"{kind}_{self._num_nodes}"
+        self._nodes.append(helper.make_node(kind, inputs, [output], **settings))
+        return output
+
+
+def _in_integers(weight: Floats) -> tuple[NDArray[np.uint8], Floats]:
+    """Round a weight, (outputs, inputs): integers (outputs, blocks, 32) and their scales.
+
+    All blocks of an output have the same scale.
+    """
+    num_blocks = -(-weight.shape[1] // _BLOCK)
+    scale = np.maximum(np.abs(weight).max(axis=1) / _LARGEST_INTEGER, _LEAST_SCALE)
+    padded = np.zeros((len(weight), num_blocks * _BLOCK), np.float32)
+    padded[:, : weight.shape[1]] = weight / scale[:, None]
+    integers = (np.rint(padded) + _ZERO).astype(np.uint8).reshape(len(weight), num_blocks, _BLOCK)
+    return integers, np.repeat(scale[:, None], num_blocks, axis=1).astype(np.float32)
+
+
+def _value(name: str, shape: Sequence[int | str]) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)

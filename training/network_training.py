@@ -1,14 +1,29 @@
-"""Train the recurrent network on aligned frames, with a second language as a second task.
+"""Train the network on sounds whose frames are aligned with states, changed anew each time.
 
 Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition"
-(cross-entropy on the states of a forced alignment); Huang et al. 2013, "Cross-language knowledge
-transfer using multilingual deep neural network with shared hidden layers" (the second task); Park
-et al. 2019, "SpecAugment" (masks); Kingma and Ba 2015, "Adam"; Polyak and Juditsky 1992 (running
-mean of the weights).
+(cross-entropy on the states of a forced alignment); Loshchilov and Hutter 2019, "Decoupled weight
+decay regularization" (AdamW); Polyak and Juditsky 1992 (running mean of the weights).
+
+Layers that come with weights learn slowly, what begins anew learns faster, and the convolutions
+stay as they are. The rate rises for some steps, stays, and falls to nothing:
+
+    rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N)) * min(1, (N - n) / (0.6 N))
+
+    loss = H(main output) + H(another output) / 2, the others in turn
+
+======== ============================================================= ================
+symbol   meaning                                                       shape
+======== ============================================================= ================
+n, N     number of a step, of all steps                                1
+H        mean cross-entropy of an output's states, nats a frame        1
+m        running mean of the weights:                                  as the weights
+         m += (1 - min(0.99, (n + 1) / (n + 10))) (weights - m)
+======== ============================================================= ================
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -17,62 +32,42 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn.functional import log_softmax
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 
-from services.recognizer.features import LiveMean
-from training.augmentation import Augmentation
-from training.network import NUM_INPUTS, Network
+from services.recognizer.neural import MOST_POSITIONS, NUM_INPUTS
+from services.recognizer.whisper_mel import WhisperMel
+from training.feature_cache import as_floats
+from training.network import Network, said_frames
+from training.sound_change import changed_sound, changed_tempo, frames_before, levelled, mask
 
-_BATCH_FRAMES = 5000
-_MOST_FRAMES = 500  # of a recording in a batch; longer ones are cut
-_POOL_BATCHES = 12  # recordings of like length are taken from so many batches' worth
-_RATE = 1.5e-3
-_WARM_UP_STEPS = 150
-_FALL_SHARE = 0.3  # of the steps, at the end, over which the rate falls to nothing
-_HEADS_ALONE_SHARE = 0.08  # of the steps, at the very end
-_LONGEST_GRADIENT = 2.0
-_MEMORY = 0.998  # of the running mean of the weights, per step
-_AUGMENTED_SHARE = 0.85
-_KNOWN_SPEAKER_SHARE = 0.4  # of the recordings, heard as if the speaker had spoken before
-_OTHERS_WEIGHT = 0.5  # of the losses of other output layers than the main one
-_MOST_MASKED_FRAMES, _MOST_MASKED_BANDS = 12, 7
+BATCH_S = 30  # of sound
+_BATCH_FRAMES = 100 * BATCH_S
+_MOST_FRAMES = 800  # of a recording in a batch; longer ones are cut
+_POOL_BATCHES = 8  # recordings of like length are taken from so many batches' worth
+_LATEST_START = 900  # position of a crop's first, as if it came from the middle of long speech
+_RATE = 2e-4  # of the layers
+_NEW_RATE = 1.2e-3  # of the last norm and the output layers
+_NEW = ("norm.", "outputs.")
+_KEPT = ("first.", "second.")
+_WEIGHT_DECAY = 0.01
+_WARM_UP_STEPS = 60
+_MOST_WARM_UP = 0.2  # of the steps
+_FALL_SHARE = 0.6  # of the steps, at the end, over which the rate falls to nothing
+_LONGEST_GRADIENT = 1.0
+_LONGEST_MEMORY = 0.99  # of the running mean of the weights, per step
+_OTHERS_WEIGHT = 0.5  # of the losses of other outputs than the main one
+_CHANGED_SHARE = 0.9
+_TEMPO_SHARE = 0.5
 NO_TARGET = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """What the network hears: one sentence in one or several voices."""
+    """What the network hears."""
 
-    voices: tuple[NDArray[np.float16], ...]  # (frames, 41) each
-    targets: NDArray[np.int64]  # (frames,) states; those of the second task follow the others
+    samples: NDArray[np.int16]  # (n,) 16 kHz
+    targets: NDArray[np.int64]  # (frames,) states
     weight: float  # how often it is heard against the others
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrontEnd:
-    """How log-mel frames are normalised before the network."""
-
-    prior_mean: NDArray[np.float32]  # (41,)
-    spread: NDArray[np.float32]  # (41,)
-
-    @classmethod
-    def measure(cls, recordings: Sequence[Recording]) -> FrontEnd:
-        """Mean and standard deviation over some of the recordings."""
-        some = recordings[:: max(1, len(recordings) // 300)]
-        log_mels = [recording.voices[0].astype(np.float32) for recording in some]
-        return cls(
-            prior_mean=np.mean([frames.mean(axis=0) for frames in log_mels], axis=0),
-            spread=np.mean([frames.std(axis=0) for frames in log_mels], axis=0),
-        )
-
-    def normalise(self, log_mel: NDArray[np.float32], *, known: bool) -> NDArray[np.float32]:
-        """Normalise as a live session would; ``known``: the speaker has spoken before."""
-        mean = LiveMean(self.prior_mean)
-        if known:
-            mean.normalise(log_mel)
-        normalised: NDArray[np.float32] = mean.normalise(log_mel) / self.spread
-        return normalised
 
 
 class Trainer:
@@ -82,33 +77,35 @@ class Trainer:
     ----------
     network
         The network; trained in place.
-    front_end
-        Normalisation.
     recordings
         With the states of their frames.
-    main_head
+    main_output
         Output layer that learns in every step; each step another one learns besides.
     seed
-        Of order and augmentation.
+        Of order and changes of the sound. The network's dropout takes PyTorch's own.
     """
 
     def __init__(
-        self,
-        network: Network,
-        front_end: FrontEnd,
-        recordings: Sequence[Recording],
-        *,
-        main_head: int,
-        seed: int,
+        self, network: Network, recordings: Sequence[Recording], *, main_output: int, seed: int
     ) -> None:
         self.network = network
-        average = get_ema_multi_avg_fn(_MEMORY)  # type: ignore[no-untyped-call]
-        self._averaged = AveragedModel(network, multi_avg_fn=average)
-        self.front_end = front_end
+        self.main_output = main_output
+        self._averaged = AveragedModel(network, avg_fn=_nearer)
+        self._averaged.eval()
         self._rng = np.random.default_rng(seed)
-        self.main_head = main_head
         self.replace_recordings(recordings)
-        self._optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=0.01)
+        slow: list[nn.Parameter] = []
+        fast: list[nn.Parameter] = []
+        for name, parameter in network.named_parameters():
+            if name.startswith(_KEPT):
+                parameter.requires_grad_(False)
+            else:
+                (fast if name.startswith(_NEW) else slow).append(parameter)
+        self._learning = [*slow, *fast]
+        self._rates = (_RATE, _NEW_RATE)
+        self._optimizer = torch.optim.AdamW(
+            [{"params": slow}, {"params": fast}], weight_decay=_WEIGHT_DECAY
+        )
 
     @property
     def mean(self) -> Network:
@@ -122,78 +119,54 @@ class Trainer:
     def train(self, num_steps: int, watch: Callable[[int, float], None]) -> None:
         """Take steps; the learning rate rises, stays, and falls to nothing.
 
-        In the last steps only the output layers learn, all of them, from a trunk that stays.
         ``watch`` is told, after each step, how many there were and the loss of the main output
-        layer in nats a frame.
+        in nats a frame.
         """
-        num_heads_alone = round(_HEADS_ALONE_SHARE * num_steps)
-        num_whole = num_steps - num_heads_alone
-        fall_steps = _FALL_SHARE * num_whole
-        for step in range(num_whole):
-            rise = min(1.0, (step + 1) / _WARM_UP_STEPS)
-            fall = min(1.0, (num_whole - step) / fall_steps)
-            watch(step + 1, self._step(step, _RATE * rise * fall))
-        for step in range(num_heads_alone):
-            rate = _RATE * (1 - step / num_heads_alone)
-            watch(num_whole + step + 1, self._step_of_heads(rate))
+        warm_up_steps = min(_WARM_UP_STEPS, _MOST_WARM_UP * num_steps)
+        for step in range(num_steps):
+            rise = min(1.0, (step + 1) / warm_up_steps)
+            fall = min(1.0, (num_steps - step) / (_FALL_SHARE * num_steps))
+            watch(step + 1, self._step(step, rise * fall))
 
-    def _step(self, number: int, rate: float) -> float:
-        """Learn from one batch; return the mean cross-entropy of the main output layer."""
+    def _step(self, number: int, share: float) -> float:
+        """Learn from one batch; return the mean cross-entropy of the main output."""
         self.network.train()
         frames, targets = next(self._batches)
-        hidden = self.network(frames)
-        loss = _cross_entropy(*self._log_shares(hidden, targets, self.main_head))
+        start = 0 if self._rng.random() < 0.5 else int(self._rng.integers(_LATEST_START))
+        hidden = self.network(frames, start)
+        loss = self._loss(hidden, targets, self.main_output)
         main_loss = float(loss.detach())
-        others = [head for head in range(len(self.network.heads)) if head != self.main_head]
+        others = [k for k in range(len(self.network.outputs)) if k != self.main_output]
         if others:
-            other = self._log_shares(hidden, targets, others[number % len(others)])
-            loss = loss + _OTHERS_WEIGHT * _cross_entropy(*other)
-        second = targets - self.network.shape.num_states
-        if (second >= 0).any():
-            delay = self.network.shape.look_aheads[self.main_head]
-            log_shares = log_softmax(self.network.second_task(hidden[:, delay:]), dim=-1)
-            due = second[:, : hidden.shape[1] - delay]
-            loss = loss + _OTHERS_WEIGHT * _cross_entropy(log_shares, due)
-        self._learn(loss, rate)
-        return main_loss
-
-    def _step_of_heads(self, rate: float) -> float:
-        self.network.train()
-        frames, targets = next(self._batches)
-        with torch.no_grad():
-            hidden = self.network(frames)
-        losses = [
-            _cross_entropy(*self._log_shares(hidden, targets, head))
-            for head in range(len(self.network.heads))
-        ]
-        self._learn(torch.stack(losses).sum(), rate)
-        return float(losses[self.main_head].detach())
-
-    def _log_shares(self, hidden: Tensor, targets: Tensor, head: int) -> tuple[Tensor, Tensor]:
-        """Return what an output layer says, and the states it ought to say."""
-        delay = self.network.shape.look_aheads[head]
-        log_shares = log_softmax(self.network.heads[head](hidden[:, delay:]), dim=-1)
-        due = targets[:, : hidden.shape[1] - delay]
-        return log_shares, torch.where(due < self.network.shape.num_states, due, NO_TARGET)
-
-    def _learn(self, loss: Tensor, rate: float) -> None:
-        for group in self._optimizer.param_groups:
-            group["lr"] = rate
+            other = others[number % len(others)]
+            loss = loss + _OTHERS_WEIGHT * self._loss(hidden, targets, other)
+        for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = share * rate
         self._optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
+        nn.utils.clip_grad_norm_(self._learning, _LONGEST_GRADIENT)
         self._optimizer.step()
         self._averaged.update_parameters(self.network)
+        return main_loss
+
+    def _loss(self, hidden: Tensor, targets: Tensor, output: int) -> Tensor:
+        """Mean cross-entropy of what an output says, nats a frame that has a target."""
+        log_shares = self.network.log_shares(hidden, output)
+        due = due_states(targets, hidden.shape[1], self.network.shape.look_aheads[output])
+        known = due != NO_TARGET
+        said = log_shares.gather(-1, due.clamp(min=0)[..., None])[..., 0]
+        return -(said * known).sum() / max(1, int(known.sum()))
 
     def _batches_of(self, recordings: Sequence[Recording]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batches without end: frames (batch, longest, 41), targets (batch, longest)."""
+        """Batches without end: frames (batch, longest, 80), targets (batch, longest)."""
         share = np.array([recording.weight for recording in recordings])
         share /= share.sum()
         while True:
             heard: list[tuple[NDArray[np.float32], NDArray[np.int64]]] = []
             size = 0
             while size < _POOL_BATCHES * _BATCH_FRAMES:
-                heard.append(self._heard(recordings[self._rng.choice(len(share), p=share)]))
+                recording = recordings[self._rng.choice(len(share), p=share)]
+                heard.append(heard_anew(recording, self._rng))
                 size += len(heard[-1][0])
             heard.sort(key=lambda pair: len(pair[0]))
             groups: list[list[tuple[NDArray[np.float32], NDArray[np.int64]]]] = [[]]
@@ -204,43 +177,88 @@ class Trainer:
             for at in self._rng.permutation(len(groups)):
                 yield _padded(groups[at])
 
-    def _heard(self, recording: Recording) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """One voice of a recording, changed anew, and its targets."""
-        rng = self._rng
-        voice = recording.voices[rng.integers(len(recording.voices))].astype(np.float32)
-        targets = recording.targets
-        if rng.random() < _AUGMENTED_SHARE:
-            augmentation = Augmentation.draw_hard(rng)
-            targets = targets[np.rint(augmentation.positions(len(voice))).astype(int)]
-            voice = augmentation.apply(voice)
-        frames = self.front_end.normalise(voice, known=rng.random() < _KNOWN_SPEAKER_SHARE)
-        if len(frames) > _MOST_FRAMES:
-            start = int(rng.integers(len(frames) - _MOST_FRAMES + 1))
-            frames = frames[start : start + _MOST_FRAMES]
-            targets = targets[start : start + _MOST_FRAMES]
-        for _ in range(rng.integers(3)):
-            at, width = rng.integers(len(frames)), rng.integers(1, _MOST_MASKED_FRAMES + 1)
-            frames[at : at + width] = 0.0
-        for _ in range(rng.integers(3)):
-            at, width = rng.integers(1, NUM_INPUTS), rng.integers(1, _MOST_MASKED_BANDS + 1)
-            frames[:, at : at + width] = 0.0
-        return frames, targets
+
+def heard_anew(
+    recording: Recording, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Change a recording; return its frames, (frames, 80), and their targets, (frames,)."""
+    samples, speed = as_floats(recording.samples), 1.0
+    if rng.random() < _CHANGED_SHARE:
+        samples, speed = changed_sound(samples, rng)
+    frames = WhisperMel().accept_waveform(levelled(samples, rng))
+    targets = recording.targets[frames_before(len(frames), speed, len(recording.targets))]
+    if rng.random() < _TEMPO_SHARE:
+        frames, were = changed_tempo(frames, rng)
+        targets = targets[were]
+    if len(frames) > _MOST_FRAMES:
+        start = int(rng.integers(len(frames) - _MOST_FRAMES + 1))
+        frames = frames[start : start + _MOST_FRAMES]
+        targets = targets[start : start + _MOST_FRAMES]
+    mask(frames, rng)
+    return frames, targets
 
 
-def _cross_entropy(log_shares: Tensor, targets: Tensor) -> Tensor:
-    """Nats a frame that has a target."""
-    known = targets >= 0
-    said = log_shares.gather(-1, targets.clamp(min=0)[..., None])[..., 0]
-    return -(said * known).sum() / max(1, int(known.sum()))
+def due_states(targets: Tensor, num_positions: int, look_ahead_frames: int) -> Tensor:
+    """States that each position ought to say: (batch, frames) to (batch, positions, 2)."""
+    frames = said_frames(num_positions, look_ahead_frames)
+    inside = (frames >= 0) & (frames < targets.shape[1])
+    due = targets[:, frames.clamp(0, targets.shape[1] - 1)]
+    return torch.where(inside, due, NO_TARGET)
+
+
+@torch.no_grad()
+def log_shares_of(network: Network, output: int, samples: NDArray[np.int16]) -> NDArray[np.float32]:
+    """Log shares of the states in all frames of a recording, as the recognizer has them.
+
+    The recognizer goes on position by position; here they are computed together, which is
+    faster.
+
+    Parameters
+    ----------
+    network
+        The network.
+    output
+        Number of its output layer.
+    samples
+        Shape (n,), 16 kHz.
+
+    Returns
+    -------
+    NDArray
+        Shape (frames, states).
+    """
+    network.eval()
+    frames = WhisperMel().accept_waveform(as_floats(samples))
+    num_frames, look_ahead = len(frames), network.shape.look_aheads[output]
+    num_positions = math.ceil((num_frames + look_ahead) / 2) - 1
+    num_missing = max(0, 2 * num_positions + 1 - num_frames)
+    seen = np.concatenate([frames, np.repeat(frames[-1:], num_missing, axis=0)])
+    rows = []
+    for start in range(0, num_positions, MOST_POSITIONS):  # as the recognizer begins again
+        piece = seen[2 * start : 2 * (start + MOST_POSITIONS) + 1]
+        hidden = network(torch.from_numpy(piece)[None])
+        rows.append(network.log_shares(hidden, output)[0].flatten(0, 1).numpy())
+    said = np.concatenate(rows)
+    first = 2 - look_ahead  # frame of the first row
+    said = said[-first:] if first < 0 else np.concatenate([said[:1]] * first + [said])
+    return np.ascontiguousarray(said[:num_frames])
+
+
+def _nearer(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
+    """Move the running mean of the weights."""
+    memory = min(_LONGEST_MEMORY, (int(num_before) + 1) / (int(num_before) + 10))
+    return mean + (1 - memory) * (weights - mean)
 
 
 def _padded(
-    group: list[tuple[NDArray[np.float32], NDArray[np.int64]]],
+    group: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]],
 ) -> tuple[Tensor, Tensor]:
-    longest = max(len(frames) for frames, _ in group)
-    frames = np.zeros((len(group), longest, NUM_INPUTS), dtype=np.float32)
+    """Make a batch; short recordings go on with their last frame, which has no target."""
+    longest = max(len(frames) for frames, _ in group) | 1  # an odd number: positions see 2 n + 1
+    frames = np.empty((len(group), longest, NUM_INPUTS), dtype=np.float32)
     targets = np.full((len(group), longest), NO_TARGET, dtype=np.int64)
     for row, (one, of_one) in enumerate(group):
         frames[row, : len(one)] = one
+        frames[row, len(one) :] = one[-1]
         targets[row, : len(of_one)] = of_one
     return torch.from_numpy(frames), torch.from_numpy(targets)

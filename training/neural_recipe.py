@@ -1,13 +1,17 @@
-"""From corpora to the neural recognizer: alignment, training, realignment, search, model card."""
+"""From corpora to the neural recognizer: alignment, training, realignment, search, model card.
+
+The network begins with the weights of Whisper's encoder, or with those of a model made here, and
+learns the states of a forced alignment. The alignment is first another model's; at half of the
+steps it becomes the network's own, with an output that hears 30 ms ahead, because a unit's
+beginning is plainer with what follows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+import os
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
-from multiprocessing import get_context
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +28,10 @@ from shared.phones import UNITS
 from training.corpus import RowErrors, is_synthetic
 from training.durations import AlignedUnit, UnitDurations
 from training.examples import WORD_UNITS, Example, load_examples
-from training.gmm import SIL, units_of_path, utterance_graph, viterbi_path
+from training.gmm import units_of_path, utterance_graph, viterbi_path
 from training.network import Network, Shape
-from training.network_export import networks_of, onnx_of
-from training.network_training import FrontEnd, Recording, Trainer
+from training.network_export import network_of, onnx_of
+from training.network_training import BATCH_S, Recording, Trainer, log_shares_of
 from training.recipes import (
     UNCHOSEN,
     Report,
@@ -38,18 +42,20 @@ from training.recipes import (
     with_penalty,
     write_card,
 )
-from training.second_language import as_nearest_units, load_second_language
 from training.unit_language import language_of_corpora, load_language
+from training.whisper_weights import load_whisper
 
 STATES_PER_UNIT = 3
 NUM_STATES = STATES_PER_UNIT * len(UNITS)
-LOOK_AHEADS_MS = (0, 10, 30, 60, 100, 200)  # of the output layers
+LOOK_AHEADS_MS = (10, 30, 60, 100, 200)  # of the output layers
 LOOK_AHEAD_MS = 10  # of the main one: 35 ms after its onset a unit may be known
-_SHARES = {"sentence": 0.5, "word": 0.17, "synthetic": 0.33}  # of the Mandarin frames heard
-_SECOND_SHARE = 0.35  # of the second task, against 1 for all Mandarin
-_ALIGNING_FRAMES = 6  # look-ahead: a unit's beginning is plainer with what follows
-_REALIGNED_AT = 0.3  # of the steps: from there on the network's own alignment counts
-_JUDGED_EVERY = 0.05  # of the steps: dev is recognised
+NUM_STEPS = 800
+_FRAME_MS = 1000 * HOP_S
+_LONGEST_LOOK_AHEAD = 100  # feature frames
+_SHARES = {"sentence": 0.5, "word": 0.12, "synthetic": 0.38}  # of the frames heard
+_ALIGNING_FRAMES = 3  # look-ahead of the output that aligns; longer ones are learnt later
+_REALIGNED_AT = 0.5  # of the steps: from there on the network's own alignment counts
+_JUDGED_EVERY = 0.1  # of the steps: dev is recognised
 _SCALE = 0.5  # of the log scores, until it is chosen
 _UNIT_PENALTY = 1.0  # likewise
 _LANGUAGE_SCALE = 2.0  # of the language's log shares; chosen on development data
@@ -76,29 +82,46 @@ class _Statistics:
     log_prior: NDArray[np.float32]  # (states,)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Lessons:
-    """What one network learns from, in which order."""
+@dataclass(slots=True, kw_only=True)
+class _Course:
+    """Follows the training: aligns anew at half of it, and recognises dev now and then."""
 
-    corpora: Sequence[Path]
-    aligner: Path
-    second_task: Path | None
-    start: Path | None
-    language: Path | None
-    look_ahead_ms: float
+    trainer: Trainer
+    examples: Sequence[Example]
+    dev: Sequence[Example]
+    language: UnitLanguage
+    statistics: _Statistics
     num_steps: int
-    num_voices: int
-    shipping: bool
+    report: Report
+    losses: list[tuple[int, float]] = field(default_factory=list)
+    rates: list[tuple[int, float]] = field(default_factory=list)
 
+    def watch(self, step: int, loss: float) -> None:
+        """Take note of a step."""
+        self.losses.append((step, loss))
+        if step == round(_REALIGNED_AT * self.num_steps):
+            self._align_anew()
+            self.report(f"step {step}: aligned anew")
+        if step % max(1, round(_JUDGED_EVERY * self.num_steps)) == 0:
+            line = f"step {step}: {loss:.3f} nats a frame"
+            if self.dev:
+                self.rates.append((step, self._dev_error_rate()))
+                line += f", dev phone error {100 * self.rates[-1][1]:.1f} %"
+            self.report(line)
 
-@dataclass(frozen=True, slots=True)
-class _Trained:
-    """A network and how it came about."""
+    def _align_anew(self) -> None:
+        network = self.trainer.mean
+        output = _aligning_output(network.shape.look_aheads)
+        scores = _scores_of(network, output, self.statistics, self.examples)
+        aligned = _aligned(scores, self.statistics.topology, self.examples)
+        self.trainer.replace_recordings(_recordings(aligned))
+        self.statistics = _statistics(aligned, self.language)
 
-    network: Network
-    model: NeuralModel
-    losses: list[tuple[int, float]]
-    rates: list[tuple[int, float]]
+    def _dev_error_rate(self) -> float:
+        output = self.trainer.main_output
+        scores = _scores_of(self.trainer.mean, output, self.statistics, self.dev)
+        scaled = [np.float32(_SCALE) * rows for rows in scores]
+        return error_rate(with_penalty(self.statistics.topology, _UNIT_PENALTY), scaled, self.dev)
 
 
 def train_neural(
@@ -106,14 +129,13 @@ def train_neural(
     output: Path,
     *,
     aligner: Path,
-    second_task: Path | None = None,
+    whisper: Path | None = None,
     start: Path | None = None,
     language: Path | None = None,
     look_ahead_ms: float = LOOK_AHEAD_MS,
     seed: int = 0,
-    num_steps: int = 4000,
-    num_networks: int = 2,
-    num_voices: int = 6,
+    num_steps: int = NUM_STEPS,
+    num_threads: int | None = None,
     shipping: bool = True,
     report: Report = print,
 ) -> None:
@@ -128,69 +150,72 @@ def train_neural(
         ``.png``.
     aligner
         A model that aligns the first time, such as :func:`training.recipes.train_gmm` writes.
-    second_task
-        Folder of speech in English, see :func:`training.second_language.load_second_language`.
+    whisper
+        Folder with Whisper base, see :func:`training.whisper_weights.load_whisper`.
     start
-        A model that this function has written, whose networks learn further, such as to know
-        one's own speakers; else they begin anew.
+        Instead of that, a model that this function has written, whose network learns further,
+        such as to know one's own speakers.
     language
         What :func:`training.unit_language.train_language` has written; else the language is that
         of the corpora.
     look_ahead_ms
         Of the output layer that counts most and is in use, in whole frames of 10 ms.
     seed
-        Of weights, order and augmentation of the first network; the others' are the next ones.
+        Of new weights, order and changes of the sound. The same seed and the same number of
+        threads give the same model.
     num_steps
-        Batches of 50 s of sound.
-    num_networks
-        Networks that learn side by side, each in a process of its own, and whose mean counts.
-    num_voices
-        Other voices for each real sentence.
+        Batches of 30 s of sound.
+    num_threads
+        That compute; None takes all cores.
     shipping
         Leave out rows whose licence forbids giving the model away.
     report
-        Receives lines of progress; those of several networks are printed.
+        Receives lines of progress.
 
     Raises
     ------
     UserError
-        If there is nothing to train on, or a file cannot be read.
+        If there is nothing to train on, nothing or two things to begin with, or a file cannot be
+        read.
     """
-    if start:
-        _begun(start, look_ahead_ms)  # finds mistakes before the long work
+    torch.set_num_threads(num_threads or os.cpu_count() or 1)
+    torch.manual_seed(seed)
+    network = _begun(whisper, start, _look_aheads(look_ahead_ms))
+    first = load_model(aligner)
     errors = RowErrors()
-    examples = load_examples(corpora, errors, shipping=shipping, num_voices=num_voices)
-    if second_task:
-        load_second_language(second_task, errors)  # finds mistakes and fills the cache for all
-    lessons = _Lessons(
-        corpora=corpora,
-        aligner=aligner,
-        second_task=second_task,
-        start=start,
-        language=language,
-        look_ahead_ms=look_ahead_ms,
+    examples = load_examples(corpora, errors, shipping=shipping, with_samples=True)
+    known = load_language(language) if language else language_of_corpora(examples)
+    aligned = _aligned(_first_scores(first, examples), first.topology, examples)
+    report(f"{len(aligned)} recordings aligned")
+    trainer = Trainer(
+        network,
+        _recordings(aligned),
+        main_output=network.shape.look_aheads.index(round(look_ahead_ms / _FRAME_MS)),
+        seed=seed,
+    )
+    course = _Course(
+        trainer=trainer,
+        examples=examples,
+        dev=_dev_examples(corpora, shipping=shipping),
+        language=known,
+        statistics=_statistics(aligned, known),
         num_steps=num_steps,
-        num_voices=num_voices,
-        shipping=shipping,
+        report=report,
     )
-    if num_networks == 1:
-        trained = [_train_one(lessons, seed, report)]
-    else:
-        with ProcessPoolExecutor(num_networks, mp_context=get_context("spawn")) as processes:
-            seeds = range(seed, seed + num_networks)
-            trained = list(processes.map(partial(_train_one, lessons), seeds))
-    unscaled = replace(
-        trained[0].model, network=onnx_of([one.network for one in trained]), kappa=1.0
+    trainer.train(num_steps, course.watch)
+    unscaled = _model(trainer, course.statistics)
+    choice = choose_search(
+        unscaled, corpora, scales=_SCALES, shipping=shipping, with_samples=True, report=report
     )
-    choice = choose_search(unscaled, corpora, scales=_SCALES, shipping=shipping, report=report)
     scale, penalty = (choice.scale, choice.unit_penalty) if choice else (_SCALE, _UNIT_PENALTY)
     replace(unscaled, topology=with_penalty(unscaled.topology, penalty), kappa=scale).save(output)
-    draw_curves(trained, output.with_suffix(".png"))
+    draw_curves(course.losses, course.rates, output.with_suffix(".png"))
+    begun = f"`{start.name}`" if start else "Whisper's weights (Radford et al. 2023, MIT licence)"
     write_card(
         output,
-        title=f"Neural recognizer, the mean of {num_networks} recurrent networks",
-        details=f"seed {seed}, {num_steps} steps, {num_voices} other voices for each sentence, "
-        f"aligned first by `{aligner.name}`" + (", with a second language" if second_task else ""),
+        title=f"Neural recognizer, a causal transformer of {network.shape.layers} layers",
+        details=f"begun with {begun}, seed {seed}, {num_steps} steps of {BATCH_S} s of sound, "
+        f"aligned first by `{aligner.name}`",
         examples=examples,
         errors=errors,
         choice=choice or UNCHOSEN,
@@ -198,117 +223,87 @@ def train_neural(
     report_rows(errors, report)
 
 
-def _train_one(lessons: _Lessons, seed: int, report: Report = print) -> _Trained:
-    torch.set_num_threads(1)  # the networks share the cores; and sums come out the same everywhere
-    torch.manual_seed(seed)
-
-    def tell(line: str) -> None:
-        report(f"network {seed}: {line}")
-
-    examples = load_examples(
-        lessons.corpora, RowErrors(), shipping=lessons.shipping, num_voices=lessons.num_voices
-    )
-    second: list[Example] = []
-    if lessons.second_task:
-        second = load_second_language(lessons.second_task, RowErrors())
-    aligner = _aligner(load_model(lessons.aligner))
-    aligned = _aligned(aligner, examples)
-    of_second = _aligned(aligner, second, as_nearest_units(second)) if second else []
-    tell(f"{len(aligned)} recordings aligned, {len(of_second)} of the second task")
-    look_aheads = _look_aheads(lessons.look_ahead_ms)
-    if lessons.start:
-        begun, front_end = _begun(lessons.start, lessons.look_ahead_ms)
-        network = begun[seed % len(begun)]
-    else:
+def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...]) -> Network:
+    """Make the network that learns."""
+    if start is None and whisper is not None:
         network = Network(Shape(num_states=NUM_STATES, look_aheads=look_aheads))
-        front_end = FrontEnd.measure(_recordings(aligned, []))
-    trainer = Trainer(
-        network,
-        front_end,
-        _recordings(aligned, of_second),
-        main_head=look_aheads.index(round(lessons.look_ahead_ms / 1000 / HOP_S)),
-        seed=seed,
-    )
-    if lessons.language:
-        language = load_language(lessons.language)
-    else:
-        language = language_of_corpora(examples)
-    statistics = _statistics(aligned, language)
-    dev = _dev_examples(lessons.corpora, shipping=lessons.shipping)
-    losses: list[tuple[int, float]] = []
-    rates: list[tuple[int, float]] = []
-
-    def watch(step: int, loss: float) -> None:
-        nonlocal statistics
-        losses.append((step, loss))
-        if step == round(_REALIGNED_AT * lessons.num_steps):
-            anew = _aligned(_aligner(_model(trainer, statistics)), examples)
-            second_anew = []
-            if second:
-                heard = _model(trainer, _statistics(of_second, language), second_task=True)
-                second_anew = _aligned(_aligner(heard), second)
-            trainer.replace_recordings(_recordings(anew, second_anew))
-            statistics = _statistics(anew, language)
-            tell(f"step {step}: aligned anew")
-        if dev and step % max(1, round(_JUDGED_EVERY * lessons.num_steps)) == 0:
-            judged = _model(trainer, statistics)
-            scores = list(all_scores(judged, dev))
-            topology = with_penalty(judged.topology, _UNIT_PENALTY)
-            rates.append((step, error_rate(topology, scores, dev)))
-            rate = 100 * rates[-1][1]
-            tell(f"step {step}: {loss:.3f} nats a frame, dev phone error {rate:.1f} %")
-
-    trainer.train(lessons.num_steps, watch)
-    return _Trained(trainer.mean, _model(trainer, statistics), losses, rates)
-
-
-def _begun(path: Path, look_ahead_ms: float) -> tuple[list[Network], FrontEnd]:
-    """Take the networks of a model to train them further, and how their input is normalised."""
-    model = load_model(path)
-    if isinstance(model, NeuralModel) and tuple(model.look_aheads) == _look_aheads(look_ahead_ms):
-        front_end = FrontEnd(prior_mean=model.prior_mean, spread=model.spread)
+        load_whisper(network, whisper)
+        return network
+    if start is None or whisper is not None:
+        raise UserError(
+            "training begins with Whisper's weights or with a model made here: give either "
+            "--whisper or --start-from"
+        )
+    model = load_model(start)
+    if isinstance(model, NeuralModel) and tuple(model.look_aheads.tolist()) == look_aheads:
         with suppress(KeyError):  # another network that runs in the same way
-            return networks_of(model.network, model.look_aheads.tolist()), front_end
+            return network_of(model.network, look_aheads)
+    asked = ", ".join(f"{frames * _FRAME_MS:g}" for frames in look_aheads)
     raise UserError(
-        f"{path} was not written by this command with a look-ahead of {look_ahead_ms:g} ms; begin "
-        "with a model that was"
+        f"{start} was not written by this command with the look-aheads {asked} ms; begin with a "
+        "model that was"
     )
 
 
 def _look_aheads(main_ms: float) -> tuple[int, ...]:
     """Look-aheads of all output layers, feature frames."""
-    return tuple(round(ms / 1000 / HOP_S) for ms in sorted({*LOOK_AHEADS_MS, main_ms}))
+    main = main_ms / _FRAME_MS
+    if not (1 <= main <= _LONGEST_LOOK_AHEAD and main == round(main)):
+        raise UserError(
+            f"a look-ahead of {main_ms:g} ms cannot be trained; give 10, 20, 30... up to "
+            f"{_LONGEST_LOOK_AHEAD * _FRAME_MS:g}"
+        )
+    others = [round(ms / _FRAME_MS) for ms in LOOK_AHEADS_MS]
+    return tuple(sorted({*others, round(main)}))
 
 
-def _aligner(model: AcousticModel) -> AcousticModel:
-    """Take a network's output layer that is best for alignment."""
-    if not isinstance(model, NeuralModel):
-        return model
-    distance = np.abs(model.look_aheads - _ALIGNING_FRAMES)
-    return replace(model, head=int(distance.argmin()), kappa=1.0)
+def _first_scores(
+    aligner: AcousticModel, examples: Sequence[Example]
+) -> Iterator[NDArray[np.float32]]:
+    """Scores of another model; a network's whole recordings at once where that can be."""
+    if not isinstance(aligner, NeuralModel):
+        return all_scores(aligner, examples)
+    output = _aligning_output(aligner.look_aheads.tolist())
+    with suppress(KeyError):
+        network = network_of(aligner.network, aligner.look_aheads.tolist())
+        statistics = _Statistics(aligner.topology, aligner.log_prior)
+        return _scores_of(network, output, statistics, examples)
+    return all_scores(replace(aligner, head=output, kappa=1.0), examples)
+
+
+def _aligning_output(look_aheads: Sequence[int]) -> int:
+    """Output layer that is best for alignment."""
+    return int(np.abs(np.array(look_aheads) - _ALIGNING_FRAMES).argmin())
+
+
+def _scores_of(
+    network: Network, output: int, statistics: _Statistics, examples: Sequence[Example]
+) -> Iterator[NDArray[np.float32]]:
+    """Scores of all frames of every recording, shape (frames, states) each."""
+    for example in examples:
+        yield log_shares_of(network, output, _samples(example)) - statistics.log_prior
+
+
+def _samples(example: Example) -> NDArray[np.int16]:
+    if example.samples is None:
+        raise ValueError("an example has no samples")
+    return example.samples
 
 
 def _aligned(
-    model: AcousticModel, examples: Sequence[Example], heard_as: Sequence[Example] | None = None
+    scores: Iterable[NDArray[np.float32]], topology: Topology, examples: Sequence[Example]
 ) -> list[_Aligned]:
-    """Find the states of all frames, ``STATES_PER_UNIT`` for each unit; drop what does not fit.
-
-    ``heard_as`` holds the same with the units that the model takes theirs for.
-    """
+    """Find the states of all frames, ``STATES_PER_UNIT`` for each unit; drop what does not fit."""
     aligned = []
-    own = np.diff(model.topology.first_state)
+    own = np.diff(topology.first_state)
     of_state = np.repeat(np.arange(len(UNITS)), own)
-    place = np.arange(len(of_state)) - model.topology.first_state[of_state]
+    place = np.arange(len(of_state)) - topology.first_state[of_state]
     # middle of the n-th part of a unit, in parts of another size
     part = (2 * place + 1) * STATES_PER_UNIT // (2 * own[of_state])
-    rows = all_scores(model, examples)
-    for scores, example, heard in zip(rows, examples, heard_as or examples, strict=True):
-        graph = utterance_graph(heard.units, heard.syllables, model.topology.first_state)
-        path, _ = viterbi_path(
-            scores[:, graph.states], graph, model.topology.log_stay, model.topology.log_leave
-        )
+    for rows, example in zip(scores, examples, strict=True):
+        graph = utterance_graph(example.units, example.syllables, topology.first_state)
+        path, _ = viterbi_path(rows[:, graph.states], graph, topology.log_stay, topology.log_leave)
         if len(path):
-            graph.units[graph.units != SIL] = example.units
             states = graph.units[graph.unit_of[path]] * STATES_PER_UNIT + part[graph.states[path]]
             aligned.append(_Aligned(example, states, units_of_path(path, graph)))
     if not aligned:
@@ -316,21 +311,11 @@ def _aligned(
     return aligned
 
 
-def _recordings(aligned: Sequence[_Aligned], of_second: Sequence[_Aligned]) -> list[Recording]:
-    """Weigh what the network hears; states of the second task follow the others."""
-    second_frames = sum(len(one.states) for one in of_second)
+def _recordings(aligned: Sequence[_Aligned]) -> list[Recording]:
+    """Weigh what the network hears."""
     return [
-        Recording(
-            voices=(one.example.log_mel, *one.example.voices), targets=one.states, weight=weight
-        )
+        Recording(samples=_samples(one.example), targets=one.states, weight=weight)
         for one, weight in zip(aligned, _weights(aligned), strict=True)
-    ] + [
-        Recording(
-            voices=(one.example.log_mel,),
-            targets=NUM_STATES + one.states,
-            weight=_SECOND_SHARE / second_frames,
-        )
-        for one in of_second
     ]
 
 
@@ -379,30 +364,30 @@ def _statistics(aligned: Sequence[_Aligned], language: UnitLanguage) -> _Statist
     return _Statistics(topology, log_prior.astype(np.float32))
 
 
-def _model(trainer: Trainer, statistics: _Statistics, *, second_task: bool = False) -> NeuralModel:
-    """Make the recognizer's model of the running mean of the weights."""
-    shape = trainer.network.shape
-    main_look_ahead = shape.look_aheads[trainer.main_head]
+def _model(trainer: Trainer, statistics: _Statistics) -> NeuralModel:
+    """Make the recognizer's model of the running mean of the weights; its scale is 1."""
     return NeuralModel(
         topology=statistics.topology,
-        network=onnx_of([trainer.mean], second_task=second_task),
-        look_aheads=np.array([main_look_ahead] if second_task else shape.look_aheads),
+        network=onnx_of(trainer.mean),
+        look_aheads=np.array(trainer.network.shape.look_aheads),
         log_prior=statistics.log_prior,
-        prior_mean=trainer.front_end.prior_mean,
-        spread=trainer.front_end.spread,
-        kappa=_SCALE,
-        head=0 if second_task else trainer.main_head,
+        kappa=1.0,
+        head=trainer.main_output,
     )
 
 
 def _dev_examples(corpora: Sequence[Path], *, shipping: bool) -> list[Example]:
     try:
-        return load_examples(corpora, RowErrors(), split="dev", shipping=shipping)
+        return load_examples(
+            corpora, RowErrors(), split="dev", shipping=shipping, with_samples=True
+        )
     except UserError:
         return []
 
 
-def draw_curves(trained: Sequence[_Trained], path: Path) -> None:
+def draw_curves(
+    losses: Sequence[tuple[int, float]], rates: Sequence[tuple[int, float]], path: Path
+) -> None:
     """Draw cross-entropy and dev phone error over the steps."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (slow to load)
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -411,15 +396,11 @@ def draw_curves(trained: Sequence[_Trained], path: Path) -> None:
     FigureCanvasAgg(figure)
     left = figure.add_subplot()
     right = left.twinx()
-    for number, one in enumerate(trained):
-        steps, losses = np.array(one.losses).T
-        width = min(_SMOOTHED, len(steps))
-        smooth = np.convolve(losses, np.ones(width) / width, "valid")
-        left.plot(steps[width - 1 :], smooth, f"C{number}", linewidth=0.8)
-        if one.rates:
-            right.plot(
-                *zip(*((step, 100 * rate) for step, rate in one.rates), strict=True), f"o:C{number}"
-            )
+    steps, nats = np.array(losses).T
+    width = min(_SMOOTHED, len(steps))
+    left.plot(steps[width - 1 :], np.convolve(nats, np.ones(width) / width, "valid"), linewidth=0.8)
+    if rates:
+        right.plot(*zip(*((step, 100 * rate) for step, rate in rates), strict=True), "o:")
     left.set_xlabel("steps")
     left.set_ylabel("nats a frame (line)")
     right.set_ylabel("dev phone error % (dots)")

@@ -14,12 +14,14 @@ from services.recognizer.acoustic_model import AcousticModel, Topology
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import NUM_FEATURES, cepstra_of_all
 from services.recognizer.gmm import GmmModel
+from services.recognizer.voice_warp import without_pitch
 from shared.errors import UserError
 from shared.phones import SILENCE, UNITS
 from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
 from training.corpus import RowErrors, is_synthetic
 from training.examples import Example, load_examples
+from training.feature_cache import as_floats
 from training.gmm import (
     FrameSet,
     decorrelate,
@@ -151,6 +153,7 @@ def choose_search(
     *,
     scales: Sequence[float] = _SCALES,
     shipping: bool = True,
+    with_samples: bool = False,
     report: Report = print,
 ) -> Choice | None:
     """Choose scale and unit penalty on the split ``dev``, if there is one.
@@ -163,9 +166,13 @@ def choose_search(
         Scales of its log scores to try.
     corpora, shipping, report
         As for :func:`train_gmm`.
+    with_samples
+        Let the model hear the recordings through its own front end.
     """
     try:
-        dev = load_examples(corpora, RowErrors(), split="dev", shipping=shipping)
+        dev = load_examples(
+            corpora, RowErrors(), split="dev", shipping=shipping, with_samples=with_samples
+        )
     except UserError:
         report("no dev recordings: scale and unit penalty are not chosen")
         return None
@@ -206,15 +213,25 @@ def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
 
 
 def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
-    """Scores of all frames of unchanged recordings, shape (frames, states) each."""
+    """Scores of all frames of unchanged recordings, shape (frames, states) each.
+
+    The model hears the samples through its own front end; without samples it is given the log-mel
+    features.
+    """
     for start in range(0, len(examples), _SCORED_TOGETHER):
         some = examples[start : start + _SCORED_TOGETHER]
         streams = [model.stream() for _ in some]
-        log_mels = [example.log_mel.astype(np.float32) for example in some]
-        begun = model.score(list(zip(streams, log_mels, strict=True)))
+        heard = [_frames_for(model, example) for example in some]
+        begun = model.score(list(zip(streams, heard, strict=True)))
         ended = model.score([(stream, None) for stream in streams])
         for pair in zip(begun, ended, strict=True):
             yield np.concatenate(pair)
+
+
+def _frames_for(model: AcousticModel, example: Example) -> NDArray[np.float32]:
+    if example.samples is None:
+        return without_pitch(example.log_mel.astype(np.float32))
+    return model.front_end().accept_waveform(as_floats(example.samples))
 
 
 def _copies(example: Example, rng: np.random.Generator) -> list[Example]:

@@ -38,13 +38,23 @@ class Topology:
         return int(self.first_state[-1])
 
 
+class FrontEnd(Protocol):
+    """The features that a model hears, of one session's sound; any chunking gives the same.
+
+    Frame ``t`` is of the samples ``160 t`` to ``160 t + 400`` and is ready with the last of them.
+    """
+
+    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take samples, shape (n,), 16 kHz, in [-1, 1]; return the new frames, (m, k)."""
+
+
 class AcousticStream(Protocol):
     """State scores of one speaker's speech, segment by segment."""
 
-    look_ahead_frames: int  # a frame's scores come this many frames after it
+    look_ahead_frames: int  # a frame's scores come this many frames after it, or sooner
 
-    def accept(self, log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take log-mel frames, shape (n, 41); return the scores ready, (m, states)."""
+    def accept(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take the front end's frames, shape (n, k); return the scores ready, (m, states)."""
 
     def finish(self) -> NDArray[np.float32]:
         """End the segment and return the scores still owed."""
@@ -53,7 +63,7 @@ class AcousticStream(Protocol):
         """Forget the segment and the speaker."""
 
 
-# A stream with log-mel frames for it, (n, 41), or with None at the end of a segment.
+# A stream with the front end's frames for it, (n, k), or with None at the end of a segment.
 Work: TypeAlias = tuple[AcousticStream, NDArray[np.float32] | None]
 # What hands out work, is sent the scores, and returns a result in the end.
 T = TypeVar("T")
@@ -66,6 +76,9 @@ class AcousticModel(Protocol):
     @property
     def topology(self) -> Topology:
         """The HMMs that the scores belong to."""
+
+    def front_end(self) -> FrontEnd:
+        """Start a front end for one session; a new one stands at the beginning of the sound."""
 
     def stream(self) -> AcousticStream:
         """Start a stream of scores for one speaker."""

@@ -17,6 +17,9 @@ log b(x) = logsumexp_m [ log w_m - 1/2 sum_k (log 2 pi covars_mk + (x_k - means_
 
 written as a product of [x^2, x, 1] with a matrix made once. The rotation is Gales 1999,
 "Semi-tied covariance matrices", one for all states.
+
+Low voices are heard as high ones (:mod:`services.recognizer.voice_warp`): the pitch that the front
+end measures in every frame counts where the frame is speech, which is what the stream is given.
 """
 
 from __future__ import annotations
@@ -43,6 +46,7 @@ from services.recognizer.model_file import (
     topology_from,
     write_archive,
 )
+from services.recognizer.voice_warp import PitchedLogMel, VoiceWarp
 
 FORMAT = "gmm 2"
 _MOST_MIXTURES = 1024
@@ -117,6 +121,10 @@ class GmmModel:
         """Matrix of the component densities, made once for all streams."""
         return self.mixtures.score_matrix()
 
+    def front_end(self) -> PitchedLogMel:
+        """Start a front end for one session."""
+        return PitchedLogMel()
+
     def stream(self) -> GmmStream:
         """Start a stream of scores for one speaker."""
         return GmmStream(self)
@@ -124,8 +132,7 @@ class GmmModel:
     def score(self, work: Sequence[Work]) -> list[NDArray[np.float32]]:
         """Score the frames of several streams, each alone; None ends a stream's segment."""
         return [
-            stream.finish() if log_mel is None else stream.accept(log_mel)
-            for stream, log_mel in work
+            stream.finish() if frames is None else stream.accept(frames) for stream, frames in work
         ]
 
     def save(self, path: Path) -> None:
@@ -149,16 +156,18 @@ class GmmStream:
 
     def __init__(self, model: GmmModel) -> None:
         self._model = model
+        self._warp = VoiceWarp()
         self._mean = LiveMean(model.prior_mean)
         self._differences = Differences(model.half_width)
         self.look_ahead_frames = self._differences.look_ahead_frames
 
-    def accept(self, log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take log-mel frames, shape (n, 41); return the scores ready, (m, states)."""
+    def accept(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take log-mel frames with their pitch, shape (n, 43); return the scores ready."""
+        log_mel = self._warp.accept(frames[:, :-2], frames[:, -2], frames[:, -1])
         return self._score(self._differences.accept(cepstra(log_mel)))
 
     def finish(self) -> NDArray[np.float32]:
-        """End the segment: return the scores still owed. The mean is kept for the next one."""
+        """End the segment: return the scores still owed. What is known of the speaker is kept."""
         scores = self._score(self._differences.finish())
         self._differences = Differences(self._model.half_width)
         return scores
@@ -166,6 +175,7 @@ class GmmStream:
     def reset(self) -> None:
         """Forget the segment and the speaker."""
         self._differences = Differences(self._model.half_width)
+        self._warp.reset()
         self._mean.reset()
 
     def _score(self, features: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """Sound in, units out: the recognizer without sockets.
 
-    samples -> resampler -> log-mel, pitch -> [in speech] warp -> acoustic model -> Viterbi ->
+    samples -> resampler -> the model's front end -> [in speech] acoustic model -> Viterbi ->
     output rule
 
 Source: Li et al. 2011, sections 1 and 2.2.
@@ -11,7 +11,8 @@ cutting of the same sound: every step works on whole frames and whole detector b
 
 Least delay of a unit after its onset, with ``L`` the frames that the acoustic model looks ahead (1,
 unless another look-ahead is set) and ``N`` the agreement (1): 25 ms window + L * 10 ms +
-(N - 1) * 10 ms = 35 ms. The paper, with N = 3 and differences that look 40 ms ahead, leaves those
+(N - 1) * 10 ms = 35 ms. A neural model speaks every other frame, so half of the frames come 10 ms
+sooner. The paper, with N = 3 and differences that look 40 ms ahead, leaves those
 out: 45 ms, in truth 85. At the beginning of speech the voice detector adds its own 32 to 64 ms;
 above 16 kHz the resampler adds about 10 ms.
 """
@@ -27,11 +28,10 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic_model import FIRST, INSIDE, AcousticModel, Listening, listen
 from services.recognizer.decoder import Decoder, Segment, segments_after
-from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S, LogMel
+from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
 from services.recognizer.output_rule import OutputRule
 from services.recognizer.resample import Resampler
 from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector
-from services.recognizer.voice_warp import PitchTracker, VoiceWarp, warped_log_mel
 from shared.phones import SILENCE, UNIT_INDEX, UNITS, Phone, SpeechChange
 
 PRE_ROLL_S = 0.20  # kept from before the detector is sure: first consonants are weak
@@ -40,7 +40,8 @@ DEFAULT_RULE = (1, 0.9)  # N (the paper's is 3) and the confidence that each fra
 SETTLED_S = 0.2  # a unit that ended so long ago is final; waiting longer corrects nothing more
 _SETTLED_FRAMES = round(SETTLED_S / HOP_S)
 _SIL = UNIT_INDEX[SILENCE]
-_WARM_UP_S = 6  # long enough that the search also forgets once, which is code of its own
+_WARM_UP_S = 0.2
+_WARM_UP_ROWS = 600  # enough that the search also forgets once, which is code of its own
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
 
 
@@ -80,15 +81,14 @@ class SpeechScores:
     """
 
     def __init__(self, model: AcousticModel, sample_rate_hz: int, num_channels: int = 1) -> None:
+        self._model = model
         self._stream = model.stream()
         self._resampler = Resampler(sample_rate_hz, num_channels)
         self._detector = VoiceActivityDetector()
-        self._warp = VoiceWarp()
         self._reset_frames()
 
     def _reset_frames(self) -> None:
-        self._log_mel = LogMel()
-        self._pitch = PitchTracker()
+        self._front_end = self._model.front_end()
         self._block = np.empty(0, dtype=np.float32)
         self._recent: deque[NDArray[np.float32]] = deque(maxlen=_PRE_ROLL_FRAMES)
         self._num_frames = 0
@@ -118,7 +118,6 @@ class SpeechScores:
         self._stream.reset()
         self._resampler.reset()
         self._detector.reset()
-        self._warp.reset()
         self._reset_frames()
 
     def _hear(self, samples: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
@@ -127,26 +126,19 @@ class SpeechScores:
             piece = samples[: BLOCK_SAMPLES - len(self._block)]
             samples = samples[len(piece) :]
             self._block = np.concatenate([self._block, piece])
-            log_mel, pitch = (
-                self._log_mel.accept_waveform(piece),
-                self._pitch.accept_waveform(piece),
-            )
-            events += yield from self._frames(np.column_stack([log_mel, *pitch]))
+            events += yield from self._frames(self._front_end.accept_waveform(piece))
             if len(self._block) == BLOCK_SAMPLES:
                 events += yield from self._judge()
                 self._block = self._block[:0]
         return events
 
     def _frames(self, frames: NDArray[np.float32]) -> Listening[list[ScoreEvent]]:
-        """Take log-mel frames with their pitch and its strength, shape (n, 43)."""
+        """Take the front end's frames, shape (n, k)."""
         self._num_frames += len(frames)
         if not self._speaking:
             self._recent.extend(frames)
             return []
-        return _if_any((yield self._stream, self._warped(frames)))
-
-    def _warped(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
-        return self._warp.accept(frames[:, :-2], frames[:, -2], frames[:, -1])
+        return _if_any((yield self._stream, frames))
 
     def _judge(self) -> Listening[list[ScoreEvent]]:
         speech = self._detector.accept_block(self._block).is_speech
@@ -155,7 +147,7 @@ class SpeechScores:
             begin = VoiceBegins(self._num_frames - len(self._recent))
             pre_roll = np.array(self._recent)
             self._recent.clear()
-            return [begin, *_if_any((yield self._stream, self._warped(pre_roll)))]
+            return [begin, *_if_any((yield self._stream, pre_roll))]
         if self._speaking and not speech:
             return (yield from self._end())
         return []
@@ -364,9 +356,10 @@ class Recognizer:
 def warm_up(model: AcousticModel) -> None:
     """Run everything once, so that the first chunk of a session waits for no compiler."""
     stream, decoder = model.stream(), Decoder(model.topology)
-    num_samples = _WARM_UP_S * SAMPLE_RATE_HZ
-    log_mel = warped_log_mel(np.zeros(num_samples, dtype=np.float32))
-    for row in (*stream.accept(log_mel), *stream.finish()):
+    silence = np.zeros(round(_WARM_UP_S * SAMPLE_RATE_HZ), dtype=np.float32)
+    frames = model.front_end().accept_waveform(silence)
+    scores = np.concatenate([stream.accept(frames), stream.finish()])
+    for row in np.resize(scores, (_WARM_UP_ROWS, scores.shape[1])):
         decoder.accept(row)
     decoder.finish()
     VoiceActivityDetector().accept_block(np.zeros(BLOCK_SAMPLES, dtype=np.float32))

@@ -26,13 +26,15 @@ in, out  log-mel bands over their centres' frequency                   (40,)
 ======== ============================================================= ====================
 
 Why: a recognizer that has heard mostly high voices takes the low formants of a long tract for
-other vowels. On 14 unseen low voices this takes phone errors from 35.4 to 32.1 %; high voices
-stay about as they are (24.8 and 24.3 %).
+other vowels. With a small recurrent network, this took the phone errors of 14 unseen low voices
+from 35.4 to 32.1 %; high voices stayed about as they were (24.8 and 24.3 %).
 
 Deviations from the paper, which models the distribution of the factor given the pitch: the factor
 is a power of the pitch, so that there is nothing to train; the mean runs along and forgets, as it
 must live; and only low voices are moved, as only they are rare. The finished bands are
 interpolated and not the filters moved, since their sound is no longer there.
+
+Only the Gaussian mixture model hears warped voices: the neural model learns what low voices are.
 
 Cost: about 1 ms for a second of sound. Delay: none beside the features', as a frame's pitch is
 that of the samples up to the frame's end. The sums run in a fixed order, so the result does not
@@ -198,10 +200,34 @@ class VoiceWarp:
         self._state = np.zeros(2)  # sum of ln(f_ref / pitch) of voiced frames, their number
 
 
-def warped_log_mel(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Log-mel frames of a whole recording, as they come live, shape (n,) to (frames, 41)."""
-    pitch = PitchTracker().accept_waveform(samples)
-    return VoiceWarp().accept(LogMel().accept_waveform(samples), *pitch)
+class PitchedLogMel:
+    """Streaming log energy and log-mel bands with the pitch; any chunking gives the same frames."""
+
+    def __init__(self) -> None:
+        self._log_mel = LogMel()
+        self._pitch = PitchTracker()
+
+    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take samples in.
+
+        Parameters
+        ----------
+        samples
+            Shape (n,), 16 kHz, in [-1, 1].
+
+        Returns
+        -------
+        NDArray
+            The new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch in
+            Hz and its strength.
+        """
+        log_mel = self._log_mel.accept_waveform(samples)
+        return np.column_stack([log_mel, *self._pitch.accept_waveform(samples)])
+
+
+def without_pitch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Give log-mel frames, (n, 41), a pitch that is not known, (n, 43): the voice stays as is."""
+    return np.pad(log_mel, ((0, 0), (0, 2)))
 
 
 @numba.njit(cache=True, nogil=True)

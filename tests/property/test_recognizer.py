@@ -1,5 +1,6 @@
 """The recognizer hears the same whatever the chunks are, and its parts keep their promises."""
 
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.decoder import Decoder
 from services.recognizer.features import Differences, LogMel, cepstra, with_differences
-from services.recognizer.load import load_model
+from services.recognizer.load import DEFAULT_MODEL, load_model, model_path
 from services.recognizer.output_rule import OutputRule
 from services.recognizer.pipeline import Recognizer
 from services.recognizer.resample import Resampler, to_16_khz
@@ -30,8 +32,13 @@ def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
     return np.split(samples, sorted(cut for cut in cuts if cut <= len(samples)))
 
 
+@cache
+def the_model(name: str = DEFAULT_MODEL) -> AcousticModel:
+    return load_model(model_path(name))
+
+
 def hear(chunks: list[np.ndarray], rate_hz: int) -> list[Phone | SpeechChange]:
-    recognizer = Recognizer(load_model(), sample_rate_hz=rate_hz)
+    recognizer = Recognizer(the_model(), sample_rate_hz=rate_hz)
     events = [event for chunk in chunks for event in recognizer.accept_waveform(chunk)]
     return events + recognizer.input_finished()
 
@@ -45,8 +52,8 @@ def test_any_chunking_is_heard_the_same(cuts: list[int], rate_hz: int) -> None:
 @settings(deadline=None, max_examples=15)
 @given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 40))
 def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: int) -> None:
-    model, rng = load_model(), np.random.default_rng(seed)
-    frames = LogMel().accept_waveform(HELLO)
+    model, rng = the_model(), np.random.default_rng(seed)
+    frames = model.front_end().accept_waveform(HELLO)
     parts = [frames[start : start + 40] for start in rng.integers(0, 150, num_sessions)]
     streams = [model.stream() for _ in parts]
     found: list[list[np.ndarray]] = [[] for _ in parts]
@@ -87,6 +94,16 @@ def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
     np.testing.assert_array_equal(np.concatenate([*parts, differences.finish()]), whole)
 
 
+@settings(deadline=None, max_examples=30)
+@given(cuts=CUTS, name=st.sampled_from(["gmm", "neural"]))
+def test_front_ends_in_any_chunks(cuts: list[int], name: str) -> None:
+    model = the_model(name)
+    front_end = model.front_end()
+    parts = [front_end.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
+    whole = model.front_end().accept_waveform(NOISE)
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
 @settings(deadline=None, max_examples=50)
 @given(
     units=st.lists(st.integers(0, 3), max_size=60), agreement=st.integers(1, 6), before=st.just(9)
@@ -105,7 +122,7 @@ def test_the_output_rule_is_the_paper_s(units: list[int], agreement: int, before
 @settings(deadline=None, max_examples=25)
 @given(seed=st.integers(0, 2**31), num_frames=st.integers(1, 400))
 def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
-    topology = load_model().topology
+    topology = the_model().topology
     rng = np.random.default_rng(seed)
     decoder = Decoder(topology)
     for row in rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32):

@@ -6,10 +6,11 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.features import NUM_FEATURES, NUM_STATIC, LogMel
+from services.recognizer.features import NUM_BANDS, NUM_FEATURES, NUM_STATIC
 from services.recognizer.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
 from services.recognizer.load import MODEL_PATH, load_model
 from services.recognizer.model_file import read_archive, write_archive
+from services.recognizer.voice_warp import VoiceWarp, without_pitch
 from shared.errors import UserError
 from shared.phones import UNITS
 from tests.languages import random_language
@@ -84,12 +85,12 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     model.save(tmp_path / "model.npz")
     loaded = load_model(tmp_path / "model.npz")
     noise = np.random.default_rng(0).normal(0, 0.1, 4000).astype(np.float32)
-    log_mel = LogMel().accept_waveform(noise)
+    frames = model.front_end().accept_waveform(noise)
     first, second = model.stream(), loaded.stream()
     assert first.look_ahead_frames == second.look_ahead_frames
-    expected = np.concatenate([first.accept(log_mel), first.finish()])
-    found = np.concatenate([second.accept(log_mel), second.finish()])
-    assert expected.shape == (len(log_mel), NUM_STATES)
+    expected = np.concatenate([first.accept(frames), first.finish()])
+    found = np.concatenate([second.accept(frames), second.finish()])
+    assert expected.shape == (len(frames), NUM_STATES)
     np.testing.assert_allclose(found, expected, rtol=2e-2, atol=2e-2)
     again = loaded.topology
     assert (again.language_scale, again.unit_penalty) == (1.5, -0.25)
@@ -98,13 +99,40 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
 
 def test_a_stream_scores_the_same_in_any_pieces_and_after_reset() -> None:
     noise = np.random.default_rng(0).normal(0, 0.1, 6000).astype(np.float32)
-    log_mel = LogMel().accept_waveform(noise)
-    stream = random_gmm().stream()
-    whole = np.concatenate([stream.accept(log_mel), stream.finish()])
+    model = random_gmm()
+    frames = model.front_end().accept_waveform(noise)
+    stream = model.stream()
+    whole = np.concatenate([stream.accept(frames), stream.finish()])
     stream.reset()
-    pieces = [stream.accept(piece) for piece in np.split(log_mel, [0, 1, 3, 10, 11, 30])]
+    pieces = [stream.accept(piece) for piece in np.split(frames, [0, 1, 3, 10, 11, 30])]
     np.testing.assert_array_equal(np.concatenate([*pieces, stream.finish()]), whole)
     assert len(stream.finish()) == 0
+
+
+def low_voice(num_samples: int) -> np.ndarray:
+    """A voice of 100 Hz: a pulse and what rings after it, again and again."""
+    pulses = np.zeros(num_samples)
+    pulses[::160] = 1.0
+    ringing = np.sin(2 * np.pi * 700 * np.arange(320) / 16_000) * np.exp(-np.arange(320) / 60)
+    voice: np.ndarray = 0.3 * np.convolve(pulses, ringing)[:num_samples]
+    return voice.astype(np.float32)
+
+
+def test_low_voices_are_warped_and_the_pitch_is_known_in_the_next_segment() -> None:
+    model = random_gmm()
+    frames = model.front_end().accept_waveform(low_voice(16_000))
+    assert frames.shape[1] == 1 + NUM_BANDS + 2
+    warp = VoiceWarp()
+    live, given = model.stream(), model.stream()
+    for segment in (frames[:60], frames[60:]):
+        warped = warp.accept(segment[:, :-2], segment[:, -2], segment[:, -1])
+        assert not np.array_equal(warped[-1], segment[-1, :-2])
+        found = np.concatenate([live.accept(segment), live.finish()])
+        expected = np.concatenate([given.accept(without_pitch(warped)), given.finish()])
+        np.testing.assert_array_equal(found, expected)
+    live.reset()
+    anew = model.stream()
+    np.testing.assert_array_equal(live.accept(frames), anew.accept(frames))
 
 
 def test_the_model_that_ships_loads_and_fits() -> None:

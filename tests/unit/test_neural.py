@@ -1,16 +1,27 @@
 """The neural model: its file, its look-aheads, sessions scored together."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from services.recognizer import neural as neural_module
 from services.recognizer.acoustic_model import listen
-from services.recognizer.features import LogMel
 from services.recognizer.load import load_model, model_path
 from services.recognizer.model_file import read_archive, write_archive
-from services.recognizer.neural import FORMAT, NUM_INPUTS, NeuralModel
+from services.recognizer.neural import (
+    FORMAT,
+    MOST_POSITIONS,
+    NUM_INPUTS,
+    WINDOW,
+    NeuralModel,
+    positions_of,
+)
 from services.recognizer.pipeline import Recognizer
+from services.recognizer.whisper_mel import WhisperMel
 from shared.audio_file import read_audio
 from shared.errors import UserError
 
@@ -18,13 +29,19 @@ pytestmark = pytest.mark.unit
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
-LOG_MEL = LogMel().accept_waveform(HELLO)
+FRAMES = WhisperMel().accept_waveform(HELLO)
 
 
+@cache
 def neural(look_ahead_ms: float | None = None) -> NeuralModel:
     model = load_model(model_path("neural"), look_ahead_ms=look_ahead_ms)
     assert isinstance(model, NeuralModel)
     return model
+
+
+def scores_of(model: NeuralModel, frames: np.ndarray) -> np.ndarray:
+    stream = model.stream()
+    return np.concatenate([stream.accept(frames), stream.finish()])
 
 
 def test_every_look_ahead_has_scores_of_its_own() -> None:
@@ -33,23 +50,97 @@ def test_every_look_ahead_has_scores_of_its_own() -> None:
         model = neural(10.0 * frames)
         stream = model.stream()
         assert stream.look_ahead_frames == frames
-        early = stream.accept(LOG_MEL)
-        assert len(early) == len(LOG_MEL) - frames
+        early = stream.accept(FRAMES)
+        num_early = len(early) - (len(FRAMES) - frames)
+        assert num_early in (0, 1)  # a position says two frames, the second as soon as the first
         found[int(frames)] = np.concatenate([early, stream.finish()])
-        assert found[int(frames)].shape == (len(LOG_MEL), model.topology.num_states)
+        assert found[int(frames)].shape == (len(FRAMES), model.topology.num_states)
     assert len({scores.tobytes() for scores in found.values()}) == len(found)
 
 
-def test_a_segment_begins_afresh_and_the_speaker_is_kept() -> None:
+@pytest.mark.parametrize("num_frames", range(8))
+def test_short_segments_have_scores_of_all_their_frames(num_frames: int) -> None:
+    for head in range(len(neural().look_aheads)):
+        stream = neural(10.0 * neural().look_aheads[head]).stream()
+        for _ in range(2):
+            rows = [*stream.accept(FRAMES[:num_frames]), *stream.finish()]
+            assert len(rows) == num_frames
+        assert len(stream.finish()) == 0
+
+
+def test_scores_come_no_later_than_the_look_ahead() -> None:
+    for frames in neural().look_aheads:
+        stream = neural(10.0 * frames).stream()
+        num_scores = 0
+        for number in range(60):
+            num_scores += len(stream.accept(FRAMES[number : number + 1]))
+            # Frame 0 with a look-ahead of one frame comes along with frame 1.
+            assert num_scores >= number + 1 - frames or number < 2
+            assert num_scores <= number + 2 - frames or num_scores == 0
+
+
+def test_a_look_ahead_of_one_frame_gives_the_first_frame_the_scores_of_the_second() -> None:
+    scores = scores_of(neural(10.0), FRAMES)
+    np.testing.assert_array_equal(scores[0], scores[1])
+    assert not np.array_equal(scores[1], scores[2])
+
+
+def test_the_last_frame_is_repeated_at_the_end() -> None:
+    for frames in (10.0, 60.0):
+        model = neural(frames)
+        longer = np.concatenate([FRAMES, np.repeat(FRAMES[-1:], 30, axis=0)])
+        again = scores_of(model, longer)[: len(FRAMES)]
+        np.testing.assert_array_equal(scores_of(model, FRAMES), again)
+
+
+def test_a_frame_is_heard_as_far_as_the_look_ahead_and_no_further() -> None:
+    model = neural(30.0)
+    other = FRAMES.copy()
+    other[50:] += 0.5
+    one, two = scores_of(model, FRAMES), scores_of(model, other)
+    same = (one == two).all(axis=1)
+    assert same[:47].all()
+    assert not same[47:].any()
+
+
+def test_only_the_window_counts() -> None:
+    """What lies before the window of every layer and the frames around it changes nothing."""
+    model = neural(10.0)
+    layers = model.sizes.layers
+    reach = 2 * layers * (WINDOW - 1) + 5
+    frames = np.resize(FRAMES, (reach + 40, NUM_INPUTS))
+    other = frames.copy()
+    other[:4] += 0.5
+    one, two = scores_of(model, frames), scores_of(model, other)
+    assert not np.array_equal(one[reach - 60], two[reach - 60])
+    np.testing.assert_array_equal(one[reach + 10 :], two[reach + 10 :])
+
+
+def test_a_segment_begins_afresh() -> None:
     stream = neural().stream()
-    first = np.concatenate([stream.accept(LOG_MEL), stream.finish()])
+    first = np.concatenate([stream.accept(FRAMES), stream.finish()])
     assert len(stream.finish()) == 0
-    second = np.concatenate([stream.accept(LOG_MEL), stream.finish()])
-    assert first.shape == second.shape
-    assert not np.array_equal(first, second)  # the mean of the speaker has been learnt
+    second = np.concatenate([stream.accept(FRAMES), stream.finish()])
+    np.testing.assert_array_equal(second, first)
+    stream.accept(FRAMES[:77])
     stream.reset()
-    again = np.concatenate([stream.accept(LOG_MEL), stream.finish()])
+    again = np.concatenate([stream.accept(FRAMES), stream.finish()])
     np.testing.assert_array_equal(again, first)
+
+
+def test_speech_beyond_the_table_of_positions_goes_on_with_an_empty_past(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = neural(10.0)
+    whole = scores_of(model, FRAMES)
+    monkeypatch.setattr(neural_module, "MOST_POSITIONS", 20)
+    short = scores_of(model, FRAMES)
+    assert short.shape == whole.shape
+    np.testing.assert_array_equal(short[:41], whole[:41])
+    assert not np.array_equal(short[41:43], whole[41:43])
+    later = FRAMES.copy()
+    later[:38] = 0.3  # what only the positions before the new beginning have seen
+    np.testing.assert_array_equal(scores_of(model, later)[41:81], short[41:81])
 
 
 def test_sessions_that_listen_together_hear_what_each_hears_alone() -> None:
@@ -67,15 +158,41 @@ def test_sessions_that_listen_together_hear_what_each_hears_alone() -> None:
     assert alone[0]
 
 
+def test_scores_are_the_same_whoever_comes_and_goes() -> None:
+    model = neural()
+    expected = scores_of(model, FRAMES)
+    streams = [model.stream() for _ in range(5)]
+    rows: list[list[np.ndarray]] = [[] for _ in streams]
+    num_frames = len(FRAMES)
+    for frame in range(num_frames):
+        company = [n for n in range(5) if frame < num_frames // (n + 1)]
+        piece = FRAMES[frame : frame + 1]
+        order = company[frame % 3 :] + company[: frame % 3]  # in any order
+        for n, scores in zip(order, model.score([(streams[n], piece) for n in order]), strict=True):
+            rows[n].append(scores)
+    for n in range(5):
+        found = np.concatenate(rows[n])
+        np.testing.assert_array_equal(found, expected[: len(found)])
+        assert len(found) >= num_frames // (n + 1) - 1
+
+
+def test_positions_are_sinusoids() -> None:
+    table = positions_of(512)
+    assert table.shape == (MOST_POSITIONS, 512)
+    np.testing.assert_array_equal(table[0], np.repeat([0, 1], 256))
+    np.testing.assert_allclose(table[7, [0, 256]], [np.sin(7), np.cos(7)], rtol=1e-6)
+    np.testing.assert_allclose(table[1000, 255], np.sin(0.1), rtol=1e-6)  # the longest wave
+
+
 def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     model = neural()
     model.save(tmp_path / "model.npz")
     again = load_model(tmp_path / "model.npz")
-    np.testing.assert_array_equal(again.stream().accept(LOG_MEL), model.stream().accept(LOG_MEL))
+    np.testing.assert_array_equal(again.stream().accept(FRAMES), model.stream().accept(FRAMES))
 
 
 def test_an_unknown_look_ahead_is_refused() -> None:
-    with pytest.raises(UserError, match="look_ahead_ms is 50; give one of 0, 10, 30"):
+    with pytest.raises(UserError, match="look_ahead_ms is 50; give one of 10, 30"):
         neural(50.0)
 
 
@@ -89,12 +206,12 @@ def test_a_gmm_has_one_look_ahead() -> None:
     [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
         ({"look_aheads": np.array([], np.int64)}, "names no look-aheads"),
-        ({"look_aheads": np.array([0, -1])}, "look-aheads"),
-        ({"look_aheads": np.arange(50)}, "does not run"),
+        ({"look_aheads": np.array([1, 0])}, "look-aheads"),
+        ({"look_aheads": np.array([1, 101])}, "look-aheads"),
+        ({"look_aheads": np.arange(1, 50)}, "its network scores"),
         ({"head": np.array(77)}, "output layer 77"),
-        ({"spread": np.zeros(NUM_INPUTS, np.float32)}, "spread"),
         ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),
-        ({"prior_mean": np.full(NUM_INPUTS, np.nan, np.float32)}, "no numbers"),
+        ({"kappa": np.array(np.nan, np.float32)}, "no numbers"),
     ],
 )
 def test_files_are_checked(change: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
@@ -104,6 +221,42 @@ def test_files_are_checked(change: dict[str, np.ndarray], message: str, tmp_path
     write_archive(path, {**arrays, **change})
     with pytest.raises(UserError, match=message):
         load_model(path)
+
+
+def with_network(change: Callable[[Any], None], path: Path) -> Path:
+    """Write the shipped model with its network changed."""
+    onnx = pytest.importorskip("onnx")
+    arrays = read_archive(model_path("neural")).arrays
+    network = onnx.load_model_from_string(arrays["network"].tobytes())
+    change(network.graph)
+    changed = np.frombuffer(network.SerializeToString(), np.uint8)
+    write_archive(path, {**arrays, "network": changed})
+    return path
+
+
+def test_a_network_of_another_form_is_refused(tmp_path: Path) -> None:
+    def without_head(graph: Any) -> None:
+        del graph.node[:], graph.output[1:], graph.input[:]
+        graph.node.add(op_type="Identity", input=["norm.bias"], output=["shares"])
+
+    def of_no_width(graph: Any) -> None:
+        graph.input[1].type.tensor_type.shape.dim[1].dim_param = "any"
+
+    def of_other_past(graph: Any) -> None:
+        graph.input[3].type.tensor_type.shape.dim[3].dim_param = "any"
+
+    def of_no_numbers(graph: Any) -> None:
+        (bias,) = (tensor for tensor in graph.initializer if tensor.name == "norm.bias")
+        bias.raw_data = np.full(bias.dims[0], np.nan, np.float32).tobytes()
+
+    for change, message in (
+        (without_head, "has the inputs"),
+        (of_no_width, "has the width any"),
+        (of_other_past, "has past of"),
+        (of_no_numbers, "are no numbers"),
+    ):
+        with pytest.raises(UserError, match=message):
+            load_model(with_network(change, tmp_path / "model.npz"))
 
 
 def test_a_network_of_other_states_is_refused(tmp_path: Path) -> None:

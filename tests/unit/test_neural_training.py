@@ -1,5 +1,8 @@
-"""Other voices and the training of the network."""
+"""Whisper's weights, changed sounds, and the training of the network."""
 
+import struct
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -7,24 +10,42 @@ import pytest
 import soundfile
 import torch
 
+from services.recognizer.features import LogMel
 from services.recognizer.load import load_model, model_path
-from services.recognizer.neural import NeuralModel
+from services.recognizer.neural import WINDOW, NeuralModel
+from services.recognizer.whisper_mel import NUM_MELS, WhisperMel
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.phones import UNITS
+from training import network_training, sound_change
 from training.corpus import RowErrors, read_corpus
-from training.network import FRONT_FRAMES, NUM_INPUTS, Network, Shape
-from training.network_export import networks_of, onnx_of
-from training.network_training import FrontEnd, Recording, Trainer
+from training.examples import load_examples
+from training.feature_cache import as_floats, samples_of
+from training.network import Network, Shape, said_frames
+from training.network_export import network_of, onnx_of
+from training.network_training import (
+    NO_TARGET,
+    Recording,
+    Trainer,
+    due_states,
+    heard_anew,
+    log_shares_of,
+)
 from training.neural_recipe import train_neural
-from training.second_language import as_nearest_units, load_second_language
-from training.voice_change import Voice, VoiceChange, changed_voices
+from training.sound_change import (
+    changed_sound,
+    changed_tempo,
+    frames_before,
+    levelled,
+    mask,
+)
+from training.whisper_weights import load_whisper
 
 pytestmark = pytest.mark.unit
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
-SHAPE = Shape(num_states=9, look_aheads=(0, 3), front=16, hidden=24)
+SMALL = partial(Shape, width=32, heads=2, layers=2, inner=48)
+SHAPE = SMALL(num_states=6, look_aheads=(1, 3, 6))
 
 
 @pytest.fixture(autouse=True)
@@ -32,254 +53,595 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-# --- other voices
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
-def in_voice(voice: Voice, warp: float) -> Voice:
-    change = VoiceChange(
-        median_f0_hz=120.0, intonation=1.0, warp_low=warp, warp_high=warp, breath=1.0, tilt=0.0
-    )
-    changed = voice.changed(change)
-    assert changed.shape == HELLO.shape
-    return Voice.analyse(changed)
+# --- Whisper's weights
 
 
-def test_a_voice_is_moved_to_the_pitch_and_formants_asked_for() -> None:
-    voice = Voice.analyse(HELLO)
-    assert voice.median_f0_hz > 180
-    low, high = in_voice(voice, 0.8), in_voice(voice, 1.25)
-    assert [low.median_f0_hz, high.median_f0_hz] == pytest.approx([120, 120], rel=0.05)
-    bins = np.arange(voice.envelope.shape[1])
-    centres = []
-    for one in (low, high):
-        power = one.envelope[one.f0_hz > 0].mean(axis=0) ** 0.3
-        centres.append((bins * power).sum() / power.sum())
-    assert centres[1] > 1.1 * centres[0]
+def encoder_arrays(num_layers: int = 3, width: int = 32, inner: int = 48) -> dict[str, np.ndarray]:
+    """Weights of a small encoder, all different, by CTranslate2's names."""
+    sizes = {
+        "conv1/weight": (width, NUM_MELS, 3),
+        "conv1/bias": (width,),
+        "conv2/weight": (width, width, 3),
+        "conv2/bias": (width,),
+        "layer_norm/gamma": (width,),
+        "layer_norm/beta": (width,),
+    }
+    for number in range(num_layers):
+        for name, size in {
+            "self_attention/layer_norm/gamma": (width,),
+            "self_attention/layer_norm/beta": (width,),
+            "self_attention/linear_0/weight": (3 * width, width),
+            "self_attention/linear_0/bias": (3 * width,),
+            "self_attention/linear_1/weight": (width, width),
+            "self_attention/linear_1/bias": (width,),
+            "ffn/layer_norm/gamma": (width,),
+            "ffn/layer_norm/beta": (width,),
+            "ffn/linear_0/weight": (inner, width),
+            "ffn/linear_0/bias": (inner,),
+            "ffn/linear_1/weight": (width, inner),
+            "ffn/linear_1/bias": (width,),
+        }.items():
+            sizes[f"layer_{number}/{name}"] = size
+    rng = np.random.default_rng(0)
+    return {
+        f"encoder/{name}": rng.normal(0, 0.2, size).astype(np.float16)
+        for name, size in sizes.items()
+    }
 
 
-def test_silence_stays_silence() -> None:
-    voice = Voice.analyse(np.zeros(8000, np.float32))
-    change = VoiceChange.draw(np.random.default_rng(0), voice.median_f0_hz)
-    assert np.abs(voice.changed(change)).max() < 1e-3
+def string(text: str) -> bytes:
+    return struct.pack("<H", len(text) + 1) + text.encode() + b"\0"
 
 
-def test_copies_have_the_frames_of_the_recording(tmp_path: Path) -> None:
-    soundfile.write(tmp_path / "a.wav", HELLO, 16_000)
-    (tmp_path / "b.wav").write_bytes(b"no sound")
-    rows = "".join(f"{n}\t{n}.wav\tS\tCC0\ttrain\t1.5\tni3\n" for n in "ab")
+def write_whisper(
+    folder: Path,
+    arrays: dict[str, np.ndarray],
+    *,
+    version: int = 6,
+    name: str = "WhisperSpec",
+) -> Path:
+    """Write a file as CTranslate2 does; arrays of uint16 are the upper halves of floats."""
+    kinds = {"f4": 0, "i1": 1, "i2": 2, "i4": 3, "f2": 4, "u2": 5}
+    content = struct.pack("<I", version) + string(name) + struct.pack("<II", 3, len(arrays))
+    for key, array in arrays.items():
+        sizes = struct.pack(f"<B{array.ndim}I", array.ndim, *array.shape)
+        kind = struct.pack("<BI", kinds[array.dtype.str[1:]], array.nbytes)
+        content += string(key) + sizes + kind + array.tobytes()
+    content += struct.pack("<I", 0)  # no aliases
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "model.bin").write_bytes(content)
+    return folder
+
+
+def floats(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().numpy()
+
+
+def test_weights_land_where_they_belong(tmp_path: Path) -> None:
+    arrays = encoder_arrays()
+    other = {"decoder/projection/weight": np.zeros((4, 4), np.float16)}
+    network = Network(SHAPE)
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    load_whisper(network, write_whisper(tmp_path, {**other, **arrays}))
+    pairs = {"first": "conv1", "second": "conv2"}
+    for number in range(2):
+        pairs |= {
+            f"layers.{number}.{ours}": f"layer_{number}/{theirs}"
+            for ours, theirs in {
+                "attention_norm": "self_attention/layer_norm",
+                "query_key_value": "self_attention/linear_0",
+                "attended": "self_attention/linear_1",
+                "inner_norm": "ffn/layer_norm",
+                "inner": "ffn/linear_0",
+                "outer": "ffn/linear_1",
+            }.items()
+        }
+    after = network.state_dict()
+    for ours, theirs in pairs.items():
+        kinds = ("gamma", "beta") if "norm" in theirs else ("weight", "bias")
+        for kind, of_file in zip(("weight", "bias"), kinds, strict=True):
+            expected = arrays[f"encoder/{theirs}/{of_file}"].astype(np.float32)
+            np.testing.assert_array_equal(floats(after.pop(f"{ours}.{kind}")), expected)
+    assert {name.split(".")[0] for name in after} == {"norm", "outputs"}
+    for name, tensor in after.items():
+        assert torch.equal(tensor, before[name])
+
+
+def test_integers_and_short_floats_are_read(tmp_path: Path) -> None:
+    arrays = encoder_arrays()
+    name = "encoder/layer_0/ffn/linear_0/weight"
+    weight = arrays[name].astype(np.float32)
+    scale = 127 / np.abs(weight).max(axis=1)
+    arrays[name] = np.rint(weight * scale[:, None]).astype(np.int8)
+    arrays[f"{name}_scale"] = scale.astype(np.float32)
+    bias = "encoder/conv1/bias"
+    short = (arrays[bias].astype(np.float32).view(np.uint32) >> 16).astype(np.uint16)
+    expected = arrays[bias].astype(np.float32)
+    arrays[bias] = short
+    network = Network(SHAPE)
+    load_whisper(network, write_whisper(tmp_path, arrays))
+    read = network.state_dict()
+    found = floats(read["layers.0.inner.weight"])
+    np.testing.assert_allclose(found, weight, atol=float(np.abs(weight).max()) / 250)
+    np.testing.assert_allclose(floats(read["first.bias"]), expected, rtol=2**-7)
+
+
+def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"model\.bin cannot be read .*for faster-whisper"):
+        load_whisper(Network(SHAPE), tmp_path)
+
+
+def test_files_of_other_kinds_and_sizes_are_named(tmp_path: Path) -> None:
+    def refused(message: str) -> None:
+        with pytest.raises(UserError, match=message) as error:
+            load_whisper(Network(SHAPE), tmp_path)
+        assert str(tmp_path / "model.bin") in str(error.value)
+
+    write_whisper(tmp_path, encoder_arrays(width=64))
+    refused("64 x 80 x 3 and not 32 x 80 x 3; give the folder of a Whisper model of width 32")
+    write_whisper(tmp_path, encoder_arrays(num_layers=1))
+    refused("holds no encoder/layer_1")
+    write_whisper(tmp_path, encoder_arrays(), name="TransformerSpec")
+    refused("holds a 'TransformerSpec'")
+    write_whisper(tmp_path, encoder_arrays(), version=3)
+    refused("version 3 of it is too old")
+    unclear = encoder_arrays()
+    unclear["encoder/conv2/bias"][3] = np.nan
+    write_whisper(tmp_path, unclear)
+    refused("conv2/bias holds what is no number")
+    for scale, message in (
+        (np.zeros(32), "what is no number"),
+        (np.ones(5), "_scale has 5 values"),
+    ):
+        scaled = encoder_arrays() | {"encoder/conv1/weight_scale": scale.astype(np.float32)}
+        write_whisper(tmp_path, scaled)
+        refused(message)
+    flat = encoder_arrays() | {"encoder/conv1/weight": np.ones((), np.float32)}
+    write_whisper(tmp_path, flat | {"encoder/conv1/weight_scale": np.ones(1, np.float32)})
+    refused("no Whisper model")
+    (tmp_path / "model.bin").write_bytes(b"")
+    refused("no Whisper model")
+
+
+def test_no_size_in_the_file_is_believed(tmp_path: Path) -> None:
+    """A file cut anywhere, and one with any number in it made enormous, is refused."""
+    write_whisper(tmp_path, encoder_arrays(num_layers=2))
+    path = tmp_path / "model.bin"
+    content = path.read_bytes()
+    used = len(content) - 4  # the aliases at the end are not read
+    for size in [*range(1, 90), *range(90, used, 997), used - 1]:
+        path.write_bytes(content[:size])
+        with pytest.raises(UserError, match="no Whisper model"):
+            load_whisper(Network(SHAPE), tmp_path)
+    first_array = content.index(b"encoder/conv1/weight\0") + len("encoder/conv1/weight") + 1
+    for at in range(first_array, first_array + 18):  # rank, sizes, kind, number of bytes
+        path.write_bytes(content[:at] + b"\xff" + content[at + 1 :])
+        with pytest.raises(UserError, match="no Whisper model"):
+            load_whisper(Network(SHAPE), tmp_path)
+
+
+# --- changed sounds
+
+
+def burst(start_s: float, end_s: float, whole_s: float, tone_hz: float = 1000.0) -> np.ndarray:
+    """A tone in silence."""
+    time_s = np.arange(round(whole_s * 16_000)) / 16_000
+    inside = (time_s >= start_s) & (time_s < end_s)
+    return (0.3 * np.sin(2 * np.pi * tone_hz * time_s) * inside).astype(np.float32)
+
+
+def test_the_same_generator_changes_a_sound_in_the_same_way() -> None:
+    results = []
+    for seed in (*range(40), *range(40)):
+        rng = np.random.default_rng(seed)
+        sound, speed = changed_sound(HELLO, rng)
+        results.append(levelled(sound, rng))
+        assert len(sound) == pytest.approx(len(HELLO) / speed, abs=1)
+        assert np.isfinite(results[-1]).all()
+        assert 10 ** (-26.1 / 20) < np.abs(results[-1]).max() <= 1.001
+    for first, second in zip(results[:40], results[40:], strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert len({len(sound) for sound in results}) == 8  # speeds
+    silence = np.zeros(4000, np.float32)
+    for seed in range(40):
+        assert np.abs(changed_sound(silence, np.random.default_rng(seed))[0]).max() < 1e-3
+
+
+def test_speed_moves_the_pitch(monkeypatch: pytest.MonkeyPatch) -> None:
+    for share in ("_ROOM_SHARE", "_NOISE_SHARE", "_TELEPHONE_SHARE", "_CODEC_SHARE"):
+        monkeypatch.setattr(sound_change, share, 0.0)
+    tone = burst(0.0, 1.0, 1.0)
+    speeds = set()
+    for seed in range(30):
+        sound, speed = changed_sound(tone, np.random.default_rng(seed))
+        spectrum = np.abs(np.fft.rfft(sound))
+        pitch_hz = spectrum.argmax() * 16_000 / len(sound)
+        assert pitch_hz == pytest.approx(1000 * speed, rel=0.01)
+        speeds.add(speed)
+    assert len(speeds) > 4
+
+
+def test_noise_is_as_loud_as_it_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    for share in ("_SPEED_SHARE", "_ROOM_SHARE", "_TELEPHONE_SHARE", "_CODEC_SHARE"):
+        monkeypatch.setattr(sound_change, share, 0.0)
+    monkeypatch.setattr(sound_change, "_COLOUR_SHARE", 0.0)
+    monkeypatch.setattr(sound_change, "_NOISE_SHARE", 1.0)
+    snr_db = []
+    for seed in range(60):
+        sound, _ = changed_sound(HELLO, np.random.default_rng(seed))
+        snr_db.append(10 * np.log10(np.mean(HELLO**2) / np.mean((sound - HELLO) ** 2)))
+    assert 2.9 < min(snr_db) < 8
+    assert 25 < max(snr_db) < 30.1
+
+
+def test_targets_stay_at_their_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a tone begins and ends, its target does, whatever the speed and the tempo."""
+    for share in ("_ROOM_SHARE", "_NOISE_SHARE"):
+        monkeypatch.setattr(sound_change, share, 0.0)
+    monkeypatch.setattr(sound_change, "_MOST_MASKS", 0)
+    sound = burst(1.0, 1.8, 3.0)
+    middle_s = (np.arange(298) * 160 + 200) / 16_000
+    targets = ((middle_s >= 1.0) & (middle_s < 1.8)).astype(np.int64)
+    samples = np.rint(32767 * sound).astype(np.int16)
+    recording = Recording(samples=samples, targets=targets, weight=1.0)
+    lengths = []
+    for seed in range(60):
+        frames, changed = heard_anew(recording, np.random.default_rng(seed))
+        assert frames.shape == (len(changed), NUM_MELS)
+        loud = frames.max(axis=1) > frames.max() - 0.5
+        at, due = np.flatnonzero(loud), np.flatnonzero(changed)
+        assert abs(at[0] - due[0]) <= 2
+        assert abs(at[-1] - due[-1]) <= 2
+        lengths.append(len(frames))
+    assert min(lengths) < 250
+    assert max(lengths) > 350
+
+
+def test_frames_know_what_they_were() -> None:
+    assert frames_before(5, 1.0, 5).tolist() == [0, 1, 2, 3, 4]
+    # the middle of frame 100 was at 2 * (16000 + 200) samples: frame 201.25
+    assert frames_before(101, 2.0, 500)[100] == 201
+    assert frames_before(101, 2.0, 150)[100] == 149
+    frames = np.arange(100, dtype=np.float32)[:, None]
+    for seed in range(20):
+        changed, were = changed_tempo(frames, np.random.default_rng(seed))
+        assert 77 <= len(changed) == len(were) <= 123
+        np.testing.assert_allclose(changed[:, 0], were, atol=0.51)
+        assert (were[0], were[-1]) == (0, 99)
+
+
+def test_masks_hide_few_frames_and_bands() -> None:
+    hidden = []
+    for seed in range(50):
+        frames = np.random.default_rng(100).normal(size=(200, NUM_MELS)).astype(np.float32)
+        before = frames.copy()
+        mask(frames, np.random.default_rng(seed))
+        changed = frames != before
+        assert np.isin(frames[changed], before.mean()).all()
+        rows, columns = changed.all(axis=1), changed.all(axis=0)
+        assert rows.sum() <= 24
+        assert columns.sum() <= 28
+        np.testing.assert_array_equal(changed, rows[:, None] | columns)
+        hidden.append(changed.mean())
+    assert min(hidden) == 0.0
+    assert 0.05 < np.mean(hidden) < 0.25
+
+
+# --- samples beside frames
+
+
+def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
+    """Recordings of one text; those whose name begins with d are for dev."""
+    folder.mkdir(exist_ok=True)
     header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin\n"
-    (tmp_path / "manifest.tsv").write_text(header + rows, encoding="utf-8")
-    utterances = read_corpus(tmp_path, RowErrors())
-    first, unreadable = changed_voices(utterances, num_voices=2, seed=0)
-    assert [block.shape for block in first] == [(148, 41)] * 2
-    assert not np.array_equal(first[0], first[1])
-    assert [len(block) for block in unreadable] == [0, 0]
-    other, _ = changed_voices(utterances, num_voices=2, seed=1)
-    assert not np.array_equal(first[0], other[0])
+    rows = ""
+    for name, sound in sounds.items():
+        soundfile.write(folder / f"{name}.wav", sound, 16_000)
+        split = "dev" if name.startswith("d") else "train"
+        pinyin = "ni3 hao3 huan1 ying2 lai2 dao4"
+        rows += f"{name}\t{name}.wav\tS\tCC0-1.0\t{split}\t1.5\t{pinyin}\n"
+    (folder / "manifest.tsv").write_text(header + rows, encoding="utf-8")
+    return folder
+
+
+def test_examples_have_the_samples_of_their_frames(tmp_path: Path) -> None:
+    late = np.concatenate([np.zeros(20_000, np.float32), HELLO, np.zeros(20_000, np.float32)])
+    corpus = write_corpus(tmp_path / "corpus", {"a": late, "b": HELLO})
+    plain = load_examples([corpus], RowErrors())
+    examples = load_examples([corpus], RowErrors(), with_samples=True)
+    assert [example.samples for example in plain] == [None, None]
+    for example, one in zip(examples, plain, strict=True):
+        assert example.samples is not None
+        assert example.samples.dtype == np.int16
+        assert isinstance(example.samples, np.memmap)
+        np.testing.assert_array_equal(example.log_mel, one.log_mel)
+        again = LogMel().accept_waveform(as_floats(example.samples))
+        np.testing.assert_array_equal(again.astype(np.float16), example.log_mel)
+    assert len(examples[0].log_mel) < len(late) / 160 - 150
+
+
+def test_samples_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO[:8000]})
+    soundfile.write(corpus / "c.wav", HELLO, 16_000)
+    rows = read_corpus(corpus, RowErrors())
+    (corpus / "b.wav").write_bytes(b"no sound")
+    first = samples_of(rows)
+    monkeypatch.setattr(
+        "training.feature_cache.read_audio", lambda _: pytest.fail("computed again")
+    )
+    for found in (first, samples_of(rows)):
+        np.testing.assert_allclose(as_floats(found[0]), HELLO, atol=2**-16)
+        assert len(found[1]) == 0
+    assert samples_of([]) == []
 
 
 # --- the network
 
 
-@pytest.mark.parametrize("num_networks", [1, 2])
-def test_the_file_computes_what_the_networks_do(num_networks: int) -> None:
+def random_frames(num_frames: int, seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(
+        np.random.default_rng(seed).normal(0, 0.5, (1, num_frames, NUM_MELS)).astype(np.float32)
+    )
+
+
+@torch.no_grad()
+def test_the_future_does_not_change_the_past() -> None:
     torch.manual_seed(0)
-    networks = [Network(SHAPE).eval() for _ in range(num_networks)]
-    frames = np.random.default_rng(0).normal(size=(20, NUM_INPUTS)).astype(np.float32)
-    expected = []
-    with torch.no_grad():
-        hidden = [network(torch.from_numpy(frames)[None])[0] for network in networks]
-        for head in range(len(SHAPE.look_aheads)):
-            logits = [n.heads[head](h) for n, h in zip(networks, hidden, strict=True)]
-            expected.append(torch.log_softmax(sum(logits) / num_networks, -1).numpy())
-    shipped = load_model(model_path("neural"))
-    assert isinstance(shipped, NeuralModel)
+    network = Network(SHAPE).eval()
+    frames = random_frames(41)
+    hidden = network(frames)
+    assert hidden.shape == (1, 20, 32)
+    for position in (0, 7, 18):
+        heard = 2 * position + 2
+        changed = frames.clone()
+        changed[:, heard + 1 :] = 3.0
+        torch.testing.assert_close(network(changed)[:, : position + 1], hidden[:, : position + 1])
+        changed = frames.clone()
+        changed[:, heard] += 3.0
+        assert (network(changed)[0, position] - hidden[0, position]).abs().max() > 1e-3
+
+
+@torch.no_grad()
+def test_a_position_attends_to_the_window_and_no_further() -> None:
+    torch.manual_seed(0)
+    network = Network(SMALL(num_states=6, look_aheads=(1,), layers=1)).eval()
+    frames = random_frames(2 * WINDOW + 21)
+    hidden = network(frames)
+    changed = frames.clone()
+    changed[:, :5] += 3.0  # positions 0 to 3 have heard it
+    difference = (network(changed) - hidden).abs().amax(dim=(0, 2))
+    assert (difference[: WINDOW + 3] > 1e-6).all()
+    assert (difference[WINDOW + 3 :] < 1e-6).all()
+
+
+def test_positions_owe_the_frames_of_their_look_ahead() -> None:
+    assert said_frames(3, 1).tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert said_frames(3, 6).tolist() == [[-4, -3], [-2, -1], [0, 1]]
+    states = torch.arange(100, 109)[None]
+    assert due_states(states, 4, 1)[0].tolist() == [[101, 102], [103, 104], [105, 106], [107, 108]]
+    assert due_states(states, 4, 3)[0].tolist() == [
+        [NO_TARGET, 100], [101, 102], [103, 104], [105, 106],
+    ]  # fmt: skip
+    assert due_states(states, 6, 1)[0, 4].tolist() == [NO_TARGET, NO_TARGET]
+
+
+@pytest.mark.parametrize("num_samples", [8000, 8160, 560])
+def test_whole_recordings_are_heard_as_the_recognizer_hears_them(num_samples: int) -> None:
+    torch.manual_seed(0)
+    network = Network(SHAPE).eval()
+    samples = np.rint(32767 * HELLO[4000 : 4000 + num_samples]).astype(np.int16)
     model = NeuralModel(
-        topology=shipped.topology,
-        network=onnx_of(networks),
+        topology=load_model(model_path("gmm")).topology,
+        network=onnx_of(network, exact=True),
         look_aheads=np.array(SHAPE.look_aheads),
-        log_prior=shipped.log_prior,
-        prior_mean=shipped.prior_mean,
-        spread=shipped.spread,
+        log_prior=np.zeros(6, np.float32),
         kappa=1.0,
     )
-    width = 24 * num_networks
-    assert model.hidden_shape == (width, width)
-    assert model.num_context == FRONT_FRAMES
-    padded = np.concatenate([np.repeat(frames[:1], FRONT_FRAMES - 1, axis=0), frames])
-    seen = np.stack([padded[at : at + FRONT_FRAMES].reshape(-1) for at in range(20)])
-    for head, shares in enumerate(expected):
-        found = model.session.run(
-            None,
-            {
-                "x": np.stack([seen, seen], axis=1),
-                "h1": np.zeros((1, 2, width), np.float32),
-                "h2": np.zeros((1, 2, width), np.float32),
-                "head": np.array(head),
-            },
-        )[0]
-        np.testing.assert_allclose(found[:, 0], shares, atol=2e-3)
+    for output, look_ahead in enumerate(SHAPE.look_aheads):
+        stream = model.with_look_ahead(10.0 * look_ahead).stream()
+        frames = WhisperMel().accept_waveform(as_floats(samples))
+        expected = np.concatenate([stream.accept(frames), stream.finish()])
+        found = log_shares_of(network, output, samples)
+        assert found.shape == (len(frames), 6)
+        np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("num_networks", [1, 2])
-def test_networks_come_back_from_their_file(num_networks: int) -> None:
-    torch.manual_seed(0)
-    networks = [Network(SHAPE) for _ in range(num_networks)]
-    file = onnx_of(networks)
-    again = networks_of(file, SHAPE.look_aheads)
-    assert [network.shape for network in again] == [SHAPE] * num_networks
-    np.testing.assert_array_equal(onnx_of(again), file)
-    for wanted, found in zip(networks, again, strict=True):
-        found_state = found.state_dict()
-        for name, tensor in wanted.state_dict().items():
-            if name.startswith("second_task") or (name.startswith("heads") and "bias" in name):
-                continue  # the one is not in the file, of the other only the mean
-            largest = float(tensor.abs().max())
-            torch.testing.assert_close(found_state[name], tensor, atol=largest / 127, rtol=0)
-    for head in range(len(SHAPE.look_aheads)):
-        biases = [
-            torch.stack([one.state_dict()[f"heads.{head}.bias"] for one in side]).mean(0)
-            for side in (networks, again)
-        ]
-        torch.testing.assert_close(biases[0], biases[1])
+# --- training
 
 
-def test_a_file_without_networks_is_refused() -> None:
-    with pytest.raises(KeyError):
-        networks_of(np.zeros(0, np.uint8), SHAPE.look_aheads)
+def tones(seed: int) -> Recording:
+    """Four tones one after the other, the states 1 to 4, between silences."""
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(4)
+    pitches_hz = np.array([300.0, 700.0, 1500.0, 3500.0])[order]
+    pieces = [burst(0.0, 0.2, 0.2, pitch_hz) for pitch_hz in pitches_hz]
+    silence = np.zeros(1600, np.float32)
+    sound = np.concatenate([silence, *pieces, silence]) + rng.normal(0, 1e-4, 16_000)
+    starts = np.searchsorted([0.1, 0.3, 0.5, 0.7, 0.9], (np.arange(98) + 1.25) / 100, "right")
+    states = np.array([0, *(1 + order), 0])
+    samples = np.rint(32767 * sound).astype(np.int16)
+    return Recording(samples=samples, targets=states[starts], weight=1.0)
 
 
-def test_the_network_learns_made_up_sounds_beside_a_second_task(
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network_training, "_BATCH_FRAMES", 300)
+    monkeypatch.setattr(network_training, "_POOL_BATCHES", 2)
+    monkeypatch.setattr(network_training, "_WARM_UP_STEPS", 2)
+
+
+def trained(
+    recordings: list[Recording], num_steps: int, seed: int = 0, main_output: int = 1
+) -> tuple[Trainer, list[float]]:
+    torch.manual_seed(seed)
+    network = Network(SHAPE)
+    with torch.no_grad():  # convolutions that have learnt say more than those just made
+        network.first.weight *= 6
+        network.second.weight *= 6
+    trainer = Trainer(network, recordings, main_output=main_output, seed=seed)
+    losses: list[float] = []
+    trainer.train(num_steps, lambda _, loss: losses.append(loss))
+    return trainer, losses
+
+
+@pytest.mark.parametrize("main_output", [0, 1])
+def test_the_network_learns_which_tone_is_when(
+    main_output: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loss falls, and an output says the states of the frames that it looks back to."""
+    quick(monkeypatch)
+    monkeypatch.setattr(sound_change, "_MOST_MASKS", 0)
+    monkeypatch.setattr(network_training, "_RATE", 5e-3)
+    monkeypatch.setattr(network_training, "_NEW_RATE", 5e-3)
+    monkeypatch.setattr(network_training, "_CHANGED_SHARE", 0.0)
+    recordings = [tones(seed) for seed in range(8)]
+    trainer, losses = trained(recordings, 100, main_output=main_output)
+    assert np.mean(losses[-10:]) < 0.2 * np.mean(losses[:10])
+    unheard = tones(100)
+    said = log_shares_of(trainer.mean, main_output, unheard.samples).argmax(axis=1)
+    assert np.mean(said == unheard.targets) > 0.96  # two frames late would be 0.9
+
+
+def test_convolutions_stay_and_all_else_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch)
+    begun = {k: v.clone() for k, v in trained([tones(0)], 0)[0].network.state_dict().items()}
+    trainer, losses = trained([tones(0)], 4)
+    assert all(np.isfinite(losses))
+    for network in (trainer.network, trainer.mean):
+        for name, tensor in network.state_dict().items():
+            stays = name.startswith(("first.", "second."))
+            assert torch.equal(tensor, begun[name]) == stays, name
+    weights, mean = (floats(n.norm.weight) for n in (trainer.network, trainer.mean))
+    assert not np.array_equal(weights, mean)
+
+
+def test_the_same_seed_gives_the_same_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch)
+    recordings = [tones(seed) for seed in range(3)]
+    first, second, other = (trained(recordings, 3, seed)[0].mean.state_dict() for seed in (0, 0, 1))
+    assert all(torch.equal(tensor, second[name]) for name, tensor in first.items())
+    assert not torch.equal(first["outputs.0.weight"], other["outputs.0.weight"])
+
+
+def test_long_recordings_are_cut_and_speech_may_have_begun_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("training.network_training._BATCH_FRAMES", 500)
-    monkeypatch.setattr("training.network_training._AUGMENTED_SHARE", 0.2)
-    monkeypatch.setattr("training.network_training._WARM_UP_STEPS", 1)
-    monkeypatch.setattr("training.network_training._RATE", 1e-2)
-    torch.manual_seed(0)
-    rng = np.random.default_rng(0)
-    patterns = rng.normal(14, 2, (SHAPE.num_states, NUM_INPUTS))
+    long = Recording(
+        samples=np.tile(tones(0).samples, 12),
+        targets=np.arange(1198) % 6,
+        weight=1.0,
+    )
+    frames, targets = heard_anew(long, np.random.default_rng(0))
+    assert frames.shape == (800, NUM_MELS)
+    assert len(targets) == 800
+    starts = []
+    forward = Network.forward
 
-    def recording(first_target: int) -> Recording:
-        states = np.repeat(rng.integers(0, SHAPE.num_states, 8), 8)
-        log_mel = patterns[states] + rng.normal(0, 0.3, (len(states), NUM_INPUTS))
-        targets = first_target + states
-        return Recording(voices=(log_mel.astype(np.float16),), targets=targets, weight=1.0)
+    def noted(network: Network, seen: torch.Tensor, start: int = 0) -> torch.Tensor:
+        starts.append(start)
+        return forward(network, seen, start)
 
-    recordings = [recording(first) for first in (0, 0, SHAPE.num_states) for _ in range(15)]
-    trainer = Trainer(Network(SHAPE), FrontEnd.measure(recordings), recordings, main_head=1, seed=0)
-    untrained = trainer.network.second_task.bias.detach().clone()
-    losses: list[float] = []
-    trainer.train(40, lambda _, loss: losses.append(loss))
-    assert np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
-    assert not torch.equal(trainer.network.second_task.bias, untrained)
-    assert trainer.mean is not trainer.network
+    quick(monkeypatch)
+    monkeypatch.setattr(Network, "forward", noted)
+    trained([tones(0)], 20)
+    assert 4 < starts.count(0) < 16
+    assert 300 < max(starts) < 900
 
 
 # --- the recipe
 
 
 @pytest.fixture
-def corpora(tmp_path: Path) -> tuple[Path, Path]:
-    """Two sentences in Mandarin, one for dev, and one said to be English."""
-    corpus, second = tmp_path / "corpus", tmp_path / "second"
-    corpus.mkdir()
-    second.mkdir()
-    soundfile.write(corpus / "a.wav", HELLO, 16_000)
-    soundfile.write(second / "a.wav", HELLO, 16_000)
-    pinyin = "ni3 hao3 huan1 ying2 lai2 dao4"
-    header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin\n"
-    rows = [f"{n}\ta.wav\tS\tCC0-1.0\t{'dev' if n else 'train'}\t1.5\t{pinyin}\n" for n in range(2)]
-    (corpus / "manifest.tsv").write_text(header + "".join(rows), encoding="utf-8")
-    (second / "manifest.tsv").write_text(
-        "utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\tHH AH L OW\n", encoding="utf-8"
-    )
-    return corpus, second
+def corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two recordings of a sentence, one of them for dev; networks and batches are small."""
+    quick(monkeypatch)
+    monkeypatch.setattr("training.neural_recipe.Shape", SMALL)
+    return write_corpus(tmp_path / "corpus", {"a": HELLO, "d": HELLO})
 
 
-def test_the_recipe_writes_model_card_and_curves(
-    corpora: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    corpus, second = corpora
-    monkeypatch.setattr("training.network_training._BATCH_FRAMES", 300)
+def test_the_recipe_writes_model_card_and_curves(corpus: Path, tmp_path: Path) -> None:
+    whisper = write_whisper(tmp_path / "whisper", encoder_arrays())
     lines: list[str] = []
     output = tmp_path / "neural.npz"
     train_neural(
-        [corpus], output, aligner=model_path("gmm"), second_task=second,
-        look_ahead_ms=150.0, num_steps=10, num_networks=1, num_voices=1, report=lines.append,
+        [corpus], output, aligner=model_path("gmm"), whisper=whisper,
+        look_ahead_ms=150.0, num_steps=10, num_threads=1, report=lines.append,
     )  # fmt: skip
     model = load_model(output)
     assert isinstance(model, NeuralModel)
     assert model.topology.num_states == 3 * 60
+    assert model.look_aheads.tolist() == [1, 3, 6, 10, 15, 20]
     assert model.look_ahead_frames == 15
     assert load_model(output, look_ahead_ms=60.0).topology.num_states == 3 * 60
-    assert "aligned anew" in "".join(lines)
-    assert "CC0-1.0" in output.with_suffix(".md").read_text()
+    learnt = network_of(model.network, model.look_aheads.tolist()).state_dict()
+    conv1 = encoder_arrays()["encoder/conv1/weight"].astype(np.float32)
+    np.testing.assert_allclose(learnt["first.weight"], conv1, atol=np.abs(conv1).max() / 120)
+    assert sum("dev phone error" in line for line in lines) >= 10
+    assert "step 5: aligned anew" in lines
+    card = output.with_suffix(".md").read_text()
+    assert "CC0-1.0" in card
+    assert "Whisper's weights (Radford et al. 2023, MIT licence)" in card
     assert output.with_suffix(".png").stat().st_size > 1000
-    # and learns further, with nothing to judge it by
-    further = tmp_path / "further.npz"
-    manifest = corpus / "manifest.tsv"
+
+
+def test_the_same_seed_gives_the_same_model_and_it_learns_further(
+    corpus: Path, tmp_path: Path
+) -> None:
+    manifest = corpus / "manifest.tsv"  # nothing to judge by
     manifest.write_text(manifest.read_text().replace("\tdev\t", "\ttest\t"))
-    train_neural(
-        [corpus], further, aligner=model_path("gmm"), start=output, language=model_path("gmm"),
-        look_ahead_ms=150.0, num_steps=1, num_networks=1, num_voices=0, report=lines.append,
-    )  # fmt: skip
-    learnt = load_model(further)
-    assert isinstance(learnt, NeuralModel)
-    np.testing.assert_array_equal(learnt.prior_mean, model.prior_mean)
-    np.testing.assert_array_equal(learnt.spread, model.spread)
-    (before,), (after,) = (networks_of(m.network, m.look_aheads.tolist()) for m in (model, learnt))
-    for name, weights in before.state_dict().items():
-        if not name.startswith("second_task"):
-            torch.testing.assert_close(after.state_dict()[name], weights, atol=0.01, rtol=0.05)
-    shipped = load_model(model_path("gmm")).topology.language
-    np.testing.assert_array_equal(learnt.topology.language.unit, shipped.unit)
-
-
-@pytest.mark.parametrize("start", ["gmm", "neural"])
-def test_what_cannot_learn_further_is_refused(
-    start: str, corpora: tuple[Path, Path], tmp_path: Path
-) -> None:
-    """A Gaussian mixture model, and networks without an output layer for 150 ms."""
-    with pytest.raises(UserError, match="not written by this command with a look-ahead of 150 ms"):
+    whisper = write_whisper(tmp_path / "whisper", encoder_arrays())
+    paths = [tmp_path / f"{name}.npz" for name in ("first", "second", "other")]
+    lines: list[str] = []
+    for path, seed in zip(paths, (0, 0, 1), strict=True):
         train_neural(
-            [corpora[0]], tmp_path / "n.npz", aligner=model_path("gmm"), start=model_path(start),
-            look_ahead_ms=150.0, num_steps=1, num_networks=1, num_voices=0,
+            [corpus], path, aligner=model_path("gmm"), whisper=whisper,
+            num_steps=3, num_threads=1, seed=seed, report=lines.append,
         )  # fmt: skip
-
-
-def test_networks_that_learn_side_by_side_become_one_model(
-    corpora: tuple[Path, Path], tmp_path: Path
-) -> None:
-    output = tmp_path / "neural.npz"
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert paths[0].read_bytes() != paths[2].read_bytes()
+    assert torch.get_num_threads() == 1
+    further = tmp_path / "further.npz"
     train_neural(
-        [corpora[0]], output, aligner=model_path("gmm"),
-        num_steps=1, num_networks=2, num_voices=0, report=lambda _: None,
+        [corpus], further, aligner=paths[0], start=paths[0], language=model_path("gmm"),
+        num_steps=1, num_threads=1, report=lines.append,
     )  # fmt: skip
-    model = load_model(output)
-    assert isinstance(model, NeuralModel)
-    assert model.hidden_shape == (512, 512)
+    before, after = load_model(paths[0]), load_model(further)
+    assert isinstance(before, NeuralModel)
+    assert isinstance(after, NeuralModel)
+    old, new = (
+        network_of(model.network, model.look_aheads.tolist()).state_dict()
+        for model in (before, after)
+    )
+    for name, weights in old.items():
+        torch.testing.assert_close(new[name], weights, atol=0.02, rtol=0.05)
+    assert "`first.npz`" in further.with_suffix(".md").read_text()
+    shipped = load_model(model_path("gmm")).topology.language
+    np.testing.assert_array_equal(after.topology.language.unit, shipped.unit)
+    assert len(before.topology.language.unit) < len(shipped.unit)
 
 
-@pytest.mark.parametrize(
-    ("manifest", "message"),
-    [
-        ("utt_id\tpath\nx\ta.wav\n", "is no list of utt_id"),
-        ("utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\tHH QQ\n", "QQ"),
-        ("utt_id\tpath\tseconds\tarpabet\nx\ta.wav\t1.5\t" + 90 * "HH " + "\n", "long enough"),
-    ],
-)
-def test_mistakes_in_the_second_language_are_named(
-    corpora: tuple[Path, Path], manifest: str, message: str
-) -> None:
-    second = corpora[1]
-    (second / "manifest.tsv").write_text(manifest, encoding="utf-8")
-    with pytest.raises(UserError, match=message):
-        load_second_language(second, RowErrors())
+def test_training_begins_with_one_thing(corpus: Path, tmp_path: Path) -> None:
+    train = partial(train_neural, [corpus], tmp_path / "n.npz", aligner=model_path("gmm"))
+    for whisper, start in ((None, None), (tmp_path, model_path("gmm"))):
+        with pytest.raises(UserError, match="either --whisper or --start-from"):
+            train(num_threads=1, whisper=whisper, start=start)
+    with pytest.raises(UserError, match=r"model\.bin cannot be read"):
+        train(num_threads=1, whisper=tmp_path)
+    with pytest.raises(UserError, match=r"not written by this command .* 10, 30, 60, 100, 200 ms"):
+        train(num_threads=1, start=model_path("gmm"))
 
 
-def test_phones_are_taken_for_the_units_that_sound_like_them(corpora: tuple[Path, Path]) -> None:
-    (example,) = load_second_language(corpora[1], RowErrors())
-    (heard,) = as_nearest_units([example])
-    assert [UNITS[unit] for unit in heard.units] == ["h", "e", "l", "ou"]
-    assert len(example.units) == len(example.syllables) == 4
+@pytest.mark.parametrize("look_ahead_ms", [0.0, 5.0, 25.0, -10.0, 2000.0, float("nan")])
+def test_look_aheads_that_cannot_be_are_named(look_ahead_ms: float, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be trained; give 10, 20, 30"):
+        train_neural(
+            [], tmp_path / "n.npz", aligner=model_path("gmm"), whisper=tmp_path,
+            look_ahead_ms=look_ahead_ms, num_threads=1,
+        )  # fmt: skip

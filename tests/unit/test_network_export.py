@@ -1,0 +1,94 @@
+"""The network's file: what is written is what is read again and what onnxruntime computes."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from services.recognizer.load import load_model, model_path
+from services.recognizer.neural import NUM_INPUTS, NeuralModel
+from training.network import Network, Shape
+from training.network_export import network_of, onnx_of
+
+pytestmark = pytest.mark.unit
+
+SHAPE = Shape(num_states=180, look_aheads=(2, 7), width=64, heads=4, layers=2, inner=80)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def some_network() -> Network:
+    torch.manual_seed(0)
+    network = Network(SHAPE).eval()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return network
+
+
+def log_shares_of(network: Network, frames: np.ndarray, output: int) -> np.ndarray:
+    """Whole segment in PyTorch, (frames said, states), from the first that a position says."""
+    with torch.no_grad():
+        shares = network.log_shares(network(torch.from_numpy(frames)[None]), output)[0]
+    rows: np.ndarray = shares.reshape(-1, SHAPE.num_states).numpy()
+    return rows[max(0, SHAPE.look_aheads[output] - 2) :]
+
+
+def scores_of(file: np.ndarray, frames: np.ndarray, output: int) -> np.ndarray:
+    """The same live."""
+    shipped = load_model(model_path("neural"))
+    model = NeuralModel(
+        topology=shipped.topology,
+        network=file,
+        look_aheads=np.array(SHAPE.look_aheads),
+        log_prior=np.zeros(SHAPE.num_states, np.float32),
+        kappa=1.0,
+        head=output,
+    )
+    return model.stream().accept(frames)
+
+
+@pytest.mark.parametrize("output", [0, 1])
+@pytest.mark.parametrize(("exact", "atol"), [(True, 1e-4), (False, 0.1)])
+def test_onnxruntime_computes_what_pytorch_does(output: int, exact: bool, atol: float) -> None:
+    frames = np.random.default_rng(0).normal(0.3, 0.3, (301, NUM_INPUTS)).astype(np.float32)
+    file = onnx_of(some_network(), exact=exact)
+    expected = log_shares_of(network_of(file, SHAPE.look_aheads).eval(), frames, output)
+    found = scores_of(file, frames, output)
+    assert found.shape == expected.shape
+    np.testing.assert_allclose(found, expected, atol=atol)
+
+
+def test_floats_are_read_as_they_were() -> None:
+    network = some_network()
+    again = network_of(onnx_of(network, exact=True), SHAPE.look_aheads)
+    assert again.shape == SHAPE
+    for name, tensor in network.state_dict().items():
+        torch.testing.assert_close(again.state_dict()[name], tensor, rtol=1e-6, atol=0)
+
+
+def test_integers_are_read_within_half_a_step() -> None:
+    network = some_network()
+    file = onnx_of(network)
+    assert len(file) < 0.45 * len(onnx_of(network, exact=True))
+    again = network_of(file, SHAPE.look_aheads).state_dict()
+    for name, tensor in network.state_dict().items():
+        if tensor.dim() > 1:
+            rows = tensor.reshape(len(tensor), -1)
+            step = rows.abs().amax(dim=1, keepdim=True) / 127
+            error = (again[name].reshape(rows.shape) - rows).abs()
+            assert (error <= 0.51 * step).all()
+        else:
+            torch.testing.assert_close(again[name], tensor, rtol=1e-6, atol=0)
+
+
+def test_what_is_no_such_file_is_refused() -> None:
+    with pytest.raises(KeyError):
+        network_of(np.zeros(0, np.uint8), SHAPE.look_aheads)

@@ -1,0 +1,55 @@
+"""The neural model's front end against the textbook's definition."""
+
+import numpy as np
+import pytest
+
+from services.recognizer.whisper_mel import NUM_MELS, WhisperMel, mel_bands
+
+pytestmark = pytest.mark.unit
+
+
+def tone(hz: float, num_samples: int = 4000) -> np.ndarray:
+    return np.sin(2 * np.pi * hz * np.arange(num_samples) / 16_000).astype(np.float32)
+
+
+def test_a_frame_every_10_ms_as_soon_as_its_window_is_full() -> None:
+    mel = WhisperMel()
+    assert mel.accept_waveform(np.zeros(399, np.float32)).shape == (0, NUM_MELS)
+    assert len(mel.accept_waveform(np.zeros(1, np.float32))) == 1
+    assert len(mel.accept_waveform(np.zeros(159, np.float32))) == 0
+    assert len(mel.accept_waveform(np.zeros(1 + 160 * 8, np.float32))) == 9
+
+
+def test_frames_are_those_of_the_definition() -> None:
+    sound = np.random.default_rng(0).normal(0, 0.1, 3000)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(400) / 400)
+    expected = []
+    for start in range(0, len(sound) - 399, 160):
+        power = np.abs(np.fft.rfft(sound[start : start + 400] * window)) ** 2
+        expected.append((np.log10(np.maximum(power @ mel_bands(), 1e-7)) + 4) / 4)
+    found = WhisperMel().accept_waveform(sound.astype(np.float32))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_silence_is_the_floor_and_a_full_tone_is_far_above() -> None:
+    silence = WhisperMel().accept_waveform(np.zeros(4000, np.float32))
+    np.testing.assert_array_equal(silence, np.float32(-0.75))
+    assert 0.9 < WhisperMel().accept_waveform(tone(1000.0)).max() < 1.6
+
+
+def test_bands_are_slaney_s() -> None:
+    """Below 1 kHz a mel is 66.7 Hz, above it 6.9 percent; every triangle has the area 1."""
+    bands = mel_bands()
+    assert bands.shape == (201, NUM_MELS)
+    centre_hz = bands.argmax(axis=0) * 40
+    assert centre_hz[NUM_MELS - 1] == pytest.approx(7700, abs=40)
+    assert (np.diff(centre_hz) >= 0).all()
+    wide = bands[:, -20:].sum(axis=0) * 40  # lines are 40 Hz apart
+    np.testing.assert_allclose(wide, 1, atol=0.03)
+
+
+@pytest.mark.parametrize("hz", [300.0, 1000.0, 3000.0, 7000.0])
+def test_a_tone_is_loudest_in_the_band_around_it(hz: float) -> None:
+    loudest = WhisperMel().accept_waveform(tone(hz))[5].argmax()
+    low, high = mel_bands()[:, loudest].nonzero()[0][[0, -1]] * 40
+    assert low - 40 <= hz <= high + 40
