@@ -16,7 +16,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -57,6 +57,13 @@ class RowErrors:
     def add(self, place: str, what: str) -> None:
         """Note one bad row."""
         self.messages.append(f"{place}: {what}; row skipped")
+
+    def tell(self, report: Callable[[str], None]) -> None:
+        """Say which rows were skipped, and how many."""
+        for message in self.messages:
+            report(message)
+        if self.messages:
+            report(f"{len(self.messages)} rows skipped")
 
 
 def may_ship(licence: str) -> bool:

@@ -38,7 +38,6 @@ from training.recipes import (
     all_scores,
     choose_search,
     error_rate,
-    report_rows,
     with_penalty,
     write_card,
 )
@@ -220,7 +219,7 @@ def train_neural(
         errors=errors,
         choice=choice or UNCHOSEN,
     )
-    report_rows(errors, report)
+    errors.tell(report)
 
 
 def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...]) -> Network:

@@ -144,7 +144,7 @@ def train_gmm(
         errors=errors,
         choice=choice,
     )
-    report_rows(errors, report)
+    errors.tell(report)
 
 
 def choose_search(
@@ -264,14 +264,6 @@ def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
     ]
     mean: NDArray[np.float32] = np.mean(means, axis=0, dtype=np.float32)
     return mean
-
-
-def report_rows(errors: RowErrors, report: Report) -> None:
-    """Say which rows were skipped."""
-    for message in errors.messages:
-        report(message)
-    if errors.messages:
-        report(f"{len(errors.messages)} rows skipped")
 
 
 def write_card(

@@ -156,8 +156,7 @@ def train_language(
     write_archive(output, language_arrays(language))
     levels = language.levels
     sizes = ", ".join(f"{end - first}" for first, end in pairwise(levels[1:]))
-    for message in errors.messages:
-        report(message)
+    errors.tell(report)
     report(f"n-grams of 1 to {len(levels) - 2} units kept: {sizes}")
 
 
