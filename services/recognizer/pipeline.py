@@ -41,7 +41,7 @@ SETTLED_S = 0.2  # a unit that ended so long ago is final; waiting longer correc
 _SETTLED_FRAMES = round(SETTLED_S / HOP_S)
 _SIL = UNIT_INDEX[SILENCE]
 _WARM_UP_S = 0.2
-_WARM_UP_ROWS = 600  # enough that the search also forgets once, which is code of its own
+_WARM_UP_ROWS = 200  # that say nothing: so many paths stay that the search forgets once
 _UNSEEN_CONFIDENCE = 0.5  # of a unit that was never put out before it was final
 
 
@@ -359,7 +359,7 @@ def warm_up(model: AcousticModel) -> None:
     silence = np.zeros(round(_WARM_UP_S * SAMPLE_RATE_HZ), dtype=np.float32)
     frames = model.front_end().accept_waveform(silence)
     scores = np.concatenate([stream.accept(frames), stream.finish()])
-    for row in np.resize(scores, (_WARM_UP_ROWS, scores.shape[1])):
+    for row in (*scores, *np.zeros((_WARM_UP_ROWS, scores.shape[1]), dtype=np.float32)):
         decoder.accept(row)
     decoder.finish()
     VoiceActivityDetector().accept_block(np.zeros(BLOCK_SAMPLES, dtype=np.float32))
