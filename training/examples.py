@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.recognizer.features import HOP_SAMPLES, WINDOW_SAMPLES
 from shared.errors import UserError
 from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
@@ -26,8 +27,6 @@ _EVEN_MINUTES = 30.0
 _LEAST_WEIGHT, _MOST_WEIGHT = 0.3, 3.0
 WORD_UNITS = 8  # a recording of at most so many units is a word, not connected speech
 _MARGIN_FRAMES = 25  # of silence left at both ends
-_HOP_SAMPLES = 160
-_WINDOW_SAMPLES = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,5 +132,5 @@ def speech_span(log_mel: NDArray[np.float16]) -> slice:
 
 def _samples_of(span: slice, num_frames: int) -> slice:
     """Find the samples that so many frames from the beginning of a span are computed from."""
-    first = _HOP_SAMPLES * span.start
-    return slice(first, first + _HOP_SAMPLES * (num_frames - 1) + _WINDOW_SAMPLES)
+    first = HOP_SAMPLES * span.start
+    return slice(first, first + HOP_SAMPLES * (num_frames - 1) + WINDOW_SAMPLES)

@@ -33,6 +33,8 @@ from numpy.typing import NDArray
 SAMPLE_RATE_HZ = 16_000
 WINDOW_S = 0.025
 HOP_S = 0.010
+WINDOW_SAMPLES = round(WINDOW_S * SAMPLE_RATE_HZ)
+HOP_SAMPLES = round(HOP_S * SAMPLE_RATE_HZ)
 NUM_BANDS = 40
 NUM_STATIC = 13  # log energy, then cepstra 1 to 12
 NUM_FEATURES = 3 * NUM_STATIC
@@ -40,7 +42,6 @@ NUM_FEATURES = 3 * NUM_STATIC
 LOWEST_HZ, HIGHEST_HZ = 40.0, 7600.0  # edges of the filter bank
 MELS, MEL_KNEE_HZ = 1127.0, 700.0  # mel = 1127 ln(1 + f / 700)
 
-_HOP_SAMPLES = 160
 _FULL_SCALE = 32768.0  # the filter bank's energies are those of 16-bit samples
 LOG_FLOOR = 6.0  # some decibels above the noise of one least significant bit
 _MEAN_MEMORY_FRAMES = 1500.0  # the live mean forgets older speech

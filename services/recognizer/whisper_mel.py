@@ -29,17 +29,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
+from services.recognizer.features import HOP_SAMPLES, SAMPLE_RATE_HZ, WINDOW_SAMPLES
 
 NUM_MELS = 80
 
-_WINDOW = round(WINDOW_S * SAMPLE_RATE_HZ)
-_HOP = round(HOP_S * SAMPLE_RATE_HZ)
 _FLOOR = 1e-7  # power
 _HZ_A_MEL = 200 / 3  # below the knee; Slaney's mels
 _KNEE_HZ = 1000.0
 _LOG_STEP = math.log(6.4) / 27  # a mel above the knee
-_HANN = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(_WINDOW) / _WINDOW)
+_HANN = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(WINDOW_SAMPLES) / WINDOW_SAMPLES)
 
 
 def mel_bands() -> NDArray[np.float64]:
@@ -48,7 +46,7 @@ def mel_bands() -> NDArray[np.float64]:
     highest = knee + math.log(SAMPLE_RATE_HZ / 2 / _KNEE_HZ) / _LOG_STEP
     mel = np.linspace(0, highest, NUM_MELS + 2)
     edges = np.where(mel < knee, mel * _HZ_A_MEL, _KNEE_HZ * np.exp(_LOG_STEP * (mel - knee)))
-    hz = np.fft.rfftfreq(_WINDOW, 1 / SAMPLE_RATE_HZ)[:, None]
+    hz = np.fft.rfftfreq(WINDOW_SAMPLES, 1 / SAMPLE_RATE_HZ)[:, None]
     low, centre, high = edges[:-2], edges[1:-1], edges[2:]
     triangles = np.minimum((hz - low) / (centre - low), (high - hz) / (high - centre))
     bands: NDArray[np.float64] = np.maximum(triangles, 0) * 2 / (high - low)
@@ -80,8 +78,8 @@ class WhisperMel:
             The new feature frames, shape (frames, 80).
         """
         known = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
-        num_frames = max(0, (len(known) - _WINDOW) // _HOP + 1)
-        self._samples = known[_HOP * num_frames :]
+        num_frames = max(0, (len(known) - WINDOW_SAMPLES) // HOP_SAMPLES + 1)
+        self._samples = known[HOP_SAMPLES * num_frames :]
         if num_frames == 0:
             return np.empty((0, NUM_MELS), dtype=np.float32)
         # Each row is transformed and summed alone, in a fixed order.
@@ -95,7 +93,7 @@ def _windows(
     out = np.empty((num_frames, len(window)))
     for row in range(num_frames):
         for k in range(len(window)):
-            out[row, k] = window[k] * samples[_HOP * row + k]
+            out[row, k] = window[k] * samples[HOP_SAMPLES * row + k]
     return out
 
 

@@ -1,7 +1,5 @@
 """The network's file: what is written is what is read again and what onnxruntime computes."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -11,17 +9,9 @@ from services.recognizer.neural import NUM_INPUTS, NeuralModel
 from training.network import Network, Shape
 from training.network_export import network_of, onnx_of
 
-pytestmark = pytest.mark.unit
+pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 
 SHAPE = Shape(num_states=180, look_aheads=(2, 7), width=64, heads=4, layers=2, inner=80)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def some_network() -> Network:

@@ -1,7 +1,6 @@
 """Whisper's weights, changed sounds, and the training of the network."""
 
 import struct
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +39,7 @@ from training.sound_change import (
 )
 from training.whisper_weights import load_whisper
 
-pytestmark = pytest.mark.unit
+pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
@@ -51,14 +50,6 @@ SHAPE = SMALL(num_states=6, look_aheads=(1, 3, 6))
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 # --- Whisper's weights
