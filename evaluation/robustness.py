@@ -6,7 +6,7 @@ minute it hears in sounds that hold no Mandarin.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +21,9 @@ from evaluation.recognizer import ErrorCounts, count_errors, first_said, once_fi
 from services.recognizer.acoustic_model import AcousticModel
 from services.recognizer.features import SAMPLE_RATE_HZ
 from services.recognizer.pipeline import Recognizer, ScoreEvent, full_traceback, scores_of
-from shared.errors import UserError
 from shared.phones import UNITS, Phone, SpeechChange
 from training.align import spoken
-from training.corpus import RowErrors, read_corpus
+from training.corpus import RowErrors, audio_files, read_corpus
 from training.feature_cache import read_audio
 
 _SOUND_S = 60.0
@@ -115,13 +114,6 @@ def _units_a_minute(model: AcousticModel, sounds: Sequence[NDArray[np.float32]])
 
 def recordings_in(folder: Path) -> list[NDArray[np.float32]]:
     """Read some of the recordings in a folder, evenly spread; UserError if there is none."""
-    found = list(_audio_files(folder))
-    if not found:
-        raise UserError(f"{folder} holds no wav, flac, ogg or opus files; give another folder")
+    found = audio_files(folder)
     step = max(1, len(found) // _OTHER_RECORDINGS)
     return [read_audio(path) for path in found[::step][:_OTHER_RECORDINGS]]
-
-
-def _audio_files(folder: Path) -> Iterator[Path]:
-    suffixes = {".wav", ".flac", ".ogg", ".opus"}
-    return (path for path in sorted(folder.rglob("*")) if path.suffix in suffixes)

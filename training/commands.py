@@ -93,10 +93,22 @@ def neural(
     output: Model,
     aligner: Annotated[Path, typer.Option(help="A model file that aligns the first time.")],
     whisper: Annotated[
-        Path | None, typer.Option(help="Folder of Whisper base for faster-whisper, to begin with.")
+        Path | None,
+        typer.Option(
+            help="Folder of Whisper base for faster-whisper: it teaches the network, which begins "
+            "with its weights."
+        ),
     ] = None,
     start_from: Annotated[
-        Path | None, typer.Option(help="A neural model whose network learns further.")
+        Path | None,
+        typer.Option(help="Begin with a neural model's network; without --whisper nobody teaches."),
+    ] = None,
+    untranscribed: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of recordings without text, in any language, of which --whisper says what "
+            "is heard; repeat for several."
+        ),
     ] = None,
     language: Language = None,
     seed: Seed = 0,
@@ -121,6 +133,7 @@ def neural(
         aligner=aligner,
         whisper=whisper,
         start=start_from,
+        untranscribed=untranscribed or [],
         language=language,
         look_ahead_ms=look_ahead_ms,
         seed=seed,

@@ -30,6 +30,7 @@ _FREE_LICENCE = re.compile(
 )
 _CLOSED_LICENCE = re.compile(r"\bnc\b|\bnd\b|non-?commercial|no-?deriv", re.I)
 _SHORTEST_UNIT_S = 0.03
+_AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")
 
 
@@ -64,6 +65,11 @@ class RowErrors:
             report(message)
         if self.messages:
             report(f"{len(self.messages)} rows skipped")
+
+    def nothing_left(self, where: str) -> UserError:
+        """Say that none of the recordings can be used, and why the last one cannot."""
+        last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
+        return UserError(f"no usable recordings {where}{last}; give others")
 
 
 def may_ship(licence: str) -> bool:
@@ -114,6 +120,14 @@ def read_corpus(folder: Path, errors: RowErrors, *, split: str | None = None) ->
         raise UserError(f"{error.filename}: cannot be read: {error.strerror}") from error
     utterances = [_utterance(place, row, errors) for place, row in chosen]
     return [utterance for utterance in utterances if utterance]
+
+
+def audio_files(folder: Path) -> list[Path]:
+    """Find the recordings below a folder, in order of their names; UserError if there is none."""
+    found = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
+    if not found:
+        raise UserError(f"{folder} holds no wav, flac, ogg or opus files; give another folder")
+    return found
 
 
 def _split_of(row: dict[str, str]) -> str:

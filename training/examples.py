@@ -17,16 +17,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.features import HOP_SAMPLES, WINDOW_SAMPLES
-from shared.errors import UserError
 from training import SYNTHETIC_WEIGHT
 from training.augmentation import Augmentation
-from training.corpus import RowErrors, Utterance, is_synthetic, may_ship, read_corpus
+from training.corpus import (
+    RowErrors,
+    Utterance,
+    audio_files,
+    is_synthetic,
+    may_ship,
+    read_corpus,
+)
 from training.feature_cache import log_mel_of, samples_of
 
 _EVEN_MINUTES = 30.0
 _LEAST_WEIGHT, _MOST_WEIGHT = 0.3, 3.0
 WORD_UNITS = 8  # a recording of at most so many units is a word, not connected speech
 _MARGIN_FRAMES = 25  # of silence left at both ends
+_LEAST_FRAMES = 20  # of a recording without text
+_MOST_FRAMES = 2000  # likewise; longer ones are cut into pieces
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,11 +123,61 @@ def load_examples(
             )
         )
     if not examples:
-        raise UserError(
-            f"no usable recordings of split {split!r} in {', '.join(map(str, corpora))}; "
-            "see the messages about rows"
-        )
+        raise errors.nothing_left(f"of split {split!r} in {', '.join(map(str, corpora))}")
     return examples
+
+
+def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArray[np.int16]]:
+    """Read recordings without text, in any language.
+
+    Parameters
+    ----------
+    folders
+        Folders with audio files, at any depth.
+    errors
+        Receives a message for every file that cannot be used.
+
+    Returns
+    -------
+    list
+        Samples at 16 kHz without the long silence at both ends, in pieces of 20 s at most.
+
+    Raises
+    ------
+    UserError
+        If a folder holds no audio files, or none of them can be used.
+    """
+    pieces = []
+    for folder in folders:
+        files = [_file_without_text(path) for path in audio_files(folder)]
+        sounds = samples_of(files)
+        for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
+            if log_mel is None:
+                continue
+            span = speech_span(log_mel)
+            num_frames = len(log_mel[span])
+            if num_frames < _LEAST_FRAMES:
+                errors.add(file.utterance_id, "it is too short")
+            for start in range(0, num_frames - _LEAST_FRAMES + 1, _MOST_FRAMES):
+                piece = slice(span.start + start, span.stop)
+                pieces.append(sound[_samples_of(piece, min(_MOST_FRAMES, num_frames - start))])
+    if not pieces:
+        raise errors.nothing_left(f"in {', '.join(map(str, folders))}")
+    return pieces
+
+
+def _file_without_text(path: Path) -> Utterance:
+    return Utterance(
+        utterance_id=str(path),
+        path=path,
+        speaker="",
+        source="",
+        licence="",
+        split="",
+        seconds=0.0,
+        units=(),
+        syllables=(),
+    )
 
 
 def speech_span(log_mel: NDArray[np.float16]) -> slice:

@@ -4,7 +4,8 @@ Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak su
 the encoder's layers, and the weights that training begins with); Vaswani et al. 2017, "Attention is
 all you need" (sinusoidal positions). The layers and the weights are those of Whisper's encoder;
 here a position attends to itself and to the ``WINDOW - 1`` positions before it instead of the whole
-recording, so that it can run live.
+recording, so that it can run live. The teacher (:mod:`training.teacher`) hears whole recordings
+with the same layers.
 
 ======== =========================================================== ============================
 symbol   meaning                                                     shape
@@ -45,7 +46,7 @@ class Shape:
 
 
 class Layer(nn.Module):
-    """Attention to the past, then two products position by position; each adds to what comes in."""
+    """Attention, then two products position by position; each adds to what comes in."""
 
     def __init__(self, shape: Shape, dropout: float) -> None:
         super().__init__()
@@ -58,8 +59,11 @@ class Layer(nn.Module):
         self.outer = nn.Linear(shape.inner, shape.width)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, hidden: Tensor, may_attend: Tensor) -> Tensor:
-        """(batch, positions, width) to the same; ``may_attend`` is (positions, positions)."""
+    def forward(self, hidden: Tensor, may_attend: Tensor | None = None) -> Tensor:
+        """(batch, positions, width) to the same.
+
+        ``may_attend`` is (positions, positions); None lets all attend to all.
+        """
         batch, num_positions, width = hidden.shape
         query, key, value = (
             self.query_key_value(self.attention_norm(hidden))
@@ -74,20 +78,38 @@ class Layer(nn.Module):
         return out
 
 
-class Network(nn.Module):
-    """Two convolutions, layers of attention to the past, an output layer per look-ahead."""
+class Encoder(nn.Module):
+    """What Whisper's encoder consists of: two convolutions, a table of positions, layers.
+
+    ``padding`` is the number of zeros at both ends of what each convolution hears.
+    """
 
     positions: Tensor  # (1500, width)
 
-    def __init__(self, shape: Shape, dropout: float = 0.1) -> None:
+    def __init__(self, shape: Shape, *, dropout: float, padding: int) -> None:
         super().__init__()
         self.shape = shape
-        self.first = nn.Conv1d(NUM_INPUTS, shape.width, 3)
-        self.second = nn.Conv1d(shape.width, shape.width, 3, stride=2)
+        self.first = nn.Conv1d(NUM_INPUTS, shape.width, 3, padding=padding)
+        self.second = nn.Conv1d(shape.width, shape.width, 3, stride=2, padding=padding)
         self.register_buffer(
             "positions", torch.from_numpy(positions_of(shape.width)), persistent=False
         )
         self.layers = nn.ModuleList(Layer(shape, dropout) for _ in range(shape.layers))
+
+    def placed(self, bands: Tensor, start: int = 0) -> Tensor:
+        """Compute what the first layer hears: (batch, 80, frames) to (batch, positions, width).
+
+        ``start`` is the place of the first position, below ``MOST_POSITIONS`` with all that follow.
+        """
+        hidden = gelu(self.second(gelu(self.first(bands)))).transpose(1, 2)
+        return hidden + self.positions[start : start + hidden.shape[1]]
+
+
+class Network(Encoder):
+    """Two convolutions, layers of attention to the past, an output layer per look-ahead."""
+
+    def __init__(self, shape: Shape, dropout: float = 0.1) -> None:
+        super().__init__(shape, dropout=dropout, padding=0)
         self.norm = nn.LayerNorm(shape.width)
         self.outputs = nn.ModuleList(
             nn.Linear(shape.width, 2 * shape.num_states) for _ in shape.look_aheads
@@ -97,15 +119,11 @@ class Network(nn.Module):
     def forward(self, frames: Tensor, start: int = 0) -> Tensor:
         """Run the trunk on a segment: (batch, frames, 80) to (batch, positions, width).
 
-        There are ``(frames - 1) // 2`` positions.
-
-        ``start`` is the place of the first position, below ``MOST_POSITIONS`` with all that follow.
+        There are ``(frames - 1) // 2`` positions, the first of them in the place ``start``.
         """
         before = frames.new_zeros((len(frames), FRAMES_BEFORE, NUM_INPUTS))
-        seen = torch.cat([before, frames], dim=1).transpose(1, 2)
-        hidden = gelu(self.second(gelu(self.first(seen)))).transpose(1, 2)
+        hidden = self.placed(torch.cat([before, frames], dim=1).transpose(1, 2), start)
         places = torch.arange(hidden.shape[1])
-        hidden = hidden + self.positions[start + places]
         back = places[:, None] - places
         may_attend = (back >= 0) & (back < WINDOW)
         for layer in self.layers:

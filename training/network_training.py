@@ -1,13 +1,17 @@
-"""Train the network on sounds whose frames are aligned with states, changed anew each time.
+"""Train the network on sounds whose frames have states as targets, changed anew each time.
 
 Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition"
-(cross-entropy on the states of a forced alignment); Loshchilov and Hutter 2019, "Decoupled weight
-decay regularization" (AdamW); Polyak and Juditsky 1992 (running mean of the weights).
+(cross-entropy on the states of a forced alignment); Hinton, Vinyals and Dean 2015, "Distilling the
+knowledge in a neural network" (several states with a share each); Loshchilov and Hutter 2019,
+"Decoupled weight decay regularization" (AdamW); Polyak and Juditsky 1992 (running mean of the
+weights).
 
 Layers that come with weights learn slowly, what begins anew learns faster, and the convolutions
 stay as they are. The rate rises for some steps, stays, and falls to nothing:
 
     rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N)) * min(1, (N - n) / (0.6 N))
+
+    H = - sum_t sum_j w[t, j] log y[t, s[t, j]] / sum_t sum_j w[t, j]
 
     loss = H(main output) + H(another output) / 2, the others in turn
 
@@ -15,7 +19,10 @@ stay as they are. The rate rises for some steps, stays, and falls to nothing:
 symbol   meaning                                                       shape
 ======== ============================================================= ================
 n, N     number of a step, of all steps                                1
-H        mean cross-entropy of an output's states, nats a frame        1
+s, w     states that frames ought to say, and their shares, which sum  (frames, k)
+         to one, or to zero where nothing is known
+y        shares of the states that an output says                      (frames, states)
+H        mean cross-entropy of an output, nats a frame                 1
 m        running mean of the weights:                                  as the weights
          m += (1 - min(0.99, (n + 1) / (n + 10))) (weights - m)
 ======== ============================================================= ================
@@ -26,7 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -34,7 +41,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from services.recognizer.neural import MOST_POSITIONS, NUM_INPUTS
+from services.recognizer.neural import MOST_POSITIONS
 from services.recognizer.whisper_mel import WhisperMel
 from training.feature_cache import as_floats
 from training.network import Network, said_frames
@@ -58,7 +65,37 @@ _LONGEST_MEMORY = 0.99  # of the running mean of the weights, per step
 _OTHERS_WEIGHT = 0.5  # of the losses of other outputs than the main one
 _CHANGED_SHARE = 0.9
 _TEMPO_SHARE = 0.5
-NO_TARGET = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """What frames ought to say: some states of 256 at most, and the share of each."""
+
+    states: NDArray[np.uint8]  # (frames, k)
+    shares: NDArray[np.float16]  # (frames, k)
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @classmethod
+    def hard(cls, states: NDArray[np.integer[Any]]) -> Targets:
+        """One state a frame, shape (frames,), with all of the share."""
+        return cls(states[:, None].astype(np.uint8), np.ones((len(states), 1), np.float16))
+
+    def of(self, frames: NDArray[np.int64] | slice) -> Targets:
+        """Targets of some of the frames."""
+        return Targets(self.states[frames], self.shares[frames])
+
+    def halved_with(self, other: Targets) -> Targets:
+        """Give half of the share to other targets of the same frames."""
+        return Targets(
+            np.hstack([self.states, other.states]),
+            np.hstack([self.shares, other.shares]) * np.float16(0.5),
+        )
+
+
+Heard = tuple[NDArray[np.floating[Any]], Targets]  # what a batch is made of: (rows, inputs)
+Batch = tuple[Tensor, Tensor, Tensor]  # inputs; states and shares, (batch, frames, k)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +103,7 @@ class Recording:
     """What the network hears."""
 
     samples: NDArray[np.int16]  # (n,) 16 kHz
-    targets: NDArray[np.int64]  # (frames,) states
+    targets: Targets  # of its frames
     weight: float  # how often it is heard against the others
 
 
@@ -78,7 +115,7 @@ class Trainer:
     network
         The network; trained in place.
     recordings
-        With the states of their frames.
+        With the targets of their frames.
     main_output
         Output layer that learns in every step; each step another one learns besides.
     seed
@@ -90,7 +127,7 @@ class Trainer:
     ) -> None:
         self.network = network
         self.main_output = main_output
-        self._averaged = AveragedModel(network, avg_fn=_nearer)
+        self._averaged = AveragedModel(network, avg_fn=nearer)
         self._averaged.eval()
         self._rng = np.random.default_rng(seed)
         self.replace_recordings(recordings)
@@ -114,7 +151,12 @@ class Trainer:
 
     def replace_recordings(self, recordings: Sequence[Recording]) -> None:
         """Go on with other recordings, or other targets for the same."""
-        self._batches = self._batches_of(recordings)
+        share = shares_of(recordings)
+
+        def draw() -> Heard:
+            return heard_anew(recordings[self._rng.choice(len(share), p=share)], self._rng)
+
+        self._batches = batches_of(draw, _BATCH_FRAMES, self._rng)
 
     def train(self, num_steps: int, watch: Callable[[int, float], None]) -> None:
         """Take steps; the learning rate rises, stays, and falls to nothing.
@@ -131,15 +173,15 @@ class Trainer:
     def _step(self, number: int, share: float) -> float:
         """Learn from one batch; return the mean cross-entropy of the main output."""
         self.network.train()
-        frames, targets = next(self._batches)
+        frames, states, shares = next(self._batches)
         start = 0 if self._rng.random() < 0.5 else int(self._rng.integers(_LATEST_START))
         hidden = self.network(frames, start)
-        loss = self._loss(hidden, targets, self.main_output)
+        loss = self._loss(hidden, states, shares, self.main_output)
         main_loss = float(loss.detach())
         others = [k for k in range(len(self.network.outputs)) if k != self.main_output]
         if others:
             other = others[number % len(others)]
-            loss = loss + _OTHERS_WEIGHT * self._loss(hidden, targets, other)
+            loss = loss + _OTHERS_WEIGHT * self._loss(hidden, states, shares, other)
         for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
             group["lr"] = share * rate
         self._optimizer.zero_grad()
@@ -149,61 +191,85 @@ class Trainer:
         self._averaged.update_parameters(self.network)
         return main_loss
 
-    def _loss(self, hidden: Tensor, targets: Tensor, output: int) -> Tensor:
-        """Mean cross-entropy of what an output says, nats a frame that has a target."""
-        log_shares = self.network.log_shares(hidden, output)
-        due = due_states(targets, hidden.shape[1], self.network.shape.look_aheads[output])
-        known = due != NO_TARGET
-        said = log_shares.gather(-1, due.clamp(min=0)[..., None])[..., 0]
-        return -(said * known).sum() / max(1, int(known.sum()))
+    def _loss(self, hidden: Tensor, states: Tensor, shares: Tensor, output: int) -> Tensor:
+        """Mean cross-entropy of what an output says, nats a frame."""
+        look_ahead = self.network.shape.look_aheads[output]
+        due = due_targets(states, shares, hidden.shape[1], look_ahead)
+        return cross_entropy(self.network.log_shares(hidden, output), *due)
 
-    def _batches_of(self, recordings: Sequence[Recording]) -> Iterator[tuple[Tensor, Tensor]]:
-        """Batches without end: frames (batch, longest, 80), targets (batch, longest)."""
-        share = np.array([recording.weight for recording in recordings])
-        share /= share.sum()
-        while True:
-            heard: list[tuple[NDArray[np.float32], NDArray[np.int64]]] = []
-            size = 0
-            while size < _POOL_BATCHES * _BATCH_FRAMES:
-                recording = recordings[self._rng.choice(len(share), p=share)]
-                heard.append(heard_anew(recording, self._rng))
-                size += len(heard[-1][0])
-            heard.sort(key=lambda pair: len(pair[0]))
-            groups: list[list[tuple[NDArray[np.float32], NDArray[np.int64]]]] = [[]]
-            for pair in heard:
-                if groups[-1] and (len(groups[-1]) + 1) * len(pair[0]) > _BATCH_FRAMES:
-                    groups.append([])
-                groups[-1].append(pair)
-            for at in self._rng.permutation(len(groups)):
-                yield _padded(groups[at])
+
+def shares_of(recordings: Sequence[Recording]) -> NDArray[np.float64]:
+    """How often each of the recordings is heard; the sum is one."""
+    share = np.array([recording.weight for recording in recordings])
+    share /= share.sum()
+    return share
+
+
+def batches_of(
+    draw: Callable[[], Heard], num_rows: int, rng: np.random.Generator
+) -> Iterator[Batch]:
+    """Batches without end, of about so many rows, in which all are of like length."""
+    while True:
+        pool: list[Heard] = []
+        size = 0
+        while size < _POOL_BATCHES * num_rows:
+            pool.append(draw())
+            size += len(pool[-1][0])
+        pool.sort(key=lambda pair: len(pair[0]))
+        groups: list[list[Heard]] = [[]]
+        for pair in pool:
+            if groups[-1] and (len(groups[-1]) + 1) * len(pair[0]) > num_rows:
+                groups.append([])
+            groups[-1].append(pair)
+        for at in rng.permutation(len(groups)):
+            yield _padded(groups[at])
+
+
+def cross_entropy(log_shares: Tensor, states: Tensor, shares: Tensor) -> Tensor:
+    """Mean over the frames that have targets, in nats.
+
+    Parameters
+    ----------
+    log_shares
+        What is said, shape (..., states).
+    states, shares
+        What ought to be said, shape (..., k).
+    """
+    return -(log_shares.gather(-1, states) * shares).sum() / shares.sum().clamp(min=1.0)
 
 
 def heard_anew(
     recording: Recording, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Change a recording; return its frames, (frames, 80), and their targets, (frames,)."""
+) -> tuple[NDArray[np.float32], Targets]:
+    """Change a recording; return its frames, (frames, 80), and their targets."""
     samples, speed = as_floats(recording.samples), 1.0
     if rng.random() < _CHANGED_SHARE:
         samples, speed = changed_sound(samples, rng)
     frames = WhisperMel().accept_waveform(levelled(samples, rng))
-    targets = recording.targets[frames_before(len(frames), speed, len(recording.targets))]
+    targets = recording.targets.of(frames_before(len(frames), speed, len(recording.targets)))
     if rng.random() < _TEMPO_SHARE:
         frames, were = changed_tempo(frames, rng)
-        targets = targets[were]
+        targets = targets.of(were)
     if len(frames) > _MOST_FRAMES:
         start = int(rng.integers(len(frames) - _MOST_FRAMES + 1))
-        frames = frames[start : start + _MOST_FRAMES]
-        targets = targets[start : start + _MOST_FRAMES]
+        kept = slice(start, start + _MOST_FRAMES)
+        frames, targets = frames[kept], targets.of(kept)
     mask(frames, rng)
     return frames, targets
 
 
-def due_states(targets: Tensor, num_positions: int, look_ahead_frames: int) -> Tensor:
-    """States that each position ought to say: (batch, frames) to (batch, positions, 2)."""
+def due_targets(
+    states: Tensor, shares: Tensor, num_positions: int, look_ahead_frames: int
+) -> tuple[Tensor, Tensor]:
+    """Find what each position ought to say: (batch, frames, k) to (batch, positions, 2, k), both.
+
+    Shares of frames that are not there are 0.
+    """
+    num_frames = states.shape[1]
     frames = said_frames(num_positions, look_ahead_frames)
-    inside = (frames >= 0) & (frames < targets.shape[1])
-    due = targets[:, frames.clamp(0, targets.shape[1] - 1)]
-    return torch.where(inside, due, NO_TARGET)
+    inside = (frames >= 0) & (frames < num_frames)
+    at = frames.clamp(0, num_frames - 1)
+    return states[:, at], shares[:, at] * inside[..., None]
 
 
 @torch.no_grad()
@@ -244,21 +310,24 @@ def log_shares_of(network: Network, output: int, samples: NDArray[np.int16]) -> 
     return np.ascontiguousarray(said[:num_frames])
 
 
-def _nearer(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
+def nearer(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
     """Move the running mean of the weights."""
     memory = min(_LONGEST_MEMORY, (int(num_before) + 1) / (int(num_before) + 10))
     return mean + (1 - memory) * (weights - mean)
 
 
-def _padded(
-    group: Sequence[tuple[NDArray[np.float32], NDArray[np.int64]]],
-) -> tuple[Tensor, Tensor]:
-    """Make a batch; short recordings go on with their last frame, which has no target."""
-    longest = max(len(frames) for frames, _ in group) | 1  # an odd number: positions see 2 n + 1
-    frames = np.empty((len(group), longest, NUM_INPUTS), dtype=np.float32)
-    targets = np.full((len(group), longest), NO_TARGET, dtype=np.int64)
-    for row, (one, of_one) in enumerate(group):
-        frames[row, : len(one)] = one
-        frames[row, len(one) :] = one[-1]
-        targets[row, : len(of_one)] = of_one
-    return torch.from_numpy(frames), torch.from_numpy(targets)
+def _padded(group: Sequence[Heard]) -> Batch:
+    """Make a batch; what is short goes on with its last row, of which nothing is known."""
+    longest = max(len(rows) for rows, _ in group) | 1  # an odd number: positions see 2 n + 1
+    inputs = np.empty((len(group), longest, group[0][0].shape[1]), dtype=np.float32)
+    num_frames = max(len(targets) for _, targets in group)
+    most_states = max(targets.states.shape[1] for _, targets in group)
+    states = np.zeros((len(group), num_frames, most_states), dtype=np.int64)
+    shares = np.zeros(states.shape, dtype=np.float32)
+    for number, (rows, targets) in enumerate(group):
+        inputs[number, : len(rows)] = rows
+        inputs[number, len(rows) :] = rows[-1]
+        place = number, slice(len(targets)), slice(targets.states.shape[1])
+        states[place] = targets.states
+        shares[place] = targets.shares
+    return torch.from_numpy(inputs), torch.from_numpy(states), torch.from_numpy(shares)

@@ -1,9 +1,13 @@
-"""From corpora to the neural recognizer: alignment, training, realignment, search, model card.
+"""From corpora to the neural recognizer: alignment, teacher, training, search, model card.
 
 The network begins with the weights of Whisper's encoder, or with those of a model made here, and
 learns the states of a forced alignment. The alignment is first another model's; at half of the
 steps it becomes the network's own, with an output that hears 30 ms ahead, because a unit's
 beginning is plainer with what follows.
+
+With Whisper there is a teacher too (:mod:`training.teacher`), which hears whole recordings and has
+learnt the first alignment: half of a frame's share is then what the teacher says, and in recordings
+without text all of it.
 """
 
 from __future__ import annotations
@@ -27,11 +31,11 @@ from shared.errors import UserError
 from shared.phones import UNITS
 from training.corpus import RowErrors, is_synthetic
 from training.durations import AlignedUnit, UnitDurations
-from training.examples import WORD_UNITS, Example, load_examples
+from training.examples import WORD_UNITS, Example, load_examples, load_untranscribed
 from training.gmm import units_of_path, utterance_graph, viterbi_path
 from training.network import Network, Shape
 from training.network_export import network_of, onnx_of
-from training.network_training import BATCH_S, Recording, Trainer, log_shares_of
+from training.network_training import BATCH_S, Recording, Targets, Trainer, log_shares_of
 from training.recipes import (
     UNCHOSEN,
     Report,
@@ -41,6 +45,7 @@ from training.recipes import (
     with_penalty,
     write_card,
 )
+from training.teacher import NUM_LAYERS, Teacher, WholeEncoder, train_teacher, with_progress
 from training.unit_language import language_of_corpora, load_language
 from training.whisper_weights import load_whisper
 
@@ -51,7 +56,9 @@ LOOK_AHEAD_MS = 10  # of the main one: 35 ms after its onset a unit may be known
 NUM_STEPS = 800
 _FRAME_MS = 1000 * HOP_S
 _LONGEST_LOOK_AHEAD = 100  # feature frames
-_SHARES = {"sentence": 0.5, "word": 0.12, "synthetic": 0.38}  # of the frames heard
+_SHARES = {"sentence": 0.33, "word": 0.08, "synthetic": 0.30}  # of the frames heard
+_UNTRANSCRIBED_SHARE = 0.29  # likewise
+_LESSONS = 1000  # recordings of a kind that the teacher learns
 _ALIGNING_FRAMES = 3  # look-ahead of the output that aligns; longer ones are learnt later
 _REALIGNED_AT = 0.5  # of the steps: from there on the network's own alignment counts
 _JUDGED_EVERY = 0.1  # of the steps: dev is recognised
@@ -68,6 +75,7 @@ _SMOOTHED = 20  # steps, in the curves
 class _Aligned:
     """An utterance with its states."""
 
+    number: int  # of the example
     example: Example
     states: NDArray[np.int64]  # (frames,)
     units: list[AlignedUnit]
@@ -81,6 +89,14 @@ class _Statistics:
     log_prior: NDArray[np.float32]  # (states,)
 
 
+@dataclass(frozen=True, slots=True)
+class _Taught:
+    """What the teacher says; without one there is nothing."""
+
+    examples: list[Targets] = field(default_factory=list)  # of every example
+    untranscribed: list[Recording] = field(default_factory=list)
+
+
 @dataclass(slots=True, kw_only=True)
 class _Course:
     """Follows the training: aligns anew at half of it, and recognises dev now and then."""
@@ -88,6 +104,7 @@ class _Course:
     trainer: Trainer
     examples: Sequence[Example]
     dev: Sequence[Example]
+    taught: _Taught
     language: UnitLanguage
     statistics: _Statistics
     num_steps: int
@@ -113,7 +130,7 @@ class _Course:
         output = _aligning_output(network.shape.look_aheads)
         scores = _scores_of(network, output, self.statistics, self.examples)
         aligned = _aligned(scores, self.statistics.topology, self.examples)
-        self.trainer.replace_recordings(_recordings(aligned))
+        self.trainer.replace_recordings(_recordings(aligned, self.taught))
         self.statistics = _statistics(aligned, self.language)
 
     def _dev_error_rate(self) -> float:
@@ -130,6 +147,7 @@ def train_neural(
     aligner: Path,
     whisper: Path | None = None,
     start: Path | None = None,
+    untranscribed: Sequence[Path] = (),
     language: Path | None = None,
     look_ahead_ms: float = LOOK_AHEAD_MS,
     seed: int = 0,
@@ -150,10 +168,14 @@ def train_neural(
     aligner
         A model that aligns the first time, such as :func:`training.recipes.train_gmm` writes.
     whisper
-        Folder with Whisper base, see :func:`training.whisper_weights.load_whisper`.
+        Folder with Whisper base, see :func:`training.whisper_weights.load_whisper`: the teacher.
+        Without it the states of the alignment alone are learnt.
     start
-        Instead of that, a model that this function has written, whose network learns further,
-        such as to know one's own speakers.
+        A model that this function has written, whose network learns further, such as to know one's
+        own speakers; without it the network begins with Whisper's weights.
+    untranscribed
+        Folders of recordings in any language, which the teacher labels. Nobody knows their
+        licences: name only what may be used.
     language
         What :func:`training.unit_language.train_language` has written; else the language is that
         of the corpora.
@@ -174,21 +196,30 @@ def train_neural(
     Raises
     ------
     UserError
-        If there is nothing to train on, nothing or two things to begin with, or a file cannot be
-        read.
+        If there is nothing to train on, nothing to begin with, no teacher for recordings without
+        text, or a file cannot be read.
     """
+    if untranscribed and whisper is None:
+        raise UserError("only a teacher can label what --untranscribed names: give --whisper too")
     torch.set_num_threads(num_threads or os.cpu_count() or 1)
     torch.manual_seed(seed)
     network = _begun(whisper, start, _look_aheads(look_ahead_ms))
+    encoder = _whole_encoder(whisper) if whisper else None
     first = load_model(aligner)
     errors = RowErrors()
     examples = load_examples(corpora, errors, shipping=shipping, with_samples=True)
+    sounds = load_untranscribed(untranscribed, errors) if untranscribed else []
     known = load_language(language) if language else language_of_corpora(examples)
     aligned = _aligned(_first_scores(first, examples), first.topology, examples)
     report(f"{len(aligned)} recordings aligned")
+    taught = _Taught()
+    if encoder:
+        lessons = _recordings(_lessons(aligned, seed), taught)
+        teacher = train_teacher(encoder, lessons, seed=seed, report=report)
+        taught = _taught(teacher, examples, sounds, report)
     trainer = Trainer(
         network,
-        _recordings(aligned),
+        _recordings(aligned, taught),
         main_output=network.shape.look_aheads.index(round(look_ahead_ms / _FRAME_MS)),
         seed=seed,
     )
@@ -196,6 +227,7 @@ def train_neural(
         trainer=trainer,
         examples=examples,
         dev=_dev_examples(corpora, shipping=shipping),
+        taught=taught,
         language=known,
         statistics=_statistics(aligned, known),
         num_steps=num_steps,
@@ -214,7 +246,7 @@ def train_neural(
         output,
         title=f"Neural recognizer, a causal transformer of {network.shape.layers} layers",
         details=f"begun with {begun}, seed {seed}, {num_steps} steps of {BATCH_S} s of sound, "
-        f"aligned first by `{aligner.name}`",
+        f"aligned first by `{aligner.name}`" + _words_about(taught),
         examples=examples,
         errors=errors,
         choice=choice or UNCHOSEN,
@@ -224,15 +256,15 @@ def train_neural(
 
 def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...]) -> Network:
     """Make the network that learns."""
-    if start is None and whisper is not None:
+    if start is None:
+        if whisper is None:
+            raise UserError(
+                "training begins with Whisper's weights or with a model made here: give --whisper, "
+                "--start-from or both"
+            )
         network = Network(Shape(num_states=NUM_STATES, look_aheads=look_aheads))
         load_whisper(network, whisper)
         return network
-    if start is None or whisper is not None:
-        raise UserError(
-            "training begins with Whisper's weights or with a model made here: give either "
-            "--whisper or --start-from"
-        )
     model = load_model(start)
     if isinstance(model, NeuralModel) and tuple(model.look_aheads.tolist()) == look_aheads:
         with suppress(KeyError):  # another network that runs in the same way
@@ -242,6 +274,13 @@ def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...
         f"{start} was not written by this command with the look-aheads {asked} ms; begin with a "
         "model that was"
     )
+
+
+def _whole_encoder(whisper: Path) -> WholeEncoder:
+    shape = Shape(num_states=NUM_STATES, look_aheads=(), layers=NUM_LAYERS)
+    encoder = WholeEncoder(shape)
+    load_whisper(encoder, whisper)
+    return encoder
 
 
 def _look_aheads(main_ms: float) -> tuple[int, ...]:
@@ -299,23 +338,72 @@ def _aligned(
     place = np.arange(len(of_state)) - topology.first_state[of_state]
     # middle of the n-th part of a unit, in parts of another size
     part = (2 * place + 1) * STATES_PER_UNIT // (2 * own[of_state])
-    for rows, example in zip(scores, examples, strict=True):
+    for number, (rows, example) in enumerate(zip(scores, examples, strict=True)):
         graph = utterance_graph(example.units, example.syllables, topology.first_state)
         path, _ = viterbi_path(rows[:, graph.states], graph, topology.log_stay, topology.log_leave)
         if len(path):
             states = graph.units[graph.unit_of[path]] * STATES_PER_UNIT + part[graph.states[path]]
-            aligned.append(_Aligned(example, states, units_of_path(path, graph)))
+            aligned.append(_Aligned(number, example, states, units_of_path(path, graph)))
     if not aligned:
         raise UserError("no recording fits its text; is the aligner trained?")
     return aligned
 
 
-def _recordings(aligned: Sequence[_Aligned]) -> list[Recording]:
-    """Weigh what the network hears."""
-    return [
-        Recording(samples=_samples(one.example), targets=one.states, weight=weight)
-        for one, weight in zip(aligned, _weights(aligned), strict=True)
+def _lessons(aligned: Sequence[_Aligned], seed: int) -> list[_Aligned]:
+    """Draw what the teacher learns."""
+    rng = np.random.default_rng(seed)
+    drawn = []
+    for kind in _SHARES:
+        of_kind = [one for one in aligned if _kind(one.example) == kind]
+        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:_LESSONS]]
+    return drawn
+
+
+def _taught(
+    teacher: Teacher,
+    examples: Sequence[Example],
+    sounds: Sequence[NDArray[np.int16]],
+    report: Report,
+) -> _Taught:
+    """Let the teacher hear everything once."""
+    said = [
+        teacher.targets_of(samples)
+        for samples in with_progress(
+            [*map(_samples, examples), *sounds], "labelled by the teacher", report
+        )
     ]
+    without_text = said[len(examples) :]
+    num_frames = sum(map(len, without_text))
+    return _Taught(
+        said[: len(examples)],
+        [
+            Recording(samples=samples, targets=targets, weight=_UNTRANSCRIBED_SHARE / num_frames)
+            for samples, targets in zip(sounds, without_text, strict=True)
+        ],
+    )
+
+
+def _words_about(taught: _Taught) -> str:
+    """Say on the card who taught, and how much without text."""
+    if not taught.examples:
+        return ""
+    words = ", taught by a readout of Whisper's whole encoder"
+    if taught.untranscribed:
+        minutes = sum(len(recording.targets) for recording in taught.untranscribed) * HOP_S / 60
+        words += f", also on {minutes:.1f} minutes without text"
+    return words
+
+
+def _recordings(aligned: Sequence[_Aligned], taught: _Taught) -> list[Recording]:
+    """Weigh what the network hears."""
+    recordings = []
+    for one, weight in zip(aligned, _weights(aligned), strict=True):
+        targets = Targets.hard(one.states)
+        if taught.examples:
+            targets = targets.halved_with(taught.examples[one.number])
+        samples = _samples(one.example)
+        recordings.append(Recording(samples=samples, targets=targets, weight=weight))
+    return recordings + taught.untranscribed
 
 
 def _weights(aligned: Sequence[_Aligned]) -> list[float]:

@@ -44,18 +44,18 @@ _TINY = 1e-9
 
 _SPEED_SHARE = 0.75
 _SPEED_STEPS, _LEAST_STEPS, _MOST_STEPS = 20, 17, 24  # new lengths are 17/20 to 24/20
-_ROOM_SHARE = 0.4
+_ROOM_SHARE = 0.35
 _SHORTEST_T60_S, _LONGEST_T60_S, _LONGEST_ROOM_S = 0.1, 0.7, 0.5
-_NOISE_SHARE = 0.65
+_NOISE_SHARE = 0.6
 _LEAST_SNR_DB, _MOST_SNR_DB = 3.0, 30.0
 _SLOWEST_HZ = 50.0  # noise is no stronger below
-_FLUTTER_SHARE, _KNOCKS_SHARE = 0.4, 0.15
+_FLUTTER_SHARE, _KNOCKS_SHARE = 0.35, 0.15
 _FLUTTER_SAMPLES = 2400  # from one knot of the noise's level to the next
 _KNOCK_SAMPLES = 160
 _KNOCKING = 0.03  # of these pieces
-_TELEPHONE_SHARE, _CODEC_SHARE = 0.14, 0.22
+_TELEPHONE_SHARE, _CODEC_SHARE = 0.14, 0.2
 _COLOUR_SHARE = 0.5
-_QUIETEST_DB = -26.0  # the peak, against full scale
+_QUIETEST_DB = -36.0  # the peak, against full scale
 _SLOWEST, _FASTEST = -0.20, 0.25  # log of the tempo
 _MOST_MASKS, _MOST_MASKED_FRAMES, _MOST_MASKED_BANDS = 2, 12, 14
 
@@ -91,7 +91,7 @@ def changed_sound(samples: Samples, rng: np.random.Generator) -> tuple[Samples, 
 
 
 def levelled(samples: Samples, rng: np.random.Generator) -> Samples:
-    """Put the peak at a random level, -26 to 0 dB of full scale."""
+    """Put the peak at a random level, -36 to 0 dB of full scale."""
     peak = np.abs(samples).max() + _TINY
     gain = 10 ** (rng.uniform(_QUIETEST_DB, 0.0) / 20) / peak
     return samples * np.float32(gain)

@@ -39,7 +39,7 @@ import torch
 from numpy.typing import NDArray
 
 from shared.errors import UserError
-from training.network import Network
+from training.network import Encoder
 
 _FILE_NAME = "model.bin"
 _LEAST_VERSION = 4
@@ -62,10 +62,10 @@ _OF_LAYER = {
 }
 
 
-def load_whisper(network: Network, folder: Path) -> None:
+def load_whisper(network: Encoder, folder: Path) -> None:
     """Give a network the weights of Whisper's convolutions and of as many layers as it has.
 
-    Its last norm and its output layers stay what they are.
+    All else in it stays what it is.
 
     Parameters
     ----------

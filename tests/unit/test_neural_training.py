@@ -1,6 +1,7 @@
 """Whisper's weights, changed sounds, and the training of the network."""
 
 import struct
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,17 +16,20 @@ from services.recognizer.neural import WINDOW, NeuralModel
 from services.recognizer.whisper_mel import NUM_MELS, WhisperMel
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from training import network_training, sound_change
+from tests.tones import burst, tones
+from training import network_training, sound_change, teacher
 from training.corpus import RowErrors, read_corpus
-from training.examples import load_examples
+from training.examples import load_examples, load_untranscribed
 from training.feature_cache import as_floats, samples_of
 from training.network import Network, Shape, said_frames
 from training.network_export import network_of, onnx_of
 from training.network_training import (
-    NO_TARGET,
     Recording,
+    Targets,
     Trainer,
-    due_states,
+    batches_of,
+    cross_entropy,
+    due_targets,
     heard_anew,
     log_shares_of,
 )
@@ -222,13 +226,6 @@ def test_no_size_in_the_file_is_believed(tmp_path: Path) -> None:
 # --- changed sounds
 
 
-def burst(start_s: float, end_s: float, whole_s: float, tone_hz: float = 1000.0) -> np.ndarray:
-    """A tone in silence."""
-    time_s = np.arange(round(whole_s * 16_000)) / 16_000
-    inside = (time_s >= start_s) & (time_s < end_s)
-    return (0.3 * np.sin(2 * np.pi * tone_hz * time_s) * inside).astype(np.float32)
-
-
 def test_the_same_generator_changes_a_sound_in_the_same_way() -> None:
     results = []
     for seed in (*range(40), *range(40)):
@@ -237,7 +234,7 @@ def test_the_same_generator_changes_a_sound_in_the_same_way() -> None:
         results.append(levelled(sound, rng))
         assert len(sound) == pytest.approx(len(HELLO) / speed, abs=1)
         assert np.isfinite(results[-1]).all()
-        assert 10 ** (-26.1 / 20) < np.abs(results[-1]).max() <= 1.001
+        assert 10 ** (-36.1 / 20) < np.abs(results[-1]).max() <= 1.001
     for first, second in zip(results[:40], results[40:], strict=True):
         np.testing.assert_array_equal(first, second)
     assert len({len(sound) for sound in results}) == 8  # speeds
@@ -274,13 +271,17 @@ def test_noise_is_as_loud_as_it_is_drawn(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_targets_stay_at_their_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a tone begins and ends, its target does, whatever the speed and the tempo."""
+    """Where a tone begins and ends, its targets do, whatever the speed and the tempo."""
     for share in ("_ROOM_SHARE", "_NOISE_SHARE"):
         monkeypatch.setattr(sound_change, share, 0.0)
     monkeypatch.setattr(sound_change, "_MOST_MASKS", 0)
     sound = burst(1.0, 1.8, 3.0)
     middle_s = (np.arange(298) * 160 + 200) / 16_000
-    targets = ((middle_s >= 1.0) & (middle_s < 1.8)).astype(np.int64)
+    inside = (middle_s >= 1.0) & (middle_s < 1.8)
+    tone = Targets(
+        np.outer(inside, [3, 5]).astype(np.uint8), np.full((298, 2), [0.75, 0.25], np.float16)
+    )
+    targets = Targets.hard(inside.astype(np.int64)).halved_with(tone)
     samples = np.rint(32767 * sound).astype(np.int16)
     recording = Recording(samples=samples, targets=targets, weight=1.0)
     lengths = []
@@ -288,7 +289,9 @@ def test_targets_stay_at_their_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
         frames, changed = heard_anew(recording, np.random.default_rng(seed))
         assert frames.shape == (len(changed), NUM_MELS)
         loud = frames.max(axis=1) > frames.max() - 0.5
-        at, due = np.flatnonzero(loud), np.flatnonzero(changed)
+        at, due = np.flatnonzero(loud), np.flatnonzero(changed.states[:, 0])
+        np.testing.assert_array_equal(changed.states, changed.states[:, :1] * np.array([1, 3, 5]))
+        np.testing.assert_array_equal(changed.shares[7], [0.5, 0.375, 0.125])
         assert abs(at[0] - due[0]) <= 2
         assert abs(at[-1] - due[-1]) <= 2
         lengths.append(len(frames))
@@ -416,12 +419,16 @@ def test_a_position_attends_to_the_window_and_no_further() -> None:
 def test_positions_owe_the_frames_of_their_look_ahead() -> None:
     assert said_frames(3, 1).tolist() == [[1, 2], [3, 4], [5, 6]]
     assert said_frames(3, 6).tolist() == [[-4, -3], [-2, -1], [0, 1]]
-    states = torch.arange(100, 109)[None]
-    assert due_states(states, 4, 1)[0].tolist() == [[101, 102], [103, 104], [105, 106], [107, 108]]
-    assert due_states(states, 4, 3)[0].tolist() == [
-        [NO_TARGET, 100], [101, 102], [103, 104], [105, 106],
-    ]  # fmt: skip
-    assert due_states(states, 6, 1)[0, 4].tolist() == [NO_TARGET, NO_TARGET]
+    states = torch.arange(100, 109)[None, :, None] + torch.tensor([0, 50])
+    shares = torch.tensor([0.75, 0.25]).expand(1, 9, 2)
+    due, of_due = due_targets(states, shares, 4, 1)
+    assert due[0, ..., 0].tolist() == [[101, 102], [103, 104], [105, 106], [107, 108]]
+    assert (due[..., 1] == due[..., 0] + 50).all()
+    assert (of_due == shares[0, 0]).all()
+    due, of_due = due_targets(states, shares, 4, 3)
+    assert due[0, ..., 0].flatten().tolist()[1:] == [100, 101, 102, 103, 104, 105, 106]
+    assert of_due[0, 0].tolist() == [[0, 0], [0.75, 0.25]]
+    assert not due_targets(states, shares, 6, 1)[1][0, 4].any()
 
 
 @pytest.mark.parametrize("num_samples", [8000, 8160, 560])
@@ -448,24 +455,34 @@ def test_whole_recordings_are_heard_as_the_recognizer_hears_them(num_samples: in
 # --- training
 
 
-def tones(seed: int) -> Recording:
-    """Four tones one after the other, the states 1 to 4, between silences."""
-    rng = np.random.default_rng(seed)
-    order = rng.permutation(4)
-    pitches_hz = np.array([300.0, 700.0, 1500.0, 3500.0])[order]
-    pieces = [burst(0.0, 0.2, 0.2, pitch_hz) for pitch_hz in pitches_hz]
-    silence = np.zeros(1600, np.float32)
-    sound = np.concatenate([silence, *pieces, silence]) + rng.normal(0, 1e-4, 16_000)
-    starts = np.searchsorted([0.1, 0.3, 0.5, 0.7, 0.9], (np.arange(98) + 1.25) / 100, "right")
-    states = np.array([0, *(1 + order), 0])
-    samples = np.rint(32767 * sound).astype(np.int16)
-    return Recording(samples=samples, targets=states[starts], weight=1.0)
+def test_the_loss_is_the_cross_entropy_of_shares() -> None:
+    shares_said = torch.tensor([[0.5, 0.25, 0.25], [0.125, 0.125, 0.75], [1 / 3, 1 / 3, 1 / 3]])
+    states = torch.tensor([[0, 1], [2, 0], [1, 1]])
+    shares = torch.tensor([[1.0, 0.0], [0.75, 0.25], [0.0, 0.0]])  # of the last nothing is known
+    expected = (np.log(2) + 0.75 * np.log(4 / 3) + 0.25 * np.log(8)) / 2
+    found = cross_entropy(shares_said.log(), states, shares)
+    assert float(found) == pytest.approx(expected, rel=1e-6)
+    assert float(cross_entropy(shares_said.log(), states, 0 * shares)) == 0.0
+
+
+def test_batches_hold_recordings_with_one_state_a_frame_and_with_several() -> None:
+    hard = Targets.hard(np.array([4, 5]))
+    soft = hard.halved_with(Targets.hard(np.array([6, 6])))
+    kinds = iter([hard, soft] * 100)
+    rows = np.arange(6, dtype=np.float32).reshape(2, 3)
+    batches = batches_of(lambda: (rows, next(kinds)), 4, np.random.default_rng(0))
+    inputs, states, shares = next(batches)
+    assert inputs.tolist() == [[*rows.tolist(), rows[1].tolist()]] * 2
+    assert states.tolist() == [[[4, 0], [5, 0]], [[4, 6], [5, 6]]]
+    assert shares.tolist() == [[[1.0, 0.0]] * 2, [[0.5, 0.5]] * 2]
 
 
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(network_training, "_BATCH_FRAMES", 300)
     monkeypatch.setattr(network_training, "_POOL_BATCHES", 2)
     monkeypatch.setattr(network_training, "_WARM_UP_STEPS", 2)
+    monkeypatch.setattr(teacher, "_BATCH_POSITIONS", 200)
+    monkeypatch.setattr(teacher, "_NUM_STEPS", 5)
 
 
 def trained(
@@ -497,7 +514,7 @@ def test_the_network_learns_which_tone_is_when(
     assert np.mean(losses[-10:]) < 0.2 * np.mean(losses[:10])
     unheard = tones(100)
     said = log_shares_of(trainer.mean, main_output, unheard.samples).argmax(axis=1)
-    assert np.mean(said == unheard.targets) > 0.96  # two frames late would be 0.9
+    assert np.mean(said == unheard.targets.states[:, 0]) > 0.94  # two frames late would be 0.9
 
 
 def test_convolutions_stay_and_all_else_learns(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -526,7 +543,7 @@ def test_long_recordings_are_cut_and_speech_may_have_begun_before(
 ) -> None:
     long = Recording(
         samples=np.tile(tones(0).samples, 12),
-        targets=np.arange(1198) % 6,
+        targets=Targets.hard(np.arange(1198) % 6),
         weight=1.0,
     )
     frames, targets = heard_anew(long, np.random.default_rng(0))
@@ -557,8 +574,14 @@ def corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return write_corpus(tmp_path / "corpus", {"a": HELLO, "d": HELLO})
 
 
-def test_the_recipe_writes_model_card_and_curves(corpus: Path, tmp_path: Path) -> None:
-    whisper = write_whisper(tmp_path / "whisper", encoder_arrays())
+@pytest.fixture
+def whisper(tmp_path: Path) -> Path:
+    return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6))
+
+
+def test_the_recipe_writes_model_card_and_curves(
+    corpus: Path, whisper: Path, tmp_path: Path
+) -> None:
     lines: list[str] = []
     output = tmp_path / "neural.npz"
     train_neural(
@@ -572,22 +595,94 @@ def test_the_recipe_writes_model_card_and_curves(corpus: Path, tmp_path: Path) -
     assert model.look_ahead_frames == 15
     assert load_model(output, look_ahead_ms=60.0).topology.num_states == 3 * 60
     learnt = network_of(model.network, model.look_aheads.tolist()).state_dict()
-    conv1 = encoder_arrays()["encoder/conv1/weight"].astype(np.float32)
+    conv1 = encoder_arrays(6)["encoder/conv1/weight"].astype(np.float32)
     np.testing.assert_allclose(learnt["first.weight"], conv1, atol=np.abs(conv1).max() / 120)
     assert sum("dev phone error" in line for line in lines) >= 10
     assert "step 5: aligned anew" in lines
+    assert "1 of 1 recordings heard by the teacher, to learn" in lines
+    assert "1 of 1 recordings labelled by the teacher" in lines
+    assert sum("teacher, step" in line for line in lines) == 5
     card = output.with_suffix(".md").read_text()
     assert "CC0-1.0" in card
     assert "Whisper's weights (Radford et al. 2023, MIT licence)" in card
+    assert "taught by a readout of Whisper's whole encoder." in card
     assert output.with_suffix(".png").stat().st_size > 1000
 
 
+def test_the_teacher_labels_recordings_without_text(
+    corpus: Path, whisper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sentence's share is half the teacher's, before and after it is aligned anew."""
+    folder = tmp_path / "other" / "deep"
+    folder.mkdir(parents=True)
+    soundfile.write(folder / "x.wav", HELLO[:16_000], 16_000)
+    (folder / "y.wav").write_bytes(b"no sound")
+    learnt: list[list[Recording]] = []
+    replace = Trainer.replace_recordings
+
+    def noted(trainer: Trainer, recordings: Sequence[Recording]) -> None:
+        learnt.append(list(recordings))
+        replace(trainer, recordings)
+
+    monkeypatch.setattr(Trainer, "replace_recordings", noted)
+    lines: list[str] = []
+    output = tmp_path / "neural.npz"
+    train = partial(train_neural, [corpus], aligner=model_path("gmm"), num_threads=1)
+    train(
+        output, whisper=whisper, untranscribed=[tmp_path / "other"], num_steps=2,
+        report=lines.append,
+    )  # fmt: skip
+    assert len(learnt) == 2
+    for sentence, other in learnt:
+        assert sentence.targets.states.shape[1] == 9
+        assert (sentence.targets.shares[:, 0] == 0.5).all()
+        assert other.targets.states.shape[1] == 8
+        for one, share in ((sentence, 0.33), (other, 0.29)):
+            sums = one.targets.shares.sum(axis=1, dtype=np.float32)
+            np.testing.assert_allclose(sums, 1.0, atol=2e-3)
+            assert one.weight * len(one.targets) == pytest.approx(share)
+    for first, again in zip(*learnt, strict=True):
+        np.testing.assert_array_equal(first.targets.states[:, 1:], again.targets.states[:, 1:])
+    assert "2 of 2 recordings labelled by the teacher" in lines
+    assert "1 rows skipped" in lines
+    assert "also on 0.0 minutes without text" in output.with_suffix(".md").read_text()
+    train(tmp_path / "further.npz", whisper=whisper, start=output, num_steps=1, report=lines.append)
+    card = (tmp_path / "further.md").read_text()
+    assert "begun with `neural.npz`" in card
+    assert "taught by" in card
+
+
+def test_recordings_without_text_are_trimmed_and_cut(tmp_path: Path) -> None:
+    silence = np.zeros(20_000, np.float32)
+    long = np.concatenate([silence, *[HELLO] * 20, silence])
+    soundfile.write(tmp_path / "a.flac", long, 16_000)
+    soundfile.write(tmp_path / "b.wav", HELLO[:2000], 16_000)
+    (tmp_path / "c.ogg").write_bytes(b"no sound")
+    (tmp_path / "d.txt").write_text("no sound")
+    errors = RowErrors()
+    first, second = load_untranscribed([tmp_path], errors)
+    assert len(first) == 2000 * 160 + 240
+    assert 8 * 16_000 < len(second) < 11 * 16_000
+    np.testing.assert_array_equal(first[2000 * 160 :], second[:240])
+    assert [message.split(": ", 1)[1] for message in errors.messages] == [
+        f"no audio in {tmp_path / 'c.ogg'}; row skipped",
+        "it is too short; row skipped",
+    ]
+
+
+def test_folders_without_usable_recordings_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=f"{tmp_path} holds no wav"):
+        load_untranscribed([tmp_path], RowErrors())
+    (tmp_path / "c.ogg").write_bytes(b"no sound")
+    with pytest.raises(UserError, match=r"no usable recordings .*no audio in .*c\.ogg.*; give"):
+        load_untranscribed([tmp_path], RowErrors())
+
+
 def test_the_same_seed_gives_the_same_model_and_it_learns_further(
-    corpus: Path, tmp_path: Path
+    corpus: Path, whisper: Path, tmp_path: Path
 ) -> None:
     manifest = corpus / "manifest.tsv"  # nothing to judge by
     manifest.write_text(manifest.read_text().replace("\tdev\t", "\ttest\t"))
-    whisper = write_whisper(tmp_path / "whisper", encoder_arrays())
     paths = [tmp_path / f"{name}.npz" for name in ("first", "second", "other")]
     lines: list[str] = []
     for path, seed in zip(paths, (0, 0, 1), strict=True):
@@ -618,11 +713,12 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     assert len(before.topology.language.unit) < len(shipped.unit)
 
 
-def test_training_begins_with_one_thing(corpus: Path, tmp_path: Path) -> None:
+def test_training_begins_with_something(corpus: Path, tmp_path: Path) -> None:
     train = partial(train_neural, [corpus], tmp_path / "n.npz", aligner=model_path("gmm"))
-    for whisper, start in ((None, None), (tmp_path, model_path("gmm"))):
-        with pytest.raises(UserError, match="either --whisper or --start-from"):
-            train(num_threads=1, whisper=whisper, start=start)
+    with pytest.raises(UserError, match="give --whisper, --start-from or both"):
+        train(num_threads=1)
+    with pytest.raises(UserError, match="what --untranscribed names: give --whisper too"):
+        train(num_threads=1, start=model_path("gmm"), untranscribed=[corpus])
     with pytest.raises(UserError, match=r"model\.bin cannot be read"):
         train(num_threads=1, whisper=tmp_path)
     with pytest.raises(UserError, match=r"not written by this command .* 10, 30, 60, 100, 200 ms"):

@@ -224,8 +224,11 @@ def test_weights_and_licence_filter(tmp_path: Path) -> None:
     assert [example.weight for example in examples] == [3.0, 1.5]  # rare speakers count most
     assert any("CC BY-NC" in message for message in errors.messages)
     assert len(load_examples([tmp_path], RowErrors(), shipping=False)) == 3
-    with pytest.raises(UserError, match="no usable recordings"):
+    with pytest.raises(UserError, match="no usable recordings of split 'test'"):
         load_examples([tmp_path], RowErrors(), split="test")
+    write_corpus(tmp_path, ["b\t1.wav\tB\tx\tCC BY-NC\ttrain\t1.25\t你好\tni3 hao3"])
+    with pytest.raises(UserError, match=r"last of them: b: its licence \(CC BY-NC\)"):
+        load_examples([tmp_path], RowErrors())
 
 
 def test_cache_is_used_and_unreadable_audio_is_noted(

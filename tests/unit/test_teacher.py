@@ -1,0 +1,146 @@
+"""The teacher: Whisper's encoder on whole recordings, and the readout of states."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import erf, softmax
+
+from services.recognizer.neural import positions_of
+from services.recognizer.whisper_mel import NUM_MELS, mel_bands
+from tests.tones import tones
+from training import teacher
+from training.network import Shape
+from training.teacher import Teacher, WholeEncoder, centred_mel, num_frames_of, train_teacher
+
+pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+
+SHAPE = Shape(num_states=6, look_aheads=(), width=32, heads=2, layers=4, inner=48)
+
+
+def whole_encoder() -> WholeEncoder:
+    torch.manual_seed(0)
+    encoder = WholeEncoder(SHAPE).eval()
+    with torch.no_grad():  # convolutions that have learnt say more than those just made
+        encoder.first.weight *= 6
+        encoder.second.weight *= 6
+    return encoder
+
+
+# --- the encoder
+
+
+def test_bands_are_whispers() -> None:
+    """Frame 30 against its definition; the floor lies eight decades below the loudest band."""
+    samples = np.zeros(16_000, np.float32)
+    samples[:8000] = np.random.default_rng(0).normal(0, 0.1, 8000)
+    bands = centred_mel(samples).numpy()
+    assert bands.shape == (NUM_MELS, 100)
+    window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(400) / 400)
+    power = np.abs(np.fft.rfft(window * samples[30 * 160 - 200 : 30 * 160 + 200])) ** 2
+    expected = (np.log10(power @ mel_bands()) + 4) / 4
+    np.testing.assert_allclose(bands[:, 30], expected, atol=1e-4)
+    assert bands.max() - bands.min() == pytest.approx(2.0)
+    np.testing.assert_array_equal(bands[:, 60:], bands.min())
+
+
+def test_all_positions_attend_to_all() -> None:
+    """The encoder against plain formulas, position by position and head by head."""
+    encoder = whole_encoder()
+    weights = {name: tensor.numpy() for name, tensor in encoder.state_dict().items()}
+    bands = np.random.default_rng(0).normal(0, 0.5, (NUM_MELS, 12)).astype(np.float32)
+
+    def convolved(rows: np.ndarray, name: str, step: int) -> np.ndarray:
+        padded = np.pad(rows, ((1, 1), (0, 0)))
+        weight, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
+        return np.array([
+            np.einsum("oik,ki->o", weight, padded[at : at + 3]) + bias
+            for at in range(0, len(rows), step)
+        ])  # fmt: skip
+
+    def gelu(x: np.ndarray) -> np.ndarray:
+        return np.asarray(x * (1 + erf(x / np.sqrt(2))) / 2)
+
+    def product(x: np.ndarray, name: str) -> np.ndarray:
+        return np.asarray(x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"])
+
+    def normed(x: np.ndarray, name: str) -> np.ndarray:
+        x = x - x.mean(axis=1, keepdims=True)
+        x /= np.sqrt((x**2).mean(axis=1, keepdims=True) + 1e-5)
+        return np.asarray(x * weights[f"{name}.weight"] + weights[f"{name}.bias"])
+
+    hidden = gelu(convolved(gelu(convolved(bands.T, "first", 1)), "second", 2))
+    hidden = hidden + positions_of(32)[:6]
+    after = []
+    for layer in (f"layers.{number}" for number in range(4)):
+        parts = product(normed(hidden, f"{layer}.attention_norm"), f"{layer}.query_key_value")
+        query, key, value = parts.reshape(6, 3, 2, 16).transpose(1, 2, 0, 3)
+        seen = [softmax(query[h] @ key[h].T / 4, axis=1) @ value[h] for h in range(2)]
+        hidden = hidden + product(np.hstack(seen), f"{layer}.attended")
+        inner = gelu(product(normed(hidden, f"{layer}.inner_norm"), f"{layer}.inner"))
+        hidden = hidden + product(inner, f"{layer}.outer")
+        after.append(hidden)
+    with torch.no_grad():
+        found = encoder(torch.from_numpy(bands)[None])[0].numpy()
+    np.testing.assert_allclose(found, np.hstack(after[1:]), atol=1e-4)
+
+
+@pytest.mark.parametrize("num_frames", [1, 2, 19, 20, 21, 45])
+def test_long_recordings_are_heard_in_pieces(
+    num_frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(teacher, "_PIECE_FRAMES", 20)
+    encoder = whole_encoder()
+    samples = tones(0).samples[8000 : 8000 + 240 + 160 * num_frames]
+    assert num_frames_of(samples) == num_frames
+    features = encoder.features(samples)
+    assert features.shape == ((num_frames + 1) // 2, 96)
+    for start in range(0, num_frames, 20):
+        alone = encoder.features(samples[160 * start : 160 * (start + 20) + 240])
+        np.testing.assert_array_equal(features[start // 2 : start // 2 + 10], alone)
+
+
+def test_a_position_hears_its_two_frames() -> None:
+    """A click in the middle of two frames is loudest in the position that says them."""
+    encoder = whole_encoder()
+    with torch.no_grad():
+        for parameter in encoder.parameters():
+            parameter.zero_()  # layers change nothing
+        encoder.positions.zero_()
+        encoder.first.weight[:, :, 1] = 1 / NUM_MELS
+        encoder.second.weight[:, :, 1] = 1 / 32
+    for pair in (0, 1, 17, 48):
+        samples = np.zeros(16_000, np.int16)
+        samples[320 * pair + 280] = 20_000
+        assert encoder.features(samples)[:, 0].argmax() == pair
+
+
+# --- the readout
+
+
+def taught(num_steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Teacher, list[str]]:
+    monkeypatch.setattr(teacher, "_BATCH_POSITIONS", 200)
+    monkeypatch.setattr(teacher, "_CROP_POSITIONS", 30)
+    monkeypatch.setattr(teacher, "_NUM_STEPS", num_steps)
+    lines: list[str] = []
+    recordings = [tones(seed) for seed in range(12)]
+    return train_teacher(whole_encoder(), recordings, seed=0, report=lines.append), lines
+
+
+def test_the_teacher_learns_which_tone_is_when(monkeypatch: pytest.MonkeyPatch) -> None:
+    learnt, lines = taught(100, monkeypatch)
+    unheard = tones(100)
+    targets = learnt.targets_of(unheard.samples)
+    assert targets.states.shape == targets.shares.shape == (98, 6)
+    np.testing.assert_allclose(targets.shares.sum(axis=1, dtype=np.float32), 1.0, atol=2e-3)
+    assert (np.diff(targets.shares, axis=1) <= 0).all()
+    # a frame early or late would be 0.95
+    assert np.mean(targets.states[:, 0] == unheard.targets.states[:, 0]) > 0.97
+    assert "12 of 12 recordings heard by the teacher, to learn" in lines
+    assert lines[-1].startswith("teacher, step 100: ")
+
+
+def test_the_same_seed_gives_the_same_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = tones(100).samples
+    first, second = (taught(3, monkeypatch)[0].targets_of(samples) for _ in range(2))
+    np.testing.assert_array_equal(first.states, second.states)
+    np.testing.assert_array_equal(first.shares, second.shares)

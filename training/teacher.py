@@ -1,0 +1,285 @@
+"""The network's teacher: Whisper's encoder, which hears whole recordings, and a readout of states.
+
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
+encoder with its front end, section 2.2, and its weights); Cho et al. 2014, "Learning phrase
+representations using RNN encoder-decoder for statistical machine translation" (the GRU); Hinton,
+Vinyals and Dean 2015, "Distilling the knowledge in a neural network" (what a large network says is
+the target of a small one). The encoder stays as it is; the readout learns the states of an
+alignment. Since it knows what follows, it says them much better than a network that runs live can,
+also in recordings that nobody has transcribed.
+
+    m[k, j] = (max(log10 max(B[k] P[j], 1e-10), max log10 - 8) + 4) / 4
+    z = clip((concat(h_4, h_5, h_6) - mean) / deviation, -6, 6)
+    a = gelu(W z)
+    y = log softmax(V concat(GRU(a), a))
+
+========== ========================================================== ======================
+symbol     meaning                                                    shape
+========== ========================================================== ======================
+P          power spectra of 25 ms, centred on samples 160 j           (201, frames)
+B          triangles of :mod:`services.recognizer.whisper_mel`        (80, 201)
+m          log-mel bands; the floor is eight decades below the        (80, frames)
+           recording's loudest
+h_l        positions after layer l, centred on samples 320 p          (positions, width)
+mean,      of the features in the training data                       (3 width,)
+deviation
+a          what the GRU hears, in both directions                     (positions, 256)
+y          log shares of the states at two frames                     (positions, 2, states)
+========== ========================================================== ======================
+
+The recognizer's frame ``t`` is centred on sample ``160 t + 200``, so frames ``2 p - 2`` and
+``2 p - 1`` lie around the middle of position ``p``, which says them. Position 0 says nothing and is
+left out.
+
+Whisper takes 30 s at most: longer recordings are heard in pieces. Cost: about a second of one core
+for 20 s of sound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import gelu, log_softmax
+from torch.optim.swa_utils import AveragedModel
+
+from services.recognizer.features import HOP_SAMPLES, WINDOW_SAMPLES
+from services.recognizer.whisper_mel import mel_bands
+from training.feature_cache import as_floats
+from training.network import Encoder, Shape
+from training.network_training import (
+    Heard,
+    Recording,
+    Targets,
+    batches_of,
+    cross_entropy,
+    nearer,
+    shares_of,
+)
+from training.recipes import Report
+
+NUM_LAYERS = 6  # of Whisper base's encoder
+_NUM_STEPS = 300  # batches of 70 s of sound
+_KEPT_LAYERS = 3  # the last ones
+_PIECE_FRAMES = 2960  # with what is appended, less than 30 s
+_APPENDED = np.zeros(4800, np.float32)  # samples after a piece
+_LEAST_POWER, _FLOOR_DECADES = 1e-10, 8.0
+_LARGEST_HALF = 6e4  # that a 16-bit float holds
+_LIKELIEST = 8  # states a frame, in soft targets
+
+_INNER, _GRU = 256, 160  # widths in the readout
+_DROPOUT = 0.3
+_MOST_DEVIATIONS = 6.0
+_STANDARD_RECORDINGS = 250  # of which mean and deviation are taken
+_NOISE = 0.3  # deviations; as much again lasts for a whole recording
+_HIDDEN_INPUTS = 0.1  # of the inputs, for a whole recording
+_MASKS, _MASK_SHARE, _MOST_MASKED = 2, 0.5, 7  # masks, how often each comes, positions
+
+_BATCH_POSITIONS = 3500
+_CROP_POSITIONS = 250
+_RATE = 2e-3
+_WEIGHT_DECAY = 0.02
+_WARM_UP_STEPS = 30
+_FALL_SHARE = 0.5  # of the steps, at the end, over which the rate falls to nothing
+_LONGEST_GRADIENT = 2.0
+
+T = TypeVar("T")
+
+
+class WholeEncoder(Encoder):
+    """Whisper's encoder: every position attends to the whole recording."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__(shape, dropout=0.0, padding=1)
+
+    def forward(self, bands: Tensor) -> Tensor:
+        """(batch, 80, frames) to (batch, positions, 3 width): the last three layers."""
+        hidden = self.placed(bands)
+        after = []
+        for layer in self.layers:
+            hidden = layer(hidden)
+            after.append(hidden)
+        return torch.cat(after[-_KEPT_LAYERS:], dim=-1)
+
+    @torch.no_grad()
+    def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
+        """Hear a recording.
+
+        Parameters
+        ----------
+        samples
+            Shape (n,), 16 kHz.
+
+        Returns
+        -------
+        NDArray
+            Of each two frames, shape (ceil(frames / 2), 3 width).
+        """
+        pieces = []
+        num_frames = num_frames_of(samples)
+        for start in range(0, num_frames, _PIECE_FRAMES):
+            end = min(start + _PIECE_FRAMES, num_frames)
+            piece = samples[HOP_SAMPLES * start : HOP_SAMPLES * (end - 1) + WINDOW_SAMPLES]
+            bands = centred_mel(np.concatenate([as_floats(piece), _APPENDED]))
+            hidden = self(bands[None])[0, 1 : 1 + math.ceil((end - start) / 2)]
+            pieces.append(hidden.clamp(-_LARGEST_HALF, _LARGEST_HALF).half().numpy())
+        return np.concatenate(pieces)
+
+
+class Readout(nn.Module):
+    """Reads the states of two frames off each position."""
+
+    mean: Tensor  # (inputs,)
+    deviation: Tensor  # (inputs,)
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        num_inputs = _KEPT_LAYERS * shape.width
+        self.register_buffer("mean", torch.zeros(num_inputs))
+        self.register_buffer("deviation", torch.ones(num_inputs))
+        self.inner = nn.Linear(num_inputs, _INNER)
+        self.gru = nn.GRU(_INNER, _GRU, batch_first=True, bidirectional=True)
+        self.output = nn.Linear(2 * _GRU + _INNER, 2 * shape.num_states)
+        self.dropout = nn.Dropout(_DROPOUT)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(batch, positions, inputs) to log shares, (batch, 2 positions, states)."""
+        standard = ((features - self.mean) / self.deviation).clamp(
+            -_MOST_DEVIATIONS, _MOST_DEVIATIONS
+        )
+        if self.training:
+            standard = _disturbed(standard)
+        inner = self.dropout(gelu(self.inner(standard)))
+        followed, _ = self.gru(inner)
+        logits = self.output(self.dropout(torch.cat([followed, inner], dim=-1)))
+        return log_softmax(logits.unflatten(-1, (2, -1)).flatten(1, 2), dim=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class Teacher:
+    """Whisper's encoder with a readout that has learnt."""
+
+    encoder: WholeEncoder
+    readout: Readout
+
+    @torch.no_grad()
+    def targets_of(self, samples: NDArray[np.int16]) -> Targets:
+        """Likeliest states of a recording's frames; their shares sum to one.
+
+        Parameters
+        ----------
+        samples
+            Shape (n,), 16 kHz, 25 ms or more.
+        """
+        features = torch.from_numpy(self.encoder.features(samples)).float()
+        log_shares = self.readout(features[None])[0, : num_frames_of(samples)]
+        best, states = log_shares.topk(min(_LIKELIEST, log_shares.shape[-1]))
+        shares = best.softmax(dim=-1)
+        return Targets(states.numpy().astype(np.uint8), shares.numpy().astype(np.float16))
+
+
+def train_teacher(
+    encoder: WholeEncoder,
+    recordings: Sequence[Recording],
+    *,
+    seed: int,
+    report: Report,
+) -> Teacher:
+    """Train a readout.
+
+    Parameters
+    ----------
+    encoder
+        With Whisper's weights, see :func:`training.whisper_weights.load_whisper`.
+    recordings
+        With the states of an alignment as targets. What the encoder makes of them is held in
+        memory, 150 KB a second with Whisper base.
+    seed
+        Of the order. New weights, dropout and disturbances take PyTorch's own.
+    report
+        Receives lines of progress.
+    """
+    rng = np.random.default_rng(seed)
+    share = shares_of(recordings)
+    heard = with_progress(recordings, "heard by the teacher, to learn", report)
+    features = [encoder.features(recording.samples) for recording in heard]
+
+    def draw() -> Heard:
+        number = rng.choice(len(share), p=share)
+        most = max(0, len(features[number]) - _CROP_POSITIONS)
+        start = int(rng.integers(most + 1))
+        end = start + _CROP_POSITIONS
+        targets = recordings[number].targets.of(slice(2 * start, 2 * end))
+        return features[number][start:end], targets
+
+    readout = Readout(encoder.shape)
+    drawn = rng.choice(len(share), size=_STANDARD_RECORDINGS, p=share)
+    some = np.concatenate([features[number].astype(np.float32) for number in drawn])
+    readout.mean[:] = torch.from_numpy(some.mean(axis=0))
+    readout.deviation[:] = torch.from_numpy(some.std(axis=0) + 1e-3)
+    averaged = AveragedModel(readout, avg_fn=nearer)
+    optimizer = torch.optim.AdamW(readout.parameters(), weight_decay=_WEIGHT_DECAY)
+    batches = batches_of(draw, _BATCH_POSITIONS, rng)
+    for step in range(_NUM_STEPS):
+        rise = min(1.0, (step + 1) / _WARM_UP_STEPS)
+        fall = min(1.0, (_NUM_STEPS - step) / (_FALL_SHARE * _NUM_STEPS))
+        optimizer.param_groups[0]["lr"] = _RATE * rise * fall
+        inputs, states, shares = next(batches)
+        loss = cross_entropy(readout(inputs)[:, : states.shape[1]], states, shares)
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(readout.parameters(), _LONGEST_GRADIENT)
+        optimizer.step()
+        averaged.update_parameters(readout)
+        if (step + 1) % math.ceil(_NUM_STEPS / 5) == 0:
+            report(f"teacher, step {step + 1}: {float(loss.detach()):.3f} nats a frame")
+    return Teacher(encoder.eval(), cast(Readout, averaged.module).eval())
+
+
+def centred_mel(samples: NDArray[np.float32]) -> Tensor:
+    """Whisper's log-mel bands of a whole recording, shape (80, n // 160)."""
+    spectra = torch.stft(
+        torch.from_numpy(samples),
+        WINDOW_SAMPLES,
+        HOP_SAMPLES,
+        window=torch.hann_window(WINDOW_SAMPLES),
+        return_complex=True,
+    )[:, :-1]
+    power = torch.from_numpy(mel_bands().T).float() @ spectra.abs().square()
+    log_power = power.clamp(min=_LEAST_POWER).log10()
+    return (log_power.clamp(min=float(log_power.max()) - _FLOOR_DECADES) + 4) / 4
+
+
+def num_frames_of(samples: NDArray[np.int16]) -> int:
+    """Count the recognizer's frames in a recording."""
+    return (len(samples) - WINDOW_SAMPLES) // HOP_SAMPLES + 1
+
+
+def with_progress(items: Sequence[T], what: str, report: Report) -> Iterator[T]:
+    """Give items one after the other; report each tenth part."""
+    step = math.ceil(len(items) / 10)
+    for number, item in enumerate(items, start=1):
+        yield item
+        if number % step == 0 or number == len(items):
+            report(f"{number} of {len(items)} recordings {what}")
+
+
+def _disturbed(standard: Tensor) -> Tensor:
+    """Add noise to features, (batch, positions, inputs); hide inputs and some positions."""
+    batch, num_positions, num_inputs = standard.shape
+    lasting = torch.randn(batch, 1, num_inputs) * torch.rand(batch, 1, 1)
+    noisy = standard + _NOISE * (lasting + torch.randn_like(standard))
+    noisy = noisy * (torch.rand(batch, 1, num_inputs) >= _HIDDEN_INPUTS)
+    place = torch.arange(num_positions)[:, None]
+    for _ in range(_MASKS):
+        first = torch.randint(num_positions, (batch, 1, 1))
+        width = torch.randint(1, _MOST_MASKED + 1, (batch, 1, 1))
+        comes = torch.rand(batch, 1, 1) < _MASK_SHARE
+        noisy = noisy * ~(comes & (place >= first) & (place < first + width))
+    return noisy
