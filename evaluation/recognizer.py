@@ -47,7 +47,12 @@ from training.feature_cache import read_audio
 
 # N of the output rule and the confidence a frame needs: the paper's rule, its N = 3 with frames
 # that are sure, and the recognizer's own
-RULES = (*((agreement, 0.0) for agreement in (1, 2, 3, 4, 5, 6)), (3, 0.95), DEFAULT_RULE)
+RULES = (
+    *((agreement, 0.0) for agreement in (1, 2, 3, 4, 5, 6)),
+    (3, 0.95),
+    (3, 0.99),
+    DEFAULT_RULE,
+)
 _CHUNK_SAMPLES = 160  # sound is fed as it would arrive, 10 ms at a time
 _NUM_RESAMPLES = 2000
 _SESSIONS_TOGETHER = 16
