@@ -8,6 +8,7 @@ import signal
 import sys
 import webbrowser
 from dataclasses import asdict
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -58,6 +59,8 @@ Control = Annotated[
 def main() -> None:
     """Run the command line; a user's mistake is one line on standard error and status 2."""
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file, too
     try:
         app()
     except UserError as error:

@@ -222,3 +222,22 @@ def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -
         "synthesizer",
         "driver",
     }
+
+
+def test_lines_reach_a_log_file_at_once() -> None:
+    """Killed in the middle, a command has written all the lines it printed."""
+    code = """
+import os, signal
+from services import command_line
+command_line.app = lambda: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
+command_line.main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONUNBUFFERED": ""},
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    assert done.stdout == "step 1\n"
