@@ -166,9 +166,8 @@ class Trainer:
         """
         warm_up_steps = min(_WARM_UP_STEPS, _MOST_WARM_UP * num_steps)
         for step in range(num_steps):
-            rise = min(1.0, (step + 1) / warm_up_steps)
-            fall = min(1.0, (num_steps - step) / (_FALL_SHARE * num_steps))
-            watch(step + 1, self._step(step, rise * fall))
+            share = rate_share(step, num_steps, warm_up_steps, _FALL_SHARE)
+            watch(step + 1, self._step(step, share))
 
     def _step(self, number: int, share: float) -> float:
         """Learn from one batch; return the mean cross-entropy of the main output."""
@@ -196,6 +195,13 @@ class Trainer:
         look_ahead = self.network.shape.look_aheads[output]
         due = due_targets(states, shares, hidden.shape[1], look_ahead)
         return cross_entropy(self.network.log_shares(hidden, output), *due)
+
+
+def rate_share(step: int, num_steps: int, warm_up_steps: float, fall_share: float) -> float:
+    """How much of its full rate a step learns at: rising, staying, falling to nothing."""
+    rise = min(1.0, (step + 1) / warm_up_steps)
+    fall = min(1.0, (num_steps - step) / (fall_share * num_steps))
+    return rise * fall
 
 
 def shares_of(recordings: Sequence[Recording]) -> NDArray[np.float64]:

@@ -49,7 +49,7 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax
 from torch.optim.swa_utils import AveragedModel
 
-from services.recognizer.features import HOP_SAMPLES, WINDOW_SAMPLES
+from services.recognizer.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from services.recognizer.whisper_mel import mel_bands
 from training.feature_cache import as_floats
 from training.network import Encoder, Shape
@@ -60,6 +60,7 @@ from training.network_training import (
     batches_of,
     cross_entropy,
     nearer,
+    rate_share,
     shares_of,
 )
 from training.recipes import Report
@@ -122,7 +123,7 @@ class WholeEncoder(Encoder):
             Of each two frames, shape (ceil(frames / 2), 3 width).
         """
         pieces = []
-        num_frames = num_frames_of(samples)
+        num_frames = frames_in(len(samples))
         for start in range(0, num_frames, _PIECE_FRAMES):
             end = min(start + _PIECE_FRAMES, num_frames)
             piece = samples[HOP_SAMPLES * start : HOP_SAMPLES * (end - 1) + WINDOW_SAMPLES]
@@ -178,7 +179,7 @@ class Teacher:
             Shape (n,), 16 kHz, 25 ms or more.
         """
         features = torch.from_numpy(self.encoder.features(samples)).float()
-        log_shares = self.readout(features[None])[0, : num_frames_of(samples)]
+        log_shares = self.readout(features[None])[0, : frames_in(len(samples))]
         best, states = log_shares.topk(min(_LIKELIEST, log_shares.shape[-1]))
         shares = best.softmax(dim=-1)
         return Targets(states.numpy().astype(np.uint8), shares.numpy().astype(np.float16))
@@ -227,9 +228,8 @@ def train_teacher(
     optimizer = torch.optim.AdamW(readout.parameters(), weight_decay=_WEIGHT_DECAY)
     batches = batches_of(draw, _BATCH_POSITIONS, rng)
     for step in range(_NUM_STEPS):
-        rise = min(1.0, (step + 1) / _WARM_UP_STEPS)
-        fall = min(1.0, (_NUM_STEPS - step) / (_FALL_SHARE * _NUM_STEPS))
-        optimizer.param_groups[0]["lr"] = _RATE * rise * fall
+        rate = _RATE * rate_share(step, _NUM_STEPS, _WARM_UP_STEPS, _FALL_SHARE)
+        optimizer.param_groups[0]["lr"] = rate
         inputs, states, shares = next(batches)
         loss = cross_entropy(readout(inputs)[:, : states.shape[1]], states, shares)
         optimizer.zero_grad()
@@ -254,11 +254,6 @@ def centred_mel(samples: NDArray[np.float32]) -> Tensor:
     power = torch.from_numpy(mel_bands().T).float() @ spectra.abs().square()
     log_power = power.clamp(min=_LEAST_POWER).log10()
     return (log_power.clamp(min=float(log_power.max()) - _FLOOR_DECADES) + 4) / 4
-
-
-def num_frames_of(samples: NDArray[np.int16]) -> int:
-    """Count the recognizer's frames in a recording."""
-    return (len(samples) - WINDOW_SAMPLES) // HOP_SAMPLES + 1
 
 
 def with_progress(items: Sequence[T], what: str, report: Report) -> Iterator[T]:

@@ -94,6 +94,11 @@ def _cepstral_matrix() -> NDArray[np.float32]:
 _CEPSTRAL = _cepstral_matrix()
 
 
+def frames_in(num_samples: int) -> int:
+    """Count the whole feature frames in so many samples."""
+    return max(0, (num_samples - WINDOW_SAMPLES) // HOP_SAMPLES + 1)
+
+
 class LogMel:
     """Streaming log energy and log-mel bands; any chunking gives the same frames."""
 

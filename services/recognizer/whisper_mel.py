@@ -29,7 +29,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.features import HOP_SAMPLES, SAMPLE_RATE_HZ, WINDOW_SAMPLES
+from services.recognizer.features import HOP_SAMPLES, SAMPLE_RATE_HZ, WINDOW_SAMPLES, frames_in
 
 NUM_MELS = 80
 
@@ -78,7 +78,7 @@ class WhisperMel:
             The new feature frames, shape (frames, 80).
         """
         known = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
-        num_frames = max(0, (len(known) - WINDOW_SAMPLES) // HOP_SAMPLES + 1)
+        num_frames = frames_in(len(known))
         self._samples = known[HOP_SAMPLES * num_frames :]
         if num_frames == 0:
             return np.empty((0, NUM_MELS), dtype=np.float32)

@@ -5,12 +5,13 @@ import pytest
 import torch
 from scipy.special import erf, softmax
 
+from services.recognizer.features import frames_in
 from services.recognizer.neural import positions_of
 from services.recognizer.whisper_mel import NUM_MELS, mel_bands
 from tests.tones import tones
 from training import teacher
 from training.network import Shape
-from training.teacher import Teacher, WholeEncoder, centred_mel, num_frames_of, train_teacher
+from training.teacher import Teacher, WholeEncoder, centred_mel, train_teacher
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 
@@ -91,7 +92,7 @@ def test_long_recordings_are_heard_in_pieces(
     monkeypatch.setattr(teacher, "_PIECE_FRAMES", 20)
     encoder = whole_encoder()
     samples = tones(0).samples[8000 : 8000 + 240 + 160 * num_frames]
-    assert num_frames_of(samples) == num_frames
+    assert frames_in(len(samples)) == num_frames
     features = encoder.features(samples)
     assert features.shape == ((num_frames + 1) // 2, 96)
     for start in range(0, num_frames, 20):
