@@ -4,10 +4,15 @@ Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in spee
 (cross-entropy on the states of a forced alignment); Hinton, Vinyals and Dean 2015, "Distilling the
 knowledge in a neural network" (several states with a share each); Loshchilov and Hutter 2019,
 "Decoupled weight decay regularization" (AdamW); Polyak and Juditsky 1992 (running mean of the
-weights).
+weights); Izmailov et al. 2018, "Averaging weights leads to wider optima and better generalization"
+(mean of the weights at the ends of cycles); Wortsman et al. 2022, "Robust fine-tuning of zero-shot
+models" (mean of the weights before and after).
 
 Layers that come with weights learn slowly, what begins anew learns faster, and the convolutions
-stay as they are. The rate rises for some steps, stays, and falls to nothing:
+stay as they are. Training goes in cycles of about 900 steps, and what is kept is the mean of the
+weights at their ends: with those that a trained network began with; without those after the first
+cycle if a new one did and there are others. In each cycle the rate rises for some steps, stays, and
+falls to nothing:
 
     rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N)) * min(1, (N - n) / (0.6 N))
 
@@ -18,13 +23,14 @@ stay as they are. The rate rises for some steps, stays, and falls to nothing:
 ======== ============================================================= ================
 symbol   meaning                                                       shape
 ======== ============================================================= ================
-n, N     number of a step, of all steps                                1
+n, N     number of a step in its cycle, of all its steps               1
 s, w     states that frames ought to say, and their shares, which sum  (frames, k)
          to one, or to zero where nothing is known
 y        shares of the states that an output says                      (frames, states)
 H        mean cross-entropy of an output, nats a frame                 1
 m        running mean of the weights:                                  as the weights
-         m += (1 - min(0.99, (n + 1) / (n + 10))) (weights - m)
+         m += (1 - min(0.99, (k + 1) / (k + 10))) (weights - m)
+k        number of a step in all cycles                                1
 ======== ============================================================= ================
 """
 
@@ -57,9 +63,10 @@ _NEW_RATE = 1.2e-3  # of the last norm and the output layers
 _NEW = ("norm.", "outputs.")
 _KEPT = ("first.", "second.")
 _WEIGHT_DECAY = 0.01
+_CYCLE_STEPS = 900  # more or less: cycles are of the same length
 _WARM_UP_STEPS = 60
-_MOST_WARM_UP = 0.2  # of the steps
-_FALL_SHARE = 0.6  # of the steps, at the end, over which the rate falls to nothing
+_MOST_WARM_UP = 0.2  # of a cycle's steps
+_FALL_SHARE = 0.6  # of a cycle's steps, at the end, over which the rate falls to nothing
 _LONGEST_GRADIENT = 1.0
 _LONGEST_MEMORY = 0.99  # of the running mean of the weights, per step
 _OTHERS_WEIGHT = 0.5  # of the losses of other outputs than the main one
@@ -118,14 +125,23 @@ class Trainer:
         With the targets of their frames.
     main_output
         Output layer that learns in every step; each step another one learns besides.
+    further
+        The network has been trained before: what it begins with counts too in what is kept.
     seed
         Of order and changes of the sound. The network's dropout takes PyTorch's own.
     """
 
     def __init__(
-        self, network: Network, recordings: Sequence[Recording], *, main_output: int, seed: int
+        self,
+        network: Network,
+        recordings: Sequence[Recording],
+        *,
+        main_output: int,
+        further: bool,
+        seed: int,
     ) -> None:
         self.network = network
+        self._further = further
         self.main_output = main_output
         self._averaged = AveragedModel(network, avg_fn=nearer)
         self._averaged.eval()
@@ -138,7 +154,6 @@ class Trainer:
                 parameter.requires_grad_(False)
             else:
                 (fast if name.startswith(_NEW) else slow).append(parameter)
-        self._learning = [*slow, *fast]
         self._rates = (_RATE, _NEW_RATE)
         self._optimizer = torch.optim.AdamW(
             [{"params": slow}, {"params": fast}], weight_decay=_WEIGHT_DECAY
@@ -146,7 +161,7 @@ class Trainer:
 
     @property
     def mean(self) -> Network:
-        """The network with the running mean of the weights."""
+        """The network with the running mean of the weights; in the end, with that of the cycles."""
         return cast(Network, self._averaged.module)
 
     def replace_recordings(self, recordings: Sequence[Recording]) -> None:
@@ -159,15 +174,26 @@ class Trainer:
         self._batches = batches_of(draw, _BATCH_FRAMES, self._rng)
 
     def train(self, num_steps: int, watch: Callable[[int, float], None]) -> None:
-        """Take steps; the learning rate rises, stays, and falls to nothing.
+        """Take steps in cycles; the learning rate rises, stays, and falls to nothing in each.
 
         ``watch`` is told, after each step, how many there were and the loss of the main output
         in nats a frame.
         """
-        warm_up_steps = min(_WARM_UP_STEPS, _MOST_WARM_UP * num_steps)
-        for step in range(num_steps):
-            share = rate_share(step, num_steps, warm_up_steps, _FALL_SHARE)
-            watch(step + 1, self._step(step, share))
+        cycles = np.array_split(np.arange(num_steps), max(1, round(num_steps / _CYCLE_STEPS)))
+        ends = AveragedModel(self.network)
+        if self._further:
+            ends.update_parameters(self.network)
+        first_kept = 1 if self._further or len(cycles) == 1 else 2
+        for number, cycle in enumerate(cycles, start=1):
+            warm_up_steps = min(_WARM_UP_STEPS, _MOST_WARM_UP * len(cycle))
+            for place, step in enumerate(cycle.tolist()):
+                share = rate_share(place, len(cycle), warm_up_steps, _FALL_SHARE)
+                loss = self._step(step, share)
+                if place == len(cycle) - 1 and number >= first_kept:
+                    ends.update_parameters(self.mean)
+                if step == num_steps - 1:
+                    self.mean.load_state_dict(ends.module.state_dict())
+                watch(step + 1, loss)
 
     def _step(self, number: int, share: float) -> float:
         """Learn from one batch; return the mean cross-entropy of the main output."""
@@ -183,11 +209,7 @@ class Trainer:
             loss = loss + _OTHERS_WEIGHT * self._loss(hidden, states, shares, other)
         for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
             group["lr"] = share * rate
-        self._optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self._learning, _LONGEST_GRADIENT)
-        self._optimizer.step()
-        self._averaged.update_parameters(self.network)
+        learn(loss, self._optimizer, self.network, self._averaged, _LONGEST_GRADIENT)
         return main_loss
 
     def _loss(self, hidden: Tensor, states: Tensor, shares: Tensor, output: int) -> Tensor:
@@ -195,6 +217,21 @@ class Trainer:
         look_ahead = self.network.shape.look_aheads[output]
         due = due_targets(states, shares, hidden.shape[1], look_ahead)
         return cross_entropy(self.network.log_shares(hidden, output), *due)
+
+
+def learn(
+    loss: Tensor,
+    optimizer: torch.optim.Optimizer,
+    network: nn.Module,
+    averaged: AveragedModel,
+    longest_gradient: float,
+) -> None:
+    """Step down a gradient, shortened to that length; the running mean of the weights follows."""
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    nn.utils.clip_grad_norm_(network.parameters(), longest_gradient)
+    optimizer.step()
+    averaged.update_parameters(network)
 
 
 def rate_share(step: int, num_steps: int, warm_up_steps: float, fall_share: float) -> float:

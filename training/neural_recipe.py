@@ -8,6 +8,9 @@ beginning is plainer with what follows.
 With Whisper there is a teacher too (:mod:`training.teacher`), which hears whole recordings and has
 learnt the first alignment: half of a frame's share is then what the teacher says, and in recordings
 without text all of it.
+
+The recognizer says units early and corrects them: the scale of the scores and the unit penalty are
+those with the fewest errors on dev, as first said and in the full traceback together.
 """
 
 from __future__ import annotations
@@ -22,13 +25,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from evaluation.recognizer import ErrorCounts, count_errors, first_said
 from services.recognizer.acoustic_model import AcousticModel, Topology
-from services.recognizer.features import HOP_S
+from services.recognizer.features import HOP_S, SAMPLE_RATE_HZ
 from services.recognizer.load import load_model
 from services.recognizer.neural import NeuralModel
+from services.recognizer.pipeline import Recognizer, VoiceBegins, VoiceEnds
 from services.recognizer.unit_language import UnitLanguage
 from shared.errors import UserError
-from shared.phones import UNITS
+from shared.phones import UNITS, Phone
+from training.align import spoken
 from training.corpus import RowErrors, is_synthetic
 from training.durations import AlignedUnit, UnitDurations
 from training.examples import WORD_UNITS, Example, load_examples, load_untranscribed
@@ -129,7 +135,7 @@ class _Course:
         network = self.trainer.mean
         output = _aligning_output(network.shape.look_aheads)
         scores = _scores_of(network, output, self.statistics, self.examples)
-        aligned = _aligned(scores, self.statistics.topology, self.examples)
+        aligned = _aligned(scores, self.statistics.topology, self.examples, self.report)
         self.trainer.replace_recordings(_recordings(aligned, self.taught))
         self.statistics = _statistics(aligned, self.language)
 
@@ -172,7 +178,8 @@ def train_neural(
         Without it the states of the alignment alone are learnt.
     start
         A model that this function has written, whose network learns further, such as to know one's
-        own speakers; without it the network begins with Whisper's weights.
+        own speakers; what is kept is a mean of its weights and the new ones. Without it the network
+        begins with Whisper's weights.
     untranscribed
         Folders of recordings in any language, which the teacher labels. Nobody knows their
         licences: name only what may be used.
@@ -210,8 +217,8 @@ def train_neural(
     examples = load_examples(corpora, errors, shipping=shipping, with_samples=True)
     sounds = load_untranscribed(untranscribed, errors) if untranscribed else []
     known = load_language(language) if language else language_of_corpora(examples)
-    aligned = _aligned(_first_scores(first, examples), first.topology, examples)
-    report(f"{len(aligned)} recordings aligned")
+    aligned = _aligned(_first_scores(first, examples), first.topology, examples, report)
+    report(f"{len(aligned)} of them fit their text")
     taught = _Taught()
     if encoder:
         lessons = _recordings(_lessons(aligned, seed), taught)
@@ -221,6 +228,7 @@ def train_neural(
         network,
         _recordings(aligned, taught),
         main_output=network.shape.look_aheads.index(round(look_ahead_ms / _FRAME_MS)),
+        further=start is not None,
         seed=seed,
     )
     course = _Course(
@@ -235,8 +243,21 @@ def train_neural(
     )
     trainer.train(num_steps, course.watch)
     unscaled = _model(trainer, course.statistics)
+
+    def rate(
+        topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
+    ) -> float:
+        first = first_said_error_rate(replace(unscaled, topology=topology), scores, examples)
+        return (error_rate(topology, scores, examples) + first) / 2
+
     choice = choose_search(
-        unscaled, corpora, scales=_SCALES, shipping=shipping, with_samples=True, report=report
+        unscaled,
+        corpora,
+        scales=_SCALES,
+        shipping=shipping,
+        with_samples=True,
+        rate=rate,
+        report=report,
     )
     scale, penalty = (choice.scale, choice.unit_penalty) if choice else (_SCALE, _UNIT_PENALTY)
     replace(unscaled, topology=with_penalty(unscaled.topology, penalty), kappa=scale).save(output)
@@ -250,8 +271,26 @@ def train_neural(
         examples=examples,
         errors=errors,
         choice=choice or UNCHOSEN,
+        measure="mean of the phone error rates of the full traceback and as first said",
     )
     errors.tell(report)
+
+
+def first_said_error_rate(
+    model: AcousticModel, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
+) -> float:
+    """Phone error rate of what is first said live, from the examples' scaled scores."""
+    total = ErrorCounts()
+    for rows, example in zip(scores, examples, strict=True):
+        recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
+        said: list[Phone] = []
+        known: set[int] = set()
+        for event in (VoiceBegins(0), *rows[:, None], VoiceEnds(len(rows))):
+            said += spoken(first_said(recognizer.follow([event]), known))
+        total += count_errors(
+            [UNITS[unit] for unit in example.units], [phone.unit for phone in said]
+        )
+    return total.rate
 
 
 def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...]) -> Network:
@@ -329,7 +368,10 @@ def _samples(example: Example) -> NDArray[np.int16]:
 
 
 def _aligned(
-    scores: Iterable[NDArray[np.float32]], topology: Topology, examples: Sequence[Example]
+    scores: Iterable[NDArray[np.float32]],
+    topology: Topology,
+    examples: Sequence[Example],
+    report: Report,
 ) -> list[_Aligned]:
     """Find the states of all frames, ``STATES_PER_UNIT`` for each unit; drop what does not fit."""
     aligned = []
@@ -338,7 +380,8 @@ def _aligned(
     place = np.arange(len(of_state)) - topology.first_state[of_state]
     # middle of the n-th part of a unit, in parts of another size
     part = (2 * place + 1) * STATES_PER_UNIT // (2 * own[of_state])
-    for number, (rows, example) in enumerate(zip(scores, examples, strict=True)):
+    followed = with_progress(examples, "aligned", report)
+    for number, (rows, example) in enumerate(zip(scores, followed, strict=True)):
         graph = utterance_graph(example.units, example.syllables, topology.first_state)
         path, _ = viterbi_path(rows[:, graph.states], graph, topology.log_stay, topology.log_leave)
         if len(path):

@@ -33,6 +33,7 @@ from training.gmm import (
 from training.unit_language import language_of_corpora, load_language
 
 Report = Callable[[str], None]
+Rate = Callable[[Topology, Sequence[NDArray[np.float32]], Sequence[Example]], float]
 
 _STATES_PER_UNIT = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # of the differences: the textbook's
@@ -147,50 +148,6 @@ def train_gmm(
     errors.tell(report)
 
 
-def choose_search(
-    model: AcousticModel,
-    corpora: Sequence[Path],
-    *,
-    scales: Sequence[float] = _SCALES,
-    shipping: bool = True,
-    with_samples: bool = False,
-    report: Report = print,
-) -> Choice | None:
-    """Choose scale and unit penalty on the split ``dev``, if there is one.
-
-    Parameters
-    ----------
-    model
-        A model whose own scale is 1.
-    scales
-        Scales of its log scores to try.
-    corpora, shipping, report
-        As for :func:`train_gmm`.
-    with_samples
-        Let the model hear the recordings through its own front end.
-    """
-    try:
-        dev = load_examples(
-            corpora, RowErrors(), split="dev", shipping=shipping, with_samples=with_samples
-        )
-    except UserError:
-        report("no dev recordings: scale and unit penalty are not chosen")
-        return None
-    scores = list(all_scores(model, dev))
-    best: Choice | None = None
-    for scale in scales:
-        scaled = [np.float32(scale) * rows for rows in scores]
-        for unit_penalty in _UNIT_PENALTIES:
-            rate = error_rate(with_penalty(model.topology, unit_penalty), scaled, dev)
-            if best is None or rate < best.error_rate:
-                best = Choice(scale, unit_penalty, rate)
-                report(
-                    f"dev phone error rate {100 * rate:.1f} % with scale {scale} and unit penalty "
-                    f"{unit_penalty}"
-                )
-    return best
-
-
 def error_rate(
     topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
 ) -> float:
@@ -205,6 +162,53 @@ def error_rate(
         heard = [unit for unit in units if unit != SILENCE]
         total += count_errors([UNITS[unit] for unit in example.units], heard)
     return total.rate
+
+
+def choose_search(
+    model: AcousticModel,
+    corpora: Sequence[Path],
+    *,
+    scales: Sequence[float] = _SCALES,
+    shipping: bool = True,
+    with_samples: bool = False,
+    rate: Rate = error_rate,
+    report: Report = print,
+) -> Choice | None:
+    """Choose scale and unit penalty on the split ``dev``, if there is one.
+
+    Parameters
+    ----------
+    model
+        A model whose own scale is 1.
+    scales
+        Scales of its log scores to try.
+    corpora, shipping, report
+        As for :func:`train_gmm`.
+    with_samples
+        Let the model hear the recordings through its own front end.
+    rate
+        What is to be least, of the scaled scores of all recordings.
+    """
+    try:
+        dev = load_examples(
+            corpora, RowErrors(), split="dev", shipping=shipping, with_samples=with_samples
+        )
+    except UserError:
+        report("no dev recordings: scale and unit penalty are not chosen")
+        return None
+    scores = list(all_scores(model, dev))
+    best: Choice | None = None
+    for scale in scales:
+        scaled = [np.float32(scale) * rows for rows in scores]
+        for unit_penalty in _UNIT_PENALTIES:
+            found = rate(with_penalty(model.topology, unit_penalty), scaled, dev)
+            if best is None or found < best.error_rate:
+                best = Choice(scale, unit_penalty, found)
+                report(
+                    f"{100 * found:.1f} % errors on dev with scale {scale} and unit penalty "
+                    f"{unit_penalty}"
+                )
+    return best
 
 
 def with_penalty(topology: Topology, unit_penalty: float) -> Topology:
@@ -274,8 +278,9 @@ def write_card(
     examples: Sequence[Example],
     errors: RowErrors,
     choice: Choice,
+    measure: str = "phone error rate",
 ) -> None:
-    """Write what the model was made of, beside the model."""
+    """Write what the model was made of, beside the model; ``measure`` is what was chosen by."""
     licences: dict[str, list[Example]] = {}
     for example in examples:
         licences.setdefault(example.licence or "none given", []).append(example)
@@ -299,6 +304,6 @@ def write_card(
         lines += [
             "",
             f"Chosen on dev: scale of the log scores {choice.scale}, unit penalty "
-            f"{choice.unit_penalty}; phone error rate there {100 * choice.error_rate:.1f} %.",
+            f"{choice.unit_penalty}; {measure} there {100 * choice.error_rate:.1f} %.",
         ]
     output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")

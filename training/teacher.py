@@ -59,6 +59,7 @@ from training.network_training import (
     Targets,
     batches_of,
     cross_entropy,
+    learn,
     nearer,
     rate_share,
     shares_of,
@@ -232,11 +233,7 @@ def train_teacher(
         optimizer.param_groups[0]["lr"] = rate
         inputs, states, shares = next(batches)
         loss = cross_entropy(readout(inputs)[:, : states.shape[1]], states, shares)
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(readout.parameters(), _LONGEST_GRADIENT)
-        optimizer.step()
-        averaged.update_parameters(readout)
+        learn(loss, optimizer, readout, averaged, _LONGEST_GRADIENT)
         if (step + 1) % math.ceil(_NUM_STEPS / 5) == 0:
             report(f"teacher, step {step + 1}: {float(loss.detach()):.3f} nats a frame")
     return Teacher(encoder.eval(), cast(Readout, averaged.module).eval())

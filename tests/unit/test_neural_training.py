@@ -493,7 +493,7 @@ def trained(
     with torch.no_grad():  # convolutions that have learnt say more than those just made
         network.first.weight *= 6
         network.second.weight *= 6
-    trainer = Trainer(network, recordings, main_output=main_output, seed=seed)
+    trainer = Trainer(network, recordings, main_output=main_output, further=False, seed=seed)
     losses: list[float] = []
     trainer.train(num_steps, lambda _, loss: losses.append(loss))
     return trainer, losses
@@ -528,6 +528,48 @@ def test_convolutions_stay_and_all_else_learns(monkeypatch: pytest.MonkeyPatch) 
             assert torch.equal(tensor, begun[name]) == stays, name
     weights, mean = (floats(n.norm.weight) for n in (trainer.network, trainer.mean))
     assert not np.array_equal(weights, mean)
+
+
+@pytest.mark.parametrize(
+    ("further", "num_steps", "counted"),
+    [
+        (False, 9, [6, 9]),
+        (False, 6, [6]),
+        (False, 4, [4]),
+        (True, 6, [0, 3, 6]),
+        (True, 1, [0, 1]),
+    ],
+)
+def test_what_is_kept_is_the_mean_of_the_ends_of_cycles(
+    further: bool, num_steps: int, counted: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which ends count depends on what was known before; all cycles have the same rates."""
+    quick(monkeypatch)
+    monkeypatch.setattr(network_training, "_CYCLE_STEPS", 3)
+    monkeypatch.setattr(network_training, "nearer", lambda mean, weights, before: weights)
+    rates: list[float] = []
+    step = Trainer._step
+
+    def noted(trainer: Trainer, number: int, share: float) -> float:
+        rates.append(share)
+        return step(trainer, number, share)
+
+    monkeypatch.setattr(Trainer, "_step", noted)
+    network = Network(SHAPE)
+    trainer = Trainer(network, [tones(0)], main_output=1, further=further, seed=0)
+    weights = [floats(network.norm.weight).copy()]
+
+    def watch(number: int, loss: float) -> None:
+        assert number == len(weights)
+        assert np.isfinite(loss)
+        weights.append(floats(network.norm.weight).copy())
+
+    trainer.train(num_steps, watch)
+    expected = np.mean([weights[place] for place in counted], axis=0)
+    np.testing.assert_allclose(floats(trainer.mean.norm.weight), expected, rtol=1e-6)
+    if num_steps >= 6:
+        assert rates[:3] * (num_steps // 3) == rates
+        assert rates[1] > rates[2]
 
 
 def test_the_same_seed_gives_the_same_network(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -599,6 +641,7 @@ def test_the_recipe_writes_model_card_and_curves(
     np.testing.assert_allclose(learnt["first.weight"], conv1, atol=np.abs(conv1).max() / 120)
     assert sum("dev phone error" in line for line in lines) >= 10
     assert "step 5: aligned anew" in lines
+    assert lines.count("1 of 1 recordings aligned") == 2
     assert "1 of 1 recordings heard by the teacher, to learn" in lines
     assert "1 of 1 recordings labelled by the teacher" in lines
     assert sum("teacher, step" in line for line in lines) == 5
