@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from services.recognizer.neural import WINDOW, NeuralModel
 from services.recognizer.whisper_mel import NUM_MELS, WhisperMel
 from shared.audio_file import read_audio
 from shared.errors import UserError
+from shared.phones import SILENCE, UNIT_INDEX
 from tests.tones import burst, tones
 from training import network_training, sound_change, teacher
 from training.corpus import RowErrors, read_corpus
@@ -33,7 +35,7 @@ from training.network_training import (
     heard_anew,
     log_shares_of,
 )
-from training.neural_recipe import train_neural
+from training.neural_recipe import first_said_error_rate, train_neural
 from training.sound_change import (
     changed_sound,
     changed_tempo,
@@ -652,6 +654,24 @@ def test_the_recipe_writes_model_card_and_curves(
     assert output.with_suffix(".png").stat().st_size > 1000
 
 
+def test_the_search_is_judged_by_what_is_first_said(corpus: Path) -> None:
+    """Scores that leave no doubt make no errors; a unit that is not there is one."""
+    (example,) = load_examples([corpus], RowErrors())
+    model = load_model(model_path("gmm"))
+    spoken = [UNIT_INDEX[SILENCE], *example.units, UNIT_INDEX[SILENCE]]
+    own = np.diff(model.topology.first_state)
+    rows = []
+    for unit in spoken:
+        for state in range(own[unit]):
+            row = np.full(model.topology.num_states, -60.0, np.float32)
+            row[model.topology.first_state[unit] + state] = 0.0
+            rows += [row] * 4
+    scores = [np.array(rows)]
+    assert first_said_error_rate(model, scores, [example]) == 0.0
+    fewer = replace(example, units=example.units[1:])
+    assert first_said_error_rate(model, scores, [fewer]) == 1 / len(fewer.units)
+
+
 def test_the_teacher_labels_recordings_without_text(
     corpus: Path, whisper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -661,11 +681,11 @@ def test_the_teacher_labels_recordings_without_text(
     soundfile.write(folder / "x.wav", HELLO[:16_000], 16_000)
     (folder / "y.wav").write_bytes(b"no sound")
     learnt: list[list[Recording]] = []
-    replace = Trainer.replace_recordings
+    replace_recordings = Trainer.replace_recordings
 
     def noted(trainer: Trainer, recordings: Sequence[Recording]) -> None:
         learnt.append(list(recordings))
-        replace(trainer, recordings)
+        replace_recordings(trainer, recordings)
 
     monkeypatch.setattr(Trainer, "replace_recordings", noted)
     lines: list[str] = []
