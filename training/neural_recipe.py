@@ -33,7 +33,7 @@ from services.recognizer.neural import NeuralModel
 from services.recognizer.pipeline import Recognizer, VoiceBegins, VoiceEnds
 from services.recognizer.unit_language import UnitLanguage
 from shared.errors import UserError
-from shared.phones import UNITS, Phone
+from shared.phones import UNITS
 from training.align import spoken
 from training.corpus import RowErrors, is_synthetic
 from training.durations import AlignedUnit, UnitDurations
@@ -283,13 +283,9 @@ def first_said_error_rate(
     total = ErrorCounts()
     for rows, example in zip(scores, examples, strict=True):
         recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
-        said: list[Phone] = []
-        known: set[int] = set()
-        for event in (VoiceBegins(0), *rows[:, None], VoiceEnds(len(rows))):
-            said += spoken(first_said(recognizer.follow([event]), known))
-        total += count_errors(
-            [UNITS[unit] for unit in example.units], [phone.unit for phone in said]
-        )
+        live = recognizer.follow([VoiceBegins(0), rows, VoiceEnds(len(rows))])
+        said = [phone.unit for phone in spoken(first_said(live, set()))]
+        total += count_errors([UNITS[unit] for unit in example.units], said)
     return total.rate
 
 
