@@ -91,7 +91,10 @@ def gmm(
 def neural(
     corpus: Corpora,
     output: Model,
-    aligner: Annotated[Path, typer.Option(help="A model file that aligns the first time.")],
+    aligner: Annotated[
+        Path | None,
+        typer.Option(help="A model that aligns at first; without it the one of --start-from does."),
+    ] = None,
     whisper: Annotated[
         Path | None,
         typer.Option(

@@ -1,9 +1,9 @@
 """From corpora to the neural recognizer: alignment, teacher, training, search, model card.
 
 The network begins with the weights of Whisper's encoder, or with those of a model made here, and
-learns the states of a forced alignment. The alignment is first another model's; at half of the
-steps it becomes the network's own, with an output that hears 30 ms ahead, because a unit's
-beginning is plainer with what follows.
+learns the states of a forced alignment. The alignment is that of the model it begins with, or
+another model's until half of the steps and then the network's own: of an output that hears 30 ms
+ahead, because a unit's beginning is plainer with what follows.
 
 With Whisper there is a teacher too (:mod:`training.teacher`), which hears whole recordings and has
 learnt the first alignment: half of a frame's share is then what the teacher says, and in recordings
@@ -51,7 +51,14 @@ from training.recipes import (
     with_penalty,
     write_card,
 )
-from training.teacher import NUM_LAYERS, Teacher, WholeEncoder, train_teacher, with_progress
+from training.teacher import (
+    NUM_LAYERS,
+    Teacher,
+    WholeEncoder,
+    all_heard,
+    train_teacher,
+    with_progress,
+)
 from training.unit_language import language_of_corpora, load_language
 from training.whisper_weights import load_whisper
 
@@ -66,7 +73,7 @@ _SHARES = {"sentence": 0.33, "word": 0.08, "synthetic": 0.30}  # of the frames h
 _UNTRANSCRIBED_SHARE = 0.29  # likewise
 _LESSONS = 1000  # recordings of a kind that the teacher learns
 _ALIGNING_FRAMES = 3  # look-ahead of the output that aligns; longer ones are learnt later
-_REALIGNED_AT = 0.5  # of the steps: from there on the network's own alignment counts
+_ALIGNED_ANEW_AT = 0.5  # of the steps: from there on another model's alignment counts no more
 _JUDGED_EVERY = 0.1  # of the steps: dev is recognised
 _SCALE = 0.5  # of the log scores, until it is chosen
 _UNIT_PENALTY = 1.0  # likewise
@@ -105,7 +112,7 @@ class _Taught:
 
 @dataclass(slots=True, kw_only=True)
 class _Course:
-    """Follows the training: aligns anew at half of it, and recognises dev now and then."""
+    """Follows the training: aligns anew in its course, and recognises dev now and then."""
 
     trainer: Trainer
     examples: Sequence[Example]
@@ -114,6 +121,7 @@ class _Course:
     language: UnitLanguage
     statistics: _Statistics
     num_steps: int
+    aligned_anew_at: int | None  # step
     report: Report
     losses: list[tuple[int, float]] = field(default_factory=list)
     rates: list[tuple[int, float]] = field(default_factory=list)
@@ -121,7 +129,7 @@ class _Course:
     def watch(self, step: int, loss: float) -> None:
         """Take note of a step."""
         self.losses.append((step, loss))
-        if step == round(_REALIGNED_AT * self.num_steps):
+        if step == self.aligned_anew_at:
             self._align_anew()
             self.report(f"step {step}: aligned anew")
         if step % max(1, round(_JUDGED_EVERY * self.num_steps)) == 0:
@@ -150,7 +158,7 @@ def train_neural(
     corpora: Sequence[Path],
     output: Path,
     *,
-    aligner: Path,
+    aligner: Path | None = None,
     whisper: Path | None = None,
     start: Path | None = None,
     untranscribed: Sequence[Path] = (),
@@ -172,7 +180,8 @@ def train_neural(
         The ``.npz`` file to write; the card is written beside it as ``.md``, the curves as
         ``.png``.
     aligner
-        A model that aligns the first time, such as :func:`training.recipes.train_gmm` writes.
+        A model that aligns until the network does, such as :func:`training.recipes.train_gmm`
+        writes. None leaves it to ``start``.
     whisper
         Folder with Whisper base, see :func:`training.whisper_weights.load_whisper`: the teacher.
         Without it the states of the alignment alone are learnt.
@@ -203,16 +212,18 @@ def train_neural(
     Raises
     ------
     UserError
-        If there is nothing to train on, nothing to begin with, no teacher for recordings without
-        text, or a file cannot be read.
+        If there is nothing to train on, nothing to begin with, nothing that aligns, no teacher for
+        recordings without text, or a file cannot be read.
     """
     if untranscribed and whisper is None:
         raise UserError("only a teacher can label what --untranscribed names: give --whisper too")
+    if (first_aligner := aligner or start) is None:
+        raise UserError("nothing aligns the recordings: give --aligner or --start-from")
     torch.set_num_threads(num_threads or os.cpu_count() or 1)
     torch.manual_seed(seed)
     network = _begun(whisper, start, _look_aheads(look_ahead_ms))
     encoder = _whole_encoder(whisper) if whisper else None
-    first = load_model(aligner)
+    first = load_model(first_aligner)
     errors = RowErrors()
     examples = load_examples(corpora, errors, shipping=shipping, with_samples=True)
     sounds = load_untranscribed(untranscribed, errors) if untranscribed else []
@@ -239,6 +250,7 @@ def train_neural(
         language=known,
         statistics=_statistics(aligned, known),
         num_steps=num_steps,
+        aligned_anew_at=round(_ALIGNED_ANEW_AT * num_steps) if aligner else None,
         report=report,
     )
     trainer.train(num_steps, course.watch)
@@ -267,7 +279,7 @@ def train_neural(
         output,
         title=f"Neural recognizer, a causal transformer of {network.shape.layers} layers",
         details=f"begun with {begun}, seed {seed}, {num_steps} steps of {BATCH_S} s of sound, "
-        f"aligned first by `{aligner.name}`" + _words_about(taught),
+        f"aligned{' first' if aligner else ''} by `{first_aligner.name}`" + _words_about(taught),
         examples=examples,
         errors=errors,
         choice=choice or UNCHOSEN,
@@ -405,12 +417,8 @@ def _taught(
     report: Report,
 ) -> _Taught:
     """Let the teacher hear everything once."""
-    said = [
-        teacher.targets_of(samples)
-        for samples in with_progress(
-            [*map(_samples, examples), *sounds], "labelled by the teacher", report
-        )
-    ]
+    recordings = [*map(_samples, examples), *sounds]
+    said = all_heard(teacher.targets_of, recordings, "labelled by the teacher", report)
     without_text = said[len(examples) :]
     num_frames = sum(map(len, without_text))
     return _Taught(

@@ -38,7 +38,8 @@ for 20 s of sound.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar, cast
 
@@ -209,8 +210,8 @@ def train_teacher(
     """
     rng = np.random.default_rng(seed)
     share = shares_of(recordings)
-    heard = with_progress(recordings, "heard by the teacher, to learn", report)
-    features = [encoder.features(recording.samples) for recording in heard]
+    samples = [recording.samples for recording in recordings]
+    features = all_heard(encoder.features, samples, "heard by the teacher, to learn", report)
 
     def draw() -> Heard:
         number = rng.choice(len(share), p=share)
@@ -251,6 +252,24 @@ def centred_mel(samples: NDArray[np.float32]) -> Tensor:
     power = torch.from_numpy(mel_bands().T).float() @ spectra.abs().square()
     log_power = power.clamp(min=_LEAST_POWER).log10()
     return (log_power.clamp(min=float(log_power.max()) - _FLOOR_DECADES) + 4) / 4
+
+
+def all_heard(
+    hear: Callable[[NDArray[np.int16]], T],
+    recordings: Sequence[NDArray[np.int16]],
+    what: str,
+    report: Report,
+) -> list[T]:
+    """Hear each recording on one core; many short ones are heard sooner so than each on all."""
+    num_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    pool = ThreadPoolExecutor(num_threads)
+    try:
+        followed = with_progress(recordings, what, report)
+        return [heard for heard, _ in zip(pool.map(hear, recordings), followed, strict=True)]
+    finally:
+        pool.shutdown(cancel_futures=True)
+        torch.set_num_threads(num_threads)
 
 
 def with_progress(items: Sequence[T], what: str, report: Report) -> Iterator[T]:

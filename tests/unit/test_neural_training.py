@@ -758,9 +758,10 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     assert torch.get_num_threads() == 1
     further = tmp_path / "further.npz"
     train_neural(
-        [corpus], further, aligner=paths[0], start=paths[0], language=model_path("gmm"),
-        num_steps=1, num_threads=1, report=lines.append,
+        [corpus], further, start=paths[0], language=model_path("gmm"),
+        num_steps=2, num_threads=1, report=lines.append,
     )  # fmt: skip
+    assert [line for line in lines if "aligned anew" in line] == ["step 2: aligned anew"] * 3
     before, after = load_model(paths[0]), load_model(further)
     assert isinstance(before, NeuralModel)
     assert isinstance(after, NeuralModel)
@@ -770,7 +771,8 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     )
     for name, weights in old.items():
         torch.testing.assert_close(new[name], weights, atol=0.02, rtol=0.05)
-    assert "`first.npz`" in further.with_suffix(".md").read_text()
+    assert "begun with `first.npz`" in further.with_suffix(".md").read_text()
+    assert "aligned by `first.npz`" in further.with_suffix(".md").read_text()
     shipped = load_model(model_path("gmm")).topology.language
     np.testing.assert_array_equal(after.topology.language.unit, shipped.unit)
     assert len(before.topology.language.unit) < len(shipped.unit)
@@ -782,6 +784,8 @@ def test_training_begins_with_something(corpus: Path, tmp_path: Path) -> None:
         train(num_threads=1)
     with pytest.raises(UserError, match="what --untranscribed names: give --whisper too"):
         train(num_threads=1, start=model_path("gmm"), untranscribed=[corpus])
+    with pytest.raises(UserError, match="give --aligner or --start-from"):
+        train(aligner=None, num_threads=1, whisper=tmp_path)
     with pytest.raises(UserError, match=r"model\.bin cannot be read"):
         train(num_threads=1, whisper=tmp_path)
     with pytest.raises(UserError, match=r"not written by this command .* 10, 30, 60, 100, 200 ms"):

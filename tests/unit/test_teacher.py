@@ -1,8 +1,12 @@
 """The teacher: Whisper's encoder on whole recordings, and the readout of states."""
 
+import threading
+import time
+
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from scipy.special import erf, softmax
 
 from services.recognizer.features import frames_in
@@ -11,7 +15,7 @@ from services.recognizer.whisper_mel import NUM_MELS, mel_bands
 from tests.tones import tones
 from training import teacher
 from training.network import Shape
-from training.teacher import Teacher, WholeEncoder, centred_mel, train_teacher
+from training.teacher import Teacher, WholeEncoder, all_heard, centred_mel, train_teacher
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 
@@ -145,3 +149,39 @@ def test_the_same_seed_gives_the_same_teacher(monkeypatch: pytest.MonkeyPatch) -
     first, second = (taught(3, monkeypatch)[0].targets_of(samples) for _ in range(2))
     np.testing.assert_array_equal(first.states, second.states)
     np.testing.assert_array_equal(first.shares, second.shares)
+
+
+# --- many recordings
+
+
+def test_two_recordings_at_a_time_are_heard_in_order() -> None:
+    together = threading.Barrier(2, timeout=10.0)
+
+    def hear(samples: NDArray[np.int16]) -> int:
+        assert torch.get_num_threads() == 1
+        together.wait()
+        return len(samples)
+
+    lines: list[str] = []
+    recordings = [np.zeros(num, np.int16) for num in (5, 3, 4, 1)]
+    torch.set_num_threads(2)
+    assert all_heard(hear, recordings, "heard", lines.append) == [5, 3, 4, 1]
+    assert lines[-1] == "4 of 4 recordings heard"
+    assert torch.get_num_threads() == 2
+
+
+def test_an_error_ends_the_hearing() -> None:
+    heard: list[int] = []
+
+    def hear(samples: NDArray[np.int16]) -> None:
+        heard.append(len(samples))
+        if len(samples) == 0:
+            raise ValueError("nothing to hear")
+        time.sleep(0.01)
+
+    recordings = [np.zeros(num, np.int16) for num in range(300)]
+    torch.set_num_threads(2)
+    with pytest.raises(ValueError, match="nothing to hear"):
+        all_heard(hear, recordings, "heard", lambda _: None)
+    assert len(heard) < 150
+    assert torch.get_num_threads() == 2
