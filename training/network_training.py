@@ -3,18 +3,17 @@
 Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition"
 (cross-entropy on the states of a forced alignment); Hinton, Vinyals and Dean 2015, "Distilling the
 knowledge in a neural network" (several states with a share each); Loshchilov and Hutter 2019,
-"Decoupled weight decay regularization" (AdamW); Polyak and Juditsky 1992 (running mean of the
-weights); Izmailov et al. 2018, "Averaging weights leads to wider optima and better generalization"
-(mean of the weights at the ends of cycles); Wortsman et al. 2022, "Robust fine-tuning of zero-shot
-models" (mean of the weights before and after).
+"Decoupled weight decay regularization" (AdamW); Shamir and Zhang 2013, "Stochastic gradient descent
+for non-smooth optimization: convergence results and optimal averaging schemes" (the running mean of
+the weights, in which late ones weigh more).
 
 Layers that come with weights learn slowly, what begins anew learns faster, and the convolutions
-stay as they are. Training goes in cycles of about 900 steps, and what is kept is the mean of the
-weights at their ends: with those that a trained network began with; without those after the first
-cycle if a new one did and there are others. In each cycle the rate rises for some steps, stays, and
-falls to nothing:
+stay as they are. The rate rises and then stays: weights that keep moving differ more, and what is
+kept, their mean, is the better for it.
 
-    rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N)) * min(1, (N - n) / (0.6 N))
+    rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N))
+
+    m(0) = v(0),  m(n) = m(n - 1) + 3 / (n + 4) * (v(n) - m(n - 1))
 
     H = - sum_t sum_j w[t, j] log y[t, s[t, j]] / sum_t sum_j w[t, j]
 
@@ -23,14 +22,12 @@ falls to nothing:
 ======== ============================================================= ================
 symbol   meaning                                                       shape
 ======== ============================================================= ================
-n, N     number of a step in its cycle, of all its steps               1
+n, N     number of a step, and of all steps                            1
+v, m     weights after a step, and their running mean                  as the weights
 s, w     states that frames ought to say, and their shares, which sum  (frames, k)
          to one, or to zero where nothing is known
 y        shares of the states that an output says                      (frames, states)
 H        mean cross-entropy of an output, nats a frame                 1
-m        running mean of the weights:                                  as the weights
-         m += (1 - min(0.99, (k + 1) / (k + 10))) (weights - m)
-k        number of a step in all cycles                                1
 ======== ============================================================= ================
 """
 
@@ -63,12 +60,10 @@ _NEW_RATE = 1.2e-3  # of the last norm and the output layers
 _NEW = ("norm.", "outputs.")
 _KEPT = ("first.", "second.")
 _WEIGHT_DECAY = 0.01
-_CYCLE_STEPS = 900  # more or less: cycles are of the same length
 _WARM_UP_STEPS = 60
-_MOST_WARM_UP = 0.2  # of a cycle's steps
-_FALL_SHARE = 0.6  # of a cycle's steps, at the end, over which the rate falls to nothing
+_MOST_WARM_UP = 0.2  # of the steps
 _LONGEST_GRADIENT = 1.0
-_LONGEST_MEMORY = 0.99  # of the running mean of the weights, per step
+_EXPONENT = 2  # of the running mean of the weights
 _OTHERS_WEIGHT = 0.5  # of the losses of other outputs than the main one
 _CHANGED_SHARE = 0.9
 _TEMPO_SHARE = 0.5
@@ -125,8 +120,6 @@ class Trainer:
         With the targets of their frames.
     main_output
         Output layer that learns in every step; each step another one learns besides.
-    further
-        The network has been trained before: what it begins with counts too in what is kept.
     seed
         Of order and changes of the sound. The network's dropout takes PyTorch's own.
     """
@@ -137,13 +130,11 @@ class Trainer:
         recordings: Sequence[Recording],
         *,
         main_output: int,
-        further: bool,
         seed: int,
     ) -> None:
         self.network = network
-        self._further = further
         self.main_output = main_output
-        self._averaged = AveragedModel(network, avg_fn=nearer)
+        self._averaged = AveragedModel(network, avg_fn=late_mean(_EXPONENT))
         self._averaged.eval()
         self._rng = np.random.default_rng(seed)
         self.replace_recordings(recordings)
@@ -161,7 +152,7 @@ class Trainer:
 
     @property
     def mean(self) -> Network:
-        """The network with the running mean of the weights; in the end, with that of the cycles."""
+        """The network with the running mean of the weights."""
         return cast(Network, self._averaged.module)
 
     def replace_recordings(self, recordings: Sequence[Recording]) -> None:
@@ -174,26 +165,15 @@ class Trainer:
         self._batches = batches_of(draw, _BATCH_FRAMES, self._rng)
 
     def train(self, num_steps: int, watch: Callable[[int, float], None]) -> None:
-        """Take steps in cycles; the learning rate rises, stays, and falls to nothing in each.
+        """Take steps.
 
         ``watch`` is told, after each step, how many there were and the loss of the main output
         in nats a frame.
         """
-        cycles = np.array_split(np.arange(num_steps), max(1, round(num_steps / _CYCLE_STEPS)))
-        ends = AveragedModel(self.network)
-        if self._further:
-            ends.update_parameters(self.network)
-        first_kept = 1 if self._further or len(cycles) == 1 else 2
-        for number, cycle in enumerate(cycles, start=1):
-            warm_up_steps = min(_WARM_UP_STEPS, _MOST_WARM_UP * len(cycle))
-            for place, step in enumerate(cycle.tolist()):
-                share = rate_share(place, len(cycle), warm_up_steps, _FALL_SHARE)
-                loss = self._step(step, share)
-                if place == len(cycle) - 1 and number >= first_kept:
-                    ends.update_parameters(self.mean)
-                if step == num_steps - 1:
-                    self.mean.load_state_dict(ends.module.state_dict())
-                watch(step + 1, loss)
+        warm_up_steps = min(_WARM_UP_STEPS, _MOST_WARM_UP * num_steps)
+        for step in range(num_steps):
+            share = min(1.0, (step + 1) / warm_up_steps)
+            watch(step + 1, self._step(step, share))
 
     def _step(self, number: int, share: float) -> float:
         """Learn from one batch; return the mean cross-entropy of the main output."""
@@ -232,13 +212,6 @@ def learn(
     nn.utils.clip_grad_norm_(network.parameters(), longest_gradient)
     optimizer.step()
     averaged.update_parameters(network)
-
-
-def rate_share(step: int, num_steps: int, warm_up_steps: float, fall_share: float) -> float:
-    """How much of its full rate a step learns at: rising, staying, falling to nothing."""
-    rise = min(1.0, (step + 1) / warm_up_steps)
-    fall = min(1.0, (num_steps - step) / (fall_share * num_steps))
-    return rise * fall
 
 
 def shares_of(recordings: Sequence[Recording]) -> NDArray[np.float64]:
@@ -353,10 +326,14 @@ def log_shares_of(network: Network, output: int, samples: NDArray[np.int16]) -> 
     return np.ascontiguousarray(said[:num_frames])
 
 
-def nearer(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
-    """Move the running mean of the weights."""
-    memory = min(_LONGEST_MEMORY, (int(num_before) + 1) / (int(num_before) + 10))
-    return mean + (1 - memory) * (weights - mean)
+def late_mean(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
+    """Make a running mean in which the n-th weights weigh about n ** exponent."""
+
+    def moved(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
+        share = (exponent + 1) / (int(num_before) + exponent + 2)
+        return mean + share * (weights - mean)
+
+    return moved
 
 
 def _padded(group: Sequence[Heard]) -> Batch:

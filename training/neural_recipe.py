@@ -187,8 +187,7 @@ def train_neural(
         Without it the states of the alignment alone are learnt.
     start
         A model that this function has written, whose network learns further, such as to know one's
-        own speakers; what is kept is a mean of its weights and the new ones. Without it the network
-        begins with Whisper's weights.
+        own speakers. Without it the network begins with Whisper's weights.
     untranscribed
         Folders of recordings in any language, which the teacher labels. Nobody knows their
         licences: name only what may be used.
@@ -239,7 +238,6 @@ def train_neural(
         network,
         _recordings(aligned, taught),
         main_output=network.shape.look_aheads.index(round(look_ahead_ms / _FRAME_MS)),
-        further=start is not None,
         seed=seed,
     )
     course = _Course(

@@ -60,9 +60,8 @@ from training.network_training import (
     Targets,
     batches_of,
     cross_entropy,
+    late_mean,
     learn,
-    nearer,
-    rate_share,
     shares_of,
 )
 from training.recipes import Report
@@ -91,6 +90,7 @@ _WEIGHT_DECAY = 0.02
 _WARM_UP_STEPS = 30
 _FALL_SHARE = 0.5  # of the steps, at the end, over which the rate falls to nothing
 _LONGEST_GRADIENT = 2.0
+_EXPONENT = 8  # of the running mean of the weights
 
 T = TypeVar("T")
 
@@ -226,12 +226,13 @@ def train_teacher(
     some = np.concatenate([features[number].astype(np.float32) for number in drawn])
     readout.mean[:] = torch.from_numpy(some.mean(axis=0))
     readout.deviation[:] = torch.from_numpy(some.std(axis=0) + 1e-3)
-    averaged = AveragedModel(readout, avg_fn=nearer)
+    averaged = AveragedModel(readout, avg_fn=late_mean(_EXPONENT))
     optimizer = torch.optim.AdamW(readout.parameters(), weight_decay=_WEIGHT_DECAY)
     batches = batches_of(draw, _BATCH_POSITIONS, rng)
     for step in range(_NUM_STEPS):
-        rate = _RATE * rate_share(step, _NUM_STEPS, _WARM_UP_STEPS, _FALL_SHARE)
-        optimizer.param_groups[0]["lr"] = rate
+        rise = min(1.0, (step + 1) / _WARM_UP_STEPS)
+        fall = min(1.0, (_NUM_STEPS - step) / (_FALL_SHARE * _NUM_STEPS))
+        optimizer.param_groups[0]["lr"] = _RATE * rise * fall
         inputs, states, shares = next(batches)
         loss = cross_entropy(readout(inputs)[:, : states.shape[1]], states, shares)
         learn(loss, optimizer, readout, averaged, _LONGEST_GRADIENT)

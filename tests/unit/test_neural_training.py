@@ -495,7 +495,7 @@ def trained(
     with torch.no_grad():  # convolutions that have learnt say more than those just made
         network.first.weight *= 6
         network.second.weight *= 6
-    trainer = Trainer(network, recordings, main_output=main_output, further=False, seed=seed)
+    trainer = Trainer(network, recordings, main_output=main_output, seed=seed)
     losses: list[float] = []
     trainer.train(num_steps, lambda _, loss: losses.append(loss))
     return trainer, losses
@@ -532,23 +532,12 @@ def test_convolutions_stay_and_all_else_learns(monkeypatch: pytest.MonkeyPatch) 
     assert not np.array_equal(weights, mean)
 
 
-@pytest.mark.parametrize(
-    ("further", "num_steps", "counted"),
-    [
-        (False, 9, [6, 9]),
-        (False, 6, [6]),
-        (False, 4, [4]),
-        (True, 6, [0, 3, 6]),
-        (True, 1, [0, 1]),
-    ],
-)
-def test_what_is_kept_is_the_mean_of_the_ends_of_cycles(
-    further: bool, num_steps: int, counted: list[int], monkeypatch: pytest.MonkeyPatch
+def test_the_rate_rises_and_stays_and_late_weights_count_more(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Which ends count depends on what was known before; all cycles have the same rates."""
-    quick(monkeypatch)
-    monkeypatch.setattr(network_training, "_CYCLE_STEPS", 3)
-    monkeypatch.setattr(network_training, "nearer", lambda mean, weights, before: weights)
+    monkeypatch.setattr(network_training, "_WARM_UP_STEPS", 4)
+    monkeypatch.setattr(network_training, "_BATCH_FRAMES", 300)
+    monkeypatch.setattr(network_training, "_MOST_WARM_UP", 0.5)
     rates: list[float] = []
     step = Trainer._step
 
@@ -558,20 +547,19 @@ def test_what_is_kept_is_the_mean_of_the_ends_of_cycles(
 
     monkeypatch.setattr(Trainer, "_step", noted)
     network = Network(SHAPE)
-    trainer = Trainer(network, [tones(0)], main_output=1, further=further, seed=0)
-    weights = [floats(network.norm.weight).copy()]
+    trainer = Trainer(network, [tones(0)], main_output=1, seed=0)
+    weights: list[np.ndarray] = []
 
     def watch(number: int, loss: float) -> None:
+        weights.append(floats(network.norm.weight).copy())
         assert number == len(weights)
         assert np.isfinite(loss)
-        weights.append(floats(network.norm.weight).copy())
 
-    trainer.train(num_steps, watch)
-    expected = np.mean([weights[place] for place in counted], axis=0)
-    np.testing.assert_allclose(floats(trainer.mean.norm.weight), expected, rtol=1e-6)
-    if num_steps >= 6:
-        assert rates[:3] * (num_steps // 3) == rates
-        assert rates[1] > rates[2]
+    trainer.train(10, watch)
+    assert rates == [0.25, 0.5, 0.75, *[1.0] * 7]
+    counted = [8, *(n * (n + 1) for n in range(3, 12))]
+    expected = np.average(weights, axis=0, weights=counted)
+    np.testing.assert_allclose(floats(trainer.mean.norm.weight), expected, rtol=1e-5)
 
 
 def test_the_same_seed_gives_the_same_network(monkeypatch: pytest.MonkeyPatch) -> None:
