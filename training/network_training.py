@@ -47,7 +47,7 @@ from torch.optim.swa_utils import AveragedModel
 from services.recognizer.neural import MOST_POSITIONS
 from services.recognizer.whisper_mel import WhisperMel
 from training.feature_cache import as_floats
-from training.network import Network, said_frames
+from training.network import Network, said_frames, short_products
 from training.sound_change import changed_sound, changed_tempo, frames_before, levelled, mask
 
 BATCH_S = 30  # of sound
@@ -180,13 +180,14 @@ class Trainer:
         self.network.train()
         frames, states, shares = next(self._batches)
         start = 0 if self._rng.random() < 0.5 else int(self._rng.integers(_LATEST_START))
-        hidden = self.network(frames, start)
-        loss = self._loss(hidden, states, shares, self.main_output)
-        main_loss = float(loss.detach())
-        others = [k for k in range(len(self.network.outputs)) if k != self.main_output]
-        if others:
-            other = others[number % len(others)]
-            loss = loss + _OTHERS_WEIGHT * self._loss(hidden, states, shares, other)
+        with short_products():
+            hidden = self.network(frames, start)
+            loss = self._loss(hidden, states, shares, self.main_output)
+            main_loss = float(loss.detach())
+            others = [k for k in range(len(self.network.outputs)) if k != self.main_output]
+            if others:
+                other = others[number % len(others)]
+                loss = loss + _OTHERS_WEIGHT * self._loss(hidden, states, shares, other)
         for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
             group["lr"] = share * rate
         learn(loss, self._optimizer, self.network, self._averaged, _LONGEST_GRADIENT)

@@ -198,7 +198,7 @@ def train_neural(
         Of the output layer that counts most and is in use, in whole frames of 10 ms.
     seed
         Of new weights, order and changes of the sound. The same seed and the same number of
-        threads give the same model.
+        threads give the same model on the same kind of processor.
     num_steps
         Batches of 30 s of sound.
     num_threads
@@ -216,13 +216,14 @@ def train_neural(
     """
     if untranscribed and whisper is None:
         raise UserError("only a teacher can label what --untranscribed names: give --whisper too")
-    if (first_aligner := aligner or start) is None:
-        raise UserError("nothing aligns the recordings: give --aligner or --start-from")
     torch.set_num_threads(num_threads or os.cpu_count() or 1)
     torch.manual_seed(seed)
-    network = _begun(whisper, start, _look_aheads(look_ahead_ms))
+    before = load_model(start) if start else None
+    first = load_model(aligner) if aligner else before
+    if first is None:
+        raise UserError("nothing aligns the recordings: give --aligner or --start-from")
+    network = _begun(whisper, before, _look_aheads(look_ahead_ms))
     encoder = _whole_encoder(whisper) if whisper else None
-    first = load_model(first_aligner)
     errors = RowErrors()
     examples = load_examples(corpora, errors, shipping=shipping, with_samples=True)
     sounds = load_untranscribed(untranscribed, errors) if untranscribed else []
@@ -277,7 +278,8 @@ def train_neural(
         output,
         title=f"Neural recognizer, a causal transformer of {network.shape.layers} layers",
         details=f"begun with {begun}, seed {seed}, {num_steps} steps of {BATCH_S} s of sound, "
-        f"aligned{' first' if aligner else ''} by `{first_aligner.name}`" + _words_about(taught),
+        f"aligned {f'first by `{aligner.name}`' if aligner else 'by the same'}"
+        + _words_about(taught),
         examples=examples,
         errors=errors,
         choice=choice or UNCHOSEN,
@@ -299,9 +301,11 @@ def first_said_error_rate(
     return total.rate
 
 
-def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...]) -> Network:
-    """Make the network that learns."""
-    if start is None:
+def _begun(
+    whisper: Path | None, before: AcousticModel | None, look_aheads: tuple[int, ...]
+) -> Network:
+    """Make the network that learns, of Whisper's or of a model's that learnt before."""
+    if before is None:
         if whisper is None:
             raise UserError(
                 "training begins with Whisper's weights or with a model made here: give --whisper, "
@@ -310,14 +314,13 @@ def _begun(whisper: Path | None, start: Path | None, look_aheads: tuple[int, ...
         network = Network(Shape(num_states=NUM_STATES, look_aheads=look_aheads))
         load_whisper(network, whisper)
         return network
-    model = load_model(start)
-    if isinstance(model, NeuralModel) and tuple(model.look_aheads.tolist()) == look_aheads:
+    if isinstance(before, NeuralModel) and tuple(before.look_aheads.tolist()) == look_aheads:
         with suppress(KeyError):  # another network that runs in the same way
-            return network_of(model.network, look_aheads)
+            return network_of(before.network, look_aheads)
     asked = ", ".join(f"{frames * _FRAME_MS:g}" for frames in look_aheads)
     raise UserError(
-        f"{start} was not written by this command with the look-aheads {asked} ms; begin with a "
-        "model that was"
+        f"the model of --start-from was not written by this command with the look-aheads {asked} "
+        "ms; begin with one that was"
     )
 
 

@@ -53,7 +53,7 @@ from torch.optim.swa_utils import AveragedModel
 from services.recognizer.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
 from services.recognizer.whisper_mel import mel_bands
 from training.feature_cache import as_floats
-from training.network import Encoder, Shape
+from training.network import Encoder, Shape, short_products
 from training.network_training import (
     Heard,
     Recording,
@@ -130,7 +130,8 @@ class WholeEncoder(Encoder):
             end = min(start + _PIECE_FRAMES, num_frames)
             piece = samples[HOP_SAMPLES * start : HOP_SAMPLES * (end - 1) + WINDOW_SAMPLES]
             bands = centred_mel(np.concatenate([as_floats(piece), _APPENDED]))
-            hidden = self(bands[None])[0, 1 : 1 + math.ceil((end - start) / 2)]
+            with short_products():
+                hidden = self(bands[None])[0, 1 : 1 + math.ceil((end - start) / 2)]
             pieces.append(hidden.clamp(-_LARGEST_HALF, _LARGEST_HALF).half().numpy())
         return np.concatenate(pieces)
 

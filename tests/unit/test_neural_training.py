@@ -418,6 +418,14 @@ def test_a_position_attends_to_the_window_and_no_further() -> None:
     assert (difference[WINDOW + 3 :] < 1e-6).all()
 
 
+def test_shares_sum_to_one_when_products_are_short() -> None:
+    network = Network(SHAPE)
+    with torch.autocast("cpu", torch.bfloat16):
+        log_shares = network.log_shares(network(random_frames(41)), 0)
+    assert log_shares.dtype == torch.float32
+    torch.testing.assert_close(log_shares.exp().sum(dim=-1), torch.ones(1, 20, 2))
+
+
 def test_positions_owe_the_frames_of_their_look_ahead() -> None:
     assert said_frames(3, 1).tolist() == [[1, 2], [3, 4], [5, 6]]
     assert said_frames(3, 6).tolist() == [[-4, -3], [-2, -1], [0, 1]]
@@ -759,8 +767,9 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     )
     for name, weights in old.items():
         torch.testing.assert_close(new[name], weights, atol=0.02, rtol=0.05)
-    assert "begun with `first.npz`" in further.with_suffix(".md").read_text()
-    assert "aligned by `first.npz`" in further.with_suffix(".md").read_text()
+    card = further.with_suffix(".md").read_text()
+    assert "begun with `first.npz`" in card
+    assert "aligned by the same" in card
     shipped = load_model(model_path("gmm")).topology.language
     np.testing.assert_array_equal(after.topology.language.unit, shipped.unit)
     assert len(before.topology.language.unit) < len(shipped.unit)
