@@ -32,7 +32,7 @@ The recognizer's frame ``t`` is centred on sample ``160 t + 200``, so frames ``2
 left out.
 
 Whisper takes 30 s at most: longer recordings are heard in pieces. Cost: about a second of one core
-for 20 s of sound.
+for 35 s of sound, or for 80 s where products are short.
 """
 
 from __future__ import annotations
