@@ -1,15 +1,20 @@
-# make run   sets everything up, then a sample sentence drives the face, live in the browser and as a video
-# make demo  the same up to the video, then stops (for servers)
-# make test  the tests            make check  style, types and import rules
+# make run    sets everything up, then a sample sentence drives the face, live in the browser and as a video
+# make demo   the same up to the video, then stops (for servers)
+# make test   all tests           make quick  those to run while editing, under a minute
+# make check  style, types and import rules
+# make lock   renews the locked versions of all Python packages
 PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
 SAMPLE := shared/demo/hello-female.wav
+LOCK := requirements.lock
 TORCH := torch==2.13.0
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --retries 0 --timeout 10
+PIP := $(BIN)/python -m pip install --quiet
+NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --prefix $(PAGE) --no-audit --no-fund --loglevel=error
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: run demo setup test check clean
+.PHONY: run demo setup test quick check lock clean
 
 run: setup
 	$(BIN)/kouxing run --play $(SAMPLE)
@@ -21,32 +26,48 @@ setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(PAGE)/head.glb
 
 test: .venv/installed-dev setup
 	$(BIN)/python -m pytest
+	$(NPM) test
 
-check: .venv/installed-dev
+quick: .venv/installed-dev
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 \
+		-m "(unit or property or contract) and not slow"
+
+check: .venv/installed-dev $(PAGE)/node_modules/.bin/eslint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(NPM) run lint
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
+
+# One lock for every system and Python >= 3.11; torch keeps its version, which training depends on.
+lock: .venv/installed
+	$(PIP) uv
+	echo '$(TORCH)' | $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras \
+		--no-annotate --custom-compile-command 'make lock' --output-file $(LOCK) pyproject.toml -
 
 clean:
 	rm -rf .venv $(PAGE)/node_modules $(PAGE)/head.glb out
 
-.venv/installed: pyproject.toml deploy/system_packages.sh
+.venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --editable '.[page]'
+	$(PIP) --constraint $(LOCK) --editable '.[page]'
 	touch $@
 
 .venv/installed-dev: .venv/installed
 	sh deploy/system_packages.sh test
-	$(BIN)/python -m pip install --quiet $(TORCH_CPU) $(TORCH) || $(BIN)/python -m pip install --quiet $(TORCH)
-	$(BIN)/python -m pip install --quiet --editable '.[page,dev,neural-training]'
+	$(PIP) $(TORCH_CPU) $(TORCH) || $(PIP) $(TORCH)
+	$(PIP) --constraint $(LOCK) --editable '.[page,dev,neural-training]'
 	touch $@
 
 $(PAGE)/node_modules/.package-lock.json: $(PAGE)/package-lock.json | .venv/installed
-	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm ci --prefix $(PAGE) --no-audit --no-fund --loglevel=error
+	$(NPM) ci --omit=dev
 	touch $@
 
-$(PAGE)/head.glb: $(wildcard services/driver/assets/*) services/driver/glb.py | .venv/installed
+$(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
+	$(NPM) ci
+	touch $@ $(PAGE)/node_modules/.package-lock.json
+
+$(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py | .venv/installed
 	$(BIN)/kouxing head export $@

@@ -1,4 +1,4 @@
-"""The commands under ``kouxing evaluate``."""
+"""The commands ``kouxing bench``, and those under ``kouxing evaluate`` and ``kouxing plot``."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from services.terminal import JsonFile, check_output, say, write_json
+from services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
-app = typer.Typer(no_args_is_help=True, help="Measure the models.")
-plot_app = typer.Typer(no_args_is_help=True, help="Draw pictures of the models.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure the models.")
+plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
+bench_app = typer.Typer(add_completion=False)
 
 SENTENCE = Path(__file__).parents[1] / "shared" / "demo" / "hello-female.wav"
 
@@ -26,7 +27,7 @@ def recognizer(
     ] = None,
     look_ahead: Annotated[
         list[float] | None,
-        typer.Option("--look-ahead-ms", help="Of the neural model, such as 60; repeatable."),
+        typer.Option("--look-ahead-ms", help="Look-ahead of the neural model; repeatable."),
     ] = None,
     confusions: Annotated[
         Path | None, typer.Option(help="Picture of the last model's confusions (.png).")
@@ -34,9 +35,10 @@ def recognizer(
     json_file: JsonFile = None,
 ) -> None:
     """Measure phone and viseme errors, delays and cost of acoustic models, side by side."""
-    from evaluation.recognizer import evaluate_recognizer
-    from evaluation.recognizer_report import draw_confusions, print_figures
-    from services.recognizer.load import DEFAULT_MODEL, load_model, model_path
+    from evaluation.recognizer.confusions import draw_confusions
+    from evaluation.recognizer.error_rates import evaluate_recognizer
+    from evaluation.recognizer.report import print_figures
+    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
 
     check_output(confusions, json_file)
     results = {}
@@ -63,9 +65,9 @@ def robustness(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure errors in noise, on the telephone, too fast..., and what is heard in no speech."""
-    from evaluation.robustness import evaluate_robustness, print_robustness
-    from services.recognizer.load import DEFAULT_MODEL, load_model, model_path
+    """Measure errors in disturbed speech, and phones recognised in sounds without speech."""
+    from evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
 
     check_output(json_file)
     models = {name: load_model(model_path(name)) for name in acoustic or [DEFAULT_MODEL]}
@@ -81,16 +83,23 @@ def robustness(
 def lips(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(help="Only clips whose names begin with this and _; repeatable."),
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Compare modelled lips with tracked ones, for every scheme and look-ahead.
+    """Compare every lip model with tracked lips, at several delays, on held-out clips.
 
-    Only clips count that the parameters were neither learnt from nor chosen with.
+    The file has all figures by language, source and speaker, too.
     """
-    from evaluation.lips import main
+    from evaluation.lips.report import print_scores
+    from evaluation.lips.scores import main
 
     check_output(json_file)
-    write_json(json_file, [asdict(score) for score in main(clips, parameters)])
+    scores = main(clips, parameters, source or ())
+    print_scores(scores, Console())
+    write_json(json_file, [asdict(score) for score in scores])
 
 
 @app.command()
@@ -102,11 +111,33 @@ def visemes(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Show how well the visemes fit lips they were not learnt from, and what learning changed."""
-    from evaluation.viseme_fit import main
+    """Show how the visemes fit lips they were not trained on, and what training changed."""
+    from evaluation.lips.viseme_fit import main
 
     check_output(picture, json_file)
     write_json(json_file, main(clips, parameters, picture))
+
+
+@bench_app.command()
+def bench(
+    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")],
+    repeats: Annotated[int, typer.Option(min=1, help="How often to stream it.")] = 3,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure latency, CPU and images per second of the whole chain on this machine."""
+    from evaluation.system import latency, rendering
+
+    delays = latency.measure(audio, repeats, CONSOLE)
+    pictures = rendering.measure()
+    out = Console()
+    latency.show(delays, out)
+    rendering.show(pictures, out)
+    write_json(json_file, asdict(delays) | {"rendering": asdict(pictures)})
+
+
+@plot_app.callback()
+def plot() -> None:
+    """Draw pictures of the models."""
 
 
 @plot_app.command(name="visemes")
@@ -116,7 +147,7 @@ def plot_visemes(
     parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
 ) -> None:
     """Draw the visemes' faces, their dominance curves, and the FAP curves of a sentence."""
-    from evaluation.viseme_plots import plot_visemes as draw
+    from evaluation.lips.viseme_plots import plot_visemes as draw
 
     for path in draw(folder, audio, parameters):
-        say(f"wrote {path}")
+        print_message(f"wrote {path}")

@@ -1,6 +1,6 @@
 """Runs the command line as ``python -m services``."""
 
-from services.command_line import main
+from services.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -133,14 +133,14 @@ def microphone(sample_rate_hz: int = 16_000) -> AudioSource:
         raise UserError(
             "the microphone needs the PortAudio library: apt-get install libportaudio2"
         ) from None
-    heard: queue.SimpleQueue[Samples] = queue.SimpleQueue()
+    recorded: queue.SimpleQueue[Samples] = queue.SimpleQueue()
     try:
         stream = sounddevice.InputStream(
             samplerate=sample_rate_hz,
             channels=1,
             dtype="float32",
             blocksize=sample_rate_hz // 50,
-            callback=lambda data, *_: heard.put(data.copy()),
+            callback=lambda data, *_: recorded.put(data.copy()),
         )
     except (sounddevice.PortAudioError, ValueError) as error:
         raise UserError(f"no microphone can be opened: {error}") from None
@@ -148,7 +148,7 @@ def microphone(sample_rate_hz: int = 16_000) -> AudioSource:
     def blocks() -> Iterator[Samples]:
         with stream:
             while True:
-                yield heard.get()
+                yield recorded.get()
 
     return AudioSource("microphone", sample_rate_hz, 1, None, blocks())
 

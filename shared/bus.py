@@ -1,12 +1,11 @@
 """ZeroMQ sockets that carry messages; the only module that imports zmq.
 
 Services bind, clients connect. Every socket has explicit limits on message size, queue length and
-linger; what is no message is returned as ``BadMessage`` and costs nobody else anything.
+linger. Parts that are no message are returned as ``BadMessage``; nobody else notices them.
 """
 
 from __future__ import annotations
 
-import ipaddress
 import re
 import secrets
 from collections.abc import Iterable, Iterator
@@ -15,48 +14,27 @@ from typing import Self
 
 import zmq
 
-from shared.codec import BadMessage, decode, encode, topic
+from shared.endpoints import split_endpoint
 from shared.errors import UserError
-from shared.messages import MAX_MESSAGE_BYTES, Joined, Message
+from shared.wire.codec import BadMessage, decode, encode, topic
+from shared.wire.message import MAX_MESSAGE_BYTES, Message
+from shared.wire.session import Joined
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
-AUDIO_QUEUE_LENGTH = 500  # chunks; a sender that is faster than the recognizer soon feels it
+AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 1000)
 HANDSHAKE_MS = 2000
 _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
-_ENDPOINT = re.compile(r"^tcp://(?P<host>\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.*-]+):(?P<port>\d{1,5}|\*)$")
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message, or why the parts were none, and who sent it (ROUTER sockets only)."""
+    """One message, or why the parts were none, and its sender (ROUTER sockets only)."""
 
     message: Message | BadMessage
     sender: bytes = b""
-
-
-def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
-    """Return host and port of ``tcp://host:port``.
-
-    Raises
-    ------
-    UserError
-        Naming the configuration key, if the endpoint is not of that form.
-    """
-    match = _ENDPOINT.match(endpoint)
-    if match is None or (match["port"] != "*" and int(match["port"]) > 65535):
-        raise UserError(f"{key}: {endpoint!r} is no endpoint; write tcp://HOST:PORT")
-    return match["host"], match["port"]
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether a host name or address can only be reached from this machine."""
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 class Socket:
@@ -97,7 +75,7 @@ class Socket:
         """Subscribe to kinds of message of one session, and ask for confirmation.
 
         Every publisher answers with one ``joined`` message once all of them are in effect there:
-        subscriptions keep their order, and that to ``joined`` goes last.
+        subscriptions keep their order, and the one to ``joined`` goes last.
         """
         for kind in (*kinds, Joined):
             self.subscribe(kind, session)
@@ -109,14 +87,14 @@ class Socket:
         ``joined`` message, so that subscribers know from when on they miss nothing.
         """
         for _ in range(MAX_BATCH):
-            if self._raw.closed:  # by what was done about the last message
+            if self._raw.closed:  # by the handler of the last message
                 return
             try:
                 parts = self._raw.recv_multipart(flags=zmq.DONTWAIT)
             except zmq.Again:
                 return
             if self._publishes:
-                self._greet(parts)
+                self._confirm_subscription(parts)
                 continue
             sender = parts.pop(0) if self._routes else b""
             if len(parts) > MAX_PARTS:
@@ -131,16 +109,28 @@ class Socket:
         """Return whether something arrived within the time."""
         return bool(self._raw.poll(int(timeout_s * 1000)))
 
-    def close(self) -> None:
-        """Close; queued messages have up to a second to leave."""
-        self._raw.close(linger=1000)
+    def connect(self, endpoint: str) -> None:
+        """Connect to one more peer.
+
+        Raises
+        ------
+        UserError
+            If the endpoint is malformed.
+        """
+        split_endpoint(endpoint, "endpoint")
+        self._raw.setsockopt(zmq.IPV6, "[" in endpoint)
+        self._raw.connect(endpoint)
+
+    def close(self, *, linger_s: float = 1.0) -> None:
+        """Close; queued messages have some time to leave, then they are dropped."""
+        self._raw.close(linger=int(linger_s * 1000))
 
     @property
     def raw(self) -> zmq.Socket[bytes]:
         """For the poller of this module only."""
         return self._raw
 
-    def _greet(self, parts: list[bytes]) -> None:
+    def _confirm_subscription(self, parts: list[bytes]) -> None:
         prefix = f"\x01{Joined.kind}/".encode()
         session = parts[0].removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
         if parts[0].startswith(prefix) and _SESSION.match(session):
@@ -184,10 +174,10 @@ class Bus:
         """Return a poller for sockets of this bus."""
         return Poller()
 
-    def drop(self, socket: Socket) -> None:
-        """Close one socket early."""
+    def drop(self, socket: Socket, *, linger_s: float = 1.0) -> None:
+        """Close one socket early; see ``Socket.close``."""
         self._sockets.remove(socket)
-        socket.close()
+        socket.close(linger_s=linger_s)
 
     def close(self) -> None:
         """Close every socket and the context."""
@@ -231,12 +221,10 @@ class Bus:
         raw = self._open(kind, queue_length)
         if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))
-        for endpoint in endpoints:
-            split_endpoint(endpoint, "endpoint")
-            raw.setsockopt(zmq.IPV6, "[" in endpoint)
-            raw.connect(endpoint)
         socket = Socket(raw, routes=False, publishes=False)
         self._sockets.append(socket)
+        for endpoint in endpoints:
+            socket.connect(endpoint)
         return socket
 
 

@@ -1,38 +1,44 @@
-"""A client of a running system: opens sessions, streams audio, follows what comes out."""
+"""A client of a running system: opens sessions, streams audio, subscribes to the results."""
 
 from __future__ import annotations
 
+import dataclasses
 import secrets
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.bus import AUDIO_QUEUE_LENGTH, Bus, Socket
+from shared.bus import AUDIO_QUEUE_LENGTH, Bus, Received
+from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
-from shared.messages import (
-    MAX_AUDIO_BYTES,
-    MEDIA_RATE_HZ,
-    AudioChunk,
+from shared.follower import PollingLoop, SessionFollower
+from shared.wire.audio import AudioChunk, EndOfAudio
+from shared.wire.codec import BadMessage
+from shared.wire.control import StatusReport, StatusRequest
+from shared.wire.message import MAX_AUDIO_BYTES, Message
+from shared.wire.session import (
+    ChooseLips,
     CloseSession,
-    EndOfAudio,
     Error,
+    ErrorCode,
     FlushSession,
-    Joined,
-    Message,
     OpenSession,
+    SessionMoved,
     SessionOpened,
-    StatusReport,
-    StatusRequest,
 )
 
 RETRY_S = 1.0
+RESEND_S = 10.0  # audio kept for a recognizer that takes the place of a lost one
+MAX_RESEND = 5000  # messages of that
+MOVE_LIMIT_S = 5.0  # for a session that its recognizer does not know to move
 
 
 class Refused(UserError):
-    """A service said no."""
+    """A service refused a request."""
 
     def __init__(self, code: str, text: str) -> None:
         super().__init__(f"{code}: {text}")
@@ -41,13 +47,14 @@ class Refused(UserError):
 
 
 class Client:
-    """Commands to control over one socket; every request has an id and a deadline."""
+    """Sends requests to control over one socket; each has an id and a deadline."""
 
     def __init__(self, control: str, *, deadline_s: float = 10.0) -> None:
         self.bus = Bus()
         self._control = control
         self._deadline_s = deadline_s
         self._commands = self.bus.connect_dealer(control)
+        self._sessions: dict[str, Session] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -69,15 +76,27 @@ class Client:
         opened = self._ask(opening)
         if not isinstance(opened, SessionOpened):
             raise UserError(f"control answered {opened.kind} to open")
-        return Session(self, opening, opened)
+        session = self._sessions[opened.session] = Session(self, opening, opened)
+        return session
 
     def close_session(self, session: str, token: str) -> None:
         """Close a session."""
         self._ask(CloseSession(session=session, token=token, request=_request_id()))
+        self._sessions.pop(session, None)
 
     def flush_session(self, session: str, token: str) -> None:
-        """Drop what is queued and let the face return to rest."""
+        """Drop audio not yet shown and let the face return to rest."""
         self._ask(FlushSession(session=session, token=token, request=_request_id()))
+
+    def choose_lips(self, session: str, token: str, lips: str) -> None:
+        """Let another lip model move the mouth.
+
+        Raises
+        ------
+        Refused
+            If there is no such lip model.
+        """
+        self._ask(ChooseLips(session=session, token=token, request=_request_id(), lips=lips))
 
     def status(self) -> StatusReport:
         """Return the state of all services and sessions."""
@@ -86,7 +105,18 @@ class Client:
             raise UserError(f"control answered {report.kind} to status")
         return report
 
-    def _ask(self, message: OpenSession | CloseSession | FlushSession | StatusRequest) -> Message:
+    def take_notices(self) -> None:
+        """Handle what control sends unasked: sessions that moved."""
+        for received in self._commands.receive():
+            self._take_notice(received.message)
+
+    def _take_notice(self, message: Message | BadMessage) -> None:
+        if isinstance(message, SessionMoved) and message.session in self._sessions:
+            self._sessions[message.session].move(message)
+
+    def _ask(
+        self, message: OpenSession | CloseSession | FlushSession | ChooseLips | StatusRequest
+    ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
         while time.monotonic() < deadline_s:
             self._commands.send(message)
@@ -96,7 +126,8 @@ class Client:
                     continue
                 for received in self._commands.receive():
                     answer = received.message
-                    if isinstance(answer, Error) and answer.code == "bad-message":
+                    self._take_notice(answer)
+                    if isinstance(answer, Error) and answer.code == ErrorCode.BAD_MESSAGE:
                         raise Refused(
                             answer.code, answer.text
                         )  # control could not read our request
@@ -112,16 +143,26 @@ class Client:
 
 
 class Session:
-    """One open session: sends audio and subscribes to what comes out."""
+    """One open session: sends audio and subscribes to what comes out.
+
+    When control moves the session to another recognizer, the session sends the audio again that the
+    lost one did not get, and its subscriptions follow. Whoever uses the session need not notice.
+    """
 
     def __init__(self, client: Client, opening: OpenSession, opened: SessionOpened) -> None:
         self._client = client
         self._opening = opening
-        self.opened = opened
+        self.opened = opened  # with the endpoints of the newest move
         self.name = opened.session
         self._audio = client.bus.connect_dealer(opened.audio, queue_length=AUDIO_QUEUE_LENGTH)
+        self._subscriptions: list[Subscription] = []
         self._sequence = 0
         self._num_frames_sent = 0
+        self._sent: deque[AudioChunk | EndOfAudio] = deque(maxlen=MAX_RESEND)
+        self._to_resend: deque[AudioChunk | EndOfAudio] = deque()
+        self._unknown: tuple[float, Error] | None = (
+            None  # when the recognizer did not know the session
+        )
 
     @property
     def media_time(self) -> int:
@@ -139,6 +180,8 @@ class Session:
     def send_pcm(self, pcm: bytes, num_frames: int) -> bool:
         """Send a chunk of PCM that is in the session's encoding already.
 
+        Returns False if the queue is full, as ``send`` does.
+
         Raises
         ------
         UserError
@@ -146,9 +189,10 @@ class Session:
         """
         if len(pcm) > MAX_AUDIO_BYTES:
             raise UserError(f"a chunk of {len(pcm)} bytes is too large; send {MAX_AUDIO_BYTES}")
-        sent = self._audio.send(
+        sent = self._resend() and self._send_new(
             AudioChunk(
                 session=self.name,
+                epoch=self.opened.epoch,
                 token=self.opened.token,
                 sequence=self._sequence + 1,
                 media_time=self.media_time,
@@ -156,30 +200,46 @@ class Session:
             )
         )
         if sent:
-            self._sequence += 1
             self._num_frames_sent += num_frames
         return sent
 
+    def skip(self, num_frames: int) -> None:
+        """Leave audio out that could not be sent: media time goes on without it."""
+        self._num_frames_sent += num_frames
+
     def finish(self) -> bool:
         """Say that no more audio comes; False if the queue is full, as in ``send``."""
-        sent = self._audio.send(
+        return self._resend() and self._send_new(
             EndOfAudio(
                 session=self.name,
+                epoch=self.opened.epoch,
                 token=self.opened.token,
                 sequence=self._sequence + 1,
                 media_time=self.media_time,
             )
         )
-        self._sequence += sent
-        return sent
 
     def errors(self) -> Iterator[Error]:
-        """Yield what the recognizer complained about since the last call."""
-        for received in self._audio.receive():
-            if isinstance(received.message, Error):
-                yield received.message
+        """Yield the recognizer's errors since the last call.
 
-    def subscribe(self, *kinds: type[Message], deadline_s: float = 5.0) -> Socket:
+        An unknown session is reported only after a while: a recognizer that has just started again
+        does not know it before control has moved the session.
+        """
+        self._resend()
+        now_s = time.monotonic()
+        for received in self._audio.receive():
+            error = received.message
+            if not isinstance(error, Error):
+                continue
+            if error.code == ErrorCode.UNKNOWN_SESSION:
+                self._unknown = self._unknown or (now_s, error)
+            else:
+                yield error
+        if self._unknown is not None and now_s - self._unknown[0] > MOVE_LIMIT_S:
+            yield self._unknown[1]
+            self._unknown = None
+
+    def subscribe(self, *kinds: type[Message], deadline_s: float = 5.0) -> Subscription:
         """Return a subscription to messages of this session, once it has taken effect.
 
         Raises
@@ -187,43 +247,108 @@ class Session:
         UserError
             If a publisher does not confirm the subscription in time.
         """
-        publisher_of = {
-            **dict.fromkeys(("phone", "speech", "sound"), self.opened.phones),
-            **dict.fromkeys(("fap", "end"), self.opened.faps),
-        }
-        endpoints = sorted({publisher_of[kind.kind] for kind in kinds})
-        socket = self._client.bus.connect_subscriber(*endpoints)
-        socket.subscribe_session(kinds, self.name)
-        wait_until_joined(socket, len(endpoints), deadline_s)
-        return socket
+        subscription = Subscription(self._client.bus, self.name, kinds)
+        subscription.start(self.opened)
+        subscription.wait_until_complete(deadline_s)
+        self._subscriptions.append(subscription)
+        return subscription
+
+    def move(self, moved: SessionMoved) -> None:
+        """Go on where control has placed the session."""
+        before = self.opened
+        self.opened = dataclasses.replace(
+            before, epoch=moved.epoch, audio=moved.audio, phones=moved.phones, faps=moved.faps
+        )
+        if (before.phones, before.faps) != (moved.phones, moved.faps):
+            for subscription in self._subscriptions:
+                subscription.start(self.opened)
+        if moved.next_sequence:
+            self._client.bus.drop(self._audio, linger_s=0.0)
+            self._audio = self._client.bus.connect_dealer(
+                moved.audio, queue_length=AUDIO_QUEUE_LENGTH
+            )
+            self._to_resend = deque(
+                dataclasses.replace(message, epoch=moved.epoch)
+                for message in self._sent
+                if message.sequence >= moved.next_sequence
+            )
+            self._unknown = None
 
     def flush(self) -> None:
-        """Interrupt: drop what is queued."""
+        """Interrupt: drop audio not yet shown."""
         self._client.flush_session(self.name, self.opened.token)
+
+    def choose_lips(self, lips: str) -> None:
+        """Let another lip model move the mouth: "dynamic-visemes" or "learnt"."""
+        self._client.choose_lips(self.name, self.opened.token, lips)
 
     def close(self) -> None:
         """Close the session."""
         self._client.close_session(self.name, self.opened.token)
 
+    def _resend(self) -> bool:
+        """Send again what a new recognizer needs; return whether all of it is sent."""
+        self._client.take_notices()
+        while self._to_resend:
+            if not self._audio.send(self._to_resend[0]):
+                return False
+            self._to_resend.popleft()
+        return True
 
-def wait_until_joined(socket: Socket, num_publishers: int, deadline_s: float) -> None:
-    """Wait until the subscriptions of a socket, new and without traffic yet, are in effect.
+    def _send_new(self, message: AudioChunk | EndOfAudio) -> bool:
+        if not self._audio.send(message):
+            return False
+        self._sequence = message.sequence
+        self._sent.append(message)
+        oldest_needed = message.media_time - RESEND_S * MEDIA_RATE_HZ
+        while self._sent[0].media_time < oldest_needed:
+            self._sent.popleft()
+        return True
 
-    Raises
-    ------
-    UserError
-        If a publisher does not confirm in time.
-    """
-    end_s = time.monotonic() + deadline_s
-    publishers: set[str] = set()
-    while len(publishers) < num_publishers:
-        left_s = end_s - time.monotonic()
-        if left_s <= 0:
-            raise UserError("a publisher did not confirm the subscription")
-        if socket.wait(left_s):
-            for received in socket.receive():
-                if isinstance(received.message, Joined):
-                    publishers.add(received.message.publisher)
+
+class Subscription:
+    """Messages of one session in the order in which they arrive."""
+
+    def __init__(self, bus: Bus, session: str, kinds: Iterable[type[Message]]) -> None:
+        self._loop = PollingLoop(bus)
+        self._received: deque[Received] = deque()
+        self._follower = SessionFollower(self._loop, session, dict.fromkeys(kinds, self._take))
+
+    def start(self, opened: SessionOpened) -> None:
+        """Subscribe at the session's publishers; again when they are others."""
+        self._follower.start(opened.epoch, {"phones": opened.phones, "faps": opened.faps})
+
+    def wait_until_complete(self, deadline_s: float) -> None:
+        """Wait until the subscription is in effect.
+
+        Raises
+        ------
+        UserError
+            If a publisher does not confirm in time.
+        """
+        end_s = time.monotonic() + deadline_s
+        while not self._follower.is_complete:
+            left_s = end_s - time.monotonic()
+            if left_s <= 0:
+                raise UserError("a publisher did not confirm the subscription")
+            self._loop.step(left_s)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Return whether something arrived within the time."""
+        end_s = time.monotonic() + timeout_s
+        # A step may end with a publisher's confirmation, which is none of what is waited for.
+        while not self._received and self._loop.step(max(0.0, end_s - time.monotonic())):
+            pass
+        return bool(self._received)
+
+    def receive(self) -> Iterator[Received]:
+        """Yield what has arrived."""
+        self._loop.step(0.0)
+        while self._received:
+            yield self._received.popleft()
+
+    def _take(self, message: Message) -> None:
+        self._received.append(Received(message))
 
 
 def _request_id() -> str:

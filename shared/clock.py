@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import deque
 
-from shared.messages import MEDIA_RATE_HZ
+MEDIA_RATE_HZ = 16_000  # media time counts samples at this rate
 
 
 def to_samples(time_s: float) -> int:

@@ -1,242 +1,336 @@
-"""Configuration of every service: file < environment < command line.
+"""Configuration: defaults < TOML file < environment < command line.
 
-A TOML file has one table a service (``[recognizer]``) and ``[common]`` for keys that several
-share. The environment names a key ``KOUXING_<SERVICE>_<KEY>`` or, for all services,
-``KOUXING_<KEY>``. An error names the key and where its value came from.
+A TOML file has one table per service (``[recognizer]``) and ``[common]`` for the keys that every
+service has. The environment names a service's key ``KOUXING_<SERVICE>_<KEY>``, and a common key
+also ``KOUXING_<KEY>``. A value for one service beats one for all services. A key, table or variable
+that nobody knows is an error that names the nearest known one.
+
+Each service declares its keys as a subclass of ``ServiceConfig`` in its ``config.py``. pydantic
+checks types and ranges. The sources are read here: every value remembers where it came from.
 """
 
 from __future__ import annotations
 
-import dataclasses
+import difflib
 import os
 import socket
 import tomllib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from enum import Enum, StrEnum, auto
 from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
-from shared.bus import is_loopback, split_endpoint
+from annotated_types import Ge, Le, MultipleOf
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from shared.endpoints import WILDCARDS, is_loopback, split_endpoint
 from shared.errors import UserError
 
 PREFIX = "KOUXING_"
-WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - named to be recognised, not bound
+COMMON = "common"  # table of the keys that every service has
+_BOOLEANS = {"true", "false", "1", "0"}  # pydantic would also take "yes", "on" and others
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Config:
-    """What every service knows."""
+class Bound(Enum):
+    """Marks a key as an address that the process binds."""
 
-    control: str = "tcp://127.0.0.1:5550"  # where control takes commands
-    advertise: str = ""  # host name or address that others reach this service by
-    insecure: bool = False  # allow plaintext beyond this machine
-    log_level: str = "info"
-    instance: str = ""  # name of this process; chosen when empty
+    ENDPOINT = auto()  # tcp://HOST:PORT
+    HOST = auto()
+    PORT = auto()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControlConfig(Config):
-    """Control's own keys."""
+@dataclass(frozen=True, slots=True)
+class Form:
+    """Says in words what a value looks like, where its type does not tell."""
 
-    commands: str = "tcp://127.0.0.1:5550"
-    events: str = "tcp://127.0.0.1:5551"
-    max_sessions: int = 64
-    idle_limit_s: float = 60.0  # a session without audio for so long is closed
-    lost_after_s: float = 3.0  # a service without heartbeat for so long is lost
+    text: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecognizerConfig(Config):
-    """The recognizer's own keys."""
-
-    audio: str = "tcp://127.0.0.1:5560"
-    phones: str = "tcp://127.0.0.1:5561"
-    acoustic: str = "neural"  # model: neural, gmm, or a file
-    look_ahead_ms: float = 10.0  # of the neural model: 10, 30, 60, 100 or 200
-    agreement: int = 1  # frames that must agree before a unit is put out (N of Li 2011, who has 3)
-    least_confidence: float = 0.9  # of each of those frames; 0 is the paper's rule
+def _check_endpoint(value: str) -> str:
+    try:
+        split_endpoint(value, "")
+    except UserError as error:
+        raise ValueError(str(error)) from None
+    return value
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SynthesizerConfig(Config):
-    """The synthesizer's own keys."""
-
-    phones: str = "tcp://127.0.0.1:5570"
-    faps: str = "tcp://127.0.0.1:5571"
-    frame_rate_hz: float = 50.0
-    look_ahead_ms: float = 160.0  # how much later than its sound a frame is made; steps of 20
-    gesture_seed: int = 3  # of blinks, gaze and head motion; 0: the mouth alone moves
+def _check_boolean(value: object) -> object:
+    if isinstance(value, str) and value.lower() not in _BOOLEANS:
+        raise ValueError
+    return value
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DriverConfig(Config):
-    """The driver's own keys."""
-
-    view: str = "auto"  # window, none, or auto: a window where there is a display
-    out: str = "out"  # folder for recorded videos
-    head: str = "woman"  # a head of the package, an .npz, or a .glb with morph targets
-    background: str = "studio"  # studio, #rrggbb, or a colour's name
-    camera: str = "face"  # what fills the picture: face, head, mouth
-    virtual_camera: bool = False  # also be a camera for other programs
-    width_px: int = 1280
-    height_px: int = 720
-    frame_rate_hz: float = 25.0
+def _lower(value: object) -> object:
+    return value.lower() if isinstance(value, str) else value
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GatewayConfig(Config):
-    """The gateway's own keys."""
-
-    host: str = "127.0.0.1"
-    port: int = 8080
-    head: str = ""  # another head for the page: a GLB that 'kouxing head export' wrote
-
-
-SECTIONS: dict[str, type[Config]] = {
-    "control": ControlConfig,
-    "recognizer": RecognizerConfig,
-    "synthesizer": SynthesizerConfig,
-    "driver": DriverConfig,
-    "gateway": GatewayConfig,
-    "client": Config,
-}
-BINDS = {
-    "control": ("commands", "events"),
-    "recognizer": ("audio", "phones"),
-    "synthesizer": ("phones", "faps"),
-}
+Switch = Annotated[bool, BeforeValidator(_check_boolean)]
+Endpoint = Annotated[str, AfterValidator(_check_endpoint), Form("an endpoint, tcp://HOST:PORT")]
+BoundEndpoint = Annotated[Endpoint, Bound.ENDPOINT]
+BoundHost = Annotated[str, Bound.HOST, Form("a host name or address")]
+BoundPort = Annotated[int, Field(ge=0, le=65535), Bound.PORT]
+LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_lower)]
 
 
-def load(
-    section: str,
-    *,
-    file: Path | None = None,
-    overrides: Mapping[str, str] | None = None,
-    environment: Mapping[str, str] | None = None,
-) -> Config:
-    """Return the checked configuration of one service.
+class ServiceConfig(BaseModel):
+    """The keys that every service has."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    control: Endpoint = "tcp://127.0.0.1:5550"
+    """Where control takes commands."""
+    advertise: str = ""
+    """Host name or address by which other machines reach this service."""
+    insecure: Switch = False
+    """Allow unencrypted sockets that other machines can reach."""
+    log_level: LogLevel = "info"
+    """Least level of the log lines that are written."""
+    instance: str = ""
+    """Name of this process; chosen when empty."""
+
+
+Config = TypeVar("Config", bound=ServiceConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """A value as it was given."""
+
+    text: str
+    origin: str
+
+
+Layer = dict[str, dict[str, Given]]  # what one source gives, by table and key
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One key of one service, with its present value."""
+
+    key: str
+    value: object
+    origin: str  # "default", a file, $VARIABLE or --set
+    default: object
+    allowed: str
+    meaning: str
+
+
+class Settings:
+    """What a file and the environment say about the services.
 
     Parameters
     ----------
-    section
-        A key of ``SECTIONS``.
+    types
+        Each service's own keys, by the service's name.
     file
-        A TOML file.
-    overrides
-        Values from the command line, by key.
+        A TOML file, if there is one.
     environment
         Defaults to the process's own.
 
     Raises
     ------
     UserError
-        Naming the key, the value and what is allowed.
+        If the file cannot be read, or a table, key or variable is unknown.
     """
-    config_type = SECTIONS[section]
-    environment = os.environ if environment is None else environment
-    kinds = typing.get_type_hints(config_type)
-    values: dict[str, object] = {}
-    for table in ("common", section):
-        for key, value in _read_table(file, table).items():
-            if key not in kinds and table == section:
-                raise UserError(f"{file}: unknown key {section}.{key}; known: {', '.join(kinds)}")
-            if key in kinds:
-                values[key] = _convert(value, kinds[key], f"{section}.{key} in {file}")
-    for key, kind in kinds.items():
-        for name in (PREFIX + key.upper(), f"{PREFIX}{section.upper()}_{key.upper()}"):
-            if name in environment:
-                values[key] = _convert(environment[name], kind, f"{section}.{key} in ${name}")
-    for key, text in (overrides or {}).items():
-        if key not in kinds:
-            raise UserError(f"--set {key}: {section} has no such key; known: {', '.join(kinds)}")
-        values[key] = _convert(text, kinds[key], f"{section}.{key} in --set")
-    config = config_type(**values)  # type: ignore[arg-type]
-    _check(section, config)
-    return config
+
+    def __init__(
+        self,
+        types: Mapping[str, type[ServiceConfig]],
+        *,
+        file: Path | None = None,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self._tables: dict[str, type[ServiceConfig]] = {COMMON: ServiceConfig, **types}
+        self._layers = (
+            {} if file is None else _read_file(file, self._tables),
+            _read_environment(os.environ if environment is None else environment, self._tables),
+        )
+
+    def load(self, config_type: type[Config], overrides: Mapping[str, str] | None = None) -> Config:
+        """Return the checked configuration of a service.
+
+        Parameters
+        ----------
+        config_type
+            Class of the service's keys, or ``ServiceConfig`` for a client.
+        overrides
+            Values from the command line, by key.
+
+        Raises
+        ------
+        UserError
+            Naming the key, the value, what is allowed, and where the value came from.
+        """
+        return self._resolve(config_type, overrides or {})[0]
+
+    def describe(
+        self, config_type: type[ServiceConfig], overrides: Mapping[str, str] | None = None
+    ) -> list[Setting]:
+        """Return all keys of a service with their present values; raises as ``load``."""
+        config, given = self._resolve(config_type, overrides or {})
+        return [
+            Setting(
+                key=key,
+                value=getattr(config, key),
+                origin=given[key].origin if key in given else "default",
+                default=field.default,
+                allowed=allowed(field),
+                meaning=" ".join((field.description or "").split()),
+            )
+            for key, field in config_type.model_fields.items()
+        ]
+
+    def _resolve(
+        self, config_type: type[Config], overrides: Mapping[str, str]
+    ) -> tuple[Config, dict[str, Given]]:
+        table = next(name for name, each in self._tables.items() if each is config_type)
+        given: dict[str, Given] = {}
+        for layer in self._layers:
+            given |= layer.get(COMMON, {})
+            given |= layer.get(table, {})
+        for key, text in overrides.items():
+            if key not in config_type.model_fields:
+                nearest = _nearest(key, config_type.model_fields)
+                raise UserError(f"--set {key}: {table} has no such key; {nearest}")
+            given[key] = Given(text, "--set")
+        try:
+            config = config_type.model_validate_strings({k: g.text for k, g in given.items()})
+        except ValidationError as error:
+            key = str(error.errors()[0]["loc"][0])
+            raise _refusal(table, key, given[key], config_type) from None
+        _check_addresses(table, config)
+        return config, given
 
 
-def reachable(endpoint: str, advertise: str, key: str) -> str:
-    """Return the endpoint that others connect to for one that was bound."""
-    host, port = split_endpoint(endpoint, key)
-    return f"tcp://{advertise or host}:{port}"
+def variable(table: str, key: str) -> str:
+    """Return the environment variable of a service's key, or of a common key for all services."""
+    return PREFIX + (key if table == COMMON else f"{table}_{key}").upper()
 
 
-def _read_table(file: Path | None, table: str) -> dict[str, object]:
-    if file is None:
-        return {}
+def allowed(field: FieldInfo) -> str:
+    """Say in words which values a key takes, such as "a whole number from 1 to 20"."""
+    kind = field.annotation
+    marks: dict[type, Any] = {type(mark): mark for mark in field.metadata}
+    if Form in marks:
+        return str(marks[Form].text)
+    if typing.get_origin(kind) is Literal:
+        return f"one of {', '.join(typing.get_args(kind))}"
+    if isinstance(kind, type) and issubclass(kind, StrEnum):
+        return f"one of {', '.join(kind)}"
+    if kind is bool:
+        return "true or false"
+    if kind is str:
+        return "text"
+    number = "a number" if kind is float else "a whole number"
+    if MultipleOf in marks:
+        number = f"a multiple of {marks[MultipleOf].multiple_of}"
+    return f"{number} from {marks[Ge].ge} to {marks[Le].le}"
+
+
+def bound_keys(config_type: type[ServiceConfig]) -> dict[str, Bound]:
+    """Return the keys that are addresses which a service binds."""
+    return {
+        key: mark
+        for key, field in config_type.model_fields.items()
+        for mark in field.metadata
+        if isinstance(mark, Bound)
+    }
+
+
+def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
+    """Split what ``--set`` takes into keys and values.
+
+    Raises
+    ------
+    UserError
+        If one is not ``KEY=VALUE``.
+    """
+    values = {}
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals:
+            raise UserError(f"--set {assignment}: write --set KEY=VALUE")
+        values[key] = value
+    return values
+
+
+def _read_file(file: Path, tables: Mapping[str, type[ServiceConfig]]) -> Layer:
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UserError(f"--config {file}: {error}") from None
-    for name, entry in content.items():
-        if name not in (*SECTIONS, "common") or not isinstance(entry, dict):
-            raise UserError(
-                f"--config {file}: unknown table [{name}]; known: common, {', '.join(SECTIONS)}"
-            )
-    found: dict[str, object] = content.get(table, {})
-    return found
+    layer: Layer = {}
+    for table, entries in content.items():
+        if table not in tables or not isinstance(entries, dict):
+            raise UserError(f"{file}: unknown table [{table}]; {_nearest(table, tables)}")
+        layer[table] = {}
+        for key, value in entries.items():
+            if key not in tables[table].model_fields:
+                candidates = [
+                    f"{name}.{each}"
+                    for name, config_type in tables.items()
+                    for each in config_type.model_fields
+                    if table in (name, COMMON)
+                ]
+                name = f"{table}.{key}"
+                raise UserError(f"{file}: unknown key {name}; {_nearest(name, candidates)}")
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            layer[table][key] = Given(text, str(file))
+            if not isinstance(value, str | int | float):
+                raise _refusal(table, key, layer[table][key], tables[table])
+    return layer
 
 
-def _convert(value: object, kind: type, where: str) -> object:
-    try:
-        if kind is bool:
-            if isinstance(value, bool):
-                return value
-            return {"true": True, "1": True, "false": False, "0": False}[str(value).lower()]
-        if kind is str and not isinstance(value, str):
-            raise ValueError
-        return kind(value)
-    except (KeyError, ValueError, TypeError):
-        expected = "true or false" if kind is bool else f"a value of type {kind.__name__}"
-        raise UserError(f"{where}: {value!r} is not {expected}") from None
-
-
-def _check(section: str, config: Config) -> None:
-    split_endpoint(config.control, f"{section}.control")
-    if config.log_level.lower() not in ("debug", "info", "warning", "error"):
-        raise UserError(f"{section}.log_level: one of debug, info, warning, error")
-    for key in BINDS.get(section, ()):
-        name = f"{section}.{key}"
-        host, _ = split_endpoint(getattr(config, key), name)
-        if host in WILDCARDS and not config.advertise:
-            raise UserError(
-                f"{section}.advertise: name the host by which others reach {name} "
-                f"({host} is every address of this host), for example {socket.gethostname()}"
-            )
-        _require_secure(host, name, config)
-    ranges: dict[str, tuple[float, float]] = {
-        "agreement": (1, 20),
-        "least_confidence": (0, 1),
-        "frame_rate_hz": (10, 240),
-        "look_ahead_ms": (0, 300),
-        "width_px": (16, 7680),
-        "height_px": (16, 4320),
-        "port": (0, 65535),
-        "max_sessions": (1, 10000),
-        "idle_limit_s": (1, 86400),
-        "lost_after_s": (1, 3600),
+def _read_environment(
+    environment: Mapping[str, str], tables: Mapping[str, type[ServiceConfig]]
+) -> Layer:
+    known = {
+        variable(table, key): (table, key)
+        for table, config_type in tables.items()
+        for key in config_type.model_fields
     }
-    for field in dataclasses.fields(config):
-        if field.name in ranges:
-            low, high = ranges[field.name]
-            if not low <= getattr(config, field.name) <= high:
+    layer: Layer = {}
+    for name, text in environment.items():
+        if name in known:
+            table, key = known[name]
+            layer.setdefault(table, {})[key] = Given(text, f"${name}")
+        elif name.startswith(PREFIX):
+            raise UserError(f"${name}: unknown variable; {_nearest(name, known)}")
+    return layer
+
+
+def _refusal(table: str, key: str, given: Given, config_type: type[ServiceConfig]) -> UserError:
+    return UserError(
+        f"{table}.{key}: {given.text!r} (from {given.origin}) is not "
+        f"{allowed(config_type.model_fields[key])}"
+    )
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    """Return the hint of an error about an unknown name."""
+    (nearest,) = difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)
+    return f"the nearest is {nearest}; 'kouxing config' lists all"
+
+
+def _check_addresses(table: str, config: ServiceConfig) -> None:
+    """Refuse addresses that others cannot use, or can use though nothing is encrypted."""
+    for key, kind in bound_keys(type(config)).items():
+        if kind is Bound.PORT:
+            continue
+        name = f"{table}.{key}"
+        host = getattr(config, key)
+        if kind is Bound.ENDPOINT:
+            host, _ = split_endpoint(host, name)
+            if host in WILDCARDS and not config.advertise:
                 raise UserError(
-                    f"{section}.{field.name}: {getattr(config, field.name)} is outside "
-                    f"{low:g} to {high:g}"
+                    f"{table}.advertise: name the host by which others reach {name} "
+                    f"({host} is every address of this host), for example {socket.gethostname()}"
                 )
-    if isinstance(config, DriverConfig):
-        if config.view not in ("auto", "window", "none"):
-            raise UserError("driver.view: one of auto, window, none")
-        for key in ("width_px", "height_px"):
-            if getattr(config, key) % 2:
-                raise UserError(f"driver.{key}: must be even, for H.264")
-    if isinstance(config, GatewayConfig):
-        _require_secure(config.host, "gateway.host", config)
-
-
-def _require_secure(host: str, name: str, config: Config) -> None:
-    if not is_loopback(host) and not config.insecure:
-        raise UserError(
-            f"{name}: {host} can be reached from other machines and nothing is encrypted; "
-            "bind a loopback address, or accept the risk on a trusted network with insecure = true"
-        )
+        if not is_loopback(host) and not config.insecure:
+            raise UserError(
+                f"{name}: {host} can be reached from other machines and nothing is encrypted; bind "
+                "a loopback address, or accept the risk on a trusted network with insecure = true"
+            )

@@ -1,4 +1,4 @@
-"""JSON lines on standard error, with the session where one is concerned; never what was said."""
+"""Logs as JSON lines on standard error, with the session concerned; never speech content."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _JsonFormatter(logging.Formatter):
 
 
 class RateLimit:
-    """Lets a warning of one kind through at most once in ``period_s``."""
+    """Allows a warning of one kind at most once in ``period_s``."""
 
     def __init__(self, period_s: float = 5.0) -> None:
         self._period_s = period_s

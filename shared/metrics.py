@@ -1,4 +1,4 @@
-"""Counts and latencies of a service, small enough to travel in every heartbeat."""
+"""Counts and latencies of a service, small enough to be in every heartbeat."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import Counter, deque
 
 import numpy as np
 
-WINDOW = 1000  # newest values that percentiles are taken of
+WINDOW = 1000  # newest values, of which the percentiles are taken
 PERCENTS = (50, 95, 99)
 
 
@@ -24,7 +24,7 @@ class Metrics:
         self._counts[name] += amount
 
     def observe(self, name: str, value: float) -> None:
-        """Take one value of a distribution; the name carries the unit, as in ``chunk_ms``."""
+        """Add one value to a distribution; the name carries the unit, as in ``chunk_ms``."""
         self._values.setdefault(name, deque(maxlen=WINDOW)).append(value)
 
     def snapshot(self, now_s: float) -> dict[str, float]:

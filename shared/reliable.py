@@ -1,7 +1,7 @@
 """A stream of messages that survives a reconnect.
 
-Sequence numbers, cumulative acknowledgement and a ring of what was not acknowledged yet: ZeroMQ
-drops what is in flight when a peer goes away, and a high-water mark does not prevent it.
+Sequence numbers, cumulative acknowledgement, and a queue of messages not acknowledged yet: ZeroMQ
+drops messages in flight when a peer goes away, and a high-water mark does not prevent it.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import dataclasses
 from collections import deque
 
 from shared.bus import Socket
-from shared.messages import Acknowledge, Message
+from shared.wire.message import Message
+from shared.wire.speech import Acknowledge
 
 RESEND_AFTER_S = 0.5
-ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
+ACKNOWLEDGE_EVERY = 32  # messages; each tick acknowledges the rest
 
 
 class ReliableSender:
@@ -24,8 +25,8 @@ class ReliableSender:
         self._session = session
         self._epoch = epoch
         self._next = 1
-        self._waiting: deque[Message] = deque()  # its owner limits it by the backlog
-        self._heard_s = 0.0
+        self._waiting: deque[Message] = deque()  # the owner watches its length, the backlog
+        self._progress_s = 0.0
 
     @property
     def waiting(self) -> tuple[Message, ...]:
@@ -44,22 +45,22 @@ class ReliableSender:
         )
         self._next += 1
         if not self._waiting:
-            self._heard_s = now_s
+            self._progress_s = now_s
         self._waiting.append(numbered)
         self._socket.send(numbered)
         return numbered
 
     def acknowledge(self, up_to: int, now_s: float) -> None:
-        """Forget what the receiver has."""
+        """Forget the messages that the receiver has."""
         while self._waiting and self._waiting[0].sequence <= up_to:
             self._waiting.popleft()
-            self._heard_s = now_s
+            self._progress_s = now_s
 
     def tick(self, now_s: float) -> int:
-        """Send again what has waited too long; return how many messages that were."""
-        if not self._waiting or now_s - self._heard_s < RESEND_AFTER_S:
+        """Send the waiting messages again after too long without progress; return their number."""
+        if not self._waiting or now_s - self._progress_s < RESEND_AFTER_S:
             return 0
-        self._heard_s = now_s
+        self._progress_s = now_s
         for message in self._waiting:
             self._socket.send(message)
         return len(self._waiting)
@@ -77,9 +78,9 @@ class ReliableReceiver:
         self._peer = b""
 
     def accept(self, message: Message, sender: bytes) -> bool:
-        """Return whether this message is the next one; others are to be ignored.
+        """Return whether this message is the next one; ignore it if not.
 
-        The first message of a greater epoch starts anew at whatever number it carries.
+        The first message of a greater epoch starts again at whatever number it carries.
         """
         if message.epoch < self._epoch:
             return False
@@ -89,7 +90,7 @@ class ReliableReceiver:
             self._last = message.sequence - 1
             self._acknowledged = self._last
         if message.sequence != self._last + 1:
-            self._send_acknowledgement()  # tells what to send again, if anything
+            self._send_acknowledgement()  # so that the sender knows which are missing
             return False
         self._last = message.sequence
         if self._last - self._acknowledged >= ACKNOWLEDGE_EVERY:
@@ -97,7 +98,7 @@ class ReliableReceiver:
         return True
 
     def tick(self) -> None:
-        """Acknowledge what came since the last time."""
+        """Acknowledge messages that came since the last acknowledgement."""
         if self._last > self._acknowledged:
             self._send_acknowledgement()
 

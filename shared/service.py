@@ -2,7 +2,7 @@
 
 Start-up (configuration, sockets, load, registration) -> "ready" -> one poller, control first ->
 SIGTERM or SIGINT sets a flag -> drain with a deadline -> exit 0. A second signal forces the end.
-Heartbeats leave from this loop, so a hung loop is seen as a lost service.
+Heartbeats are sent from this loop, so control sees a hung loop as a lost service.
 """
 
 from __future__ import annotations
@@ -18,47 +18,55 @@ from typing import Any, ClassVar
 
 from shared.bus import Bus, Received, Socket
 from shared.clock import ClockOffset, now_ns
-from shared.codec import BadMessage
-from shared.config import Config
+from shared.config import ServiceConfig
 from shared.errors import UserError
 from shared.logs import LOG, RateLimit, configure
-from shared.messages import (
-    Done,
-    Error,
+from shared.metrics import Metrics
+from shared.wire.codec import BadMessage
+from shared.wire.control import (
     FlushNow,
     Heartbeat,
     HeartbeatSeen,
-    Message,
+    SessionInput,
     StartSession,
     StopSession,
+    UseLips,
 )
-from shared.metrics import Metrics
+from shared.wire.message import Message
+from shared.wire.session import Done, Error, ErrorCode
 
 HEARTBEAT_S = 0.5
 TICK_S = 0.01
-TURN_S = 0.05  # for one socket's messages, before others, ticks and heartbeats get theirs
+TURN_S = 0.05  # for one socket's messages, before other sockets, ticks and heartbeats
 DRAIN_LIMIT_S = 5.0
-PARENT_VARIABLE = "KOUXING_SUPERVISOR"  # process number of the supervisor that started this one
+PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # its process number; the underscore: no setting
 
 Handler = Callable[[Any, bytes], None]
 
 
 class Service:
-    """What the five services share; subclasses add their sockets and handlers.
+    """What all services share; subclasses add their sockets and handlers.
 
-    A subclass calls ``listen`` for its own sockets, and overrides ``start_session``,
-    ``stop_session``, ``flush_session``, ``on_tick``, ``on_drain``.
+    A subclass says its role and the endpoints it needs, fills in ``endpoints`` with those it
+    provides, calls ``register`` for its own sockets, and overrides ``start_session``,
+    ``stop_session``, ``flush_session``, ``use_lips``, ``session_inputs``, ``on_tick``,
+    ``on_drain``.
     """
 
     name: ClassVar[str]
+    role: ClassVar[str]  # worker: placed in sessions; observer: takes part in all of them
+    needs: ClassVar[tuple[str, ...]] = ()  # names of the endpoints it must be told
 
-    def __init__(self, config: Config, *, control: bool = True) -> None:
+    def __init__(self, config: ServiceConfig, *, control: bool = True) -> None:
         self.config = config
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
         self.bus = Bus()
         self.metrics = Metrics()
         self.clock_offset = ClockOffset()
-        self.endpoints: dict[str, str] = {}
+        self.endpoints: dict[str, str] = {}  # what it provides, by name
+        self.language = ""  # of the phones that it recognises
+        self.frame_rate_hz = 0.0  # of the FAP frames that it makes
+        self.delay_ms = 0.0  # how much later than its sound it makes a FAP frame
         self.warnings = RateLimit()
         self._poller = self.bus.poller()
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
@@ -69,13 +77,14 @@ class Service:
         self.control: Socket | None = None
         if control:
             self.control = self.bus.connect_dealer(config.control)
-            self.listen(
+            self.register(
                 self.control,
                 {
                     HeartbeatSeen: self._on_heartbeat_seen,
                     StartSession: self._on_start,
                     StopSession: lambda message, _: self.stop_session(message.session),
                     FlushNow: lambda message, _: self.flush_session(message.session),
+                    UseLips: lambda message, _: self.use_lips(message.session, message.lips),
                     Error: self._on_error,
                     Done: lambda _message, _sender: None,
                 },
@@ -84,27 +93,37 @@ class Service:
     # --- what a subclass provides ----------------------------------------------------------------
 
     def start_session(self, start: StartSession) -> bool:
-        """Serve a session; return False if ``session_started`` will be called later."""
+        """Serve a session; return False to call ``session_started`` later."""
         return True
 
     def stop_session(self, session: str) -> None:
-        """Let go of a session, if it is known."""
+        """Forget a session, if it is known."""
 
     def flush_session(self, session: str) -> None:
-        """Drop what is queued for a session."""
+        """Drop audio of a session that is not yet shown."""
+
+    def use_lips(self, session: str, lips: str) -> None:
+        """Let another lip model move the mouth of a session, if that is made here."""
+
+    def on_start(self) -> None:
+        """Begin what needs the loop; called once, before the service says that it is ready."""
+
+    def wait(self, timeout_s: float) -> list[Socket]:
+        """Wait up to the timeout for messages; return the sockets that have some."""
+        return self._poller.wait(timeout_s)
 
     def on_tick(self, now_s: float) -> None:
-        """Do what time asks for; called about every 10 ms."""
+        """Do what is due; called about every 10 ms."""
 
     def on_drain(self) -> bool:
-        """Finish what is under way; called again until it returns True or the time is up."""
+        """Finish work in progress; called again until it returns True or the time is up."""
         return True
 
     def on_stopped(self) -> None:
-        """Save what can be saved when the time to drain is over."""
+        """Save what can be saved after draining, finished or not."""
 
-    def idle_s(self) -> dict[str, float]:
-        """Return for how long each session has had no input, for control's idle limit."""
+    def session_inputs(self) -> dict[str, SessionInput]:
+        """Return the sessions it takes part in and how far their input has come."""
         return {}
 
     def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
@@ -114,19 +133,19 @@ class Service:
 
     # --- for subclasses --------------------------------------------------------------------------
 
-    def listen(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:
+    def register(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:
         """Handle messages that arrive on a socket, by their type."""
         self._handlers[socket] = handlers
         self._poller.add(socket)
 
-    def unlisten(self, socket: Socket) -> None:
+    def unregister(self, socket: Socket) -> None:
         """Stop handling and close a socket."""
         self._poller.remove(socket)
         del self._handlers[socket]
         self.bus.drop(socket)
 
     def pause(self, socket: Socket, *, paused: bool) -> None:
-        """Leave a socket's messages in its queue for now, so that its senders feel it."""
+        """Leave a socket's messages in its queue for now, so that its senders must wait."""
         if paused and socket not in self._paused:
             self._paused.add(socket)
             self._poller.remove(socket)
@@ -135,7 +154,7 @@ class Service:
             self._poller.add(socket)
 
     def session_started(self, start: StartSession) -> None:
-        """Tell control that a session is served now."""
+        """Tell control that this service serves a session now."""
         if self.control is not None:
             self.control.send(Done(session=start.session, request=start.request))
 
@@ -145,14 +164,9 @@ class Service:
         if self.warnings.allows(reason):
             LOG.warning(text, extra={"session": session})
 
-    @property
-    def file_descriptors(self) -> list[int]:
-        """For an event loop that calls ``step`` when one becomes readable."""
-        return [socket.file_descriptor for socket in self._handlers]
-
     def step(self, timeout_s: float) -> None:
         """Handle what has arrived, waiting up to the timeout, then tick."""
-        for socket in self._poller.wait(timeout_s):
+        for socket in self.wait(timeout_s):
             handlers = self._handlers.get(socket)
             if handlers is None:  # closed by a handler in this round
                 continue
@@ -168,25 +182,22 @@ class Service:
         self.beat_if_due()
 
     def beat_if_due(self) -> None:
-        """Say that this loop is alive; for the midst of long work, too."""
+        """Send a heartbeat if one is due; also called in the midst of long work."""
         now_s = time.monotonic()
         if now_s >= self._beat_due_s:
             self._beat_due_s = now_s + HEARTBEAT_S
             self._beat()
 
-    def request_stop(self) -> None:
-        """End the loop after what is under way."""
-        self._stop_requested = True
-
     @property
     def stopping(self) -> bool:
-        """Whether the end was asked for; the supervisor's death counts as asking."""
+        """Whether the loop is to end: by request, or because the supervisor is gone."""
         parent = os.environ.get(PARENT_VARIABLE)
         return self._stop_requested or (parent is not None and os.getppid() != int(parent))
 
     def run(self) -> None:
         """Run until a signal asks for the end, then drain."""
         self._install_signals()
+        self.on_start()
         gc.collect()
         gc.freeze()  # a full collection would stop the loop for 100 ms
         self.announce_ready()
@@ -195,12 +206,12 @@ class Service:
         self.drain()
 
     def announce_ready(self) -> None:
-        """Register with control and say so."""
+        """Register with control and log it."""
         self._beat()
         LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
 
     def drain(self) -> None:
-        """Finish what is under way within the deadline and close every socket."""
+        """Finish work in progress within the deadline and close every socket."""
         deadline_s = time.monotonic() + DRAIN_LIMIT_S
         self._stop_requested = True
         while not self.on_drain() and time.monotonic() < deadline_s:
@@ -228,16 +239,21 @@ class Service:
         if isinstance(message, BadMessage):
             self.warn(message.reason, f"dropped a message: {message}")
             if received.sender:
-                socket.send(Error(code="bad-message", text=str(message)[:2000]), to=received.sender)
+                answer = Error(
+                    version=message.version,  # so that a client of another version can read it
+                    code=ErrorCode.BAD_MESSAGE,
+                    text=str(message)[:2000],
+                )
+                socket.send(answer, to=received.sender)
             return
         handler = handlers.get(type(message))
         if handler is None:
             self.warn("unexpected", f"dropped a {message.kind} message: not expected here")
             if received.sender:
                 text = f"{message.kind} is not understood on this socket"
-                socket.send(Error(code="bad-message", text=text), to=received.sender)
+                socket.send(Error(code=ErrorCode.BAD_MESSAGE, text=text), to=received.sender)
             return
-        self.metrics.count(f"in_{message.kind}")
+        self.metrics.count(f"in_{message.kind.replace('-', '_')}")
         handler(message, received.sender)
 
     def _beat(self) -> None:
@@ -245,6 +261,11 @@ class Service:
             Heartbeat(
                 service=self.name,
                 instance=self.instance,
+                role=self.role,
+                needs=list(self.needs),
+                language=self.language,
+                frame_rate_hz=self.frame_rate_hz,
+                delay_ms=self.delay_ms,
                 state="draining" if self._stop_requested else "ready",
                 sent_ns=now_ns(),
                 endpoints=self.endpoints,
@@ -253,7 +274,7 @@ class Service:
                     "cpu_s": time.process_time(),
                     "clock_offset_ms": -self.clock_offset.offset_ms,
                 },
-                idle_s=self.idle_s(),
+                sessions=self.session_inputs(),
             )
         )
 
@@ -269,16 +290,18 @@ class Service:
         except UserError as error:
             self.warn("start", str(error), start.session)
             if self.control is not None:
-                self.control.send(Error(session=start.session, code="timeout", text=str(error)))
+                self.control.send(
+                    Error(session=start.session, code=ErrorCode.TIMEOUT, text=str(error))
+                )
 
     def _on_error(self, error: Error, _sender: bytes) -> None:
-        self.warn(error.code, f"control says: {error.text}", error.session)
+        self.warn(error.code, f"control: {error.text}", error.session)
 
 
 def run_service(make: Callable[[], Service], section: str, log_level: str) -> int:
     """Make a service and run it to its end; return the exit status.
 
-    A user's mistake is one line and status 2, an internal error a traceback and status 1.
+    A user's mistake gives one line and status 2, an internal error a traceback and status 1.
     """
     configure(section, log_level)
     try:
@@ -288,6 +311,6 @@ def run_service(make: Callable[[], Service], section: str, log_level: str) -> in
         return 2
     try:
         service.run()
-    except UserError as error:  # not the user's: nothing was typed; the supervisor starts it again
+    except UserError as error:  # while running it is no mistake of the user: crash and restart
         raise RuntimeError(str(error)) from error
     return 0

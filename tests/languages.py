@@ -1,63 +1,77 @@
-"""Languages of units for tests: tables of n-grams, what the formula makes of them, their trees."""
+"""Languages for tests: an installed one, and phone language models as tables, trees and graphs."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.unit_language import NUM_UNITS, Graph, UnitLanguage
-from shared.phones import UNIT_INDEX
+from services.recognizer.search.phone_lm import Graph, PhoneLanguageModel
+from shared.phones.inventory import PhoneInventory, load_inventory
 
-SIL = UNIT_INDEX["sil"]
+MANDARIN = load_inventory("mandarin")
+NUM_PHONES = len(MANDARIN)
+SIL = MANDARIN.index[MANDARIN.silence]
 START = 1 + SIL  # the context after a pause, among the graph's
 
 Gram = tuple[int, ...]
 
 
+def install_language(folder: Path, name: str, package: str) -> None:
+    """Write what a package index's tools leave behind when they install a language."""
+    distribution = folder / f"kouxing_{name}-1.0.dist-info"
+    distribution.mkdir()
+    (distribution / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: kouxing-{name}\nVersion: 1.0\n"
+    )
+    (distribution / "entry_points.txt").write_text(f"[kouxing.languages]\n{name} = {package}\n")
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Log shares of n-grams, and log back-offs of those that others begin with."""
+    """Log-probabilities of n-grams, and log back-off weights of contexts."""
 
-    log_share: dict[Gram, float]
-    log_back_off: dict[Gram, float]
+    log_prob: dict[Gram, float]
+    log_backoff: dict[Gram, float]
 
     @classmethod
     def draw(
-        cls, rng: np.random.Generator, units: Sequence[int], *, order: int, kept: float = 1.0
+        cls, rng: np.random.Generator, phones: Sequence[int], *, order: int, kept: float = 1.0
     ) -> Table:
-        """Draw numbers for all single units, and for a part of the longer n-grams of some."""
-        grams: list[Gram] = [(unit,) for unit in range(NUM_UNITS)]
-        level: list[Gram] = [(unit,) for unit in units]
+        """Draw numbers for all single phones, and for a part of the longer n-grams of some."""
+        grams: list[Gram] = [(phone,) for phone in range(NUM_PHONES)]
+        level: list[Gram] = [(phone,) for phone in phones]
         for _ in range(order - 1):
             level = [
-                (*gram, unit)
-                for gram, unit in itertools.product(level, units)
+                (*gram, phone)
+                for gram, phone in itertools.product(level, phones)
                 if (len(gram) == 1 or gram[-1] != SIL) and rng.random() < kept
             ]
             grams += level
-        contexts = {gram[:-1] for gram in grams} | set(grams[:NUM_UNITS])
+        contexts = {gram[:-1] for gram in grams} | set(grams[:NUM_PHONES])
         return cls(
             {gram: -float(rng.exponential(2.0)) for gram in grams},
             {gram: float(rng.normal(-1.0, 1.0)) for gram in contexts},
         )
 
     @classmethod
-    def of(cls, language: UnitLanguage) -> Table:
+    def of(cls, language: PhoneLanguageModel) -> Table:
         """Read a tree."""
         grams: list[Gram] = [()]
         for node, num_children in enumerate(language.num_children.tolist()):
             first = len(grams)
-            units = language.unit[first : first + num_children].tolist()
-            grams += [(*grams[node], unit) for unit in units]
+            phones = language.phone[first : first + num_children].tolist()
+            grams += [(*grams[node], phone) for phone in phones]
         return cls(
-            dict(zip(grams[1:], language.log_share[1:].tolist(), strict=True)),
+            dict(zip(grams[1:], language.log_prob[1:].tolist(), strict=True)),
             {
-                gram: float(language.log_back_off[node])
+                gram: float(language.log_backoff[node])
                 for node, gram in enumerate(grams)
                 if language.num_children[node] or len(gram) == 1
             },
@@ -65,52 +79,54 @@ class Table:
 
     @property
     def order(self) -> int:
-        """Units in the longest n-gram."""
-        return max(map(len, self.log_share))
+        """Phones in the longest n-gram."""
+        return max(map(len, self.log_prob))
 
-    def after(self, said: Gram, unit: int) -> float:
-        """Log share of a unit after all that was said: the formula itself."""
-        if SIL in said:
-            said = said[len(said) - 1 - said[::-1].index(SIL) :]
-        return self._after(said[max(0, len(said) - self.order + 1) :], unit)
+    def after(self, before: Gram, phone: int) -> float:
+        """Log-probability of a phone after all before it: the formula itself."""
+        if SIL in before:
+            before = before[len(before) - 1 - before[::-1].index(SIL) :]
+        return self._after(before[max(0, len(before) - self.order + 1) :], phone)
 
-    def _after(self, context: Gram, unit: int) -> float:
-        if (*context, unit) in self.log_share:
-            return self.log_share[*context, unit]
-        return self.log_back_off.get(context, 0.0) + self._after(context[1:], unit)
+    def _after(self, context: Gram, phone: int) -> float:
+        if (*context, phone) in self.log_prob:
+            return self.log_prob[*context, phone]
+        return self.log_backoff.get(context, 0.0) + self._after(context[1:], phone)
 
-    def tree(self) -> UnitLanguage:
+    def tree(self, inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
         """Lay the table out as a tree."""
-        grams: list[Gram] = [(), *sorted(self.log_share, key=lambda gram: (len(gram), gram))]
+        grams: list[Gram] = [(), *sorted(self.log_prob, key=lambda gram: (len(gram), gram))]
         num_children = Counter(gram[:-1] for gram in grams[1:])
-        return UnitLanguage(
+        return PhoneLanguageModel(
+            inventory=inventory,
             num_children=np.array([num_children[gram] for gram in grams], np.uint8),
-            unit=np.array([gram[-1] if gram else 0 for gram in grams], np.uint8),
-            log_share=np.array([self.log_share.get(gram, 0) for gram in grams], np.float32),
-            log_back_off=np.array([self.log_back_off.get(gram, 0) for gram in grams], np.float32),
+            phone=np.array([gram[-1] if gram else 0 for gram in grams], np.uint8),
+            log_prob=np.array([self.log_prob.get(gram, 0) for gram in grams], np.float32),
+            log_backoff=np.array([self.log_backoff.get(gram, 0) for gram in grams], np.float32),
         )
 
 
-def flat_language() -> UnitLanguage:
-    """Make every unit as likely as any other, whatever was said."""
-    shares: dict[Gram, float] = {(unit,): -float(np.log(NUM_UNITS)) for unit in range(NUM_UNITS)}
-    return Table(shares, {}).tree()
+def flat_language(inventory: PhoneInventory = MANDARIN) -> PhoneLanguageModel:
+    """Make every phone as likely as any other, whatever came before."""
+    num_phones = len(inventory)
+    log_probs: dict[Gram, float] = {(phone,): -math.log(num_phones) for phone in range(num_phones)}
+    return Table(log_probs, {}).tree(inventory)
 
 
-def random_language(rng: np.random.Generator) -> UnitLanguage:
-    """Draw a small language."""
+def random_language(rng: np.random.Generator) -> PhoneLanguageModel:
+    """Draw a small phone language model."""
     return Table.draw(rng, [0, 21, 30, SIL], order=3).tree()
 
 
-def step(graph: Graph, context: int, unit: int) -> tuple[float, int]:
-    """Log share of a unit after a context, and the context it leads to, as the graph has them."""
+def step(graph: Graph, context: int, phone: int) -> tuple[float, int]:
+    """Log-probability of a phone after a context, and the next context, by the graph."""
     total = 0.0
     while True:
         arcs = slice(graph.first_arc[context], graph.first_arc[context + 1])
-        units: NDArray[np.uint8] = graph.arc_unit[arcs]
-        at = int(np.searchsorted(units, unit))
-        if at < len(units) and units[at] == unit:
+        phones: NDArray[np.uint8] = graph.arc_phone[arcs]
+        at = int(np.searchsorted(phones, phone))
+        if at < len(phones) and phones[at] == phone:
             arc = int(graph.first_arc[context]) + at
-            return total + float(graph.arc_log_share[arc]), int(graph.arc_context[arc])
-        total += float(graph.log_back_off[context])
-        context = int(graph.shorter[context])
+            return total + float(graph.arc_log_prob[arc]), int(graph.arc_context[arc])
+        total += float(graph.log_backoff[context])
+        context = int(graph.backoff_state[context])

@@ -1,25 +1,74 @@
-"""Made-up speakers with tracked lips."""
+"""Made-up speakers with tracked lips, and faces that ship."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.visemes import MOUTH_FAPS
-from shared.phones import Phone
-from training.lip_clips import LipClip
+from corpora.lip_clips import LipClip
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.face import Face, Frame
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes, VisemeArticulation
+from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from services.synthesizer.lips.lip_model import Articulation
+from services.synthesizer.modifiers.modifier import Moment
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import Phone, Progress
+from shared.phones.inventory import load_inventory
 
+INVENTORY = load_inventory()
+LIPS = DynamicVisemes(load_parameters(), INVENTORY)
+DELAY_S = SynthesizerConfig().delay_ms / 1e3
+SILENT_DB = -120.0
 JAW, LOWER_LIP, WIDTH = (MOUTH_FAPS.index(fap) for fap in (3, 5, 6))
 
 
-def utterance(seed: int, num_units: int) -> list[Phone]:
+def make_face(
+    *, delay_s: float = DELAY_S, frame_rate_hz: float = 50.0, idle_motion_seed: int = 0
+) -> Face:
+    return Face(
+        LIPS, frame_rate_hz=frame_rate_hz, delay_s=delay_s, idle_motion_seed=idle_motion_seed
+    )
+
+
+def advance(face: Face, time_s: float) -> list[Frame]:
+    """Let a silent sound go on up to a time; return the frames that are due."""
+    return face.accept(Progress(time_s=time_s, level_db=SILENT_DB))
+
+
+def moment(
+    time_s: float,
+    articulation: Articulation | None = None,
+    levels: Sequence[tuple[float, float]] = (),
+    step_s: float = 0.02,
+) -> Moment:
+    """What modifiers are told while somebody speaks, by default nothing that is known."""
+    return Moment(
+        time_s=time_s,
+        known_s=time_s,
+        elapsed_s=time_s,
+        step_s=step_s,
+        is_speaking=True,
+        levels=levels,
+        articulation=articulation or articulation_of(()),
+    )
+
+
+def articulation_of(phones: Sequence[Phone]) -> VisemeArticulation:
+    return VisemeArticulation(build_timeline(phones, INVENTORY), LIPS.parameters.level_db)
+
+
+def utterance(seed: int, num_phones: int) -> list[Phone]:
     rng = np.random.default_rng(seed)
     onset_s, phones = 0.3, []
-    for index in range(num_units):
-        unit = str(rng.choice(["d", "g", "sh", "b"] if index % 2 == 0 else ["a", "i", "u"]))
+    for index in range(num_phones):
+        symbol = str(rng.choice(["d", "g", "sh", "b"] if index % 2 == 0 else ["a", "i", "u"]))
         duration_s = float(rng.uniform(0.06, 0.25))
         phones.append(
             Phone(
                 index=index,
-                unit=unit,
+                symbol=symbol,
                 onset_s=onset_s,
                 duration_s=duration_s,
                 confidence=1.0,
@@ -35,7 +84,9 @@ def clip_of(time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> LipClip:
         name="made_up",
         speaker="nobody",
         licence="CC0",
+        language="zh",
         part="held",
+        is_in_sync=True,
         transcript="",
         time_s=time_s,
         faps=faps,

@@ -4,14 +4,44 @@ from __future__ import annotations
 
 import numpy as np
 
-from shared import messages as m
+from shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from shared.wire.control import (
+    Event,
+    FlushNow,
+    Heartbeat,
+    HeartbeatSeen,
+    Recorded,
+    ServiceState,
+    SessionInput,
+    SessionState,
+    StartSession,
+    StatusReport,
+    StatusRequest,
+    StopSession,
+    UseLips,
+)
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.session import (
+    ChooseLips,
+    CloseSession,
+    Done,
+    Error,
+    FlushSession,
+    Joined,
+    OpenSession,
+    SessionMoved,
+    SessionOpened,
+)
+from shared.wire.speech import Acknowledge, EndOfPhones, Lips, Phone, Progress, Speech
 
 COMMON = {"session": "demo", "epoch": 1, "sequence": 7, "media_time": 16000}
 FAPS = np.arange(68, dtype="<f4").tobytes()
+MOUTH = np.arange(28, dtype="<f4").tobytes()
 
-SAMPLES: tuple[m.Message, ...] = (
-    m.OpenSession(session="demo", request="r1", sample_rate_hz=48000, num_channels=2, record=True),
-    m.SessionOpened(
+SAMPLES: tuple[Message, ...] = (
+    OpenSession(session="demo", request="r1", sample_rate_hz=48000, num_channels=2, record=True),
+    SessionOpened(
         session="demo",
         request="r1",
         token="t",
@@ -19,16 +49,28 @@ SAMPLES: tuple[m.Message, ...] = (
         phones="tcp://127.0.0.1:5561",
         faps="tcp://127.0.0.1:5571",
         events="tcp://127.0.0.1:5551",
+        language="mandarin",
+        frame_rate_hz=50.0,
     ),
-    m.CloseSession(session="demo", request="r2", token="t"),
-    m.FlushSession(session="demo", request="r3", token="t"),
-    m.StatusRequest(request="r4"),
-    m.StatusReport(
+    SessionMoved(
+        session="demo",
+        epoch=2,
+        audio="tcp://127.0.0.1:5562",
+        phones="tcp://127.0.0.1:5563",
+        faps="tcp://127.0.0.1:5571",
+        next_sequence=101,
+    ),
+    CloseSession(session="demo", request="r2", token="t"),
+    FlushSession(session="demo", request="r3", token="t"),
+    ChooseLips(session="demo", request="r3", token="t", lips="learnt"),
+    StatusRequest(request="r4"),
+    StatusReport(
         request="r4",
         services=[
-            m.ServiceState(
+            ServiceState(
                 service="recognizer",
                 instance="recognizer-1",
+                role="worker",
                 state="ready",
                 age_s=0.25,
                 clock_offset_ms=-1.5,
@@ -37,29 +79,32 @@ SAMPLES: tuple[m.Message, ...] = (
             )
         ],
         sessions=[
-            m.SessionState(
+            SessionState(
                 session="demo",
                 state="open",
                 age_s=2.0,
                 speaking=True,
-                recognizer="recognizer-1",
-                synthesizer="synthesizer-1",
+                endpoints={"audio": "tcp://127.0.0.1:5560"},
+                workers={"audio": "recognizer-1"},
             )
         ],
     ),
-    m.Done(session="demo", request="r2"),
-    m.Error(session="demo", code="unknown-session", text="there is no session", request="r2"),
-    m.Heartbeat(
+    Done(session="demo", request="r2"),
+    Error(session="demo", code="unknown-session", text="there is no session", request="r2"),
+    Heartbeat(
         service="recognizer",
         instance="recognizer-1",
+        role="worker",
         state="ready",
         sent_ns=1_700_000_000_000_000_000,
         endpoints={"audio": "tcp://127.0.0.1:5560"},
-        metrics={"in_audio": 3.0},
-        idle_s={"demo": 0.5},
+        needs=["phone_input"],
+        language="mandarin",
+        metrics={"in_audio_chunk": 3.0},
+        sessions={"demo": SessionInput(idle_s=0.5, sequence=100)},
     ),
-    m.HeartbeatSeen(sent_ns=1, received_ns=2, replied_ns=3),
-    m.StartSession(
+    HeartbeatSeen(sent_ns=1, received_ns=2, replied_ns=3),
+    StartSession(
         session="demo",
         epoch=1,
         request="start-demo-1",
@@ -69,30 +114,32 @@ SAMPLES: tuple[m.Message, ...] = (
         num_channels=1,
         record=False,
         paced=True,
-        phone_input="tcp://127.0.0.1:5570",
-        phones="tcp://127.0.0.1:5561",
-        faps="tcp://127.0.0.1:5571",
+        language="mandarin",
+        endpoints={"phone_input": "tcp://127.0.0.1:5570"},
+        delay_ms=160.0,
     ),
-    m.StopSession(session="demo", epoch=1),
-    m.FlushNow(session="demo", epoch=1),
-    m.Recorded(session="demo", path="out/demo.mp4", num_images=150, duration_s=6.0),
-    m.Event(session="demo", number=4, sequence=4, name="recorded", detail="out/demo.mp4"),
-    m.AudioChunk(**COMMON, token="t", pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
-    m.EndOfAudio(**COMMON, token="t"),  # type: ignore[arg-type]
-    m.Sound(**COMMON, pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
-    m.Speech(**COMMON, active=True),  # type: ignore[arg-type]
-    m.PhoneHeard(
+    StopSession(session="demo", epoch=1),
+    FlushNow(session="demo", epoch=1),
+    UseLips(session="demo", epoch=1, lips="learnt"),
+    Recorded(session="demo", path="out/demo.mp4", num_images=150, duration_s=6.0),
+    Event(session="demo", number=4, sequence=4, name="recorded", detail="out/demo.mp4"),
+    AudioChunk(**COMMON, token="t", pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
+    EndOfAudio(**COMMON, token="t"),  # type: ignore[arg-type]
+    Sound(**COMMON, pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
+    Speech(**COMMON, active=True),  # type: ignore[arg-type]
+    Phone(
         **COMMON,  # type: ignore[arg-type]
         index=3,
-        unit="iang",
+        symbol="iang",
         duration=1600,
         confidence=0.5,
         final=False,
     ),
-    m.Progress(**COMMON, level_db=-20.5),  # type: ignore[arg-type]
-    m.EndOfPhones(**COMMON),  # type: ignore[arg-type]
-    m.Acknowledge(**COMMON),  # type: ignore[arg-type]
-    m.FapFrame(**COMMON, values=FAPS, mask=bytes([252] + [255] * 7 + [15])),  # type: ignore[arg-type]
-    m.EndOfFaps(**COMMON),  # type: ignore[arg-type]
-    m.Joined(session="demo", publisher="p1"),
+    Lips(**COMMON, values=MOUTH, delay=960, closure=0.75, lip_to_teeth=0.125),  # type: ignore[arg-type]
+    Progress(**COMMON, level_db=-20.5),  # type: ignore[arg-type]
+    EndOfPhones(**COMMON),  # type: ignore[arg-type]
+    Acknowledge(**COMMON),  # type: ignore[arg-type]
+    FapFrame(**COMMON, values=FAPS, mask=bytes([252] + [255] * 7 + [15])),  # type: ignore[arg-type]
+    EndOfFaps(**COMMON),  # type: ignore[arg-type]
+    Joined(session="demo", publisher="p1"),
 )

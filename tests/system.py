@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Self
 
+from services.kinds import free_addresses
 from shared.client import Client
+from shared.config import variable
 from shared.errors import UserError
+from shared.wire.control import StatusReport
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
-BINDS = {
-    "control": ("COMMANDS", "EVENTS"),
-    "recognizer": ("AUDIO", "PHONES"),
-    "synthesizer": ("PHONES", "FAPS"),
-    "driver": (),
-    "gateway": (),
-}
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
 
 
@@ -36,21 +33,17 @@ def free_port(host: str = "127.0.0.1") -> int:
 
 def own_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which all services run on ports of their own, driver headless."""
-    environment = {
-        **os.environ,
-        **ONE_THREAD,
-        "KOUXING_GATEWAY_PORT": str(free_port()),
+    return {**os.environ, **ONE_THREAD, **headless(folder), **free_addresses()}
+
+
+def headless(folder: Path) -> dict[str, str]:
+    """Return the settings of a driver that has no window and writes small videos."""
+    return {
         "KOUXING_DRIVER_VIEW": "none",
         "KOUXING_DRIVER_OUT": str(folder),
         "KOUXING_DRIVER_WIDTH_PX": "320",
         "KOUXING_DRIVER_HEIGHT_PX": "240",
     }
-    for service, keys in BINDS.items():
-        for key in keys:
-            endpoint = f"tcp://127.0.0.1:{free_port()}"
-            environment[f"KOUXING_{service.upper()}_{key}"] = endpoint
-    environment["KOUXING_CONTROL"] = environment["KOUXING_CONTROL_COMMANDS"]
-    return environment
 
 
 def kouxing(
@@ -87,31 +80,19 @@ class System:
         hosts: dict[str, str] | None = None,
         settings: dict[str, str] | None = None,
     ) -> None:
-        hosts = hosts or {}
         self.folder = folder
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._services = list(services)
+        addresses = free_addresses(self._services, hosts)
+        self.ports = {int(address.rpartition(":")[2]) for address in addresses.values()}
         self.environment = {
             **os.environ,
             **ONE_THREAD,
-            "KOUXING_DRIVER_VIEW": "none",
-            "KOUXING_DRIVER_OUT": str(folder),
-            "KOUXING_DRIVER_WIDTH_PX": "320",
-            "KOUXING_DRIVER_HEIGHT_PX": "240",
+            **headless(folder),
+            **addresses,
+            **(settings or {}),
         }
-        self.ports: dict[str, int] = {}
-        for service in self._services:
-            host = hosts.get(service, "127.0.0.1")
-            for key in BINDS[service]:
-                port = self.ports[f"{service}.{key.lower()}"] = free_port(host)
-                variable = f"KOUXING_{service.upper()}_{key}"
-                self.environment[variable] = f"tcp://{host}:{port}"
-        if "gateway" in self._services:
-            self.ports["gateway"] = free_port()
-            self.environment["KOUXING_GATEWAY_PORT"] = str(self.ports["gateway"])
-        self.control = self.environment["KOUXING_CONTROL_COMMANDS"]
-        self.environment["KOUXING_CONTROL"] = self.control
-        self.environment.update(settings or {})
+        self.control = self.environment["KOUXING_CONTROL"]
 
     def __enter__(self) -> Self:
         try:
@@ -135,31 +116,43 @@ class System:
                 process.wait()
                 raise AssertionError(f"{service} did not stop: {self.log(service)}") from None
 
-    def start(self, service: str) -> None:
-        with (self.folder / f"{service}.log").open("ab") as log:
-            self.processes[service] = subprocess.Popen(
+    def start(self, service: str, name: str = "", **settings: str) -> None:
+        """Start a service, under another name if one of its kind runs already."""
+        name = name or service
+        with (self.folder / f"{name}.log").open("ab") as log:
+            self.processes[name] = subprocess.Popen(
                 [sys.executable, "-m", f"services.{service}"],
-                env=self.environment,
+                env={**self.environment, **settings},
                 cwd=ROOT,
                 stderr=log,
                 stdout=log,
             )
 
+    def start_beside(self, service: str, name: str) -> None:
+        """Start one more service of a kind that runs already and wait until control knows it."""
+        addresses = free_addresses([service])
+        self.start(service, name, **addresses, **{variable(service, "instance"): name})
+        self.wait_until(lambda report: name in {state.instance for state in report.services})
+
     def log(self, service: str) -> str:
         return (self.folder / f"{service}.log").read_text(encoding="utf-8")
 
-    def wait_ready(self, deadline_s: float = 60.0) -> None:
+    def wait_ready(self) -> None:
+        self.wait_until(
+            lambda report: {state.service for state in report.services} >= set(self.processes)
+        )
+
+    def wait_until(
+        self, condition: Callable[[StatusReport], bool], deadline_s: float = 60.0
+    ) -> None:
+        """Wait until control reports what is wanted; no service may end meanwhile."""
         end_s = time.monotonic() + deadline_s
         with Client(self.control, deadline_s=2.0) as client:
             while time.monotonic() < end_s:
-                for service, process in self.processes.items():
-                    assert process.poll() is None, f"{service} ended: {self.log(service)}"
-                try:
-                    alive = {state.service for state in client.status().services}
-                except UserError:
-                    continue
-                if alive >= set(self.processes):
-                    return
+                self.assert_all_alive()
+                with contextlib.suppress(UserError):  # control may not run yet
+                    if condition(client.status()):
+                        return
                 time.sleep(0.05)
         raise AssertionError("the services did not become ready")
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
+import ctypes.util
 import sys
 import time
 
 import glfw
 import numpy as np
 
-from services.driver.head import Head, neutral_faps
-from services.driver.render import Renderer
+from services.driver.config import DriverConfig
+from services.driver.head.head import Head, neutral_faps
+from services.driver.render.renderer import Renderer
+from services.driver.render.window import Window
 from services.driver.service import DriverService
-from services.driver.window import Window
-from shared.config import DriverConfig
 from tests.system import free_port
 
 
@@ -56,25 +58,98 @@ def size_and_close() -> None:
 def lost_stream() -> None:
     control = f"tcp://127.0.0.1:{free_port()}"  # nobody is there
     service = DriverService(DriverConfig(control=control, view="window", width_px=64, height_px=48))
-    window = service._window
+    window = service.view._window
     assert window is not None
     try:
-        service._faps = np.full(68, 100, np.float32)
         now_s = time.monotonic()
-        service._frame_s = now_s
-        assert service._shown(now_s + 0.5)[2] == 100
-        service._followers["demo"] = type("Follower", (), {"ended": False})()
-        assert 0 < service._shown(now_s + 1.2)[2] < 100
-        assert glfw.get_window_title(window._window) == "kouxing (no frames come)"
-        assert not service._shown(now_s + 2.0).any()
-        service._frame_s = now_s + 3.0
-        assert service._shown(now_s + 3.0)[2] == 100
-        assert glfw.get_window_title(window._window) == "kouxing"
+        service.poses.add("demo", now_s)
+        service.poses.accept_frame("demo", np.full(68, 100, np.float32), now_s)
+        service.on_tick(now_s + 0.5)
+        assert title(window) == "kouxing: demo"
+        service.on_tick(now_s + 1.2)
+        assert title(window) == "kouxing: demo (no frames come)"
+        service.poses.accept_frame("demo", np.full(68, 100, np.float32), now_s + 3.0)
+        service.on_tick(now_s + 3.0)
+        assert title(window) == "kouxing: demo"
+        service.poses.remove("demo")
+        service.on_tick(now_s + 3.1)
+        assert title(window) == "kouxing"
     finally:
-        service._followers.clear()
         window.close()
         service.bus.close()
 
 
+def switch() -> None:
+    steps: list[int] = []
+    window = Window(Head.load(detail="coarse"), 64, 48, on_switch=steps.append)
+    draw_until(window, (64, 48))
+    xlib = ctypes.CDLL(ctypes.util.find_library("X11"))
+    for key, modifiers in (("Tab", 0), ("Right", 0), ("Tab", SHIFT_MASK), ("Left", 0), ("a", 0)):
+        send_event(xlib, window, KEY_PRESS, key_code(xlib, key), modifiers)
+    send_event(xlib, window, BUTTON_PRESS, 1, 0)
+    for _ in range(1000):
+        assert window.draw(neutral_faps())
+        if len(steps) == 5:
+            break
+        time.sleep(0.02)
+    assert steps == [1, 1, -1, -1, 1]
+    window.close()
+
+
+KEY_PRESS, BUTTON_PRESS = 2, 4  # types of events, X.h
+SHIFT_MASK = 1
+
+
+class InputEvent(ctypes.Structure):
+    """An XKeyEvent; an XButtonEvent differs in the meaning of ``detail`` alone."""
+
+    _fields_ = (
+        ("type", ctypes.c_int),
+        ("serial", ctypes.c_ulong),
+        ("send_event", ctypes.c_int),
+        ("display", ctypes.c_void_p),
+        ("window", ctypes.c_ulong),
+        ("root", ctypes.c_ulong),
+        ("subwindow", ctypes.c_ulong),
+        ("time", ctypes.c_ulong),
+        ("place", ctypes.c_int * 4),
+        ("modifiers", ctypes.c_uint),
+        ("detail", ctypes.c_uint),
+        ("same_screen", ctypes.c_int),
+        ("rest_of_xevent", ctypes.c_long * 24),
+    )
+
+
+def key_code(xlib: ctypes.CDLL, name: str) -> int:
+    xlib.XStringToKeysym.restype = ctypes.c_ulong
+    symbol = ctypes.c_ulong(xlib.XStringToKeysym(name.encode()))
+    code: int = xlib.XKeysymToKeycode(display(), symbol)
+    return code
+
+
+def send_event(xlib: ctypes.CDLL, window: Window, kind: int, detail: int, modifiers: int) -> None:
+    """Send a key or a mouse button to the window, as the X server does."""
+    target = glfw.get_x11_window(window._window)
+    event = InputEvent(
+        type=kind,
+        display=display(),
+        window=target,
+        modifiers=modifiers,
+        detail=detail,
+        same_screen=1,
+    )
+    xlib.XSendEvent(display(), ctypes.c_ulong(target), 1, ctypes.c_long(0), ctypes.byref(event))
+    xlib.XFlush(display())
+
+
+def display() -> ctypes.c_void_p:
+    return ctypes.c_void_p(glfw.get_x11_display())  # type: ignore[no-untyped-call]
+
+
+def title(window: Window) -> str:
+    text: str = glfw.get_window_title(window._window)
+    return text
+
+
 if __name__ == "__main__":
-    {"size_and_close": size_and_close, "lost_stream": lost_stream}[sys.argv[1]]()
+    {"size_and_close": size_and_close, "lost_stream": lost_stream, "switch": switch}[sys.argv[1]]()

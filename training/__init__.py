@@ -1,3 +1,3 @@
-"""Training of models; never imported by a service."""
+"""Training of models; never imported by a service, nor by the evaluation."""
 
-SYNTHETIC_WEIGHT = 0.3  # of synthetic against real speech; chosen on development data
+SYNTHETIC_WEIGHT = 0.3  # relative to real speech; chosen on development data

@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from services.terminal import check_output
+from services.cli.terminal import check_output
 from shared.errors import UserError
+from shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from training import SYNTHETIC_WEIGHT
 
-app = typer.Typer(no_args_is_help=True, help="Train the models.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
 Corpora = Annotated[
     list[Path],
@@ -19,67 +20,84 @@ Corpora = Annotated[
 ]
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
-SyntheticWeight = Annotated[float, typer.Option(help="Of synthetic against real speech.")]
-Language = Annotated[
+SyntheticWeight = Annotated[
+    float, typer.Option(help="Weight of synthetic relative to real speech.")
+]
+Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
+PhoneLm = Annotated[
     Path | None,
-    typer.Option(help="From `kouxing train language`, or a model whose language to use."),
+    typer.Option(help="Phone language model: from `kouxing train phone-lm`, or another model's."),
 ]
 AnyLicence = Annotated[
-    bool, typer.Option("--any-licence", help="Also take rows that forbid giving the model away.")
+    bool,
+    typer.Option("--any-licence", help="Also use rows that forbid giving the model away."),
 ]
 
 
 @app.command()
-def language(
+def phone_lm(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write (.npz).")],
     corpus: Annotated[
-        list[Path] | None, typer.Option("--corpus", help="Its sentences count; repeat for several.")
+        list[Path] | None,
+        typer.Option("--corpus", help="Corpus with sentences to count; repeat for several."),
     ] = None,
     text: Annotated[
-        list[Path] | None, typer.Option("--text", help="Chinese text, UTF-8; repeat for several.")
+        list[Path] | None, typer.Option("--text", help="Text file, UTF-8; repeat for several.")
     ] = None,
     ngrams: Annotated[
-        Path | None, typer.Option(help="Output of `tslminfo -v`: words are drawn from it.")
+        Path | None, typer.Option(help="Output of `tslminfo -v`, to draw words from.")
     ] = None,
     dictionary: Annotated[
         Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, the words of the n-grams.")
     ] = None,
     words: Annotated[int, typer.Option(min=1, help="Words to draw.")] = 30_000_000,
-    order: Annotated[int, typer.Option(min=2, max=10, help="Units in the longest n-grams.")] = 6,
-    most: Annotated[int, typer.Option(min=1000, help="N-grams to keep, about.")] = 1_000_000,
+    order: Annotated[int, typer.Option(min=2, max=10, help="Phones in the longest n-grams.")] = 6,
+    max_ngrams: Annotated[int, typer.Option(min=1000, help="N-grams to keep, about.")] = 1_000_000,
+    language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
 ) -> None:
-    """Count what follows what in texts, for the recognizers' search."""
-    from training.open_gram import drawn_units
-    from training.unit_language import train_language
+    """Train a phone language model on texts, for the recognizers' search."""
+    from training.phone_lm.open_gram import draw_phones
+    from training.phone_lm.recipe import train_phone_lm
 
     check_output(output)
     if (ngrams is None) != (dictionary is None):
         raise UserError("--ngrams and --dictionary belong together; give both or neither")
+    inventory = load_inventory(language)
     drawn = None
     if ngrams and dictionary:
-        drawn = drawn_units(ngrams, dictionary, num_words=words, seed=seed)
-    train_language(corpus or [], text or [], output, drawn=drawn, order=order, most=most)
+        drawn = draw_phones(ngrams, dictionary, inventory, num_words=words, seed=seed)
+    train_phone_lm(
+        corpus or [],
+        text or [],
+        output,
+        inventory,
+        drawn=drawn,
+        order=order,
+        max_ngrams=max_ngrams,
+    )
 
 
 @app.command()
 def gmm(
     corpus: Corpora,
     output: Model,
-    language: Language = None,
+    phone_lm: PhoneLm = None,
+    language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
-    mixtures: Annotated[int, typer.Option(help="Gaussians a state, a power of two.")] = 32,
+    mixtures: Annotated[int, typer.Option(help="Gaussians per state, a power of two.")] = 32,
     synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the Gaussian mixture model of the paper; a model card is written beside it."""
-    from training.recipes import train_gmm
+    """Train the Gaussian mixture recognizer; a model card is written beside it."""
+    from training.gmm.recipe import train_gmm
 
     check_output(output)
     train_gmm(
         corpus,
         output,
-        language=language,
+        load_inventory(language),
+        phone_lm=phone_lm,
         seed=seed,
         num_mixtures=mixtures,
         synthetic_weight=synthetic_weight,
@@ -93,27 +111,27 @@ def neural(
     output: Model,
     aligner: Annotated[
         Path | None,
-        typer.Option(help="A model that aligns at first; without it the one of --start-from does."),
+        typer.Option(help="Model that aligns at first; without it --start-from aligns."),
     ] = None,
     whisper: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of Whisper base for faster-whisper: it teaches the network, which begins "
-            "with its weights."
+            help="Folder of Whisper base for faster-whisper: the teacher, and the network's first "
+            "weights."
         ),
     ] = None,
     start_from: Annotated[
         Path | None,
-        typer.Option(help="Begin with a neural model's network; without --whisper nobody teaches."),
+        typer.Option(help="Neural model to train further; without --whisper there is no teacher."),
     ] = None,
     untranscribed: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of recordings without text, in any language, of which --whisper says what "
-            "is heard; repeat for several."
+            help="Folder of recordings without text, in any language, which the teacher labels; "
+            "repeat for several."
         ),
     ] = None,
-    language: Language = None,
+    phone_lm: PhoneLm = None,
     seed: Seed = 0,
     look_ahead_ms: Annotated[
         float, typer.Option(help="The look-ahead to train for, in steps of 10 ms.")
@@ -121,10 +139,10 @@ def neural(
     steps: Annotated[int, typer.Option(min=1, help="Batches of 30 s of sound.")] = 800,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the neural model; a model card and the training curves are written beside it."""
+    """Train the neural recognizer; a model card and the training curves are written beside it."""
     check_output(output)
     try:
-        from training.neural_recipe import train_neural
+        from training.neural.recipe import train_neural
     except ModuleNotFoundError as error:
         raise UserError(
             f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
@@ -137,7 +155,7 @@ def neural(
         whisper=whisper,
         start=start_from,
         untranscribed=untranscribed or [],
-        language=language,
+        phone_lm=phone_lm,
         look_ahead_ms=look_ahead_ms,
         seed=seed,
         num_steps=steps,
@@ -147,12 +165,33 @@ def neural(
 
 @app.command()
 def visemes(
-    lips: Annotated[Path, typer.Option("--clips", help="Folder of tracked lips with sound.")],
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
     any_licence: AnyLicence = False,
 ) -> None:
-    """Learn the dynamic visemes' parameters from tracked lips."""
-    from training.visemes import train
+    """Train the dynamic visemes' parameters on tracked lips."""
+    from training.visemes.recipe import train_visemes
 
     check_output(output)
-    train(lips, output, any_licence=any_licence)
+    train_visemes(clips, output, any_licence=any_licence)
+
+
+@app.command()
+def lips(
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound, any languages.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
+    ] = Path("services/recognizer/models/lips.npz"),
+    seed: Seed = 0,
+    any_licence: AnyLicence = False,
+) -> None:
+    """Train lips from sound on tracked lips; a model card is written beside it."""
+    check_output(output)
+    try:
+        from training.lips.recipe import train_lips
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
+        ) from error
+
+    train_lips(clips, output, seed=seed, any_licence=any_licence)

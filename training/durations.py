@@ -1,77 +1,89 @@
-"""How long units last, by their place between two pauses, measured on forced alignments.
+"""Phone durations by position between two pauses, measured on forced alignments.
 
-Li et al. 2011 put a unit out live with the mean duration it has in the corpus. The last final
-before a pause is much longer than the same final inside a phrase (Klatt 1976, "Linguistic uses of
-segmental duration in English", found it for English; it holds in Mandarin too), so the statistics
-are kept apart by position.
+A live recognizer emits a phone before the phone has ended, with its mean duration in the corpus
+(Li et al. 2011). The last vowel before a pause is much longer than the same vowel inside a phrase
+(Klatt 1976, "Linguistic uses of segmental duration in English", found it for English; it holds in
+Mandarin too), so the statistics are kept per position.
 
-A position that a unit seldom has, such as an initial before a pause, leans on the unit's own mean:
+Some phones are rare in a position, such as an initial before a pause. Their statistics are smoothed
+towards the phone's own mean over all positions:
 
     mean[p, u] = (sum[p, u] + n0 * mean[u]) / (count[p, u] + n0)
 
-and the second moment likewise. Isolated words and syllables are drawn out: they count little, so
-that they only serve where there is no connected speech.
+and the second moment likewise. Isolated words and syllables are drawn out, so their weight is
+low: they matter only for phones that no connected speech contains.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic_model import FIRST, INSIDE, LAST, NUM_POSITIONS
-from services.recognizer.features import HOP_S
-from shared.phones import SILENCE, UNIT_INDEX, UNITS
+from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST, NUM_POSITIONS
+from services.recognizer.front_end.features import HOP_S
+from services.recognizer.search.decoder import Segment
+from shared.phones.inventory import PhoneInventory
 
-_SIL = UNIT_INDEX[SILENCE]
 _PRIOR_COUNT = 10.0  # n0
-_CONNECTED_UNITS = 8  # a recording of fewer units is a word, not connected speech
+_MIN_CONNECTED_PHONES = 8  # a recording with fewer phones is no connected speech
 _WORD_WEIGHT = 0.02
-_UNSEEN_FRAMES, _UNSEEN_SPREAD = 10.0, 5.0  # of a unit that no recording has
+_UNSEEN_MEAN_FRAMES, _UNSEEN_SPREAD_FRAMES = 10.0, 5.0  # for a phone in no recording
 
 
-@dataclass(frozen=True, slots=True)
-class AlignedUnit:
-    """A unit with its first frame and the frame after its last."""
+def positions_of(phones: Sequence[int], silence: int) -> list[int]:
+    """Position of each phone between the pauses around it; of a pause, within the recording.
 
-    unit: int
-    start: int
-    end: int
+    Parameters
+    ----------
+    phones
+        Indices of the phones, pauses included, in order.
+    silence
+        Index of the pause.
 
-
-def positions_of(units: Sequence[int]) -> list[int]:
-    """Position of each unit between the pauses around it; a pause's own is within the recording."""
+    Returns
+    -------
+    list of int
+        ``FIRST``, ``INSIDE`` or ``LAST`` for each phone.
+    """
     positions = []
-    for number, unit in enumerate(units):
-        before = units[number - 1] if number else None
-        after = units[number + 1] if number + 1 < len(units) else None
-        edges = (None,) if unit == _SIL else (None, _SIL)
+    for number, phone in enumerate(phones):
+        before = phones[number - 1] if number else None
+        after = phones[number + 1] if number + 1 < len(phones) else None
+        edges = (None,) if phone == silence else (None, silence)
         positions.append(LAST if after in edges else FIRST if before in edges else INSIDE)
     return positions
 
 
-class UnitDurations:
-    """Collects weighted durations of aligned units."""
+class PhoneDurations:
+    """Collects weighted durations of aligned phones."""
 
-    def __init__(self) -> None:
-        self._sums = np.zeros((3, NUM_POSITIONS, len(UNITS)))  # of 1, frames and frames^2
+    def __init__(self, inventory: PhoneInventory) -> None:
+        self._silence = inventory.index[inventory.silence]
+        # weighted sums of 1, frames and frames^2
+        self._sums = np.zeros((3, NUM_POSITIONS, len(inventory)))
 
-    def add(self, aligned: Sequence[AlignedUnit], weight: float) -> None:
-        """Take the units of one recording, pauses included, in order."""
-        positions = positions_of([unit.unit for unit in aligned])
-        if sum(unit.unit != _SIL for unit in aligned) < _CONNECTED_UNITS:
+    def add(self, aligned: Sequence[Segment], weight: float) -> None:
+        """Add the phones of one recording, pauses included, in order."""
+        phones = [segment.phone for segment in aligned]
+        if sum(phone != self._silence for phone in phones) < _MIN_CONNECTED_PHONES:
             weight *= _WORD_WEIGHT
-        for position, unit in zip(positions, aligned, strict=True):
-            frames = unit.end - unit.start
-            self._sums[:, position, unit.unit] += (weight, weight * frames, weight * frames**2)
+        positions = positions_of(phones, self._silence)
+        for position, segment in zip(positions, aligned, strict=True):
+            frames = segment.end - segment.start
+            self._sums[:, position, segment.phone] += (
+                weight,
+                weight * frames,
+                weight * frames**2,
+            )
 
     def mean_and_spread_s(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean and standard deviation of the durations, each of shape (3, 60), in seconds."""
-        unseen = (1.0, _UNSEEN_FRAMES, _UNSEEN_FRAMES**2 + _UNSEEN_SPREAD**2)
-        of_units = self._sums.sum(axis=1) + 1e-6 * np.array(unseen)[:, None]
-        prior = _PRIOR_COUNT * of_units / of_units[0]
+        """Mean and standard deviation of the durations, shape (3, num_phones) each, seconds."""
+        second_moment = _UNSEEN_MEAN_FRAMES**2 + _UNSEEN_SPREAD_FRAMES**2
+        unseen = np.array((1.0, _UNSEEN_MEAN_FRAMES, second_moment))
+        by_phone = self._sums.sum(axis=1) + 1e-6 * unseen[:, None]
+        prior = _PRIOR_COUNT * by_phone / by_phone[0]
         count, total, squares = self._sums + prior[:, None, :]
         mean = total / count
         spread = np.sqrt(np.maximum(squares / count - mean**2, 0.0))

@@ -1,9 +1,6 @@
 """Runs control as a process of its own."""
 
-import sys
-
-from services.command_line import main
+from services.process import run_module
 
 if __name__ == "__main__":
-    sys.argv.insert(1, "control")
-    main()
+    run_module("control")

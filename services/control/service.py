@@ -2,6 +2,11 @@
 
 Li et al. 2011, section 2: the control module initialises the others, passes messages between them
 and keeps them in step. Audio, phones and FAPs never pass through it.
+
+Reacts to: open-session, close-session, flush-session, status-request (clients), heartbeat, done,
+speech, recorded, error (services).
+Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
+start-session, stop-session, flush-now (services), event, session-moved (subscribers).
 """
 
 from __future__ import annotations
@@ -12,50 +17,56 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any
 
-from services.control.sessions import ENDPOINTS, REQUIRED, Refusal, Registry, SessionRecord
-from shared.bus import split_endpoint
+from services.control.config import ControlConfig
+from services.control.registry import Refusal, Registry
+from services.control.sessions import SessionRecord, Sessions
 from shared.clock import now_ns
-from shared.config import ControlConfig, reachable
+from shared.endpoints import reachable, split_endpoint
 from shared.errors import UserError
 from shared.logs import LOG
-from shared.messages import (
-    CloseSession,
-    Done,
-    Error,
+from shared.service import Handler, Service
+from shared.wire.control import (
     Event,
+    EventName,
     FlushNow,
-    FlushSession,
     Heartbeat,
     HeartbeatSeen,
-    Message,
-    OpenSession,
     Recorded,
     ServiceState,
-    SessionState,
-    Speech,
-    StartSession,
     StatusReport,
     StatusRequest,
     StopSession,
+    UseLips,
 )
-from shared.service import Handler, Service
+from shared.wire.message import Message
+from shared.wire.session import (
+    ChooseLips,
+    CloseSession,
+    Done,
+    Error,
+    ErrorCode,
+    FlushSession,
+    OpenSession,
+)
+from shared.wire.speech import Speech
 
-STOPPED = "stopped"  # why a service is gone that said goodbye
-START_LIMIT_S = 5.0  # for the services to take a session
-REPLACE_LIMIT_S = 20.0  # for a lost recognizer or synthesizer to come back
-Request = OpenSession | CloseSession | FlushSession | StatusRequest
-
-NUM_REMEMBERED = 1000  # answers kept for repeated requests
+STOPPED = "stopped"  # why a service that shut down in order is gone
+START_LIMIT_S = 5.0  # for the services to start a session
+REPLACE_LIMIT_S = 20.0  # for another worker to take the place of a lost one
+MAX_ANSWERS = 1000  # kept for repeated requests
+Request = OpenSession | CloseSession | FlushSession | ChooseLips | StatusRequest
 
 
 class ControlService(Service):
     """The control process."""
 
     name = "control"
+    role = "control"
 
     def __init__(self, config: ControlConfig) -> None:
         super().__init__(config, control=False)
-        self._registry = Registry(config.max_sessions, config.lost_after_s)
+        self._registry = Registry(config.lost_after_s)
+        self._sessions = Sessions(self._registry, config.max_sessions)
         self._idle_limit_s = config.idle_limit_s
         self._answers: OrderedDict[tuple[bytes, str], Message] = OrderedDict()
         self._num_events = 0
@@ -65,51 +76,52 @@ class ControlService(Service):
             "commands": reachable(self._commands.endpoint, config.advertise, "control.commands"),
             "events": reachable(self._events.endpoint, config.advertise, "control.events"),
         }
-        self.listen(
+        self.register(
             self._commands,
             {
-                OpenSession: self._answering(self._open),
-                CloseSession: self._answering(self._close),
-                FlushSession: self._answering(self._flush),
-                StatusRequest: self._answering(self._status),
+                OpenSession: self._request_handler(self._open),
+                CloseSession: self._request_handler(self._close),
+                FlushSession: self._request_handler(self._flush),
+                ChooseLips: self._request_handler(self._choose_lips),
+                StatusRequest: self._request_handler(self._status),
                 Heartbeat: self._on_heartbeat,
                 Done: self._on_started,
                 Speech: self._on_speech,
                 Recorded: self._on_recorded,
-                Error: self._on_error_from,
+                Error: self._on_service_error,
             },
         )
-        self.listen(self._events, {})
+        self.register(self._events, {})
 
     def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
         """Register control itself like any other service."""
-        self._registry.beat(heartbeat, b"", time.monotonic())
+        self._registry.add(heartbeat, b"", time.monotonic())
 
     def on_tick(self, now_s: float) -> None:
-        """Look for services that went silent and sessions that hang or idle."""
+        """Look for services without heartbeat and sessions that hang."""
         for instance in self._registry.silent(now_s):
-            self._service_gone(instance, "no heartbeat")
-        for record in list(self._registry.sessions.values()):
-            absent = [service for service in REQUIRED if not self._registry.serves(record, service)]
-            if absent and now_s - record.started_s > REPLACE_LIMIT_S:
-                self._end(record, f"the {' and the '.join(absent)} is lost")
-            elif not record.announced and not record.waiting_for:
-                self._announce(record)  # the last one that was waited for is gone
+            self._service_lost(instance, "no heartbeat")
+        for record in self._sessions:
+            lost = self._sessions.lost_workers(record)
+            if lost and now_s - record.started_s > REPLACE_LIMIT_S:
+                self._end(record, f"{', '.join(lost)} is lost and no other took its place")
             elif record.waiting_for and now_s - record.started_s > START_LIMIT_S:
                 self._give_up_waiting(record)
+            else:
+                self._announce_if_started(record)
 
     def on_drain(self) -> bool:
         """Close every session."""
-        for record in list(self._registry.sessions.values()):
+        for record in self._sessions:
             self._end(record, "control stops")
         return True
 
     # --- requests ------------------------------------------------------------------------------
 
-    def _answering(self, handle: Callable[[Any, bytes], Message | None]) -> Handler:
-        """Return a handler that answers: with the same words to a repeated request."""
+    def _request_handler(self, handle: Callable[[Any, bytes], Message | None]) -> Handler:
+        """Return a handler that repeats its answer when a request is repeated."""
 
-        def answer(message: Request, sender: bytes) -> None:
+        def on_request(message: Request, sender: bytes) -> None:
             remembered = self._answers.get((sender, message.request))
             if remembered is not None:
                 self._commands.send(remembered, to=sender)
@@ -128,31 +140,37 @@ class ControlService(Service):
             if reply is not None:
                 self._reply(sender, message.request, reply)
 
-        return answer
+        return on_request
 
     def _reply(self, sender: bytes, request: str, reply: Message) -> None:
         if not isinstance(reply, StatusReport):
             self._answers[sender, request] = reply
-            if len(self._answers) > NUM_REMEMBERED:
+            if len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
         self._commands.send(reply, to=sender)
 
     def _open(self, message: OpenSession, sender: bytes) -> None:
-        pending = self._registry.sessions.values()
-        if any((record.client, record.opening) == (sender, message) for record in pending):
-            return  # the same request again while its services start
-        record = self._registry.open(message, sender, time.monotonic())
+        if any((record.client, record.opening) == (sender, message) for record in self._sessions):
+            return  # the same request again while the services start
+        record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
         self._start(record)
 
     def _close(self, message: CloseSession, _sender: bytes) -> Message:
-        self._end(self._registry.owned(message.session, message.token), "closed by its client")
+        self._end(self._sessions.owned(message.session, message.token), "closed by its client")
         return Done(session=message.session, request=message.request)
 
     def _flush(self, message: FlushSession, _sender: bytes) -> Message:
-        record = self._registry.owned(message.session, message.token)
-        self._tell(record, FlushNow(session=record.name, epoch=record.epoch))
-        self._publish("session-flushed", record.name)
+        record = self._sessions.owned(message.session, message.token)
+        self._send_to_participants(record, FlushNow(session=record.name, epoch=record.epoch))
+        self._publish(EventName.SESSION_FLUSHED, record.name)
+        return Done(session=message.session, request=message.request)
+
+    def _choose_lips(self, message: ChooseLips, _sender: bytes) -> Message:
+        record = self._sessions.owned(message.session, message.token)
+        record.lips = message.lips
+        use = UseLips(session=record.name, epoch=record.epoch, lips=message.lips)
+        self._send_to_participants(record, use)
         return Done(session=message.session, request=message.request)
 
     def _status(self, message: StatusRequest, _sender: bytes) -> Message:
@@ -163,25 +181,16 @@ class ControlService(Service):
                 ServiceState(
                     service=record.heartbeat.service,
                     instance=instance,
+                    role=record.heartbeat.role,
                     state=record.heartbeat.state,
-                    age_s=now_s - record.heard_s,
+                    age_s=now_s - record.received_s,
                     clock_offset_ms=record.heartbeat.metrics.get("clock_offset_ms", 0.0),
                     endpoints=record.heartbeat.endpoints,
                     metrics=record.heartbeat.metrics,
                 )
-                for instance, record in sorted(self._registry.services.items())
+                for instance, record in self._registry.sorted()
             ],
-            sessions=[
-                SessionState(
-                    session=record.name,
-                    state="open" if record.announced else "starting",
-                    age_s=self._registry.age_s(record),
-                    speaking=record.speaking,
-                    recognizer=record.recognizer,
-                    synthesizer=record.synthesizer,
-                )
-                for record in self._registry.sessions.values()
-            ],
+            sessions=[self._sessions.state(record, now_s) for record in self._sessions],
         )
 
     # --- from the services ---------------------------------------------------------------------
@@ -191,149 +200,140 @@ class ControlService(Service):
         problem = _wrong_endpoints(heartbeat)
         if problem:
             self.warn("endpoints", f"{heartbeat.instance}: {problem}")
-            self._commands.send(Error(code="bad-message", text=problem), to=sender)
+            self._commands.send(Error(code=ErrorCode.BAD_MESSAGE, text=problem), to=sender)
             return
-        is_new = heartbeat.instance not in self._registry.services
+        if self._registry.differs(heartbeat):
+            self._service_lost(heartbeat.instance, "it started again")
+        is_new = heartbeat.instance not in self._registry
         if is_new and heartbeat.state == "draining":
             return
-        if is_new:
-            for instance in self._registry.displaced_by(heartbeat):
-                self._service_gone(instance, f"{heartbeat.instance} took its place")
-        self._registry.beat(heartbeat, sender, time.monotonic())
+        self._registry.add(heartbeat, sender, time.monotonic())
         self._commands.send(
             HeartbeatSeen(sent_ns=heartbeat.sent_ns, received_ns=received_ns, replied_ns=now_ns()),
             to=sender,
         )
         if is_new:
-            self._publish("service-ready", detail=f"{heartbeat.service} {heartbeat.instance}")
-            self._take_over(heartbeat)
+            self._on_new_service(heartbeat)
+        for session in heartbeat.sessions:
+            self._check_session(session, heartbeat, sender)
         if heartbeat.state == "draining":
-            self._service_gone(heartbeat.instance, STOPPED)
-        for session, idle_s in heartbeat.idle_s.items():
-            record = self._registry.sessions.get(session)
-            if record is None or not self._registry.takes_part(heartbeat, record):
-                # of an earlier run of control, just closed, or served by another now
-                self._commands.send(StopSession(session=session), to=sender)
-            elif heartbeat.instance == record.recognizer and idle_s > self._idle_limit_s:
-                self._end(record, f"no audio for {self._idle_limit_s:g} s")
+            self._service_lost(heartbeat.instance, STOPPED)
+
+    def _on_new_service(self, heartbeat: Heartbeat) -> None:
+        """Give a new service the sessions that miss a worker, or those that it observes."""
+        self._publish(EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}")
+        for instance in self._registry.displaced_by(heartbeat):
+            self._service_lost(instance, f"{heartbeat.instance} took its place")
+        for record in self._sessions:
+            if self._sessions.lost_workers(record):
+                self._replace(record)
+            elif heartbeat.role == "observer":
+                start = self._sessions.start_message(record)
+                self._commands.send(start, to=self._registry[heartbeat.instance].address)
+
+    def _check_session(self, session: str, heartbeat: Heartbeat, sender: bytes) -> None:
+        """Stop a session that a service should not serve, and end one without input."""
+        record = self._sessions.get(session)
+        if record is None or heartbeat.instance not in self._sessions.participants(record):
+            # of an earlier run of control, just closed, or served by another now
+            self._commands.send(StopSession(session=session), to=sender)
+        elif self._sessions.take_input(record, heartbeat) > self._idle_limit_s:
+            self._end(record, f"no audio for {self._idle_limit_s:g} s")
 
     def _on_started(self, done: Done, sender: bytes) -> None:
-        record = self._registry.sessions.get(done.session)
-        if record is None or done.request != _start_request(record):
+        record = self._sessions.get(done.session)
+        if record is None or done.request != record.start_request:
             return
-        started = {
+        record.waiting_for -= {
             instance
             for instance in record.waiting_for
-            if instance in self._registry.services
-            and self._registry.services[instance].address == sender
+            if instance in self._registry and self._registry[instance].address == sender
         }
-        if started:
-            record.waiting_for -= started
-            if not record.waiting_for:
-                self._announce(record)
+        self._announce_if_started(record)
 
     def _on_speech(self, speech: Speech, _sender: bytes) -> None:
-        record = self._registry.sessions.get(speech.session)
+        record = self._sessions.get(speech.session)
         if record is not None and record.epoch == speech.epoch:
             record.speaking = speech.active
-            name = "speech-start" if speech.active else "speech-stop"
+            name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
             self._publish(name, record.name, media_time=speech.media_time)
 
     def _on_recorded(self, recorded: Recorded, _sender: bytes) -> None:
-        self._publish("recorded", recorded.session, detail=recorded.path)
+        self._publish(EventName.RECORDED, recorded.session, detail=recorded.path)
 
-    def _on_error_from(self, error: Error, _sender: bytes) -> None:
-        self._publish("error", error.session, detail=f"{error.code}: {error.text}")
+    def _on_service_error(self, error: Error, _sender: bytes) -> None:
+        self._publish(EventName.ERROR, error.session, detail=f"{error.code}: {error.text}")
 
-    # --- inside ----------------------------------------------------------------------------------
+    # --- sessions ------------------------------------------------------------------------------
 
-    def _start(self, record: SessionRecord, only: str = "") -> None:
-        endpoints = {
-            service: self._registry.services[getattr(record, service)].heartbeat.endpoints
-            for service in REQUIRED
-        }
-        message = StartSession(
-            session=record.name,
-            epoch=record.epoch,
-            request=_start_request(record),
-            token=record.token,
-            encoding=record.opening.encoding,
-            sample_rate_hz=record.opening.sample_rate_hz,
-            num_channels=record.opening.num_channels,
-            record=record.opening.record,
-            paced=record.opening.paced,
-            phone_input=endpoints["synthesizer"]["phone_input"],
-            phones=endpoints["recognizer"]["phones"],
-            faps=endpoints["synthesizer"]["faps"],
-        )
-        if only:
-            self._commands.send(message, to=self._registry.services[only].address)
-        else:
-            self._tell(record, message)
+    def _start(self, record: SessionRecord) -> None:
+        self._send_to_participants(record, self._sessions.start_message(record))
 
-    def _tell(self, record: SessionRecord, message: Message) -> None:
-        for instance in self._registry.participants(record):
-            address = self._registry.services[instance].address
-            if address:
-                self._commands.send(message, to=address)
-            else:
-                record.waiting_for.discard(instance)
+    def _send_to_participants(self, record: SessionRecord, message: Message) -> None:
+        for instance in self._sessions.participants(record):
+            self._commands.send(message, to=self._registry[instance].address)
 
-    def _announce(self, record: SessionRecord) -> None:
-        if record.announced or not all(self._registry.serves(record, s) for s in REQUIRED):
+    def _announce_if_started(self, record: SessionRecord) -> None:
+        """Tell the client that its session is open, or that it moved, once its services serve it.
+
+        A new session waits for the observers, so that they miss nothing of it. One that moved goes
+        on at once: its client still has audio to send again.
+        """
+        if self._sessions.lost_workers(record):
             return
-        record.announced = True
-        self._publish("session-opened", record.name)
-        opened = self._registry.opened(record, self.endpoints["events"])
-        self._reply(record.client, record.opening.request, opened)
+        if not record.announced and not record.waiting_for:
+            record.announced, record.moved = True, False
+            self._publish(EventName.SESSION_OPENED, record.name)
+            opened = self._sessions.opened_message(record, self.endpoints["events"])
+            self._reply(record.client, record.opening.request, opened)
+        elif record.moved and record.announced and not self._missing_workers(record):
+            moved = self._sessions.moved_message(record)
+            record.moved, record.resume_sequence = False, 0
+            self._commands.send(moved, to=record.client)
+            self._events.send(moved)
+            self._publish(EventName.SESSION_MOVED, record.name)
 
     def _give_up_waiting(self, record: SessionRecord) -> None:
-        missing = record.waiting_for & {record.recognizer, record.synthesizer}
+        """Go on without the observers that did not start a session, but not without a worker."""
+        missing = self._missing_workers(record)
         if not missing:
             record.waiting_for.clear()
-            self._announce(record)
+            self._announce_if_started(record)
             return
         text = f"{', '.join(sorted(missing))} did not start the session in {START_LIMIT_S:g} s"
-        reply = Error(
-            session=record.name, code="timeout", text=text, request=record.opening.request
-        )
         if not record.announced:
-            self._reply(record.client, record.opening.request, reply)
+            request = record.opening.request
+            reply = Error(session=record.name, code=ErrorCode.TIMEOUT, text=text, request=request)
+            self._reply(record.client, request, reply)
         self._end(record, text)
 
-    def _take_over(self, heartbeat: Heartbeat) -> None:
-        """Give a service that just came the sessions that miss one, or that it observes."""
-        for record in list(self._registry.sessions.values()):
-            if not all(self._registry.serves(record, service) for service in REQUIRED):
-                self._replace(record)
-            elif heartbeat.service not in REQUIRED:
-                self._start(record, only=heartbeat.instance)
+    def _missing_workers(self, record: SessionRecord) -> set[str]:
+        return record.waiting_for & {*record.workers.values()}
 
     def _replace(self, record: SessionRecord) -> None:
-        if self._registry.replace(record, time.monotonic()):
+        if self._sessions.replace(record, time.monotonic()):
             self._start(record)
-            self._publish("session-moved", record.name)
 
-    def _service_gone(self, instance: str, reason: str) -> None:
-        self._registry.services.pop(instance, None)
+    def _service_lost(self, instance: str, reason: str) -> None:
+        self._registry.remove(instance)
         LOG.log(
             logging.INFO if reason == STOPPED else logging.WARNING, "lost %s: %s", instance, reason
         )
-        self._publish("service-lost", detail=f"{instance}: {reason}")
-        for record in list(self._registry.sessions.values()):
+        self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
+        for record in self._sessions:
             record.waiting_for.discard(instance)
-            if instance in (record.recognizer, record.synthesizer):
+            if instance in record.workers.values():
                 record.started_s = time.monotonic()
                 self._replace(record)
 
     def _end(self, record: SessionRecord, reason: str) -> None:
-        self._tell(record, StopSession(session=record.name, epoch=record.epoch))
-        del self._registry.sessions[record.name]
-        self._publish("session-closed", record.name, detail=reason)
+        self._send_to_participants(record, StopSession(session=record.name, epoch=record.epoch))
+        self._sessions.remove(record)
+        self._publish(EventName.SESSION_CLOSED, record.name, detail=reason)
         LOG.info("session closed: %s", reason, extra={"session": record.name})
 
     def _publish(
-        self, name: str, session: str = "", *, detail: str = "", media_time: int = 0
+        self, name: EventName, session: str = "", *, detail: str = "", media_time: int = 0
     ) -> None:
         self._num_events += 1
         self._events.send(
@@ -348,14 +348,13 @@ class ControlService(Service):
         )
 
 
-def _start_request(record: SessionRecord) -> str:
-    return f"start-{record.name}-{record.epoch}"
-
-
 def _wrong_endpoints(heartbeat: Heartbeat) -> str:
     """Return what is wrong with the endpoints that others are to connect to, if anything."""
-    for key in ENDPOINTS.get(heartbeat.service, ()):
-        endpoint = heartbeat.endpoints.get(key, "")
+    if heartbeat.role != "worker":
+        return ""
+    if not heartbeat.endpoints:
+        return "a worker must name the endpoints that it provides"
+    for key, endpoint in heartbeat.endpoints.items():
         try:
             host, port = split_endpoint(endpoint, key)
         except UserError as error:

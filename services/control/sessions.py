@@ -1,25 +1,15 @@
-"""Sessions and services as control knows them; no sockets, so every rule can be tested."""
+"""Sessions as control knows them; no sockets, so that every rule can be tested."""
 
 from __future__ import annotations
 
 import secrets
-import time
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-from shared.messages import Heartbeat, OpenSession, SessionOpened
-
-REQUIRED = ("recognizer", "synthesizer")  # one of each serves a session
-OBSERVERS = ("driver", "gateway")  # all of them take part
-ENDPOINTS = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
-
-
-@dataclass(slots=True)
-class ServiceRecord:
-    """One running service."""
-
-    address: bytes  # its identity on control's socket
-    heartbeat: Heartbeat  # the newest
-    heard_s: float
+from services.control.registry import Refusal, Registry
+from shared.wire.control import Heartbeat, SessionState, StartSession
+from shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
 
 
 @dataclass(slots=True)
@@ -29,73 +19,42 @@ class SessionRecord:
     name: str
     token: str
     opening: OpenSession
-    client: bytes  # who asked, on control's socket
+    client: bytes  # its identity on control's socket
     opened_s: float
     started_s: float  # when its services were last told to start it, or one was lost
-    recognizer: str
-    synthesizer: str
-    audio: str  # the endpoint that the client was given
-    epoch: int = 1
-    waiting_for: set[str] = field(default_factory=set)  # instances that have not started it yet
-    announced: bool = False  # the client was told
+    workers: dict[str, str]  # instance by endpoint
+    endpoints: dict[str, str]  # address by endpoint
+    language: str  # of the phones; empty if no worker states one
+    delay_ms: float  # how much later than its sound a FAP frame is made
+    waiting_for: set[str]  # instances that have not started it yet
+    epoch: int = 1  # counts its placements
+    announced: bool = False  # the client was told that it is open
+    moved: bool = False  # placed again, and the client was not told yet
     speaking: bool = False
+    lips: str = ""  # the lip model that the client has chosen
+    next_sequence: int = 1  # of the first audio message that no recognizer is known to have
+    resume_sequence: int = 0  # where a new recognizer begins; 0: it is the old one
+
+    @property
+    def start_request(self) -> str:
+        """The request that its services confirm when they have started it."""
+        return f"start-{self.name}-{self.epoch}"
 
 
-class Refusal(Exception):
-    """A request that cannot be met; ``code`` is one of PROTOCOL.md's."""
+class Sessions:
+    """The open sessions, by name."""
 
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(text)
-        self.code = code
-        self.text = text
-
-
-class Registry:
-    """Which services are alive and which sessions they serve."""
-
-    def __init__(self, max_sessions: int, lost_after_s: float) -> None:
-        self.services: dict[str, ServiceRecord] = {}
-        self.sessions: dict[str, SessionRecord] = {}
+    def __init__(self, registry: Registry, max_sessions: int) -> None:
+        self._registry = registry
         self._max_sessions = max_sessions
-        self._lost_after_s = lost_after_s
+        self._records: dict[str, SessionRecord] = {}
 
-    def beat(self, heartbeat: Heartbeat, address: bytes, now_s: float) -> None:
-        """Take a heartbeat."""
-        self.services[heartbeat.instance] = ServiceRecord(address, heartbeat, now_s)
+    def __iter__(self) -> Iterator[SessionRecord]:
+        return iter(list(self._records.values()))
 
-    def displaced_by(self, heartbeat: Heartbeat) -> list[str]:
-        """Return the instances that a new one has taken the endpoints of: they have crashed."""
-        return [
-            instance
-            for instance, record in self.services.items()
-            if heartbeat.service in REQUIRED
-            and record.heartbeat.service == heartbeat.service
-            and record.heartbeat.endpoints == heartbeat.endpoints
-        ]
-
-    def silent(self, now_s: float) -> list[str]:
-        """Return the instances whose loop has not been heard for too long."""
-        return [
-            instance
-            for instance, record in self.services.items()
-            if record.address and now_s - record.heard_s > self._lost_after_s
-        ]
-
-    def ready(self, service: str) -> list[str]:
-        """Return the instances of a service that take new sessions, least loaded first."""
-        load = dict.fromkeys(self.services, 0)
-        for session in self.sessions.values():
-            for instance in (session.recognizer, session.synthesizer):
-                if instance in load:
-                    load[instance] += 1
-        return sorted(
-            (
-                instance
-                for instance, record in self.services.items()
-                if record.heartbeat.service == service and record.heartbeat.state == "ready"
-            ),
-            key=lambda instance: (load[instance], instance),
-        )
+    def get(self, name: str) -> SessionRecord | None:
+        """Return a session, None if there is none of that name."""
+        return self._records.get(name)
 
     def open(self, opening: OpenSession, client: bytes, now_s: float) -> SessionRecord:
         """Place a new session.
@@ -106,11 +65,15 @@ class Registry:
             The name is taken, there are too many sessions, or a service is missing.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
-        if name in self.sessions:
-            raise Refusal("session-exists", f"session {name!r} is open; choose another name")
-        if len(self.sessions) >= self._max_sessions:
-            raise Refusal("too-many-sessions", f"{self._max_sessions} sessions are open already")
-        chosen = {service: self._choose(service) for service in REQUIRED}
+        if name in self._records:
+            raise Refusal(
+                ErrorCode.SESSION_EXISTS, f"session {name!r} is open; choose another name"
+            )
+        if len(self._records) >= self._max_sessions:
+            raise Refusal(
+                ErrorCode.TOO_MANY_SESSIONS, f"{self._max_sessions} sessions are open already"
+            )
+        workers = self._registry.place({}, self._load())
         record = SessionRecord(
             name=name,
             token=secrets.token_urlsafe(24),
@@ -118,34 +81,18 @@ class Registry:
             client=client,
             opened_s=now_s,
             started_s=now_s,
-            recognizer=chosen["recognizer"],
-            synthesizer=chosen["synthesizer"],
-            audio=self.services[chosen["recognizer"]].heartbeat.endpoints["audio"],
+            workers=workers,
+            endpoints=self._registry.endpoints(workers),
+            language=self._registry.language(workers.values()),
+            delay_ms=self._registry.delay_ms(workers.values()),
+            waiting_for={*workers.values()} | self._registry.observers(),
         )
-        record.waiting_for = set(self.participants(record))
-        self.sessions[name] = record
+        self._records[name] = record
         return record
 
-    def participants(self, record: SessionRecord) -> list[str]:
-        """Return the instances that take part in a session: those placed and all observers."""
-        observers = [
-            instance
-            for instance, service in self.services.items()
-            if service.heartbeat.service in OBSERVERS
-        ]
-        placed = [i for i in (record.recognizer, record.synthesizer) if i in self.services]
-        return placed + observers
-
-    def serves(self, record: SessionRecord, service: str) -> bool:
-        """Return whether the session's recognizer or synthesizer is alive."""
-        return getattr(record, service) in self.services
-
-    def takes_part(self, heartbeat: Heartbeat, record: SessionRecord) -> bool:
-        """Return whether a service is one that serves or observes the session."""
-        return heartbeat.service in OBSERVERS or heartbeat.instance in (
-            record.recognizer,
-            record.synthesizer,
-        )
+    def remove(self, record: SessionRecord) -> None:
+        """Forget a session."""
+        del self._records[record.name]
 
     def owned(self, session: str, token: str) -> SessionRecord:
         """Return a session whose token is given.
@@ -155,59 +102,110 @@ class Registry:
         Refusal
             There is no such session, or the token is another's.
         """
-        record = self.sessions.get(session)
+        record = self._records.get(session)
         if record is None:
-            raise Refusal("unknown-session", f"there is no session {session!r}; open it first")
+            raise Refusal(
+                ErrorCode.UNKNOWN_SESSION, f"there is no session {session!r}; open it first"
+            )
         if not secrets.compare_digest(record.token.encode(), token.encode()):
-            raise Refusal("bad-token", f"the token is not that of session {session!r}")
+            raise Refusal(ErrorCode.BAD_TOKEN, f"the token is not that of session {session!r}")
         return record
 
-    def replace(self, record: SessionRecord, now_s: float) -> bool:
-        """Place a session again whose recognizer or synthesizer is gone; return success.
+    def participants(self, record: SessionRecord) -> set[str]:
+        """Return the running services that take part: the session's workers and all observers."""
+        workers = {instance for instance in record.workers.values() if instance in self._registry}
+        return workers | self._registry.observers()
 
-        The client keeps sending to the endpoint it was given, so only a recognizer there will do.
-        """
+    def lost_workers(self, record: SessionRecord) -> list[str]:
+        """Return the session's workers that do not run any more."""
+        return sorted({i for i in record.workers.values() if i not in self._registry})
+
+    def take_input(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
+        """Note how far a service is with the session's input; return for how long it had none."""
+        state = heartbeat.sessions[record.name]
+        if heartbeat.instance != record.workers["audio"]:
+            return 0.0
+        record.next_sequence = max(record.next_sequence, state.sequence + 1)
+        return state.idle_s
+
+    def replace(self, record: SessionRecord, now_s: float) -> bool:
+        """Place a session again after workers were lost; return success."""
+        kept = {name: i for name, i in record.workers.items() if i in self._registry}
         try:
-            for service in REQUIRED:
-                if not self.serves(record, service):
-                    setattr(record, service, self._choose(service, record))
+            workers = self._registry.place(kept, self._load(), record.language)
         except Refusal:
             return False
+        if workers["audio"] != record.workers["audio"]:
+            record.resume_sequence = record.next_sequence
+        record.workers = workers
+        record.endpoints = self._registry.endpoints(workers)
+        record.delay_ms = self._registry.delay_ms(workers.values())
         record.epoch += 1
+        record.moved = True
         record.started_s = now_s
-        record.waiting_for = set(self.participants(record))
+        record.waiting_for = self.participants(record)
         return True
 
-    def opened(self, record: SessionRecord, events: str) -> SessionOpened:
-        """Return the answer for the client."""
-        recognizer = self.services[record.recognizer].heartbeat.endpoints
-        synthesizer = self.services[record.synthesizer].heartbeat.endpoints
-        return SessionOpened(
+    # --- messages ------------------------------------------------------------------------------
+
+    def start_message(self, record: SessionRecord) -> StartSession:
+        """Return what the services of a session are told."""
+        return StartSession(
             session=record.name,
-            request=record.opening.request,
+            epoch=record.epoch,
+            request=record.start_request,
             token=record.token,
-            audio=recognizer["audio"],
-            phones=recognizer["phones"],
-            faps=synthesizer["faps"],
-            events=events,
+            encoding=record.opening.encoding,
+            sample_rate_hz=record.opening.sample_rate_hz,
+            num_channels=record.opening.num_channels,
+            record=record.opening.record,
+            paced=record.opening.paced,
+            language=record.language,
+            endpoints=record.endpoints,
+            delay_ms=record.delay_ms,
+            lips=record.lips,
         )
 
-    def age_s(self, record: SessionRecord) -> float:
-        """Return for how long a session has been open."""
-        return time.monotonic() - record.opened_s
+    def opened_message(self, record: SessionRecord, events: str) -> SessionOpened:
+        """Return what the client is told."""
+        return SessionOpened(
+            session=record.name,
+            epoch=record.epoch,
+            request=record.opening.request,
+            token=record.token,
+            events=events,
+            language=record.language,
+            frame_rate_hz=self._registry.frame_rate_hz(record.workers.values()),
+            audio=record.endpoints["audio"],
+            phones=record.endpoints["phones"],
+            faps=record.endpoints["faps"],
+        )
 
-    def _choose(self, service: str, moved: SessionRecord | None = None) -> str:
-        instances = self.ready(service)
-        if moved is not None and service == "recognizer":
-            instances = [
-                instance
-                for instance in instances
-                if self.services[instance].heartbeat.endpoints["audio"] == moved.audio
-            ]
-        if not instances:
-            raise Refusal(
-                "no-service",
-                f"no {service} is running; start one with 'kouxing {service}' "
-                "(or everything with 'kouxing run')",
-            )
-        return instances[0]
+    def moved_message(self, record: SessionRecord) -> SessionMoved:
+        """Return what the client and all followers are told about a session placed again."""
+        return SessionMoved(
+            session=record.name,
+            epoch=record.epoch,
+            next_sequence=record.resume_sequence,
+            audio=record.endpoints["audio"],
+            phones=record.endpoints["phones"],
+            faps=record.endpoints["faps"],
+        )
+
+    def state(self, record: SessionRecord, now_s: float) -> SessionState:
+        """Return the session's part of a status report."""
+        return SessionState(
+            session=record.name,
+            state="open" if record.announced else "starting",
+            age_s=now_s - record.opened_s,
+            speaking=record.speaking,
+            endpoints=record.endpoints,
+            workers=record.workers,
+        )
+
+    # --- inside --------------------------------------------------------------------------------
+
+    def _load(self) -> Counter[str]:
+        return Counter(
+            instance for record in self._records.values() for instance in {*record.workers.values()}
+        )

@@ -1,56 +1,45 @@
-"""The driver as a service: FAP frames in, a head in a window or a video out.
+"""The driver as a service: FAP frames in, a face in a window or a video out.
 
-Reacts to: start, stop (control), fap, end (synthesizer), sound (recognizer).
-Emits: recorded (control).
+Reacts to: start-session, stop-session (control), fap-frame, end-of-faps (synthesizer), sound
+(recognizer).
+Emits: recorded, error (control).
 """
 
 from __future__ import annotations
 
-import os
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from services.driver.recording import Recording
-from services.driver.render import Renderer
-from services.driver.scene import Framing, background, camera, load_head
-from services.driver.virtual_camera import VirtualCamera
-from services.driver.window import Window
-from shared.bus import Socket
+from services.driver.config import DriverConfig
+from services.driver.poses import STALL_S, Poses
+from services.driver.recordings import Recordings
+from services.driver.video.recording import Recording
+from services.driver.view import View
 from shared.clock import to_seconds
-from shared.config import DriverConfig
-from shared.errors import UserError
-from shared.faps import NUM_FAPS
+from shared.follower import SessionFollower
 from shared.logs import LOG
-from shared.messages import (
-    EndOfFaps,
-    Error,
-    FapFrame,
-    Joined,
-    Recorded,
-    Sound,
-    StartSession,
-)
 from shared.service import Service
+from shared.wire.audio import Sound
+from shared.wire.control import Recorded, SessionInput, StartSession
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.session import Error, ErrorCode
 
-RENDER_BUDGET_S = 0.2  # of recording in one turn of the loop, so that heartbeats go on
-NUM_PUBLISHERS = 2  # recognizer and synthesizer
+DRAW_BUDGET_S = 0.2  # for videos in one turn of the loop, so that heartbeats go on
 LAST_FRAME_LIMIT_S = 10.0  # for a closed session's last frames to arrive
-STALL_S = 1.0  # without frames the window says so
 
 
 @dataclass(slots=True)
-class _Follower:
-    """What the driver knows of one session."""
+class _Session:
+    """One session that the driver follows."""
 
     start: StartSession
-    socket: Socket
-    publishers: set[str] = field(default_factory=set)  # that confirmed the subscriptions
-    sequence: int = 0
-    recording: Recording | None = None
-    ended: bool = False  # its last frame has come
+    follower: SessionFollower
     leave_by_s: float | None = None  # the session is closed; the last frames are on their way
 
 
@@ -58,231 +47,129 @@ class DriverService(Service):
     """The driver process."""
 
     name = "driver"
+    role = "observer"
+    needs = ("phones", "faps")
 
     def __init__(self, config: DriverConfig) -> None:
         super().__init__(config)
         self._config = config
-        self._followers: dict[str, _Follower] = {}
-        self._unfinished: list[tuple[str, Recording]] = []
-        self._head = load_head(config.head)
-        self._background = background(config.background)
-        if self._background is None:
-            raise UserError(
-                "driver.background: a window and MP4 have no transparency; give a colour"
-            )
-        if config.camera not in list(Framing):
-            raise UserError(f"driver.camera: one of {', '.join(Framing)}")
-        self._camera = camera(self._head, Framing(config.camera))
-        self._renderer: Renderer | None = None
-        self._faps = np.zeros(NUM_FAPS, np.float32)
-        self._frame_s = time.monotonic()
-        self._stalled = False
-        self._window = self._open_window()
-        self._visible = self._window is not None
-        self._virtual_camera: VirtualCamera | None = None
-        if config.virtual_camera:
-            self._virtual_camera = VirtualCamera(self._own_renderer(), config.frame_rate_hz)
-            LOG.info("the virtual camera is %s", self._virtual_camera.device)
+        self._sessions: dict[str, _Session] = {}
+        self._was_stalled = False
+        self.poses = Poses(config.session)
+        self.view = View(config, self.poses.switch)
+        self._recordings = Recordings(
+            self._make_recording, on_written=self._report_written, on_failed=self._report_failure
+        )
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""
-        recording = None
-        old = self._followers.get(start.session)
-        if old is not None:
-            if old.start.token == start.token:  # the same after a crash: its video goes on
-                recording, old.recording = old.recording, None
-            self._leave(old)
-        socket = self.bus.connect_subscriber(start.phones, start.faps)
-        follower = _Follower(start=start, socket=socket)
-        self.listen(
-            socket,
-            {
-                Joined: lambda message, _: self._on_joined(follower, message),
-                FapFrame: lambda message, _: self._on_frame(follower, message),
-                Sound: lambda message, _: self._on_sound(follower, message),
-                EndOfFaps: lambda message, _: self._on_end(follower),
-            },
-        )
-        kinds = (FapFrame, EndOfFaps, Sound) if start.record else (FapFrame, EndOfFaps)
-        socket.subscribe_session(kinds, start.session)
-        if start.record:
-            follower.recording = recording or self._begin_recording(start.session)
-        self._followers[start.session] = follower
+        session = self._sessions.get(start.session)
+        if session is not None and session.start.token != start.token:
+            self._leave(session)  # another one of the same name
+            session = None
+        if session is None:
+            session = self._sessions[start.session] = self._make_session(start)
+            self.poses.add(start.session, time.monotonic())
+        session.start = start
+        if start.record:  # after a crash the same video goes on
+            self._recordings.begin(start.session)
+        session.follower.start(start.epoch, start.endpoints)
         return False
 
     def stop_session(self, session: str) -> None:
         """Follow a session no longer; one that is recorded only after its last frame."""
-        follower = self._followers.get(session)
-        if follower is None:
+        left = self._sessions.get(session)
+        if left is None:
             return
-        if follower.recording is None:
-            self._leave(follower)
-        elif follower.leave_by_s is None:
-            follower.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
+        if not self._recordings.is_open(session):
+            self._leave(left)
+        elif left.leave_by_s is None:
+            left.leave_by_s = time.monotonic() + LAST_FRAME_LIMIT_S
 
     def on_tick(self, now_s: float) -> None:
         """Draw what is due."""
-        for follower in list(self._followers.values()):
-            if follower.leave_by_s is not None and now_s > follower.leave_by_s:
-                self._leave(follower)
-        if self._window is not None and self._visible:
-            self._visible = self._window.draw(self._shown(now_s))
-            if not self._visible:
-                LOG.info("the window was closed")
-                self._window.hide()  # videos under way go on drawing in its context
-        if self._virtual_camera is not None:
-            self._virtual_camera.draw(self._shown(now_s), now_s)
-        self._render_until(time.monotonic() + RENDER_BUDGET_S)
+        for session in list(self._sessions.values()):
+            if session.leave_by_s is not None and now_s > session.leave_by_s:
+                self._leave(session)
+        if self.view.is_live:
+            self._warn_if_stalled(now_s)
+            self.view.show(self.poses.faps(now_s), self.poses.caption(now_s), now_s)
+        self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
 
     def on_drain(self) -> bool:
         """Finish the videos that are under way."""
-        for follower in list(self._followers.values()):
-            self._leave(follower)
-        self._render_until(time.monotonic() + RENDER_BUDGET_S)
-        return not self._unfinished
+        for session in list(self._sessions.values()):
+            self._leave(session)
+        self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
+        return self._recordings.is_done
 
     def on_stopped(self) -> None:
         """Keep what was drawn of the videos that could not be finished in time."""
-        for session, recording in self._unfinished:
+        for session in self._recordings.close_early():
             LOG.warning("the video ends early", extra={"session": session})
-            self._finish(session, recording)
-        if self._virtual_camera is not None:
-            self._virtual_camera.close()
+        self.view.close()
 
-    def idle_s(self) -> dict[str, float]:
+    def session_inputs(self) -> dict[str, SessionInput]:
         """Name the sessions followed, so that control can say which of them are no more."""
-        return dict.fromkeys(self._followers, 0.0)
+        return dict.fromkeys(self._sessions, SessionInput())
 
-    # --- from the publishers -------------------------------------------------------------------
+    # --- sessions ------------------------------------------------------------------------------
 
-    def _on_joined(self, follower: _Follower, joined: Joined) -> None:
-        follower.publishers.add(joined.publisher)
-        if len(follower.publishers) == NUM_PUBLISHERS:
-            self.session_started(follower.start)
+    def _make_session(self, start: StartSession) -> _Session:
+        handlers: dict[type[Message], Callable[[Any], None]] = {
+            FapFrame: self._on_frame,
+            EndOfFaps: self._on_end,
+        }
+        if start.record:
+            handlers[Sound] = self._on_sound
+        follower = SessionFollower(
+            self, start.session, handlers, on_complete=lambda: self.session_started(session.start)
+        )
+        session = _Session(start, follower)
+        return session
 
-    def _on_frame(self, follower: _Follower, frame: FapFrame) -> None:
-        missed = frame.sequence - follower.sequence - 1
-        if follower.sequence and missed > 0:
-            self.metrics.count("frames_missed", missed)
-        follower.sequence = frame.sequence
-        self._faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
-        self._frame_s = time.monotonic()
-        if follower.recording is not None:
-            follower.recording.accept_frame(to_seconds(frame.media_time), self._faps)
+    def _on_frame(self, frame: FapFrame) -> None:
+        faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
+        self.poses.accept_frame(frame.session, faps, time.monotonic())
+        self._recordings.accept_frame(frame.session, to_seconds(frame.media_time), faps)
 
-    def _on_sound(self, follower: _Follower, sound: Sound) -> None:
-        if follower.recording is not None:
-            samples = np.frombuffer(sound.pcm, "<i2").astype(np.float32) / np.float32(32768)
-            try:
-                follower.recording.accept_sound(sound.media_time, samples)
-            except UserError as error:
-                self._give_up(follower.start.session, follower.recording, error)
-                follower.recording = None
+    def _on_sound(self, sound: Sound) -> None:
+        samples = np.frombuffer(sound.pcm, "<i2").astype(np.float32) / np.float32(32768)
+        self._recordings.accept_sound(sound.session, sound.media_time, samples)
 
-    def _on_end(self, follower: _Follower) -> None:
-        follower.ended = True
-        self._end_recording(follower)
-        if follower.leave_by_s is not None:
-            self._leave(follower)
+    def _on_end(self, end: EndOfFaps) -> None:
+        self.poses.end(end.session)
+        self._recordings.end(end.session)
+        session = self._sessions[end.session]
+        if session.leave_by_s is not None:
+            self._leave(session)
 
-    def _leave(self, follower: _Follower) -> None:
+    def _leave(self, session: _Session) -> None:
         """Close a session's subscriptions and finish its video with what has come."""
-        del self._followers[follower.start.session]
-        self.unlisten(follower.socket)
-        self._end_recording(follower)
+        name = session.start.session
+        del self._sessions[name]
+        session.follower.close()
+        self.poses.remove(name)
+        self._recordings.end(name)
 
-    # --- the window ----------------------------------------------------------------------------
-
-    def _open_window(self) -> Window | None:
-        has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-        if self._config.view == "none" or (self._config.view == "auto" and not has_display):
-            return None
-        config = self._config
-        head = load_head(config.head, "coarse")  # live, smooth motion is worth more than outlines
-        try:
-            return Window(
-                head,
-                config.width_px,
-                config.height_px,
-                background=self._background,
-                camera=self._camera,
+    def _warn_if_stalled(self, now_s: float) -> None:
+        is_stalled = self.poses.is_stalled(now_s)
+        if is_stalled and not self._was_stalled:
+            LOG.warning(
+                "no FAP frames for %g s: the face goes to rest",
+                STALL_S,
+                extra={"session": self.poses.shown},
             )
-        except UserError as error:
-            if self._config.view == "window":
-                raise
-            LOG.warning("no window: %s", error)
-            return None
+        self._was_stalled = is_stalled
 
-    def _shown(self, now_s: float) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-        """Return the newest frame, or while none comes one that fades to rest."""
-        silent_s = now_s - self._frame_s
-        stalled = silent_s > STALL_S
-        if stalled != self._stalled:
-            live = any(not follower.ended for follower in self._followers.values())
-            lost = stalled and live
-            if lost:
-                LOG.warning("no FAP frames for %g s: the face goes to rest", STALL_S)
-            if self._window is not None:
-                self._window.say("no frames come" if lost else "")
-            self._stalled = stalled
-        fade = np.float32(np.clip(1.0 - (silent_s - STALL_S) / 0.3, 0.0, 1.0))
-        return self._faps * fade
+    # --- videos --------------------------------------------------------------------------------
 
-    # --- recording -----------------------------------------------------------------------------
+    def _make_recording(self, session: str) -> Recording:
+        path = Path(self._config.out) / f"{session}.mp4"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return Recording(path, self.view.renderer(), self._config.frame_rate_hz)
 
-    def _own_renderer(self) -> Renderer:
-        """Make what draws beside the window, once."""
-        if self._renderer is None:
-            self._renderer = Renderer(
-                self._head,
-                self._config.width_px,
-                self._config.height_px,
-                background=self._background,
-                camera=self._camera,
-                context=None if self._window is None else self._window.context,
-            )
-        return self._renderer
-
-    def _begin_recording(self, session: str) -> Recording | None:
-        config = self._config
-        try:
-            renderer = self._own_renderer()
-            path = Path(config.out) / f"{session}.mp4"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            return Recording(path, renderer, config.frame_rate_hz)
-        except (UserError, OSError) as error:
-            self._report(session, "no-video", str(error))
-            return None
-
-    def _end_recording(self, follower: _Follower) -> None:
-        if follower.recording is not None:
-            self._unfinished.append((follower.start.session, follower.recording))
-            follower.recording = None
-
-    def _render_until(self, end_s: float) -> None:
-        for follower in self._followers.values():
-            while follower.recording is not None and time.monotonic() < end_s:
-                try:
-                    if not follower.recording.step():
-                        break
-                except UserError as error:
-                    self._give_up(follower.start.session, follower.recording, error)
-                    follower.recording = None
-        while self._unfinished and time.monotonic() < end_s:
-            session, recording = self._unfinished[0]
-            try:
-                if recording.step():
-                    continue
-                self._unfinished.pop(0)
-                self._finish(session, recording)
-            except UserError as error:
-                self._unfinished = [
-                    entry for entry in self._unfinished if entry[1] is not recording
-                ]
-                self._give_up(session, recording, error)
-
-    def _finish(self, session: str, recording: Recording) -> None:
-        recording.close()
+    def _report_written(self, session: str, recording: Recording) -> None:
         self.metrics.count("videos")
         LOG.info("wrote %s", recording.path, extra={"session": session})
         if self.control is not None:
@@ -295,11 +182,7 @@ class DriverService(Service):
                 )
             )
 
-    def _give_up(self, session: str, recording: Recording, error: UserError) -> None:
-        recording.discard()
-        self._report(session, "no-video", str(error))
-
-    def _report(self, session: str, code: str, text: str) -> None:
-        LOG.error(text, extra={"session": session})
+    def _report_failure(self, session: str, reason: str) -> None:
+        LOG.error(reason, extra={"session": session})
         if self.control is not None:
-            self.control.send(Error(session=session, code=code, text=text))
+            self.control.send(Error(session=session, code=ErrorCode.NO_VIDEO, text=reason))

@@ -1,9 +1,6 @@
 """Runs the gateway as a process of its own."""
 
-import sys
-
-from services.command_line import main
+from services.process import run_module
 
 if __name__ == "__main__":
-    sys.argv.insert(1, "gateway")
-    main()
+    run_module("gateway")

@@ -11,6 +11,7 @@ import struct
 from dataclasses import dataclass
 
 from shared.errors import UserError
+from shared.face.lip_models import LipModelName
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
@@ -18,6 +19,7 @@ SOUND_TYPE = 2  # payload: int16, 16 kHz mono
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 RATES_HZ = (8000, 48000)
+MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 
 
 def binary(kind: int, epoch: int, media_time: int, payload: bytes) -> bytes:
@@ -30,9 +32,14 @@ def text(kind: str, **fields: object) -> str:
     return json.dumps({"type": kind, **fields}, ensure_ascii=False)
 
 
+def error_text(reason: str, code: str = "refused") -> str:
+    """Return the message that something was refused, and why."""
+    return text("error", code=code, text=reason)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hello:
-    """What a browser's microphone will send."""
+    """The format of the audio that a browser's microphone will send."""
 
     sample_rate_hz: int
     num_channels: int
@@ -62,6 +69,47 @@ def parse_hello(message: str) -> Hello:
     if not isinstance(encoding, str) or encoding not in SAMPLE_BYTES:
         raise UserError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
     return Hello(sample_rate_hz=rate_hz, num_channels=num_channels, encoding=encoding)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MicrophoneCommand:
+    """A command between the chunks of a browser's microphone."""
+
+    flush: bool  # interrupt: audio not yet shown is dropped
+    num_skipped: int  # samples of each channel that it left out
+    lips: str  # the lip model that is to move the mouth; empty: as before
+
+
+def parse_command(message: str) -> MicrophoneCommand:
+    """Return a text message of a microphone.
+
+    Raises
+    ------
+    UserError
+        If it is no JSON object, the number of samples is out of range, or there is no such lip
+        model.
+    """
+    fields = parse_object(message)
+    num_skipped = fields.get("skip", 0)
+    if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:
+        raise UserError(f"skip must be a whole number of 0 to {MAX_SKIPPED}")
+    return MicrophoneCommand(
+        flush=bool(fields.get("flush")), num_skipped=num_skipped, lips=parse_lips(fields)
+    )
+
+
+def parse_lips(fields: dict[str, object]) -> str:
+    """Return the lip model that a message asks for; empty: none.
+
+    Raises
+    ------
+    UserError
+        If there is no such lip model.
+    """
+    lips = fields.get("lips", "")
+    if not isinstance(lips, str) or lips not in ("", *LipModelName):
+        raise UserError(f"lips must be one of {', '.join(LipModelName)}")
+    return lips
 
 
 def parse_object(message: str) -> dict[str, object]:

@@ -1,9 +1,6 @@
-"""Runs the synthesizer as a process of its own."""
+"""Runs a synthesizer as a process of its own."""
 
-import sys
-
-from services.command_line import main
+from services.process import run_module
 
 if __name__ == "__main__":
-    sys.argv.insert(1, "synthesizer")
-    main()
+    run_module("synthesizer")

@@ -1,9 +1,10 @@
-"""The synthesizer as a service: phones in, FAP frames out.
+"""The synthesizer as a service: phones and lips in, FAP frames out.
 
-Reacts to: phone, speech, progress, spoken (recognizer), start, stop, drop (control).
-Emits: fap, end (subscribers), ack (recognizer).
+Reacts to: phone, lips, speech, progress, end-of-phones (recognizer), start-session, stop-session,
+flush-now, use-lips (control).
+Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
 
-Frames are clocked by the audio that was heard, so a system under load is late, never wrong, and
+Frames are clocked by the audio that was processed, so a system under load is late, never wrong, and
 audio faster than real time gives the same frames. Only when a live stream stalls does the wall
 clock take over, to lead the face to rest.
 """
@@ -13,48 +14,38 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from services.synthesizer.live import REST_S, LiveSynthesizer
-from services.synthesizer.parameters import load_parameters
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.face import REST_S, Face, Frame
+from services.synthesizer.lips.load import load_lip_model
 from shared.clock import to_samples, to_seconds
-from shared.config import SynthesizerConfig, reachable
-from shared.faps import MASK_BYTES, NUM_FAPS
+from shared.endpoints import reachable
+from shared.face.faps import MASK_BYTES, NUM_FAPS
 from shared.logs import LOG
-from shared.messages import (
-    EndOfFaps,
-    EndOfPhones,
-    FapFrame,
-    Message,
-    PhoneHeard,
-    Progress,
-    Speech,
-    StartSession,
-)
-from shared.phones import UNIT_INDEX, Phone, SpeechChange
+from shared.phones.events import EndOfSound, Phone, Progress
+from shared.phones.inventory import load_inventory
 from shared.reliable import ReliableReceiver
 from shared.service import Service
+from shared.wire.control import SessionInput, StartSession
+from shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of
+from shared.wire.face import EndOfFaps, FapFrame
 
 STALL_S = 0.2  # a live stream silent for so long has stalled
-LONGEST_GAP_S = 10.0  # of media time that is filled with frames
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
 
-class _Face:
-    """One session's face."""
+class _Session:
+    """One session: its face, and its place among messages."""
 
-    def __init__(self, start: StartSession, live: LiveSynthesizer) -> None:
+    def __init__(self, start: StartSession, face: Face, receiver: ReliableReceiver) -> None:
         self.start = start
-        self.live = live
-        self.receiver: ReliableReceiver | None = None
-        self.epoch_in = 0  # of the newest message from the recognizer
-        self.heard_media_s = 0.0  # media time of that message
+        self.face = face
+        self.receiver = receiver
+        self.epoch_in = 1  # of the newest message from the recognizer
+        self.last_input_s = time.monotonic()
+        self.relaxed_s = 0.0  # until when frames were made without audio
         self.sequence_out = 0
         self.media_time = 0  # of the newest frame
-        self.heard_s = time.monotonic()
-        self.relaxed_s = 0.0  # until when frames were made without audio
         self.finished = False
 
 
@@ -62,168 +53,147 @@ class SynthesizerService(Service):
     """The synthesizer process."""
 
     name = "synthesizer"
+    role = "worker"
 
     def __init__(self, config: SynthesizerConfig) -> None:
         super().__init__(config)
-        self._frame_rate_hz = config.frame_rate_hz
-        self._gesture_seed = config.gesture_seed or None
-        self._look_ahead_s = config.look_ahead_ms / 1e3
-        self._faces: dict[str, _Face] = {}
-        self._input = self.bus.bind_router(config.phones, "synthesizer.phones")
+        self._config = config
+        self.frame_rate_hz = config.frame_rate_hz
+        self.delay_ms = config.delay_ms
+        self._sessions: dict[str, _Session] = {}
+        self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input")
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps")
         self.endpoints = {
-            "phone_input": reachable(self._input.endpoint, config.advertise, "synthesizer.phones"),
+            "phone_input": reachable(
+                self._input.endpoint, config.advertise, "synthesizer.phone_input"
+            ),
             "faps": reachable(self._faps.endpoint, config.advertise, "synthesizer.faps"),
         }
-        self._parameters = load_parameters()
-        self.listen(
-            self._input,
-            {
-                PhoneHeard: self._on_input,
-                Speech: self._on_input,
-                Progress: self._on_input,
-                EndOfPhones: self._on_input,
-            },
-        )
-        self.listen(self._faps, {})
+        load_lip_model(name=config.lips)  # the first session waits for nothing
+        self.register(self._input, dict.fromkeys(SPEECH_MESSAGES, self._on_input))
+        self.register(self._faps, {})
 
     def start_session(self, start: StartSession) -> bool:
         """Make a face at rest; a session that moved here again keeps its own."""
-        face = self._faces.get(start.session)
-        if face is None or face.start.token != start.token:
-            live = LiveSynthesizer(
-                self._parameters,
-                frame_rate_hz=self._frame_rate_hz,
-                look_ahead_s=self._look_ahead_s,
-                gesture_seed=self._gesture_seed,
-            )
-            face = _Face(start, live)
-            face.receiver = ReliableReceiver(self._input, start.session)
-            self._faces[start.session] = face
-        face.start = start
+        session = self._sessions.get(start.session)
+        if session is None or session.start.token != start.token:
+            receiver = ReliableReceiver(self._input, start.session)
+            session = _Session(start, self._new_face(start), receiver)
+            self._sessions[start.session] = session
+        session.start = start
         return True
+
+    def _new_face(self, start: StartSession) -> Face:
+        return Face(
+            load_lip_model(start.language, start.lips or self._config.lips),
+            frame_rate_hz=self.frame_rate_hz,
+            delay_s=self._config.delay_ms / 1e3,
+            idle_motion_seed=self._config.idle_motion_seed,
+        )
 
     def stop_session(self, session: str) -> None:
         """Forget a session."""
-        face = self._faces.pop(session, None)
-        if face is not None and not face.finished:
-            self._end(session, face)
+        found = self._sessions.pop(session, None)
+        if found is not None and not found.finished:
+            self._end(found)
 
     def flush_session(self, session: str) -> None:
         """Drop what is queued; the frames to come lead to rest."""
-        face = self._faces.get(session)
-        if face is not None:
-            face.live.flush()
+        found = self._sessions.get(session)
+        if found is not None:
+            found.face.flush()
+
+    def use_lips(self, session: str, lips: str) -> None:
+        """Let another lip model move the mouth from where it is."""
+        found = self._sessions.get(session)
+        if found is not None:
+            found.face.use_lips(load_lip_model(found.start.language, lips))
 
     def on_tick(self, now_s: float) -> None:
         """Acknowledge, and lead faces to rest whose live stream has stalled."""
-        for session, face in self._faces.items():
-            if face.receiver is not None:
-                face.receiver.tick()
-            if face.start.paced and not face.finished and now_s - face.heard_s > STALL_S:
-                self._relax(session, face, now_s)
+        for session in self._sessions.values():
+            session.receiver.tick()
+            is_stalled = now_s - session.last_input_s > STALL_S
+            if session.start.paced and not session.finished and is_stalled:
+                self._relax(session, now_s)
 
-    def idle_s(self) -> dict[str, float]:
+    def session_inputs(self) -> dict[str, SessionInput]:
         """Name the sessions served, so that control can say which of them are no more."""
-        return dict.fromkeys(self._faces, 0.0)
+        return dict.fromkeys(self._sessions, SessionInput())
 
     def on_drain(self) -> bool:
         """Lead every face to rest and end its stream."""
-        for session, face in self._faces.items():
-            if not face.finished:
-                num_frames = round(REST_S * self._frame_rate_hz)
-                self._publish(session, face, face.live.relax(num_frames))
-                self._end(session, face)
+        for session in self._sessions.values():
+            if not session.finished:
+                num_frames = round(REST_S * self.frame_rate_hz)
+                self._publish(session, session.face.relax(num_frames))
+                self._end(session)
         return True
 
-    def _relax(self, session: str, face: _Face, now_s: float) -> None:
-        begin_s = max(face.relaxed_s, face.heard_s + STALL_S)
-        num_frames = int((now_s - begin_s) * self._frame_rate_hz)
+    def _relax(self, session: _Session, now_s: float) -> None:
+        begin_s = max(session.relaxed_s, session.last_input_s + STALL_S)
+        num_frames = int((now_s - begin_s) * self.frame_rate_hz)
         if num_frames > 0:
-            face.relaxed_s = begin_s + num_frames / self._frame_rate_hz
+            session.relaxed_s = begin_s + num_frames / self.frame_rate_hz
             # Media time stands still with the audio; the sequence number goes on.
-            self._publish(session, face, face.live.relax(num_frames))
+            self._publish(session, session.face.relax(num_frames))
 
     # --- from the recognizer ---------------------------------------------------------------------
 
-    def _on_input(self, message: Message, sender: bytes) -> None:
-        face = self._faces.get(message.session)
-        if face is None or face.receiver is None:
+    def _on_input(self, message: SpeechMessage, sender: bytes) -> None:
+        session = self._sessions.get(message.session)
+        if session is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)
             return
-        if message.epoch != face.start.epoch:  # sent again until control has told both ends
+        if message.epoch != session.start.epoch:  # sent again until control has told both ends
             self.metrics.count("other_epoch")
             return
-        if not face.receiver.accept(message, sender):
+        if not session.receiver.accept(message, sender):
             self.metrics.count("repeated")
             return
-        if isinstance(message, PhoneHeard) and message.unit not in UNIT_INDEX:
-            self.warn("unknown-unit", f"{message.unit!r} is none of the 60 units", message.session)
+        event = event_of(message)
+        language = session.start.language
+        if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
+            text = f"{event.symbol!r} is no phone of {language}"
+            self.warn("unknown-phone", text, message.session)
             return
         started_s = time.perf_counter()
-        face.heard_s = time.monotonic()
-        time_s = to_seconds(message.media_time)
-        # After a crash the recognizer counts its units anew; after a long gap nobody wants the
-        # frames in between.
-        is_new_epoch = message.epoch not in (face.epoch_in, face.epoch_in or 1)
-        if is_new_epoch or time_s - face.heard_media_s > LONGEST_GAP_S:
-            face.live.reset(max(0.0, time_s - self._look_ahead_s))
-        face.epoch_in, face.heard_media_s = message.epoch, time_s
-        if isinstance(message, PhoneHeard):
-            face.live.accept_phone(
-                Phone(
-                    index=message.index,
-                    unit=message.unit,
-                    onset_s=time_s,
-                    duration_s=to_seconds(message.duration),
-                    confidence=message.confidence,
-                    final=message.final,
-                )
-            )
-        elif isinstance(message, Speech):
-            face.live.accept_speech(SpeechChange(active=message.active, time_s=time_s))
-        elif isinstance(message, Progress):
-            face.live.accept_level(time_s, message.level_db)
-            self._publish(message.session, face, face.live.advance(time_s))
+        session.last_input_s = time.monotonic()
+        if message.epoch != session.epoch_in:  # after a crash, which restarts the count of phones
+            session.face.restart(to_seconds(message.media_time))
+        session.epoch_in = message.epoch
+        self._publish(session, session.face.accept(event))
+        if isinstance(event, Progress):
             self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
-        elif isinstance(message, EndOfPhones):
-            self._finish(message.session, face, time_s)
+        elif isinstance(event, EndOfSound):
+            self._end(session)
 
     # --- out -------------------------------------------------------------------------------------
 
-    def _finish(self, session: str, face: _Face, time_s: float) -> None:
-        """Make the frames that are owed up to the last sample, and those that lead to rest."""
-        face.live.accept_speech(SpeechChange(active=False, time_s=time_s))
-        frames = face.live.advance(time_s + self._look_ahead_s + REST_S)
-        self._publish(session, face, frames)
-        self._end(session, face)
-
-    def _end(self, session: str, face: _Face) -> None:
-        face.finished = True
-        face.sequence_out += 1
+    def _end(self, session: _Session) -> None:
+        session.finished = True
+        session.sequence_out += 1
         self._faps.send(
             EndOfFaps(
-                session=session,
-                epoch=face.start.epoch,
-                sequence=face.sequence_out,
-                media_time=face.media_time,
+                session=session.start.session,
+                epoch=session.start.epoch,
+                sequence=session.sequence_out,
+                media_time=session.media_time,
             )
         )
-        LOG.info("end of frames", extra={"session": session})
+        LOG.info("end of frames", extra={"session": session.start.session})
 
-    def _publish(
-        self, session: str, face: _Face, frames: Sequence[tuple[float, NDArray[np.float32]]]
-    ) -> None:
-        self.metrics.count("out_fap", len(frames))
+    def _publish(self, session: _Session, frames: Sequence[Frame]) -> None:
+        self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
-            face.sequence_out += 1
-            face.media_time = to_samples(time_s)
+            session.sequence_out += 1
+            session.media_time = to_samples(time_s)
             self._faps.send(
                 FapFrame(
-                    session=session,
-                    epoch=face.start.epoch,
-                    sequence=face.sequence_out,
-                    media_time=face.media_time,
+                    session=session.start.session,
+                    epoch=session.start.epoch,
+                    sequence=session.sequence_out,
+                    media_time=session.media_time,
                     values=faps.astype("<f4").tobytes(),
                     mask=MASK,
                 )

@@ -2,44 +2,194 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
-from shared.messages import MESSAGES
-from shared.schema import schema
+from services.control.registry import CLIENT_NEEDS
+from shared.face.faps import MOUTH_FAPS
+from shared.wire.control import EventName, ServiceState, SessionInput, SessionState
+from shared.wire.kinds import MESSAGES, PUBLISHER_OF
+from shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
+from shared.wire.schema import schema
+from shared.wire.session import ErrorCode, SessionMoved, SessionOpened
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.contract
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "proto" / "PROTOCOL.md").read_text(encoding="utf-8")
+COMMON = {field.name for field in dataclasses.fields(Message)}
+STRUCTURES: dict[str, type[Any]] = {
+    **MESSAGES,
+    "service-state": ServiceState,
+    "session-state": SessionState,
+    "session-input": SessionInput,
+}
+WIRE_NAME = {cls: name for name, cls in STRUCTURES.items()}
 
 
-@pytest.mark.parametrize("kind", MESSAGES)
-def test_every_kind_is_in_the_document(kind: str) -> None:
-    assert re.search(rf"(`|\b){re.escape(kind)}(`|\b)", DOCUMENT)
-
-
-def test_every_error_code_in_the_code_is_in_the_document() -> None:
-    sources = "\n".join(
-        path.read_text(encoding="utf-8")
-        for service in ("control", "recognizer", "synthesizer", "driver")
-        for path in (ROOT / "services" / service).rglob("*.py")
+def section(heading: str) -> str:
+    """Return the document's text between a heading and the next one."""
+    found = re.search(
+        rf"^#+ {re.escape(heading)}\n(.*?)(?=^#+ |\Z)", DOCUMENT, re.DOTALL | re.MULTILINE
     )
-    pattern = r'(?:Refusal\(\s*|code=|sender, |_report\(session, )"([a-z]+(?:-[a-z]+)*)"'
-    used = set(re.findall(pattern, sources))
-    assert len(used) > 5
-    assert used <= set(re.findall(r"^\| `([a-z-]+)` \|", DOCUMENT, re.MULTILINE))
+    assert found, f"PROTOCOL.md has no heading {heading!r}"
+    return found[1]
 
 
-def test_every_event_name_in_the_code_is_in_the_document() -> None:
-    source = (ROOT / "services" / "control" / "service.py").read_text(encoding="utf-8")
-    names = set(re.findall(r'"((?:session|speech|service)-[a-z]+|recorded)"', source))
-    names.discard("session-exists")
-    assert len(names) > 5
-    assert all(f"`{name}`" in DOCUMENT for name in names)
+def table(text: str) -> list[list[str]]:
+    """Return the cells of the table in a text, without its header; no rows if there is none."""
+    rows = [line.strip("|\n") for line in text.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in row.split(" | ")] for row in rows[2:]]
+
+
+def type_text(kind: msgspec.inspect.Type) -> str:
+    match kind:
+        case msgspec.inspect.DictType():
+            return f"map of str to {type_text(kind.value_type)}"
+        case msgspec.inspect.ListType():
+            return f"list of {type_text(kind.item_type)}"
+        case msgspec.inspect.DataclassType():
+            return f"`{WIRE_NAME[kind.cls]}`"
+    return type(kind).__name__.removesuffix("Type").lower()
+
+
+def number_text(value: float) -> str:
+    for exponent in (53, 63):
+        for power, text in ((2**exponent, f"2^{exponent}"), (2**exponent - 1, f"2^{exponent} - 1")):
+            if value == power:
+                return text
+    return f"{value:.10g}"
+
+
+def span_text(low: float | None, high: float | None) -> str:
+    if low is not None and high is not None:
+        return f"{number_text(low)} to {number_text(high)}"
+    return "" if low is None else f"at least {number_text(low)}"
+
+
+def size_text(low: int | None, high: int | None, unit: str) -> str:
+    if high is None:
+        return ""
+    if low == high:
+        return f"{high} {unit}"
+    return f"{low} to {high} {unit}" if low else f"up to {high} {unit}"
+
+
+def pattern_text(pattern: str) -> str:
+    choices = re.fullmatch(r"\^\((.*)\)\$", pattern)
+    if choices:
+        return " or ".join(f"`{choice}`" for choice in choices[1].split("|"))
+    return f"`{pattern.strip('^$')}`"
+
+
+def range_text(kind: msgspec.inspect.Type) -> str:
+    text = ""
+    match kind:
+        case msgspec.inspect.StrType(pattern=str() as pattern):
+            text = pattern_text(pattern)
+        case msgspec.inspect.StrType():
+            text = size_text(kind.min_length, kind.max_length, "characters")
+        case msgspec.inspect.BytesType():
+            text = size_text(kind.min_length, kind.max_length, "bytes")
+        case msgspec.inspect.DictType() | msgspec.inspect.ListType():
+            text = size_text(kind.min_length, kind.max_length, "entries")
+        case msgspec.inspect.IntType() | msgspec.inspect.FloatType():
+            text = span_text(kind.ge, kind.le)
+    return text
+
+
+def default_text(field: msgspec.inspect.Field) -> str:
+    if field.required:
+        return "required"
+    if field.default_factory is not msgspec.NODEFAULT:
+        return "empty"
+    if isinstance(field.default, float):
+        return f"{field.default:g}"
+    return (
+        field.default
+        if field.default and isinstance(field.default, str)
+        else json.dumps(field.default)
+    )
+
+
+def expected_rows(cls: type[Any]) -> list[list[str]]:
+    """Return field, type, range and default as the document must have them."""
+    info = msgspec.inspect.type_info(cls)
+    assert isinstance(info, msgspec.inspect.DataclassType)
+    return [
+        [f"`{field.name}`", type_text(field.type), range_text(field.type), default_text(field)]
+        for field in info.fields
+        if cls is Message or field.name not in COMMON or not issubclass(cls, Message)
+    ]
+
+
+def test_the_document_is_that_of_this_version() -> None:
+    assert DOCUMENT.startswith(f"# The kouxing protocol, version {VERSION}\n")
+
+
+def test_the_common_fields_are_those_of_the_class() -> None:
+    assert [row[:4] for row in table(section("A message"))] == expected_rows(Message)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_every_field_is_in_the_document_with_type_range_and_default(name: str) -> None:
+    rows = table(section(f"`{name}`"))
+    assert [row[:4] for row in rows] == expected_rows(STRUCTURES[name])
+    assert all(row[4] for row in rows), "every field has its meaning"
+
+
+def test_the_document_describes_no_message_that_does_not_exist() -> None:
+    described = re.findall(r"^#### `([a-z-]+)`$", DOCUMENT, re.MULTILINE)
+    assert sorted(described) == sorted(STRUCTURES)
+
+
+def test_every_error_code_is_in_the_document() -> None:
+    assert {row[0].strip("`") for row in table(section("Errors"))} == {*ErrorCode}
+
+
+def test_every_event_is_in_the_document() -> None:
+    assert {row[0].strip("`") for row in table(section("Events"))} == {*EventName}
+
+
+def test_the_sockets_carry_what_the_code_publishes_there() -> None:
+    published = {
+        row[2].strip("`"): set(re.findall(r"`([a-z-]+)`", row[4]))
+        for row in table(section("Sockets"))
+        if row[1] == "XPUB"
+    }
+    for endpoint in set(PUBLISHER_OF.values()):
+        kinds = {cls.kind for cls, name in PUBLISHER_OF.items() if name == endpoint}
+        assert published[endpoint] == kinds
+
+
+def test_the_order_of_the_mouth_is_in_the_document() -> None:
+    ranges: list[list[int]] = []
+    for fap in MOUTH_FAPS:
+        if ranges and fap == ranges[-1][-1] + 1:
+            ranges[-1].append(fap)
+        else:
+            ranges.append([fap])
+    text = ", ".join(
+        f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(map(str, each))
+        for each in ranges
+    )
+    assert text in section("`lips`")
+
+
+def test_the_limits_are_in_the_document() -> None:
+    assert f"at most {MAX_MESSAGE_BYTES // 2**20} MiB" in section("A message")
+    assert f"{MAX_AUDIO_BYTES // 1024} KiB of audio" in section("A message")
+
+
+@pytest.mark.parametrize("cls", [SessionOpened, SessionMoved])
+def test_a_client_is_told_every_endpoint_that_control_places_for_it(cls: type[Message]) -> None:
+    assert set(CLIENT_NEEDS) <= {field.name for field in dataclasses.fields(cls)}
 
 
 def test_the_schema_is_that_of_the_classes() -> None:
@@ -49,6 +199,12 @@ def test_the_schema_is_that_of_the_classes() -> None:
 
 def test_there_is_a_sample_of_every_kind() -> None:
     assert [sample.kind for sample in SAMPLES] == list(MESSAGES)
+
+
+def test_kinds_are_class_names() -> None:
+    assert MESSAGES["fap-frame"].__name__ == "FapFrame"
+    for kind, cls in MESSAGES.items():
+        assert "".join(word.capitalize() for word in kind.split("-")) == cls.__name__
 
 
 def test_no_topic_is_a_prefix_of_another() -> None:

@@ -12,36 +12,39 @@ from numpy.typing import NDArray
 
 from shared.audio_file import read_audio
 from shared.bus import Received
-from shared.client import Client, Session
-from shared.messages import (
-    EndOfFaps,
-    FapFrame,
-    Message,
-    PhoneHeard,
-    Sound,
-    Speech,
-)
+from shared.client import Client, Session, Subscription
+from shared.wire.audio import Sound
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.speech import Lips, Phone, Speech
+
+KINDS: tuple[type[Message], ...] = (FapFrame, EndOfFaps, Phone, Lips, Speech, Sound)
 
 
 @dataclass
-class Heard:
+class Collected:
     frames: list[FapFrame] = field(default_factory=list)
-    phones: list[PhoneHeard] = field(default_factory=list)
+    phones: list[Phone] = field(default_factory=list)
+    lips: list[Lips] = field(default_factory=list)
     speech: list[Speech] = field(default_factory=list)
     sounds: list[Sound] = field(default_factory=list)
     ended: bool = False
 
-    def take(self, message: object) -> None:
-        if isinstance(message, FapFrame):
-            self.frames.append(message)
-        elif isinstance(message, PhoneHeard):
-            self.phones.append(message)
-        elif isinstance(message, Speech):
-            self.speech.append(message)
-        elif isinstance(message, Sound):
-            self.sounds.append(message)
-        elif isinstance(message, EndOfFaps):
-            self.ended = True
+    def add(self, received: Iterable[Received]) -> None:
+        for each in received:
+            match each.message:
+                case FapFrame() as frame:
+                    self.frames.append(frame)
+                case Phone() as phone:
+                    self.phones.append(phone)
+                case Lips() as lips:
+                    self.lips.append(lips)
+                case Speech() as speech:
+                    self.speech.append(speech)
+                case Sound() as sound:
+                    self.sounds.append(sound)
+                case EndOfFaps():
+                    self.ended = True
 
     @property
     def faps(self) -> NDArray[np.float32]:
@@ -49,9 +52,9 @@ class Heard:
         return np.array([np.frombuffer(f.values, "<f4") for f in self.frames])
 
     @property
-    def units(self) -> list[str]:
-        """The final units, in order."""
-        last = {phone.index: phone.unit for phone in self.phones}
+    def symbols(self) -> list[str]:
+        """The final phones, in order."""
+        last = {phone.index: phone.symbol for phone in self.phones}
         return [last[index] for index in sorted(last)]
 
 
@@ -70,7 +73,7 @@ def stream(
     sample_rate_hz: int = 16000,
     paced: bool = False,
     record: bool = False,
-) -> Heard:
+) -> Collected:
     """Stream float samples, paced or as fast as possible, and wait for the last frame."""
     with Client(control) as client:
         opened = client.open_session(
@@ -88,38 +91,53 @@ def stream(
 
 
 def stream_into(
-    opened: Session,
+    session: Session,
     samples: NDArray[np.float32],
     *,
     chunk: int,
     rate_hz: int = 16000,
     paced: bool = False,
-) -> Heard:
-    kinds: tuple[type[Message], ...] = (FapFrame, EndOfFaps, PhoneHeard, Speech, Sound)
-    output = opened.subscribe(*kinds)
-    heard = Heard()
+) -> Collected:
+    """Stream samples into an open session and wait for the last frame."""
+    output = session.subscribe(*KINDS)
+    collected = Collected()
+    send(session, samples, output, collected, chunk=chunk, rate_hz=rate_hz, paced=paced)
+    finish(session, output, collected)
+    return collected
+
+
+def send(
+    session: Session,
+    samples: NDArray[np.float32],
+    output: Subscription,
+    collected: Collected,
+    *,
+    chunk: int = 320,
+    rate_hz: int = 16000,
+    paced: bool = False,
+) -> None:
+    """Send samples, collecting what comes out meanwhile."""
     begin_s = time.monotonic()
     for begin in range(0, len(samples), chunk):
-        while not opened.send(samples[begin : begin + chunk]):
+        while not session.send(samples[begin : begin + chunk]):
             output.wait(0.02)
-            collect(output.receive(), heard)
+            collected.add(output.receive())
         if paced:
             due_s = begin_s + (begin + chunk) / rate_hz
             while time.monotonic() < due_s:
                 output.wait(max(0.001, due_s - time.monotonic()))
-                collect(output.receive(), heard)
-    while not opened.finish():
+                collected.add(output.receive())
+
+
+def finish(session: Session, output: Subscription, collected: Collected) -> None:
+    """End the audio and collect the rest; the recognizer must have no complaint."""
+    while not session.finish():
         output.wait(0.02)
-        collect(output.receive(), heard)
+        collected.add(output.receive())
     end_s = time.monotonic() + 60
-    while not heard.ended:
+    while not collected.ended:
         assert time.monotonic() < end_s, "the last frame did not come"
         output.wait(0.2)
-        collect(output.receive(), heard)
-    collect(output.receive(), heard)
-    return heard
-
-
-def collect(received: Iterable[Received], heard: Heard) -> None:
-    for each in received:
-        heard.take(each.message)
+        collected.add(output.receive())
+        assert list(session.errors()) == []
+    collected.add(output.receive())

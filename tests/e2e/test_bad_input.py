@@ -14,17 +14,12 @@ import zmq
 
 from shared.bus import Bus, Socket
 from shared.client import Client, Refused, Session
-from shared.messages import (
-    AudioChunk,
-    EndOfAudio,
-    Error,
-    FapFrame,
-    Heartbeat,
-    Message,
-    OpenSession,
-    PhoneHeard,
-    Progress,
-)
+from shared.wire.audio import AudioChunk, EndOfAudio
+from shared.wire.control import Heartbeat, SessionInput
+from shared.wire.face import FapFrame
+from shared.wire.message import Message
+from shared.wire.session import Error, OpenSession
+from shared.wire.speech import Phone, Progress
 from tests.e2e.following import samples_of_file, stream
 from tests.system import DEMO, System
 
@@ -175,18 +170,18 @@ def test_what_the_wire_cannot_carry_is_refused(
 GARBAGE: list[list[bytes]] = [
     [b""],
     [b"\xff" * 40],
-    [b"fap/x/", b"\xc1"],
-    [b"audio/x/"] * 3,
+    [b"fap-frame/x/", b"\xc1"],
+    [b"audio-chunk/x/"] * 3,
     [b"a"] * 50,
     [os.urandom(30), os.urandom(2000)],
-    [b"open//", b"\x81" * 3000],
+    [b"open-session//", b"\x81" * 3000],
     [b"x" * 500_000, b""],
 ]
 
 
 def test_garbage_on_every_port_harms_nobody(system: System, witness: Session) -> None:
     with zmq.Context() as context:
-        for port in system.ports.values():
+        for port in system.ports:
             for kind in (zmq.DEALER, zmq.SUB, zmq.XSUB, zmq.PUSH):
                 with context.socket(kind) as raw:
                     throw_garbage(raw, kind, f"tcp://127.0.0.1:{port}")
@@ -212,16 +207,16 @@ def throw_garbage(raw: zmq.Socket[bytes], kind: int, endpoint: str) -> None:
 
 def test_messages_of_other_sockets_are_refused_kindly(system: System, witness: Session) -> None:
     misplaced: list[Message] = [
-        PhoneHeard(session="s", index=0, unit="a", duration=1, confidence=1.0, final=True),
-        PhoneHeard(
-            session=witness.name, index=0, unit="qqqq", duration=1, confidence=1.0, final=True
-        ),
+        Phone(session="s", index=0, symbol="a", duration=1, confidence=1.0, final=True),
+        Phone(session=witness.name, index=0, symbol="qqqq", duration=1, confidence=1.0, final=True),
         Progress(session="nobody", level_db=0.0, sequence=5),
-        Heartbeat(service="recognizer", instance="ghost", state="draining", sent_ns=0),
+        Heartbeat(
+            service="recognizer", instance="ghost", role="worker", state="draining", sent_ns=0
+        ),
         FapFrame(session=witness.name, values=b"\0" * 272, mask=b"\0" * 9),
     ]
     with Bus() as bus:
-        for port in system.ports.values():
+        for port in system.ports:
             dealer = bus.connect_dealer(f"tcp://127.0.0.1:{port}")
             for message in misplaced:
                 dealer.send(message)
@@ -297,7 +292,7 @@ def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
 
 def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) -> None:
     with Bus() as bus:
-        stranger = bus.connect_dealer(f"tcp://127.0.0.1:{system.ports['synthesizer.phones']}")
+        stranger = bus.connect_dealer(system.environment["KOUXING_SYNTHESIZER_PHONE_INPUT"])
         for epoch in (0, 2, 2**53):
             stranger.send(
                 Progress(
@@ -321,10 +316,11 @@ def test_a_false_recognizer_is_not_given_sessions(
             Heartbeat(
                 service="recognizer",
                 instance="a-false-one",
+                role="worker",
                 state="ready",
                 sent_ns=0,
                 endpoints=endpoints,
-                idle_s={witness.name: 1e9},
+                sessions={witness.name: SessionInput(idle_s=1e9)},
             )
         )
         assert next(answers(stranger)).code == "bad-message"
@@ -336,7 +332,9 @@ def test_an_observer_that_never_answers_delays_no_session(
 ) -> None:
     with Bus() as bus:
         mute = bus.connect_dealer(system.control)
-        mute.send(Heartbeat(service="gateway", instance="mute", state="ready", sent_ns=0))
+        mute.send(
+            Heartbeat(service="gateway", instance="mute", role="observer", state="ready", sent_ns=0)
+        )
         time.sleep(0.2)
         session = client.open_session(encoding="f32le")
         session.close()

@@ -10,11 +10,10 @@ import av
 import numpy as np
 import pytest
 
-from shared.bus import Socket
-from shared.client import Client
-from shared.messages import FapFrame
-from shared.phones import UNITS
-from tests.e2e.following import Heard, samples_of_file, stream, stream_into
+from shared.client import Client, Subscription
+from shared.phones.inventory import load_inventory
+from shared.wire.face import FapFrame
+from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.system import DEMO, System
 
 pytestmark = pytest.mark.e2e
@@ -22,35 +21,37 @@ OPEN_JAW, RAISE_B_MIDLIP = 2, 4  # indices of FAP 3 and 5
 
 
 @pytest.fixture(scope="module")
-def heard(system: System) -> Heard:
+def collected(system: System) -> Collected:
     return stream(system.control, samples_of_file(DEMO / "hello-female.wav"))
 
 
-def test_every_frame_arrives_in_order_and_on_time(heard: Heard) -> None:
-    times = np.array([frame.media_time for frame in heard.frames])
-    assert [f.sequence for f in heard.frames] == list(range(1, len(heard.frames) + 1))
+def test_every_frame_arrives_in_order_and_on_time(collected: Collected) -> None:
+    times = np.array([frame.media_time for frame in collected.frames])
+    assert [f.sequence for f in collected.frames] == list(range(1, len(collected.frames) + 1))
     np.testing.assert_array_equal(np.diff(times), 320)
     assert times[0] == 0
     assert times[-1] >= len(samples_of_file(DEMO / "hello-female.wav"))
 
 
-def test_phones_are_units_of_the_paper_and_final_in_the_end(heard: Heard) -> None:
-    assert len(heard.units) > 20
-    assert set(heard.units) <= set(UNITS)
-    finals = {phone.index: phone.final for phone in heard.phones}
+def test_phones_are_those_of_the_language_and_final_in_the_end(collected: Collected) -> None:
+    assert len(collected.symbols) > 20
+    assert set(collected.symbols) <= set(load_inventory().phones)
+    finals = {phone.index: phone.final for phone in collected.phones}
     assert all(finals.values())
 
 
-def test_speech_begins_and_ends(heard: Heard) -> None:
-    states = [speech.active for speech in heard.speech]
+def test_speech_begins_and_ends(collected: Collected) -> None:
+    states = [speech.active for speech in collected.speech]
     assert states[0]
     assert not states[-1]
     assert all(a != b for a, b in itertools.pairwise(states))
 
 
-def test_the_mouth_moves_while_there_is_speech_and_rests_before_and_after(heard: Heard) -> None:
-    faps = heard.faps
-    begin = heard.speech[0].media_time // 320
+def test_the_mouth_moves_while_there_is_speech_and_rests_before_and_after(
+    collected: Collected,
+) -> None:
+    faps = collected.faps
+    begin = collected.speech[0].media_time // 320
     mouth = list(range(2, 13)) + list(range(50, 60))
     assert np.abs(faps[: max(1, begin - 5), mouth]).max() < 1
     assert np.abs(faps[-1, mouth]).max() < 1
@@ -59,17 +60,19 @@ def test_the_mouth_moves_while_there_is_speech_and_rests_before_and_after(heard:
     assert np.isfinite(faps).all()
 
 
-def test_the_sound_is_the_audio_that_was_sent(heard: Heard) -> None:
-    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in heard.sounds])
+def test_the_sound_is_the_audio_that_was_sent(collected: Collected) -> None:
+    sound = np.concatenate([np.frombuffer(sound.pcm, "<i2") for sound in collected.sounds])
     sent = samples_of_file(DEMO / "hello-female.wav")
     np.testing.assert_allclose(sound / 32768, sent, atol=1e-4)
 
 
 @pytest.mark.parametrize("chunk", [97, 1600, 8000])
-def test_frames_do_not_depend_on_the_chunks(system: System, heard: Heard, chunk: int) -> None:
+def test_frames_do_not_depend_on_the_chunks(
+    system: System, collected: Collected, chunk: int
+) -> None:
     again = stream(system.control, samples_of_file(DEMO / "hello-female.wav"), chunk=chunk)
-    assert again.units == heard.units
-    np.testing.assert_allclose(again.faps, heard.faps, atol=1e-3)
+    assert again.symbols == collected.symbols
+    np.testing.assert_allclose(again.faps, collected.faps, atol=1e-3)
 
 
 def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
@@ -96,23 +99,23 @@ def test_odd_chunks_leave_no_gaps(system: System, rate_hz: int, chunk: int) -> N
 
 
 @pytest.mark.parametrize("rate_hz", [8000, 22050, 44100, 48000])
-def test_any_rate_is_heard(system: System, rate_hz: int) -> None:
+def test_any_rate_is_recognised(system: System, rate_hz: int) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")
     positions = np.arange(int(len(samples) * rate_hz / 16000)) * (16000 / rate_hz)
     resampled = np.interp(positions, np.arange(len(samples)), samples).astype(np.float32)
     result = stream(system.control, resampled, sample_rate_hz=rate_hz, chunk=rate_hz // 50)
-    assert len(result.units) > 15
+    assert len(result.symbols) > 15
     assert abs(result.frames[-1].media_time - len(samples)) < 16000
 
 
-def test_int16_stereo_is_heard_as_float_mono(system: System, heard: Heard) -> None:
+def test_int16_stereo_gives_the_phones_of_float_mono(system: System, collected: Collected) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")
     stereo = np.rint(np.stack([samples, samples], axis=1) * 32768).clip(-32768, 32767)
     with Client(system.control) as client:
         session = client.open_session(encoding="s16le", num_channels=2, paced=False)
         result = stream_into(session, stereo, chunk=320)
         session.close()
-    assert result.units == heard.units
+    assert result.symbols == collected.symbols
 
 
 def test_a_stalled_stream_leads_to_rest_and_then_goes_on(system: System) -> None:
@@ -154,7 +157,7 @@ def _opening(frame: FapFrame) -> float:
     return float(np.abs(np.frombuffer(frame.values, "<f4")[2:13]).max())
 
 
-def _frames_until(output: Socket, last: Callable[[FapFrame], bool]) -> list[FapFrame]:
+def _frames_until(output: Subscription, last: Callable[[FapFrame], bool]) -> list[FapFrame]:
     """Return the frames up to the first that ``last`` holds for."""
     frames: list[FapFrame] = []
     end_s = time.monotonic() + 30

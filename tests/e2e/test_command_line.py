@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from shared.fap_file import read_fap
+from shared.face.fap_file import read_fap
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, ROOT, System, free_port, kouxing
 
@@ -154,7 +154,7 @@ def test_phones_in_every_form(form: str) -> None:
     assert result.returncode == 0, result.stderr
     if form == "csv":
         rows = list(csv.DictReader(io.StringIO(result.stdout)))
-        assert {"unit", "onset_s", "duration_s"} <= set(rows[0])
+        assert {"phone", "onset_s", "duration_s"} <= set(rows[0])
     elif form == "json":
         assert json.loads(result.stdout)
     elif form == "textgrid":
@@ -228,7 +228,7 @@ def test_lines_reach_a_log_file_at_once() -> None:
     """Killed in the middle, a command has written all the lines it printed."""
     code = """
 import os, signal
-from services import command_line
+from services.cli import main as command_line
 command_line.app = lambda: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
 command_line.main()
 """

@@ -1,8 +1,12 @@
-"""Each service on an address of its own; strangers that know PROTOCOL.md alone."""
+"""Each service on an address of its own; strangers that know only PROTOCOL.md."""
 
 from __future__ import annotations
 
+import json
+import re
 import struct
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,9 +18,10 @@ import pytest
 import zmq
 
 from tests.e2e.following import samples_of_file
-from tests.system import DEMO, System
+from tests.system import DEMO, ROOT, System
 
 pytestmark = pytest.mark.e2e
+DOCUMENT = ROOT / "proto" / "PROTOCOL.md"
 HOSTS = {
     "control": "127.0.0.11",
     "recognizer": "127.0.0.12",
@@ -49,7 +54,7 @@ class Stranger:
 
 
 def send(socket: zmq.Socket[bytes], kind: str, session: str, **fields: object) -> None:
-    body = {"version": 1, "session": session, **fields}
+    body = {"version": 2, "session": session, **fields}
     socket.send_multipart([f"{kind}/{session}/".encode(), msgpack.packb(body)])
 
 
@@ -61,14 +66,14 @@ def receive(socket: zmq.Socket[bytes]) -> tuple[str, dict[str, Any]]:
 def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> None:
     speaker, watcher = Stranger(), Stranger()
     control = speaker.socket(zmq.DEALER, spread.control)
-    send(control, "open", "stranger", request="1", encoding="s16le", paced=False)
+    send(control, "open-session", "stranger", request="1", encoding="s16le", paced=False)
     kind, opened = receive(control)
-    assert kind == "opened", opened
+    assert kind == "session-opened", opened
     for key, service in (("audio", "recognizer"), ("faps", "synthesizer"), ("events", "control")):
         assert opened[key].startswith(f"tcp://{HOSTS[service]}:")
 
     faps = watcher.socket(zmq.SUB, opened["faps"])
-    for wanted in ("fap", "end", "joined"):
+    for wanted in ("fap-frame", "end-of-faps", "joined"):
         faps.setsockopt(zmq.SUBSCRIBE, f"{wanted}/stranger/".encode())
     assert receive(faps)[0] == "joined"
 
@@ -78,19 +83,19 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> 
     for number, begin in enumerate(range(0, len(pcm), 1280), start=1):
         send(
             audio,
-            "audio",
+            "audio-chunk",
             "stranger",
             token=opened["token"],
             sequence=number,
             media_time=begin // 2,
             pcm=pcm[begin : begin + 1280],
         )
-    send(audio, "finish", "stranger", token=opened["token"], sequence=10**6)
+    send(audio, "end-of-audio", "stranger", token=opened["token"], sequence=10**6)
 
     jaw: list[float] = []
-    while (frame := receive(faps))[0] != "end":
+    while (frame := receive(faps))[0] != "end-of-faps":
         kind, body = frame
-        assert kind == "fap"
+        assert kind == "fap-frame"
         assert body["mask"] == bytes([252] + [255] * 7 + [15])
         assert body["media_time"] == 320 * len(jaw)
         jaw.append(struct.unpack("<68f", body["values"])[2])
@@ -98,7 +103,7 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> 
     assert max(jaw) > 200, "/a/ opens the jaw"
     assert abs(jaw[-1]) < 1
 
-    send(control, "close", "stranger", request="2", token=opened["token"])
+    send(control, "close-session", "stranger", request="2", token=opened["token"])
     assert receive(control)[0] == "done"
     speaker.close()
     watcher.close()
@@ -108,21 +113,21 @@ def test_the_same_request_twice_is_carried_out_once(spread: System) -> None:
     stranger = Stranger()
     control = stranger.socket(zmq.DEALER, spread.control)
     for _ in range(2):
-        send(control, "open", "", request="again")
+        send(control, "open-session", "", request="again")
     answers = [receive(control)[1]]
     control.setsockopt(zmq.RCVTIMEO, 1000)
     try:
         answers.append(receive(control)[1])
     except zmq.Again:
-        send(control, "open", "", request="again")
+        send(control, "open-session", "", request="again")
         answers.append(receive(control)[1])
     assert answers[0] == answers[1]
-    send(control, "status", "", request="status")
+    send(control, "status-request", "", request="status")
     _, report = receive(control)
     assert sum(s["session"] == answers[0]["session"] for s in report["sessions"]) == 1
     send(
         control,
-        "close",
+        "close-session",
         answers[0]["session"],
         request="done",
         token=answers[0]["token"],
@@ -131,12 +136,89 @@ def test_the_same_request_twice_is_carried_out_once(spread: System) -> None:
     stranger.close()
 
 
+def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: System) -> None:
+    stranger = Stranger()
+    lamp = stranger.socket(zmq.DEALER, spread.control)
+    heartbeat: dict[str, Any] = {
+        "service": "lamp",
+        "instance": "lamp-1",
+        "role": "observer",
+        "state": "ready",
+        "sent_ns": 0,
+        "needs": ["faps"],
+    }
+    send(lamp, "heartbeat", "", **heartbeat)
+    assert receive(lamp)[0] == "heartbeat-seen"
+
+    client = stranger.socket(zmq.DEALER, spread.control)
+    send(client, "open-session", "lit", request="1", paced=False)
+    kind, start = receive(lamp)
+    assert kind == "start-session"
+    assert start["endpoints"]["faps"].startswith(f"tcp://{HOSTS['synthesizer']}:")
+    assert not client.poll(300), "the session opens once the lamp is ready for it"
+    send(lamp, "done", "lit", request=start["request"])
+    _, opened = receive(client)
+    assert (opened["language"], opened["frame_rate_hz"]) == ("mandarin", 50.0)
+
+    send(client, "status-request", "", request="2")
+    _, report = receive(client)
+    roles = {service["service"]: service["role"] for service in report["services"]}
+    assert roles["lamp"] == roles["driver"] == "observer"
+    assert roles["recognizer"] == roles["synthesizer"] == "worker"
+
+    send(client, "close-session", "lit", request="3", token=opened["token"])
+    assert receive(lamp)[0] == "stop-session"
+    send(lamp, "heartbeat", "", **{**heartbeat, "state": "draining"})
+    assert receive(lamp)[0] == "heartbeat-seen"
+    stranger.close()
+
+
+def test_a_client_of_version_1_is_told_in_version_1_what_to_do(spread: System) -> None:
+    stranger = Stranger()
+    stored = json.loads((ROOT / "proto" / "golden" / "version1.json").read_text("utf-8"))
+    control = stranger.socket(zmq.DEALER, spread.control)
+    send(control, "open-session", "", request="now")
+    _, opened = receive(control)
+    audio = stranger.socket(zmq.DEALER, opened["audio"])
+    for socket, kind in ((control, "open"), (audio, "audio")):
+        socket.send_multipart([bytes.fromhex(part) for part in stored[kind]])
+        answer_kind, answer = receive(socket)
+        # What the client of version 1 read, and what made it give up with the text.
+        assert (answer_kind, answer["version"], answer["code"]) == ("error", 1, "bad-message")
+        assert f"'{kind}' is a message of protocol version 1" in answer["text"]
+        assert "upgrade" in answer["text"]
+        assert "proto/PROTOCOL.md" in answer["text"]
+        old_fields = set(msgpack.unpackb(bytes.fromhex(stored["error"][1])))
+        assert set(answer) == old_fields
+    send(control, "close-session", opened["session"], request="end", token=opened["token"])
+    assert receive(control)[0] == "done"
+    stranger.close()
+
+
+def test_the_example_in_the_document_runs(spread: System) -> None:
+    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
+    address = "tcp://127.0.0.1:5550"
+    assert address in example
+    result = subprocess.run(
+        [sys.executable, "-", str(DEMO / "vowels-male.wav")],
+        input=example.replace(address, spread.control),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    jaw = [float(line.split()[-1]) for line in result.stdout.splitlines()]
+    assert len(jaw) > 100
+    assert max(jaw) > 200, "/a/ opens the jaw"
+
+
 def test_services_share_no_folder_and_say_what_they_are(spread: System, tmp_path: Path) -> None:
     stranger = Stranger()
     control = stranger.socket(zmq.DEALER, spread.control)
     end_s = time.monotonic() + 10
     while True:
-        send(control, "status", "", request=str(time.monotonic()))
+        send(control, "status-request", "", request=str(time.monotonic()))
         _, report = receive(control)
         offsets = {s["service"]: s["clock_offset_ms"] for s in report["services"]}
         if set(offsets) == set(HOSTS) or time.monotonic() > end_s:

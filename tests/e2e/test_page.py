@@ -28,19 +28,17 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from services.control.config import ControlConfig
 from services.control.service import ControlService
+from services.recognizer.config import RecognizerConfig
+from services.synthesizer.config import SynthesizerConfig
 from shared.client import Client, Session
-from shared.config import ControlConfig, RecognizerConfig, SynthesizerConfig
-from shared.faps import MASK_BYTES, NUM_FAPS
-from shared.messages import (
-    AudioChunk,
-    EndOfAudio,
-    FapFrame,
-    PhoneHeard,
-    Sound,
-    StartSession,
-)
+from shared.face.faps import MASK_BYTES, NUM_FAPS
 from shared.service import Service
+from shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from shared.wire.control import StartSession
+from shared.wire.face import FapFrame
+from shared.wire.speech import Phone
 
 pytestmark = pytest.mark.e2e
 
@@ -74,6 +72,8 @@ class ScriptedRecognizer(Service):
     """Publishes what the test says, and keeps the audio that it gets."""
 
     name = "recognizer"
+    role = "worker"
+    needs = ("phone_input",)
 
     def __init__(self, control: str) -> None:
         local = "tcp://127.0.0.1:*"
@@ -84,14 +84,14 @@ class ScriptedRecognizer(Service):
         self.pcm: dict[str, bytes] = {}
         self.starts: dict[str, StartSession] = {}
         self.finished: set[str] = set()
-        self.listen(
+        self.register(
             self.audio,
             {
                 AudioChunk: self._on_audio,
                 EndOfAudio: lambda end, _: self.finished.add(end.session),
             },
         )
-        self.listen(self.phones, {})
+        self.register(self.phones, {})
 
     def start_session(self, start: StartSession) -> bool:
         self.starts[start.session] = start
@@ -105,15 +105,20 @@ class ScriptedSynthesizer(Service):
     """Publishes the FAP frames that the test says."""
 
     name = "synthesizer"
+    role = "worker"
 
     def __init__(self, control: str) -> None:
         local = "tcp://127.0.0.1:*"
-        super().__init__(SynthesizerConfig(control=control, phones=local, faps=local))
+        super().__init__(SynthesizerConfig(control=control, phone_input=local, faps=local))
         self.input = self.bus.bind_router(local, "synthesizer.phones")
         self.faps = self.bus.bind_publisher(local, "synthesizer.faps")
         self.endpoints = {"phone_input": self.input.endpoint, "faps": self.faps.endpoint}
-        self.listen(self.input, {})
-        self.listen(self.faps, {})
+        self.lips: list[tuple[str, str]] = []  # session, lip model chosen
+        self.register(self.input, {})
+        self.register(self.faps, {})
+
+    def use_lips(self, session: str, lips: str) -> None:
+        self.lips.append((session, lips))
 
 
 class System:
@@ -126,7 +131,7 @@ class System:
         self.synthesizer = ScriptedSynthesizer(self.address)
         self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(self.address)
         self.shown: NDArray[np.float32] | None = None  # the face that is published; None: nothing
-        self.unit = "a"
+        self.symbol = "a"
         self.session = ""
         self._media_time = 0
         self._sequence = 0
@@ -142,8 +147,8 @@ class System:
     def lose_recognizer(self) -> None:
         self._ask_recognizer_to_leave = True
 
-    def talk(self, session: str, shown: NDArray[np.float32], unit: str) -> None:
-        self.session, self.unit, self.shown = session, unit, shown
+    def talk(self, session: str, shown: NDArray[np.float32], symbol: str) -> None:
+        self.session, self.symbol, self.shown = session, symbol, shown
 
     def services(self) -> list[Service]:
         services = [self.control, self.recognizer, self.synthesizer]
@@ -168,9 +173,16 @@ class System:
         shown = self.shown
         if shown is None or self.recognizer is None:
             return
+        start = self.recognizer.starts.get(self.session)
+        if start is None:
+            return
         self._sequence += 1
         tone = 3000 * np.sin(2 * np.pi * 200 / 16000 * (self._media_time + np.arange(FRAME)))
-        stamp: dict[str, Any] = {"session": self.session, "sequence": self._sequence}
+        stamp: dict[str, Any] = {
+            "session": self.session,
+            "epoch": start.epoch,
+            "sequence": self._sequence,
+        }
         phones, faps = self.recognizer.phones, self.synthesizer.faps
         pcm = tone.astype("<i2").tobytes()
         phones.send(Sound(**stamp, media_time=self._media_time, pcm=pcm))
@@ -183,11 +195,11 @@ class System:
             )
         if self._sequence % 10 == 0:
             phones.send(
-                PhoneHeard(
+                Phone(
                     **stamp,
                     media_time=self._media_time,
                     index=self._sequence // 10,
-                    unit=self.unit,
+                    symbol=self.symbol,
                     duration=3200,
                     confidence=0.9,
                     final=True,
@@ -597,6 +609,22 @@ def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser)
     )
     samples = np.frombuffer(recognizer.pcm[name], "<i2").astype(float)
     assert np.sqrt((samples**2).mean()) > 300
+
+
+def test_the_lips_are_switched_while_the_microphone_is_on(system: System, browser: Browser) -> None:
+    system.synthesizer.lips.clear()
+    browser.click("lips")  # counts for the microphone to come
+    browser.wait_for("window.kouxing.state.lips === 'learnt'")
+    browser.click("microphone")
+    wait_until(lambda: len(system.synthesizer.lips) == 1, 10)
+    browser.click("lips")
+    browser.wait_for("window.kouxing.state.lips === 'dynamic-visemes'")
+    wait_until(lambda: len(system.synthesizer.lips) == 2, 10)
+    browser.click("microphone")
+    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    (first, second) = system.synthesizer.lips
+    assert first[0] == second[0] != "seen"
+    assert [first[1], second[1]] == ["learnt", "dynamic-visemes"]
 
 
 def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None:

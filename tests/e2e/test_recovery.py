@@ -14,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from services.supervisor import Supervisor
+from services.cli.supervisor import Supervisor
 from shared.client import Client, Session
 from shared.errors import UserError
-from shared.messages import FapFrame
+from shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, own_environment
 
@@ -87,6 +87,7 @@ def test_a_session_goes_on_after_a_crash(watched: Watched, service: str) -> None
         watched.until_replaced(client, service, old)
         time.sleep(0.5)
         assert moves(session, samples[24000:72000])
+        assert list(session.errors()) == []
         session.close()
     assert f"{service} ended with status -9" in watched.shown.getvalue()
 

@@ -15,14 +15,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.command_line import _chosen_head
-from services.driver.film import frames_of
-from services.driver.glb import export_glb
-from services.driver.head import Head
-from services.offline_commands import CameraName, head_import, render
-from shared.config import DriverConfig
+from services.cli.heads import import_mesh
+from services.cli.offline import render
+from services.cli.run import head_environment
+from services.driver.config import DriverConfig, Framing
+from services.driver.head.glb_export import export_glb
+from services.driver.head.head import Head
+from services.driver.video.film import frames_of
 from shared.errors import UserError
-from shared.fap_file import FapAnimation, write_fap
+from shared.face.fap_file import FapAnimation, write_fap
 from tests.glb_writer import write_glb
 from tests.meshes import meshes
 from tests.system import DEMO, ROOT, free_port, kouxing
@@ -67,7 +68,7 @@ def test_one_transparent_picture_of_another_head(face: Path, tmp_path: Path) -> 
         path = tmp_path / f"{head}{yaw:.0f}.png"
         render(
             face, path, head=head, size="161x121", background="transparent",
-            camera=CameraName.HEAD, yaw=yaw, at=0.2,
+            camera=Framing.HEAD, yaw=yaw, at=0.2,
         )  # fmt: skip
         pictures.append(np.asarray(Image.open(path)).astype(int))
     for picture in pictures:
@@ -126,16 +127,16 @@ def test_an_imported_mesh_speaks(face: Path, tmp_path: Path) -> None:
     ]
     (tmp_path / "points.tsv").write_text("\n".join(rows), encoding="utf-8")
     head = tmp_path / "mine.npz"
-    head_import(tmp_path / "mesh.glb", tmp_path / "points.tsv", head)
+    import_mesh(tmp_path / "mesh.glb", tmp_path / "points.tsv", head)
     render(face, tmp_path / "frames", head=str(head), size="64x48")
     assert len(list((tmp_path / "frames").iterdir())) == 10
 
 
 def test_the_page_gets_the_head_that_is_chosen(tmp_path: Path) -> None:
     own = DriverConfig().head
-    assert _chosen_head(own, tmp_path) == {"KOUXING_DRIVER_HEAD": own}, "whatever a file says"
+    assert head_environment(own, tmp_path) == {"KOUXING_DRIVER_HEAD": own}, "whatever a file says"
     export_glb(Head.load("child", "coarse"), tmp_path / "my.glb")
-    chosen = _chosen_head(str(tmp_path / "my.glb"), tmp_path / "out")
+    chosen = head_environment(str(tmp_path / "my.glb"), tmp_path / "out")
     assert chosen["KOUXING_DRIVER_HEAD"] == str(tmp_path / "my.glb")
     port = free_port()
     environment = {**os.environ, **chosen, "KOUXING_GATEWAY_PORT": str(port)}

@@ -28,7 +28,7 @@ def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:
         assert sum(1 for _ in film.decode(video=0)) >= 2.2 * 25
 
 
-def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
+def test_it_runs_until_it_is_interrupted(tmp_path: Path) -> None:
     environment = own_environment(tmp_path)
     running = subprocess.Popen(
         [sys.executable, "-m", "services", "run", "--no-browser"],
@@ -39,7 +39,7 @@ def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
     )
     try:
         begun = ""
-        while "listening" not in begun:
+        while "ready:" not in begun:
             line = running.stderr.readline() if running.stderr else ""
             assert line, f"it ended: {begun}"
             begun += line
@@ -60,7 +60,7 @@ def test_it_goes_on_listening_until_it_is_interrupted(tmp_path: Path) -> None:
 
 def test_a_wrong_configuration_ends_it_with_the_key(tmp_path: Path) -> None:
     config = tmp_path / "kouxing.toml"
-    config.write_text("[synthesizer]\nlook_ahead_ms = 5000\n", encoding="utf-8")
+    config.write_text("[synthesizer]\ndelay_ms = 5000\n", encoding="utf-8")
     result = kouxing("run", "--config", config, environment=own_environment(tmp_path))
     assert result.returncode == 2
-    assert "synthesizer.look_ahead_ms" in result.stderr
+    assert "synthesizer.delay_ms" in result.stderr

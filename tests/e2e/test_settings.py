@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from shared.client import Client
-from shared.messages import Error, Event
+from shared.wire.control import Event
+from shared.wire.session import Error
 from tests.e2e.following import samples_of_file, stream
 from tests.system import DEMO, System
 
 pytestmark = pytest.mark.e2e
 SETTINGS = {
     "KOUXING_SYNTHESIZER_FRAME_RATE_HZ": "30",
-    "KOUXING_SYNTHESIZER_LOOK_AHEAD_MS": "0",
-    "KOUXING_SYNTHESIZER_GESTURE_SEED": "0",
+    "KOUXING_SYNTHESIZER_DELAY_MS": "0",
+    "KOUXING_SYNTHESIZER_IDLE_MOTION_SEED": "0",
     "KOUXING_CONTROL_IDLE_LIMIT_S": "1",
     "KOUXING_CONTROL_MAX_SESSIONS": "3",
 }

@@ -1,6 +1,6 @@
 """Software GL draws the stored pictures, up to a tolerance.
 
-A change of looks that is meant: run with ``KOUXING_WRITE_GOLDEN=1`` and look at the pictures.
+A change of looks that is meant: run with ``WRITE_GOLDEN=1`` and look at the pictures.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.driver.head import neutral_faps
-from services.driver.render import Renderer
+from services.driver.head.head import neutral_faps
+from services.driver.render.renderer import Renderer
 from tests import heads
 
 pytestmark = pytest.mark.golden
@@ -43,7 +43,7 @@ def test_picture(name: str, shape: str) -> None:
     image = renderer.draw(SHAPES[shape])
     renderer.close()
     stored = Path(__file__).with_name(f"render_{name}_{shape}.png")
-    if os.environ.get("KOUXING_WRITE_GOLDEN"):
+    if os.environ.get("WRITE_GOLDEN"):
         Image.fromarray(image).save(stored)
     golden = np.asarray(Image.open(stored).convert("RGB"), dtype=float)
     difference = np.abs(image.astype(float) - golden)

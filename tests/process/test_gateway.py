@@ -21,37 +21,39 @@ from urllib.parse import urlsplit
 import aiohttp
 import pytest
 
-from shared.bus import Bus
+from shared.bus import AUDIO_QUEUE_LENGTH, Bus
 from shared.clock import now_ns
-from shared.faps import MASK_BYTES, NUM_FAPS
-from shared.messages import (
-    AudioChunk,
-    CloseSession,
-    Done,
-    EndOfAudio,
-    EndOfFaps,
-    Error,
-    FapFrame,
+from shared.face.faps import MASK_BYTES, NUM_FAPS
+from shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from shared.wire.control import (
     Heartbeat,
     HeartbeatSeen,
-    Message,
-    OpenSession,
-    PhoneHeard,
     ServiceState,
-    SessionOpened,
-    Sound,
-    Speech,
     StartSession,
     StatusReport,
     StatusRequest,
     StopSession,
 )
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.session import (
+    ChooseLips,
+    CloseSession,
+    Done,
+    Error,
+    FlushSession,
+    OpenSession,
+    SessionOpened,
+)
+from shared.wire.speech import Phone, Speech
+from tests.system import free_port
 
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).parents[2]
 LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls so
+EPOCH = 3
 FACE = struct.pack(f"<{NUM_FAPS}f", *range(NUM_FAPS))
 
 
@@ -64,10 +66,13 @@ class ScriptedSystem:
         self.audio = self.bus.bind_router(LOCAL, "audio")
         self.phones = self.bus.bind_publisher(LOCAL, "phones")
         self.faps = self.bus.bind_publisher(LOCAL, "faps")
+        self.audio_endpoint = self.audio.endpoint  # that clients are given
         self.page = ""
         self.gateway = b""
         self.started: list[str] = []  # sessions that the gateway has confirmed
         self.closed: list[str] = []
+        self.flushed: list[str] = []
+        self.chosen: list[tuple[str, str]] = []  # session, lip model
         self.audio_messages: list[Message] = []
         self.forget()
         self._openings: dict[str, tuple[OpenSession, bytes]] = {}
@@ -84,8 +89,9 @@ class ScriptedSystem:
     def forget(self) -> None:
         self.running = ["recognizer", "synthesizer"]
         self.refuse = False
-        for heard in (self.started, self.closed, self.audio_messages):
-            heard.clear()
+        for received in (self.started, self.closed, self.flushed, self.audio_messages):
+            received.clear()
+        self.chosen.clear()
 
     def do(self, job: Callable[[], object]) -> None:
         """Run something on the thread that owns the sockets, and wait for it."""
@@ -94,10 +100,15 @@ class ScriptedSystem:
         self._jobs.put(done.set)
         assert done.wait(5)
 
-    def start(self, session: str) -> None:
+    def bind_audio(self) -> None:
+        """Have a recognizer at the address that clients are given."""
+        self.audio = self.bus.bind_router(self.audio_endpoint, "audio")
+        self._poller.add(self.audio)
+
+    def start(self, session: str, epoch: int = EPOCH) -> None:
         message = StartSession(
             session=session,
-            epoch=1,
+            epoch=epoch,
             request=f"start-{session}",
             token=TOKEN,
             encoding="s16le",
@@ -105,38 +116,42 @@ class ScriptedSystem:
             num_channels=1,
             record=False,
             paced=True,
-            phone_input=self.audio.endpoint,
-            phones=self.phones.endpoint,
-            faps=self.faps.endpoint,
+            language="mandarin",
+            endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
         )
         self.commands.send(message, to=self.gateway)
 
     def publish_all(self, session: str) -> None:
-        self.phones.send(Sound(session=session, media_time=320, pcm=b"\x01\x00\xff\x7f"))
-        self.phones.send(Speech(session=session, media_time=320, active=True))
         self.phones.send(
-            PhoneHeard(
+            Sound(session=session, epoch=EPOCH, media_time=320, pcm=b"\x01\x00\xff\x7f")
+        )
+        self.phones.send(Speech(session=session, epoch=EPOCH, media_time=320, active=True))
+        self.phones.send(
+            Phone(
                 session=session,
+                epoch=EPOCH,
                 media_time=320,
                 index=0,
-                unit="iao",
+                symbol="iao",
                 duration=1600,
                 confidence=0.5,
                 final=False,
             )
         )
         self.faps.send(
-            FapFrame(session=session, media_time=320, values=FACE, mask=bytes(MASK_BYTES))
+            FapFrame(
+                session=session, epoch=EPOCH, media_time=320, values=FACE, mask=bytes(MASK_BYTES)
+            )
         )
 
     def _run(self) -> None:
-        poller = self.bus.poller()
+        self._poller = self.bus.poller()
         for socket_ in (self.commands, self.audio, self.phones, self.faps):
-            poller.add(socket_)
+            self._poller.add(socket_)
         while not self._stop:
             while not self._jobs.empty():
                 self._jobs.get()()
-            for socket_ in poller.wait(0.005):
+            for socket_ in self._poller.wait(0.005):
                 for received in socket_.receive():
                     if socket_ is self.commands:
                         self._on_command(received.message, received.sender)
@@ -165,10 +180,17 @@ class ScriptedSystem:
                 self.closed.append(message.session)
                 self.commands.send(StopSession(session=message.session), to=self.gateway)
                 answer = Done(session=message.session, request=message.request)
+            case FlushSession():
+                self.flushed.append(message.session)
+                answer = Done(session=message.session, request=message.request)
+            case ChooseLips():
+                self.chosen.append((message.session, message.lips))
+                answer = Done(session=message.session, request=message.request)
             case StatusRequest():
                 states = [
                     ServiceState(
                         service=name,
+                        role="worker",
                         instance=name,
                         state="ready",
                         age_s=0,
@@ -188,7 +210,7 @@ class ScriptedSystem:
                 session=session,
                 request=opening.request,
                 token=TOKEN,
-                audio=self.audio.endpoint,
+                audio=self.audio_endpoint,
                 phones=self.phones.endpoint,
                 faps=self.faps.endpoint,
                 events=self.faps.endpoint,
@@ -309,14 +331,18 @@ def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayP
             got = [await newest.receive(5) for _ in range(4)]
             binary = {m.data[0]: m.data for m in got if m.type is aiohttp.WSMsgType.BINARY}
             texts = [json.loads(m.data) for m in got if m.type is aiohttp.WSMsgType.TEXT]
-            assert struct.unpack_from("<B3xId", binary[1]) == (1, 0, 320.0)
+            assert struct.unpack_from("<B3xId", binary[1]) == (1, EPOCH, 320.0)
             assert binary[1][16:] == FACE
             assert binary[2][16:] == b"\x01\x00\xff\x7f"
             assert {text["type"] for text in texts} == {"speech", "phone"}
-            assert next(text for text in texts if text["type"] == "phone")["unit"] == "iao"
+            assert next(text for text in texts if text["type"] == "phone")["symbol"] == "iao"
 
             await other.send_json({"follow": "one"})
             assert (await receive_json(other, "session"))["session"] == "one"
+            system.do(lambda: system.start("one", epoch=EPOCH + 1))
+            restarted = await receive_json(newest, "session")
+            assert (restarted["session"], restarted["epoch"]) == ("one", EPOCH + 1)
+            await until(lambda: system.started == ["one", "one"])
             system.do(lambda: system.commands.send(StopSession(session="one"), to=system.gateway))
             assert (await receive_json(newest, "session"))["session"] is None
             await other.send_str("[[[[")
@@ -372,7 +398,7 @@ def test_a_microphone_streams_and_says_its_last(
                 await until(lambda: len(system.audio_messages) == 5)
             await until(lambda: len(system.audio_messages) == 6)
             assert not system.closed  # before the last frame has come
-            system.do(lambda: system.faps.send(EndOfFaps(session=session)))
+            system.do(lambda: system.faps.send(EndOfFaps(session=session, epoch=EPOCH)))
             await until(lambda: system.closed == [session], 1.0)
 
     asyncio.run(speak())
@@ -380,6 +406,40 @@ def test_a_microphone_streams_and_says_its_last(
     assert [chunk.media_time for chunk in chunks] == [0, 320, 640, 960, 1280]
     assert all(isinstance(chunk, AudioChunk) and len(chunk.pcm) == 1920 for chunk in chunks)
     assert isinstance(last, EndOfAudio)
+
+
+def test_audio_that_had_to_be_dropped_leaves_a_gap_in_media_time(
+    own_system: ScriptedSystem, own_gateway: GatewayProcess
+) -> None:
+    system, gateway = own_system, own_gateway
+    system.audio_endpoint = f"tcp://127.0.0.1:{free_port()}"  # nobody is there yet
+    num_chunks = AUDIO_QUEUE_LENGTH + 100
+    last_pcm = b"\x02\x00" * 320
+
+    async def speak() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}microphone") as browser,
+        ):
+            await browser.send_json({"sample_rate_hz": 16000})
+            await receive_json(browser, "opened")
+            for _ in range(num_chunks):
+                await browser.send_bytes(b"\x01\x00" * 320)
+            await browser.send_json({"flush": True})
+            await until(lambda: bool(system.flushed))  # the gateway has taken all of them
+            system.do(system.bind_audio)
+            await until(lambda: len(system.audio_messages) == AUDIO_QUEUE_LENGTH)
+            await browser.send_json({"skip": 320})  # what the network was too slow for
+            await browser.send_bytes(last_pcm)
+            await until(lambda: len(system.audio_messages) > AUDIO_QUEUE_LENGTH)
+
+    asyncio.run(speak())
+    *queued, last = system.audio_messages[: AUDIO_QUEUE_LENGTH + 1]
+    assert [chunk.media_time for chunk in queued] == [320 * n for n in range(AUDIO_QUEUE_LENGTH)]
+    assert isinstance(last, AudioChunk)
+    assert last.pcm == last_pcm
+    assert last.media_time == 320 * (num_chunks + 1)
+    assert last.sequence == AUDIO_QUEUE_LENGTH + 1
 
 
 def test_the_sample_sentence_is_streamed_once_for_whoever_asks(
@@ -406,6 +466,34 @@ def test_the_sample_sentence_is_streamed_once_for_whoever_asks(
     asyncio.run(ask())
     assert gateway.stop() == 0
     assert system.closed == system.started
+
+
+def test_microphone_and_sample_may_choose_their_lips(
+    own_system: ScriptedSystem, own_gateway: GatewayProcess
+) -> None:
+    system, gateway = own_system, own_gateway
+
+    async def choose() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer") as viewer,
+            http.ws_connect(f"{gateway.page}microphone") as browser,
+        ):
+            await browser.send_json({"sample_rate_hz": 16000})
+            await receive_json(browser, "opened")
+            await browser.send_json({"lips": "learnt"})
+            await until(lambda: len(system.chosen) == 1)
+            await browser.send_json({"lips": "dynamic-visemes"})
+            await until(lambda: len(system.chosen) == 2)
+            await viewer.send_json({"play": "sample", "lips": "ferguson"})
+            assert "lips must be one of" in (await receive_json(viewer, "error"))["text"]
+            await viewer.send_json({"play": "sample", "lips": "learnt"})
+            await until(lambda: len(system.chosen) == 3)
+
+    asyncio.run(choose())
+    (first, second, third) = system.chosen
+    assert first[0] == second[0] != third[0]
+    assert [first[1], second[1], third[1]] == ["learnt", "dynamic-visemes", "learnt"]
 
 
 def test_bad_microphones_are_told_why(system: ScriptedSystem, gateway: GatewayProcess) -> None:
@@ -482,6 +570,8 @@ def test_strange_pages_and_paths_are_refused(gateway: GatewayProcess) -> None:
             for path in (
                 "..%2Fservice.py",
                 "package.json",
+                "tests%2Fplayout.test.js",
+                "tests/playout.test.js",
                 "modules/three/build/..%2Fpackage.json",
             ):
                 assert await status(http, path) in (403, 404)

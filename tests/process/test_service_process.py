@@ -12,8 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from services.kinds import KINDS, free_addresses
 from shared.client import Client
-from tests.system import BINDS, ROOT, System, free_port
+from shared.config import variable
+from tests.system import ROOT, System
 
 pytestmark = pytest.mark.process
 
@@ -42,20 +44,22 @@ def test_every_service_stops_cleanly_on_sigterm(tmp_path: Path) -> None:
         assert "traceback" not in system.log(service).lower()
 
 
-@pytest.mark.parametrize("service", ["control", "recognizer", "synthesizer"])
-def test_a_port_in_use_is_named(service: str) -> None:
+@pytest.mark.parametrize(
+    ("service", "key"),
+    [("control", "commands"), ("recognizer", "audio"), ("synthesizer", "phone_input")],
+)
+def test_a_port_in_use_is_named(service: str, key: str) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        key = BINDS[service][0]
-        endpoint = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        result = ended(f"services.{service}", **{f"KOUXING_{service.upper()}_{key}": endpoint})
+        setting = {variable(service, key): f"tcp://127.0.0.1:{taken.getsockname()[1]}"}
+        result = ended(f"services.{service}", **setting)
     assert result.returncode == 2
-    assert f"{service}.{key.lower()}" in result.stderr
+    assert f"{service}.{key}" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.parametrize("service", ["control", "recognizer", "synthesizer", "driver", "gateway"])
+@pytest.mark.parametrize("service", KINDS)
 def test_a_wrong_setting_is_named_before_anything_is_opened(service: str) -> None:
     result = ended(f"services.{service}", "--set", "log_level=loud")
     assert result.returncode == 2
@@ -80,17 +84,13 @@ def test_a_hung_loop_is_seen_as_a_lost_service(tmp_path: Path) -> None:
 def test_a_service_ends_with_its_supervisor(tmp_path: Path) -> None:
     starter = (
         "import os, subprocess, sys\n"
-        "env = {**os.environ, 'KOUXING_SUPERVISOR': str(os.getpid())}\n"
+        "env = {**os.environ, '_KOUXING_SUPERVISOR': str(os.getpid())}\n"
         "child = subprocess.Popen([sys.executable, '-m', 'services.synthesizer'], env=env)\n"
         "print(child.pid, flush=True)\n"
     )
-    environment = {
-        f"KOUXING_SYNTHESIZER_{key}": f"tcp://127.0.0.1:{free_port()}"
-        for key in BINDS["synthesizer"]
-    }
     parent = subprocess.run(
         [sys.executable, "-c", starter],
-        env={**os.environ, **environment},
+        env={**os.environ, **free_addresses(["synthesizer"])},
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.codec import BadMessage, decode, encode
-from shared.messages import VERSION, AudioChunk, Message
+from shared.clock import to_seconds
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent, SpeechChange
+from shared.wire.audio import AudioChunk
+from shared.wire.codec import BadMessage, decode, encode
+from shared.wire.events import event_of, message_of
+from shared.wire.message import VERSION, Message
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.property
@@ -42,3 +48,53 @@ def test_audio_survives_the_wire(pcm: bytes, sequence: int, media_time: int) -> 
         media_time=media_time,
     )
     assert decode(encode(chunk)) == chunk
+
+
+TIMES = st.integers(0, 2**40).map(to_seconds)  # two years
+EVENTS: st.SearchStrategy[SoundEvent] = st.one_of(
+    st.builds(
+        Phone,
+        index=st.integers(0, 2**53),
+        symbol=st.from_regex("[a-z]{1,4}", fullmatch=True),
+        onset_s=TIMES,
+        duration_s=TIMES,
+        confidence=st.floats(0, 1),
+        final=st.booleans(),
+    ),
+    st.builds(SpeechChange, active=st.booleans(), time_s=TIMES),
+    st.builds(Progress, time_s=TIMES, level_db=st.floats(-200, 20)),
+    st.builds(EndOfSound, time_s=TIMES),
+)
+
+
+@given(EVENTS)
+def test_an_event_survives_the_wire_without_loss(event: SoundEvent) -> None:
+    message = message_of(event)
+    assert decode(encode(message)) == message
+    assert event_of(message) == event
+
+
+@given(
+    st.builds(
+        LipFrame,
+        time_s=TIMES,
+        delay_s=TIMES,
+        faps=st.lists(
+            st.floats(width=32, allow_nan=False), min_size=len(MOUTH_FAPS), max_size=len(MOUTH_FAPS)
+        ).map(lambda faps: np.array(faps, np.float32)),
+        closure=st.floats(0, 1),
+        lip_to_teeth=st.floats(0, 1),
+    )
+)
+def test_a_mouth_survives_the_wire_without_loss(frame: LipFrame) -> None:
+    message = message_of(frame)
+    assert decode(encode(message)) == message
+    read = event_of(message)
+    assert isinstance(read, LipFrame)
+    np.testing.assert_array_equal(read.faps, frame.faps)
+    assert (read.time_s, read.delay_s, read.closure, read.lip_to_teeth) == (
+        frame.time_s,
+        frame.delay_s,
+        frame.closure,
+        frame.lip_to_teeth,
+    )

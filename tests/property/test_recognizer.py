@@ -1,4 +1,4 @@
-"""The recognizer hears the same whatever the chunks are, and its parts keep their promises."""
+"""Any chunking gives the same result, and the parts of the recognizer keep their promises."""
 
 from functools import cache
 from itertools import pairwise
@@ -9,16 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.recognizer.acoustic_model import AcousticModel
-from services.recognizer.decoder import Decoder
-from services.recognizer.features import Differences, LogMel, cepstra, with_differences
-from services.recognizer.load import DEFAULT_MODEL, load_model, model_path
-from services.recognizer.output_rule import OutputRule
-from services.recognizer.pipeline import Recognizer
-from services.recognizer.resample import Resampler, to_16_khz
-from services.recognizer.unit_language import NUM_UNITS
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
+from services.recognizer.front_end.features import Differences, LogMel, cepstra, with_differences
+from services.recognizer.front_end.resample import Resampler, to_16_khz
+from services.recognizer.recognizer import Emission, Recognizer
+from services.recognizer.search.decoder import Decoder
+from services.recognizer.search.output_rule import OutputRule
 from shared.audio_file import read_audio
-from shared.phones import Phone, SpeechChange
 
 pytestmark = pytest.mark.property
 
@@ -37,18 +35,20 @@ def the_model(name: str = DEFAULT_MODEL) -> AcousticModel:
     return load_model(model_path(name))
 
 
-def hear(chunks: list[np.ndarray], rate_hz: int) -> list[Phone | SpeechChange]:
+def recognise(chunks: list[np.ndarray], rate_hz: int) -> list[Emission]:
     recognizer = Recognizer(the_model(), sample_rate_hz=rate_hz)
     events = [event for chunk in chunks for event in recognizer.accept_waveform(chunk)]
     return events + recognizer.input_finished()
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=12)
 @given(cuts=CUTS, rate_hz=st.sampled_from([16_000, 44_100]))
-def test_any_chunking_is_heard_the_same(cuts: list[int], rate_hz: int) -> None:
-    assert hear(pieces(HELLO, cuts), rate_hz) == hear([HELLO], rate_hz)
+def test_any_chunking_gives_the_same_phones(cuts: list[int], rate_hz: int) -> None:
+    assert recognise(pieces(HELLO, cuts), rate_hz) == recognise([HELLO], rate_hz)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=15)
 @given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 40))
 def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: int) -> None:
@@ -106,17 +106,21 @@ def test_front_ends_in_any_chunks(cuts: list[int], name: str) -> None:
 
 @settings(deadline=None, max_examples=50)
 @given(
-    units=st.lists(st.integers(0, 3), max_size=60), agreement=st.integers(1, 6), before=st.just(9)
+    phones=st.lists(st.integers(0, 3), max_size=60),
+    num_stable_frames=st.integers(1, 6),
+    before=st.just(9),
 )
-def test_the_output_rule_is_the_paper_s(units: list[int], agreement: int, before: int) -> None:
+def test_the_output_rule_is_the_paper_s(
+    phones: list[int], num_stable_frames: int, before: int
+) -> None:
     """Li 2011, eq. 4, word for word."""
-    rule = OutputRule(agreement, 0.0, last_output=before)
+    rule = OutputRule(num_stable_frames, 0.0, last_emitted=before)
     last = before
-    for t, unit in enumerate(units):
-        recent = units[max(0, t - agreement + 1) : t + 1]
-        expected = len(recent) == agreement and set(recent) == {unit} and unit != last
-        assert rule.accept(unit, 0.1) == expected
-        last = unit if expected else last
+    for t, phone in enumerate(phones):
+        recent = phones[max(0, t - num_stable_frames + 1) : t + 1]
+        expected = len(recent) == num_stable_frames and set(recent) == {phone} and phone != last
+        assert rule.accept(phone, 0.1) == expected
+        last = phone if expected else last
 
 
 @settings(deadline=None, max_examples=25)
@@ -126,8 +130,8 @@ def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
     rng = np.random.default_rng(seed)
     decoder = Decoder(topology)
     for row in rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32):
-        unit, start, confidence = decoder.accept(row)
-        assert 0 <= unit < NUM_UNITS
+        phone, start, confidence = decoder.accept(row)
+        assert 0 <= phone < len(topology.inventory)
         assert start < num_frames
         assert 0 < confidence <= 1
     segments = decoder.finish()
@@ -136,4 +140,4 @@ def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
     shortest = np.diff(topology.first_state)
     for one, two in pairwise(segments):
         assert one.end == two.start
-        assert one.end - one.start >= shortest[one.unit]
+        assert one.end - one.start >= shortest[one.phone]

@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.offline_commands import PhoneFormat, align
-from services.recognizer.load import load_model
+from services.cli.offline import PhoneFormat, align
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.alignment import align_text, spoken
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.phone_files import format_phones
-from shared.phones import Phone
-from training.align import align_text, spoken
+from shared.phones.events import Phone
+from shared.phones.inventory import load_inventory
+from shared.phones.phone_files import format_phones
 
 pytestmark = pytest.mark.unit
 
@@ -26,8 +27,9 @@ def vowels() -> list[Phone]:
     return align_text(load_model(), samples, rate_hz, "啊，喔，鹅，衣，乌，迂。")
 
 
-def test_all_units_in_order_without_gaps(vowels: list[Phone]) -> None:
-    assert [phone.unit for phone in spoken(vowels)] == ["a", "o", "e", "i", "u", "v"]
+def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
+    symbols = [phone.symbol for phone in spoken(vowels, load_inventory())]
+    assert symbols == ["a", "o", "e", "i", "u", "v"]
     for one, two in pairwise(vowels):
         assert one.onset_s + one.duration_s == pytest.approx(two.onset_s)
     assert vowels[0].onset_s == pytest.approx(0.0075)
@@ -36,7 +38,7 @@ def test_all_units_in_order_without_gaps(vowels: list[Phone]) -> None:
 def test_vowels_are_where_the_sound_is(vowels: list[Phone]) -> None:
     samples, rate_hz = read_audio(DEMO / "vowels-male.wav")
     loud = np.square(samples[:, 0]).mean()
-    for phone in spoken(vowels):
+    for phone in spoken(vowels, load_inventory()):
         first = int(phone.onset_s * rate_hz)
         part = samples[first : int((phone.onset_s + phone.duration_s) * rate_hz), 0]
         assert np.square(part).mean() > 0.2 * loud  # the last one dies away
@@ -48,25 +50,25 @@ def test_pinyin_and_characters_are_the_same() -> None:
     by_text = align_text(model, samples, rate_hz, "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。")
     pinyin = "ba4 ba ma1 ma pǎo bu4 mai3 ping2 guo3 bo2 bo pei2 po2 po man4 man pin3 cha2"
     by_pinyin = align_text(model, samples, rate_hz, pinyin)
-    assert [p.unit for p in by_text] == [p.unit for p in by_pinyin]
+    assert [p.symbol for p in by_text] == [p.symbol for p in by_pinyin]
 
 
 PHONES = [
-    Phone(index=0, unit="n", onset_s=0.25, duration_s=0.1, confidence=0.5, final=True),
-    Phone(index=1, unit="i", onset_s=0.35, duration_s=0.2, confidence=1.0, final=True),
-    Phone(index=2, unit="sil", onset_s=0.8, duration_s=0.3, confidence=0.25, final=True),
+    Phone(index=0, symbol="n", onset_s=0.25, duration_s=0.1, confidence=0.5, final=True),
+    Phone(index=1, symbol="i", onset_s=0.35, duration_s=0.2, confidence=1.0, final=True),
+    Phone(index=2, symbol="sil", onset_s=0.8, duration_s=0.3, confidence=0.25, final=True),
 ]
 
 
 def test_csv_and_json_and_table() -> None:
     rows = list(csv.DictReader(io.StringIO(format_phones(PHONES, "csv", 1.0))))
-    assert [row["unit"] for row in rows] == ["n", "i", "sil"]
+    assert [row["phone"] for row in rows] == ["n", "i", "sil"]
     assert rows[1]["onset_s"] == "0.35"
     read = json.loads(format_phones(PHONES, "json", 1.0))
     assert read["total_s"] == 1.0
     assert read["phones"][2] == {
         "index": 2,
-        "unit": "sil",
+        "phone": "sil",
         "onset_s": 0.8,
         "duration_s": 0.3,
         "confidence": 0.25,
@@ -97,10 +99,10 @@ def test_nothing_said_is_one_empty_interval() -> None:
     ("name", "form", "beginning"),
     [
         ("said.TextGrid", None, "File type"),
-        ("said.csv", None, "index,unit"),
+        ("said.csv", None, "index,phone"),
         ("said.json", None, "{"),
         ("said.txt", None, "  onset_s"),
-        ("said.txt", PhoneFormat.CSV, "index,unit"),
+        ("said.txt", PhoneFormat.CSV, "index,phone"),
     ],
 )
 def test_the_suffix_tells_the_form(

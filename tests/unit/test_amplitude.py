@@ -5,28 +5,28 @@ import math
 import numpy as np
 import pytest
 
-from services.synthesizer.amplitude import Amplitude
-from services.synthesizer.full import synthesize
-from services.synthesizer.parameters import load_parameters
-from services.synthesizer.timeline import Timeline, build_timeline
-from services.synthesizer.visemes import VISEME_INDEX, VISEMES
-from shared.phones import Phone
+from services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
+from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
+from services.synthesizer.modifiers.amplitude import Amplitude
+from services.synthesizer.offline import synthesize
+from shared.phones.events import Phone
+from tests.lips import LIPS, articulation_of, moment
 
 pytestmark = pytest.mark.unit
 
-PARAMETERS = load_parameters()
+PARAMETERS = LIPS.parameters
 JAW, UPPER_LIP, LOWER_LIP, WIDTH = 2, 3, 4, 5
 STEP_S = 0.02
 
 
-def syllables(rate_hz: float, units: str = "d a", num: int = 12) -> list[Phone]:
-    """Syllables of one initial and one final at a rate."""
-    initial, final = units.split()
+def syllables(rate_hz: float, phones: str = "d a", num: int = 12) -> list[Phone]:
+    """Syllables of one initial and one vowel at a rate."""
+    initial, vowel = phones.split()
     length_s = 1.0 / rate_hz
     return [
         Phone(
             index=2 * k + part,
-            unit=(initial, final)[part],
+            symbol=(initial, vowel)[part],
             onset_s=0.2 + k * length_s + part * 0.35 * length_s,
             duration_s=(0.35, 0.65)[part] * length_s,
             confidence=1.0,
@@ -37,15 +37,15 @@ def syllables(rate_hz: float, units: str = "d a", num: int = 12) -> list[Phone]:
     ]
 
 
-def gains(timeline: Timeline, levels_db: list[float]) -> list[float]:
+def gains(articulation: VisemeArticulation, levels_db: list[float]) -> list[float]:
     """Gain of every frame for a level at each."""
-    amplitude = Amplitude(PARAMETERS.level_db)
+    amplitude = Amplitude()
     found = []
     for k, level_db in enumerate(levels_db):
-        amplitude.accept_level(k * STEP_S, level_db)
+        level = (k * STEP_S, level_db)
         faps = np.zeros(68, dtype=np.float32)
         faps[[JAW, UPPER_LIP, LOWER_LIP, WIDTH]] = 100.0, -100.0, 100.0, -100.0
-        amplitude.scale(faps, timeline, k * STEP_S, k * STEP_S, STEP_S)
+        amplitude.apply(faps, moment(k * STEP_S, articulation, [level], STEP_S))
         assert faps[UPPER_LIP] == -faps[JAW]
         assert faps[LOWER_LIP] == 100.0  # pressed lips stay pressed
         assert faps[WIDTH] == -100.0
@@ -54,22 +54,21 @@ def gains(timeline: Timeline, levels_db: list[float]) -> list[float]:
 
 
 def test_nothing_is_scaled_while_nothing_is_known() -> None:
-    amplitude = Amplitude(PARAMETERS.level_db)
+    amplitude = Amplitude()
     faps = np.full(68, 100.0, dtype=np.float32)
-    amplitude.scale(faps, build_timeline(()), 0.0, 0.0, STEP_S)
+    amplitude.apply(faps, moment(0.0))
     assert (faps == 100.0).all()
-    amplitude.accept_level(math.nan, -20.0)
-    amplitude.accept_level(0.0, -math.inf)
-    amplitude.scale(faps, build_timeline(syllables(5.0)), 0.1, 0.1, STEP_S)
+    levels = [(math.nan, -20.0), (0.0, -math.inf)]
+    amplitude.apply(faps, moment(0.1, articulation_of(syllables(5.0)), levels))
     assert (faps == 100.0).all()
 
 
 def test_louder_speech_opens_further_and_microphones_do_not_matter() -> None:
-    vowel = [Phone(index=0, unit="a", onset_s=0.0, duration_s=9.0, confidence=1.0, final=True)]
-    timeline = build_timeline(vowel)
+    vowel = [Phone(index=0, symbol="a", onset_s=0.0, duration_s=9.0, confidence=1.0, final=True)]
+    articulation = articulation_of(vowel)
     for microphone_db in (-40.0, -20.0):
         levels = [microphone_db] * 300 + [microphone_db + 8.0] * 25 + [microphone_db - 8.0] * 25
-        gain = gains(timeline, levels)
+        gain = gains(articulation, levels)
         assert gain[299] == pytest.approx(1.0, abs=0.02)
         assert gain[324] > 1.15
         assert gain[349] < 0.85
@@ -77,24 +76,25 @@ def test_louder_speech_opens_further_and_microphones_do_not_matter() -> None:
 
 
 def test_a_level_that_is_usual_for_the_viseme_changes_nothing() -> None:
-    timeline = build_timeline(syllables(4.0, num=30))
-    usual = {unit: float(PARAMETERS.level_db[VISEME_INDEX[unit]]) for unit in "da"}
+    articulation = articulation_of(syllables(4.0, num=30))
+    timeline = articulation.timeline
+    usual = {viseme: float(PARAMETERS.level_db[VISEME_INDEX[viseme]]) for viseme in "da"}
     assert usual["a"] > usual["d"] + 3.0
     assert PARAMETERS.level_db.shape == (len(VISEMES),)
     levels = []
     for k in range(350):
-        middle_s = (timeline.centre_start_s + timeline.centre_end_s) / 2.0
+        middle_s = (timeline.apex_start_s + timeline.apex_end_s) / 2.0
         near = timeline.viseme[np.argmin(np.abs(middle_s - k * STEP_S))]
         levels.append(-30.0 + usual[VISEMES[near]])
-    gain = gains(timeline, levels)[150:]
+    gain = gains(articulation, levels)[150:]
     assert max(gain) - min(gain) < 0.05
-    flat = gains(timeline, [-30.0] * 350)[150:]  # a vowel as quiet as its consonant is weak
+    flat = gains(articulation, [-30.0] * 350)[150:]  # a vowel as quiet as its consonant is weak
     assert max(flat) - min(flat) > 0.1
 
 
 def test_fast_speech_opens_less_beyond_what_blending_does() -> None:
     slow, usual, fast = (
-        gains(build_timeline(syllables(rate_hz)), [math.nan] * 100)[60]
+        gains(articulation_of(syllables(rate_hz)), [math.nan] * 100)[60]
         for rate_hz in (3.0, 5.0, 8.0)
     )
     assert slow == pytest.approx(1.06, abs=0.01)
@@ -105,7 +105,7 @@ def test_fast_speech_opens_less_beyond_what_blending_does() -> None:
 def test_jaw_and_lips_shrink_with_the_rate() -> None:
     peaks = []
     for rate_hz in (3.0, 5.0, 8.0):
-        frames = synthesize(PARAMETERS, syllables(rate_hz), 400)
+        frames = synthesize(LIPS, syllables(rate_hz), 400)
         middle = frames[60 : int(50.0 * 12.0 / rate_hz)]
         peaks.append([float(np.ptp(middle[:, fap])) for fap in (JAW, LOWER_LIP)])
     slow, usual, fast = np.array(peaks)

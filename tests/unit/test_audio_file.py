@@ -39,6 +39,7 @@ def test_rates_above_48_khz_are_resampled(tmp_path: Path) -> None:
     np.testing.assert_allclose(read[1000:-1000, 0], expected[1000:-1000], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_hour_is_read_without_holding_it(tmp_path: Path) -> None:
     with soundfile.SoundFile(tmp_path / "hour.flac", "w", 8000, 1) as file:
         for _ in range(60):

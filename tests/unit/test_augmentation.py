@@ -1,10 +1,10 @@
-"""Changes to log-mel bands."""
+"""Augmentation of log-mel bands."""
 
 import numpy as np
 import pytest
 
-from services.recognizer.features import LOG_FLOOR
-from training.augmentation import Augmentation
+from services.recognizer.front_end.features import LOG_FLOOR
+from training.gmm.augmentation import Augmentation
 
 pytestmark = pytest.mark.unit
 
@@ -50,3 +50,8 @@ def test_a_warp_moves_a_peak_up() -> None:
     warped = changed(log_mel, warp=1.12)
     assert warped[5, 1:].argmax() > 19
     assert changed(log_mel, warp=1.0)[5, 1:].argmax() == 19
+
+
+def test_no_change_changes_little() -> None:
+    log_mel = np.random.default_rng(0).normal(14, 2, (80, 41)).astype(np.float32)
+    np.testing.assert_allclose(changed(log_mel), np.maximum(log_mel, LOG_FLOOR), atol=0.02)

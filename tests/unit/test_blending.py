@@ -8,35 +8,48 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.blending import around, blend, log_weights, softmax
-from services.synthesizer.full import synthesize
-from services.synthesizer.parameters import (
+from services.synthesizer.lips.dynamic_visemes.blending import (
+    active_visemes,
+    blend,
+    log_weights,
+    softmax,
+)
+from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from services.synthesizer.lips.dynamic_visemes.parameters import (
     VisemeParameters,
     load_parameters,
     save_parameters,
 )
-from services.synthesizer.timeline import EDGE_S, build_timeline
-from services.synthesizer.visemes import MOUTH_FAPS, VISEME_INDEX, static_targets
+from services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
+from services.synthesizer.lips.dynamic_visemes.visemes import (
+    VISEME_INDEX,
+    static_targets,
+)
+from services.synthesizer.offline import synthesize
 from shared.errors import UserError
-from shared.phones import Phone
-from training.viseme_start import starting_parameters
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import Phone
+from shared.phones.inventory import load_inventory
 
 pytestmark = pytest.mark.unit
 
-PARAMETERS = starting_parameters()  # these do not change with training
+INVENTORY = load_inventory()
+
+PARAMETERS = initial_parameters()  # these do not change with training
 JAW = MOUTH_FAPS.index(3)
 LOWER_LIP = MOUTH_FAPS.index(5)
 
 
 def phones(text: str, start_s: float = 0.5) -> list[Phone]:
-    """Units as "b:0.08 a:0.2", one after the other."""
+    """Phones as "b:0.08 a:0.2", one after the other."""
     made: list[Phone] = []
     for word in text.split():
-        unit, duration = word.split(":")
+        symbol, duration = word.split(":")
         made.append(
             Phone(
                 index=len(made),
-                unit=unit,
+                symbol=symbol,
                 onset_s=start_s,
                 duration_s=float(duration),
                 confidence=1.0,
@@ -48,11 +61,11 @@ def phones(text: str, start_s: float = 0.5) -> list[Phone]:
 
 
 def curve(text: str, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    return blend(PARAMETERS, build_timeline(phones(text)), time_s)
+    return blend(PARAMETERS, build_timeline(phones(text), INVENTORY), time_s)
 
 
 def sharp(parameters: VisemeParameters) -> VisemeParameters:
-    """Parameters whose visemes have died away at each other's centres."""
+    """Parameters whose visemes have died away at each other's apexes."""
     return dataclasses.replace(
         parameters,
         theta_minus=parameters.theta_minus * 20.0,
@@ -69,7 +82,7 @@ def test_weights_sum_to_one_and_do_not_overflow() -> None:
 def test_pair_of_visemes_by_hand() -> None:
     # Li 2011, eq. 11, written out as quotients
     p = PARAMETERS
-    timeline = build_timeline(phones("e:0.1 i:0.12"))
+    timeline = build_timeline(phones("e:0.1 i:0.12"), INVENTORY)
     first, second = (VISEME_INDEX[shape] for shape in "ei")
     time_s = 0.6
     d_first = p.alpha[first] * np.exp(
@@ -78,16 +91,16 @@ def test_pair_of_visemes_by_hand() -> None:
     d_second = p.alpha[second] * np.exp(
         -p.theta_minus[second] * np.abs(0.66 + p.offset_s[second] - time_s) ** p.c
     )
-    # centres before the one and after the other viseme, so that plus and minus are these
+    # apexes before the one and after the other viseme, so that plus and minus are these
     assert (np.abs(p.offset_s[[first, second]]) < 0.05).all()
     want = (d_second * p.target[second] + d_first * p.target[first]) / (d_second + d_first)
     alone = dataclasses.replace(timeline, silence_start_s=np.zeros(0), silence_end_s=np.zeros(0))
     np.testing.assert_allclose(blend(p, alone, np.array([time_s]))[0], want)
 
 
-def test_curve_is_at_its_target_at_centres_when_neighbours_have_died_away() -> None:
-    timeline = build_timeline(phones("d:0.2 a:0.3 j:0.2 i:0.3 g:0.2 u:0.3"))
-    got = blend(sharp(PARAMETERS), timeline, timeline.centre_start_s)
+def test_curve_is_at_its_target_at_apexes_when_neighbours_have_died_away() -> None:
+    timeline = build_timeline(phones("d:0.2 a:0.3 j:0.2 i:0.3 g:0.2 u:0.3"), INVENTORY)
+    got = blend(sharp(PARAMETERS), timeline, timeline.apex_start_s)
     np.testing.assert_allclose(got, PARAMETERS.target[timeline.viseme], atol=3.0)
 
 
@@ -97,11 +110,13 @@ def test_fast_speech_falls_short_of_its_targets() -> None:
     assert fast[0, JAW] < 0.9 * slow[0, JAW]
 
 
-def test_curve_is_continuous_at_every_centre() -> None:
-    timeline = build_timeline(phones("n:0.07 i:0.12 h:0.08 ao:0.25 sil:0.1 b:0.08 iao:0.2 m:0.06"))
-    centres = np.concatenate([timeline.centre_start_s, timeline.centre_end_s])
+def test_curve_is_continuous_at_every_apex() -> None:
+    timeline = build_timeline(
+        phones("n:0.07 i:0.12 h:0.08 ao:0.25 sil:0.1 b:0.08 iao:0.2 m:0.06"), INVENTORY
+    )
+    apexes = np.concatenate([timeline.apex_start_s, timeline.apex_end_s])
     beside = 1e-7
-    left, right = (blend(PARAMETERS, timeline, centres + sign * beside) for sign in (-1.0, 1.0))
+    left, right = (blend(PARAMETERS, timeline, apexes + sign * beside) for sign in (-1.0, 1.0))
     # no faster than the fastest lips of the model
     assert np.abs(right - left).max() < 2.0 * beside * 40_000.0
 
@@ -117,9 +132,9 @@ def test_pause_relaxes_the_mouth_the_more_the_longer_it_is() -> None:
     assert jaw[3] < 0.05 * held
 
 
-def test_no_silence_between_touching_units() -> None:
-    assert len(build_timeline(phones("a:0.2 i:0.2")).silence_start_s) == 2
-    assert len(build_timeline(phones("a:0.2 sil:0.2 i:0.2")).silence_start_s) == 3
+def test_no_silence_between_touching_phones() -> None:
+    assert len(build_timeline(phones("a:0.2 i:0.2"), INVENTORY).silence_start_s) == 2
+    assert len(build_timeline(phones("a:0.2 sil:0.2 i:0.2"), INVENTORY).silence_start_s) == 3
 
 
 def test_long_vowel_is_held() -> None:
@@ -133,36 +148,39 @@ def test_mouth_is_at_rest_a_million_seconds_away() -> None:
 
 
 def test_speech_at_a_million_seconds_looks_the_same() -> None:
-    timeline = build_timeline(phones("d:0.1 a:0.2 b:0.1", start_s=1e6))
+    timeline = build_timeline(phones("d:0.1 a:0.2 b:0.1", start_s=1e6), INVENTORY)
     far = blend(PARAMETERS, timeline, 1e6 + np.arange(0.0, 0.5, 0.02))
     near = curve("d:0.1 a:0.2 b:0.1", 0.5 + np.arange(0.0, 0.5, 0.02))
     np.testing.assert_allclose(far, near, atol=0.1)
 
 
 def test_pair_and_reach() -> None:
-    timeline = build_timeline(phones("d:0.1 a:0.1 j:0.1 i:0.1 g:0.1"))  # centres 0.55, 0.65, ...
-    assert around(timeline, 0.62, 0.0).tolist() == [True, True, False, False, False]
-    assert around(timeline, 0.67, 0.0).tolist() == [False, True, True, False, False]
-    assert around(timeline, 0.67, 0.15).tolist() == [True, True, True, False, False]
-    assert around(timeline, 0.67, 0.3).all()
-    assert around(timeline, 0.0, 0.0).tolist() == [True, False, False, False, False]
-    assert around(timeline, 9.0, 0.0).tolist() == [False, False, False, False, True]
+    timeline = build_timeline(
+        phones("d:0.1 a:0.1 j:0.1 i:0.1 g:0.1"), INVENTORY
+    )  # apexes 0.55, 0.65, ...
+    assert active_visemes(timeline, 0.62, 0.0).tolist() == [True, True, False, False, False]
+    assert active_visemes(timeline, 0.67, 0.0).tolist() == [False, True, True, False, False]
+    assert active_visemes(timeline, 0.67, 0.15).tolist() == [True, True, True, False, False]
+    assert active_visemes(timeline, 0.67, 0.3).all()
+    assert active_visemes(timeline, 0.0, 0.0).tolist() == [True, False, False, False, False]
+    assert active_visemes(timeline, 9.0, 0.0).tolist() == [False, False, False, False, True]
 
 
 def test_weights_have_one_row_for_each_viseme_and_silence() -> None:
-    timeline = build_timeline(phones("d:0.1 iao:0.2 sil:0.1 b:0.1"))
+    timeline = build_timeline(phones("d:0.1 iao:0.2 sil:0.1 b:0.1"), INVENTORY)
     shape = log_weights(PARAMETERS, timeline, np.zeros(7)).shape
     assert shape == (4 + 3, 7, len(MOUTH_FAPS))
 
 
 def test_full_model_does_not_depend_on_its_blocks() -> None:
     spoken = phones("d:0.1 a:0.2 sil:0.3 b:0.1 iao:0.2 " * 8)
-    faps = synthesize(PARAMETERS, spoken, 500)
-    whole = blend(PARAMETERS, build_timeline(spoken), np.arange(500) / 50.0)
+    lips = DynamicVisemes(PARAMETERS, INVENTORY)
+    faps = synthesize(lips, spoken, 500)
+    whole = blend(PARAMETERS, build_timeline(spoken, INVENTORY), np.arange(500) / 50.0)
     unscaled = [fap for fap in MOUTH_FAPS if fap in (6, 7, 12, 13, 14, 16, 17, 53, 54)]
     columns = [MOUTH_FAPS.index(fap) for fap in unscaled]
     np.testing.assert_allclose(faps[:, np.array(unscaled) - 1], whole[:, columns], atol=0.01)
-    assert synthesize(PARAMETERS, [], 3).shape == (3, 68)
+    assert synthesize(lips, [], 3).shape == (3, 68)
 
 
 def test_parameters_that_ship_open_the_mouth_for_a_and_round_it_for_u() -> None:
@@ -177,7 +195,7 @@ def test_parameters_that_ship_open_the_mouth_for_a_and_round_it_for_u() -> None:
 
 def test_parameters_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
-    parameters = starting_parameters()
+    parameters = initial_parameters()
     save_parameters(parameters, path, "a test")
     again = load_parameters(path)
     for field in dataclasses.fields(VisemeParameters):
@@ -202,7 +220,7 @@ def test_parameters_round_trip(tmp_path: Path) -> None:
 )
 def test_bad_parameters_are_refused(tmp_path: Path, key: str, value: object) -> None:
     path = tmp_path / "parameters.json"
-    save_parameters(starting_parameters(), path, "a test")
+    save_parameters(initial_parameters(), path, "a test")
     data = json.loads(path.read_text())
     data[key] = value
     path.write_text(json.dumps(data))
@@ -212,7 +230,7 @@ def test_bad_parameters_are_refused(tmp_path: Path, key: str, value: object) -> 
 
 def test_values_without_sense_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
-    save_parameters(starting_parameters(), path, "a test")
+    save_parameters(initial_parameters(), path, "a test")
     data = json.loads(path.read_text())
     data["visemes"]["a"]["alpha"][0] = float("nan")
     path.write_text(json.dumps(data))

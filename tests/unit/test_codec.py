@@ -3,8 +3,11 @@ from __future__ import annotations
 import msgpack
 import pytest
 
-from shared.codec import BadMessage, decode, encode, topic
-from shared.messages import AudioChunk, Done, FapFrame, OpenSession, PhoneHeard
+from shared.wire.audio import AudioChunk
+from shared.wire.codec import BadMessage, decode, encode, topic
+from shared.wire.face import FapFrame
+from shared.wire.session import Done, OpenSession
+from shared.wire.speech import Phone
 
 pytestmark = pytest.mark.unit
 
@@ -14,11 +17,11 @@ def parts_of(kind: str, session: str = "s", **fields: object) -> list[bytes]:
 
 
 def test_the_topic_ends_in_a_slash() -> None:
-    assert topic(FapFrame, "demo") == b"fap/demo/"
+    assert topic(FapFrame, "demo") == b"fap-frame/demo/"
 
 
 def test_fields_with_defaults_may_be_left_out() -> None:
-    message = decode(parts_of("open", request="r"))
+    message = decode(parts_of("open-session", request="r"))
     assert message == OpenSession(session="s", request="r")
 
 
@@ -42,12 +45,16 @@ def test_unknown_fields_are_ignored() -> None:
         (parts_of("done", request=5), "body"),
         (parts_of("done", request=""), "body"),
         (parts_of("done", request="r", media_time=-1), "body"),
-        (parts_of("open", request="r", sample_rate_hz=192000), "body"),
-        (parts_of("open", request="r", encoding="mp3"), "body"),
-        (parts_of("open", session="a b", request="r"), "body"),
-        (parts_of("fap", values=b"short", mask=b"\0" * 9), "body"),
-        (parts_of("done", request="r", version=2), "version"),
-        (parts_of("done", version=2, other=1), "version"),
+        (parts_of("open-session", request="r", sample_rate_hz=192000), "body"),
+        (parts_of("open-session", request="r", encoding="mp3"), "body"),
+        (parts_of("open-session", session="a b", request="r"), "body"),
+        (parts_of("fap-frame", values=b"short", mask=b"\0" * 9), "body"),
+        (parts_of("done", request="r", version=1), "version"),
+        (parts_of("done", version=1, other=1), "version"),
+        (parts_of("open", request="r", version=1), "version"),
+        (parts_of("open", request="r"), "kind"),
+        (parts_of("done", request="r", version=0), "body"),
+        (parts_of("done", request="r", version="1"), "body"),
         ([b"done/other/", msgpack.packb({"session": "s", "request": "r"})], "topic"),
     ],
 )
@@ -57,10 +64,21 @@ def test_what_is_no_message_is_refused_with_its_reason(parts: list[bytes], reaso
     assert caught.value.reason == reason
 
 
+@pytest.mark.parametrize("version", [1, 3, 65535])
+def test_another_version_is_named_with_what_to_do(version: int) -> None:
+    with pytest.raises(BadMessage, match="upgrade the program") as caught:
+        decode(parts_of("open", request="r", version=version))
+    assert caught.value.version == version
+    assert f"'open' is a message of protocol version {version}" in str(caught.value)
+    assert "proto/PROTOCOL.md" in str(caught.value)
+
+
 @pytest.mark.parametrize("confidence", [float("nan"), 1.5, -0.1, float("inf")])
 def test_a_confidence_outside_0_to_1_is_refused(confidence: float) -> None:
     with pytest.raises(BadMessage):
-        decode(parts_of("phone", index=0, unit="a", duration=1, confidence=confidence, final=True))
+        decode(
+            parts_of("phone", index=0, symbol="a", duration=1, confidence=confidence, final=True)
+        )
 
 
 def test_binary_fields_are_binary_in_msgpack() -> None:
@@ -69,7 +87,7 @@ def test_binary_fields_are_binary_in_msgpack() -> None:
 
 
 def test_a_phone_survives_the_wire() -> None:
-    phone = PhoneHeard(
-        session="s", index=2, unit="zh", duration=800, confidence=0.25, final=True, media_time=5
+    phone = Phone(
+        session="s", index=2, symbol="zh", duration=800, confidence=0.25, final=True, media_time=5
     )
     assert decode(encode(phone)) == phone

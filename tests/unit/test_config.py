@@ -1,13 +1,28 @@
+"""Configuration: which source counts, what is refused, and what an error says."""
+
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
-from shared.config import ControlConfig, RecognizerConfig, SynthesizerConfig, load, reachable
+from services.control.config import ControlConfig
+from services.driver.config import DriverConfig, Framing
+from services.gateway.config import GatewayConfig
+from services.kinds import KINDS, free_addresses
+from services.recognizer.config import RecognizerConfig
+from services.synthesizer.config import SynthesizerConfig
+from shared.config import ServiceConfig, Settings
+from shared.endpoints import reachable
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
+
+
+def settings(file: Path | None = None, environment: dict[str, str] | None = None) -> Settings:
+    types = {kind.name: kind.config_type for kind in KINDS.values()}
+    return Settings(types, file=file, environment=environment or {})
 
 
 def written(folder: Path, text: str) -> Path:
@@ -16,66 +31,189 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_defaults_are_loopback() -> None:
-    config = load("control", environment={})
-    assert isinstance(config, ControlConfig)
-    assert config.commands == "tcp://127.0.0.1:5550"
+CONFIG_TYPES = [ServiceConfig, *(kind.config_type for kind in KINDS.values())]
+
+
+@pytest.mark.parametrize("config_type", CONFIG_TYPES)
+def test_defaults_are_allowed(config_type: type[ServiceConfig]) -> None:
+    defaults = settings().load(config_type)
+    texts = {key: str(value) for key, value in defaults}
+    assert settings().load(config_type, texts) == defaults
+
+
+@pytest.mark.parametrize("config_type", CONFIG_TYPES)
+def test_every_key_says_what_it_means_and_takes(config_type: type[ServiceConfig]) -> None:
+    for each in settings().describe(config_type):
+        assert each.meaning.endswith("."), each.key
+        assert each.allowed, each.key
 
 
 def test_file_is_weaker_than_environment_is_weaker_than_command_line(tmp_path: Path) -> None:
-    file = written(tmp_path, "[recognizer]\nagreement = 2\n[common]\nlog_level = 'debug'\n")
-    from_file = load("recognizer", file=file, environment={})
-    assert isinstance(from_file, RecognizerConfig)
-    assert (from_file.agreement, from_file.log_level) == (2, "debug")
-    environment = {"KOUXING_RECOGNIZER_AGREEMENT": "4", "KOUXING_CONTROL": "tcp://10.0.0.1:5550"}
-    both = load("recognizer", file=file, environment=environment)
-    assert isinstance(both, RecognizerConfig)
-    assert (both.agreement, both.control) == (4, "tcp://10.0.0.1:5550")
-    all_three = load("recognizer", file=file, environment=environment, overrides={"agreement": "5"})
-    assert isinstance(all_three, RecognizerConfig)
-    assert all_three.agreement == 5
+    file = written(tmp_path, "[recognizer]\nnum_stable_frames = 2\n[common]\nlog_level = 'debug'\n")
+    from_file = settings(file).load(RecognizerConfig)
+    assert (from_file.num_stable_frames, from_file.log_level) == (2, "debug")
+    environment = {
+        "KOUXING_RECOGNIZER_NUM_STABLE_FRAMES": "4",
+        "KOUXING_CONTROL": "tcp://10.0.0.1:5550",
+    }
+    both = settings(file, environment).load(RecognizerConfig)
+    assert (both.num_stable_frames, both.control) == (4, "tcp://10.0.0.1:5550")
+    all_three = settings(file, environment).load(RecognizerConfig, {"num_stable_frames": "5"})
+    assert all_three.num_stable_frames == 5
+
+
+def test_one_service_is_stronger_than_all_services(tmp_path: Path) -> None:
+    file = written(tmp_path, "[recognizer]\nlog_level = 'debug'\n[common]\nlog_level = 'error'\n")
+    assert settings(file).load(RecognizerConfig).log_level == "debug"
+    assert settings(file).load(ControlConfig).log_level == "error"
+    environment = {"KOUXING_RECOGNIZER_LOG_LEVEL": "DEBUG", "KOUXING_LOG_LEVEL": "error"}
+    assert settings(environment=environment).load(RecognizerConfig).log_level == "debug"
+    assert settings(environment=environment).load(ControlConfig).log_level == "error"
+
+
+def test_every_value_tells_where_it_came_from(tmp_path: Path) -> None:
+    file = written(tmp_path, "[driver]\ncamera = 'mouth'\nwidth_px = 640\nvirtual_camera = true\n")
+    environment = {"KOUXING_DRIVER_WIDTH_PX": "320", "KOUXING_LOG_LEVEL": "error"}
+    found = settings(file, environment).describe(DriverConfig, {"out": "films"})
+    given = {each.key: (each.value, each.origin) for each in found if each.origin != "default"}
+    assert given == {
+        "camera": (Framing.MOUTH, str(file)),
+        "virtual_camera": (True, str(file)),
+        "width_px": (320, "$KOUXING_DRIVER_WIDTH_PX"),
+        "log_level": ("error", "$KOUXING_LOG_LEVEL"),
+        "out": ("films", "--set"),
+    }
 
 
 @pytest.mark.parametrize(
-    ("section", "overrides", "named"),
+    ("config_type", "key", "text", "said"),
     [
-        ("recognizer", {"agreement": "many"}, "recognizer.agreement"),
-        ("recognizer", {"agreement": "0"}, "recognizer.agreement"),
-        ("recognizer", {"speed": "1"}, "speed"),
-        ("recognizer", {"audio": "5560"}, "recognizer.audio"),
-        ("recognizer", {"audio": "tcp://127.0.0.1:99999"}, "recognizer.audio"),
-        ("recognizer", {"audio": "tcp://192.168.1.5:5560"}, "recognizer.audio"),
-        ("recognizer", {"audio": "tcp://0.0.0.0:5560"}, "recognizer.advertise"),
-        ("recognizer", {"insecure": "perhaps"}, "recognizer.insecure"),
-        ("synthesizer", {"look_ahead_ms": "900"}, "synthesizer.look_ahead_ms"),
-        ("synthesizer", {"frame_rate_hz": "nan"}, "synthesizer.frame_rate_hz"),
-        ("driver", {"view": "hologram"}, "driver.view"),
-        ("gateway", {"host": "0.0.0.0"}, "gateway.host"),  # noqa: S104
-        ("control", {"log_level": "loud"}, "control.log_level"),
+        (RecognizerConfig, "num_stable_frames", "many", "a whole number from 1 to 20"),
+        (RecognizerConfig, "num_stable_frames", "0", "a whole number from 1 to 20"),
+        (RecognizerConfig, "num_stable_frames", "2.9", "a whole number from 1 to 20"),
+        (RecognizerConfig, "audio", "5560", "an endpoint, tcp://HOST:PORT"),
+        (RecognizerConfig, "audio", "tcp://127.0.0.1:99999", "an endpoint, tcp://HOST:PORT"),
+        (RecognizerConfig, "control", "here", "an endpoint, tcp://HOST:PORT"),
+        (RecognizerConfig, "insecure", "perhaps", "true or false"),
+        (RecognizerConfig, "insecure", "yes", "true or false"),
+        (SynthesizerConfig, "delay_ms", "900", "a number from 0 to 300"),
+        (SynthesizerConfig, "frame_rate_hz", "nan", "a number from 10 to 240"),
+        (DriverConfig, "view", "hologram", "one of auto, window, none"),
+        (
+            DriverConfig,
+            "session",
+            "a/b",
+            "newest, or the name of a session (up to 64 letters, digits, '-' and '_')",
+        ),
+        (DriverConfig, "camera", "foot", "one of face, head, mouth"),
+        (DriverConfig, "width_px", "641", "a multiple of 2 from 16 to 7680"),
+        (GatewayConfig, "port", "65536", "a whole number from 0 to 65535"),
+        (ControlConfig, "log_level", "loud", "one of debug, info, warning, error"),
     ],
 )
-def test_an_error_names_the_key(section: str, overrides: dict[str, str], named: str) -> None:
+def test_an_error_names_key_value_origin_and_what_is_allowed(
+    config_type: type[ServiceConfig], key: str, text: str, said: str
+) -> None:
+    section = config_type.__name__.removesuffix("Config").lower()
+    with pytest.raises(UserError) as error:
+        settings().load(config_type, {key: text})
+    assert str(error.value) == f"{section}.{key}: {text!r} (from --set) is not {said}"
+
+
+@pytest.mark.parametrize(
+    ("config_type", "key", "text", "named"),
+    [
+        (RecognizerConfig, "audio", "tcp://192.168.1.5:5560", "recognizer.audio: 192.168.1.5"),
+        (RecognizerConfig, "audio", "tcp://0.0.0.0:5560", "recognizer.advertise: name the host"),
+        (GatewayConfig, "host", "0.0.0.0", "gateway.host: 0.0.0.0"),  # noqa: S104
+        (RecognizerConfig, "min_confidenc", "1", "the nearest is min_confidence"),
+    ],
+)
+def test_addresses_and_names_are_checked(
+    config_type: type[ServiceConfig], key: str, text: str, named: str
+) -> None:
     with pytest.raises(UserError, match=named):
-        load(section, overrides=overrides, environment={})
+        settings().load(config_type, {key: text})
 
 
-@pytest.mark.parametrize("text", ["[recogniser]\n", "[recognizer]\nspeed = 1\n", "agreement ="])
-def test_an_unknown_key_or_bad_file_is_an_error(tmp_path: Path, text: str) -> None:
-    with pytest.raises(UserError, match=r"kouxing\.toml"):
-        load("recognizer", file=written(tmp_path, text), environment={})
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("num_stable_frames =", "Invalid value"),
+        ("[recogniser]\n", r"unknown table \[recogniser\]; the nearest is recognizer"),
+        ("common = 1\n", r"unknown table \[common\]"),
+        ("[recognizer]\nspeed = 1\n", "unknown key recognizer.speed; the nearest is recognizer."),
+        ("[common]\nmin_confidence = 1\n", "the nearest is recognizer.min_confidence"),
+        ("[synthesizer]\nlook_ahead_ms = 60\n", "the nearest is synthesizer.delay_ms"),
+        ("[client]\n", "unknown table"),
+        ("[driver]\nout = ['a']\n", "driver.out: .* is not text"),
+        ("[driver]\nwidth_px = true\n", "driver.width_px: 'true'"),
+        (
+            "[recognizer]\nnum_stable_frames = 2.9\n",
+            r"num_stable_frames: '2.9' \(from .*kouxing.toml",
+        ),
+    ],
+)
+def test_what_a_file_gets_wrong_is_named(tmp_path: Path, text: str, said: str) -> None:
+    file = written(tmp_path, text)
+    config_type = DriverConfig if "driver" in text else RecognizerConfig
+    with pytest.raises(UserError, match=said) as error:
+        settings(file).load(config_type)
+    assert "kouxing.toml" in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nowhere"):
-        load("recognizer", file=tmp_path / "nowhere.toml", environment={})
+        settings(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("KOUXING_LOOK_AHEAD_MS", "KOUXING_RECOGNIZER_LOOK_AHEAD_MS"),
+        ("KOUXING_PHONES", "KOUXING_RECOGNIZER_PHONES"),
+        ("KOUXING_HEAD", "KOUXING_DRIVER_HEAD"),
+        ("KOUXING_CONTROLL", "KOUXING_CONTROL"),
+        ("KOUXING_SYNTHESIZER_DELAY", "KOUXING_SYNTHESIZER_DELAY_MS"),
+    ],
+)
+def test_an_unknown_variable_is_an_error_that_names_the_nearest(name: str, nearest: str) -> None:
+    with pytest.raises(UserError, match=rf"\${name}: .* the nearest is {nearest};"):
+        settings(environment={name: "1"})
+
+
+@pytest.mark.parametrize("name", ["docker-compose.yml", "README.md"])
+def test_the_variables_in_documents_are_known(name: str) -> None:
+    text = (Path(__file__).parents[2] / name).read_text(encoding="utf-8")
+    names = re.findall(r"KOUXING_\w+", text)
+    assert names
+    settings(environment=dict.fromkeys(names, ""))
+
+
+def test_no_variable_sets_two_keys_of_a_service_kind() -> None:
+    names = [
+        f"{kind.name}_{key}".upper()
+        for kind in KINDS.values()
+        for key in kind.config_type.model_fields
+    ]
+    common = [key.upper() for key in ServiceConfig.model_fields]
+    assert len({*names, *common}) == len(names) + len(common)
 
 
 def test_other_addresses_need_consent() -> None:
-    environment = {"KOUXING_INSECURE": "true", "KOUXING_ADVERTISE": "face-host"}
-    config = load(
-        "synthesizer",
-        environment=environment,
-        overrides={"faps": "tcp://0.0.0.0:5571"},
+    environment = {"KOUXING_INSECURE": "1", "KOUXING_ADVERTISE": "face-host"}
+    config = settings(environment=environment).load(
+        SynthesizerConfig, {"faps": "tcp://0.0.0.0:5571"}
     )
-    assert isinstance(config, SynthesizerConfig)
     assert reachable(config.faps, config.advertise, "faps") == "tcp://face-host:5571"
+
+
+def test_free_addresses_cover_every_key_that_binds() -> None:
+    addresses = free_addresses(hosts={"synthesizer": "127.0.0.3"})
+    assert addresses["KOUXING_CONTROL"] == addresses["KOUXING_CONTROL_COMMANDS"]
+    loaded = settings(environment=addresses)
+    synthesizer, gateway = loaded.load(SynthesizerConfig), loaded.load(GatewayConfig)
+    assert synthesizer.phone_input.startswith("tcp://127.0.0.3:")
+    assert gateway.port != GatewayConfig().port
+    assert len(set(addresses.values())) == len(addresses) - 1

@@ -7,35 +7,35 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer import decoder as search
-from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.decoder import Decoder, Segment, segments_after
-from services.recognizer.unit_language import NUM_UNITS, UnitLanguage
-from tests.languages import SIL, Gram, Table, flat_language
+from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from services.recognizer.search import decoder as search
+from services.recognizer.search.decoder import Decoder, Segment, segments_after
+from services.recognizer.search.phone_lm import PhoneLanguageModel
+from tests.languages import MANDARIN, NUM_PHONES, SIL, Gram, Table, flat_language
 
 pytestmark = pytest.mark.unit
 
 
 def topology(
-    states_per_unit: int, rng: np.random.Generator, language: UnitLanguage | None = None
+    states_per_phone: int, rng: np.random.Generator, language: PhoneLanguageModel | None = None
 ) -> Topology:
-    num_states = NUM_UNITS * states_per_unit
+    num_states = NUM_PHONES * states_per_phone
     stay = rng.uniform(0.2, 0.8, num_states)
     return Topology(
-        first_state=np.arange(NUM_UNITS + 1) * states_per_unit,
+        first_state=np.arange(NUM_PHONES + 1) * states_per_phone,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        language=language or flat_language(),
-        duration_mean_s=np.full((NUM_POSITIONS, NUM_UNITS), 0.1, np.float32),
-        duration_spread_s=np.full((NUM_POSITIONS, NUM_UNITS), 0.1, np.float32),
+        phone_lm=language or flat_language(),
+        duration_mean_s=np.full((NUM_POSITIONS, NUM_PHONES), 0.1, np.float32),
+        duration_spread_s=np.full((NUM_POSITIONS, NUM_PHONES), 0.1, np.float32),
     )
 
 
-def only(units: list[int], states_per_unit: int, scores: NDArray[np.float32]) -> None:
-    """Make all other units impossible."""
-    for unit in range(NUM_UNITS):
-        if unit not in units:
-            scores[:, unit * states_per_unit : (unit + 1) * states_per_unit] = -1e4
+def only(phones: list[int], states_per_phone: int, scores: NDArray[np.float32]) -> None:
+    """Make all other phones impossible."""
+    for phone in range(NUM_PHONES):
+        if phone not in phones:
+            scores[:, phone * states_per_phone : (phone + 1) * states_per_phone] = -1e4
 
 
 @dataclass(frozen=True)
@@ -44,38 +44,38 @@ class Path:
 
     score: float
     ended: tuple[Segment, ...]
-    unit: int
-    state: int  # of the unit
-    start: int  # of the unit
+    phone: int
+    state: int  # of the phone
+    start: int  # of the phone
 
 
 def brute_force(
-    model: Topology, table: Table, scores: NDArray[np.float32], units: list[int]
+    model: Topology, table: Table, scores: NDArray[np.float32], phones: list[int]
 ) -> list[Segment]:
     """Try every path that the loop allows."""
 
-    def cost(said: tuple[int, ...], unit: int) -> float:
-        log_share = 0.0 if said == (SIL,) and unit == SIL else table.after(said, unit)
-        return model.language_scale * log_share + model.unit_penalty
+    def cost(before: tuple[int, ...], phone: int) -> float:
+        log_prob = 0.0 if before == (SIL,) and phone == SIL else table.after(before, phone)
+        return model.lm_scale * log_prob + model.phone_penalty
 
-    paths = [Path(cost((SIL,), unit), (), unit, 0, 0) for unit in units]
+    paths = [Path(cost((SIL,), phone), (), phone, 0, 0) for phone in phones]
     for frame, observed in enumerate(scores):
         longer = []
         for path in paths:
-            place = int(model.first_state[path.unit]) + path.state
-            score = path.score + float(observed[place])
-            left = score + float(model.log_leave[place])
-            longer.append(replace(path, score=score + float(model.log_stay[place])))
-            if place + 1 < model.first_state[path.unit + 1]:
+            at = int(model.first_state[path.phone]) + path.state
+            score = path.score + float(observed[at])
+            left = score + float(model.log_leave[at])
+            longer.append(replace(path, score=score + float(model.log_stay[at])))
+            if at + 1 < model.first_state[path.phone + 1]:
                 longer.append(replace(path, score=left, state=path.state + 1))
                 continue
-            ended = (*path.ended, Segment(path.unit, path.start, frame + 1))
-            said = (SIL, *(segment.unit for segment in ended))
+            ended = (*path.ended, Segment(path.phone, path.start, frame + 1))
+            before = (SIL, *(segment.phone for segment in ended))
+            is_last = frame + 1 == len(scores)
             longer += [
-                Path(left + (cost(said, unit) if frame + 1 < len(scores) else 0.0), ended, unit, 0,
-                     frame + 1)
-                for unit in units
-            ]  # fmt: skip
+                Path(left + (0.0 if is_last else cost(before, phone)), ended, phone, 0, frame + 1)
+                for phone in phones
+            ]
         paths = longer
     complete = [path for path in paths if path.start == len(scores)]
     return list(max(complete, key=lambda path: path.score).ended)
@@ -83,24 +83,22 @@ def brute_force(
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(
-    ("order", "kept", "states_per_unit", "num_frames"),
+    ("order", "kept", "states_per_phone", "num_frames"),
     [(2, 1.0, 2, 8), (2, 1.0, 3, 9), (3, 1.0, 2, 9), (3, 0.5, 2, 9), (4, 0.6, 1, 7)],
 )
 def test_same_as_trying_every_path(
-    seed: int, order: int, kept: float, states_per_unit: int, num_frames: int
+    seed: int, order: int, kept: float, states_per_phone: int, num_frames: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    units = [3, 40, SIL]
-    table = Table.draw(rng, units, order=order, kept=kept)
-    model = replace(
-        topology(states_per_unit, rng, table.tree()), language_scale=1.5, unit_penalty=1.25
-    )
+    phones = [3, 40, SIL]
+    table = Table.draw(rng, phones, order=order, kept=kept)
+    model = replace(topology(states_per_phone, rng, table.tree()), lm_scale=1.5, phone_penalty=1.25)
     scores = rng.normal(size=(num_frames, model.num_states)).astype(np.float32)
-    only(units, states_per_unit, scores)
+    only(phones, states_per_phone, scores)
     decoder = Decoder(model)
     for row in scores:
         decoder.accept(row)
-    assert decoder.finish() == brute_force(model, table, scores, units)
+    assert decoder.finish() == brute_force(model, table, scores, phones)
 
 
 def clear_scores(
@@ -108,8 +106,8 @@ def clear_scores(
 ) -> NDArray[np.float32]:
     """Scores that leave no doubt."""
     rows = []
-    for unit in sequence:
-        for state in range(model.first_state[unit], model.first_state[unit + 1]):
+    for phone in sequence:
+        for state in range(model.first_state[phone], model.first_state[phone + 1]):
             row = np.full(model.num_states, -contrast, np.float32)
             row[state] = 0.0
             rows += [row] * frames_per_state
@@ -122,10 +120,10 @@ def test_clear_speech_is_read_off() -> None:
     decoder = Decoder(model)
     scores = clear_scores(sequence, model, frames_per_state=2)
     last = [decoder.accept(row) for row in scores]
-    assert [segment.unit for segment in decoder.finish()] == sequence
+    assert [segment.phone for segment in decoder.finish()] == sequence
     assert [(s.start, s.end) for s in decoder.finish()] == [(t, t + 10) for t in range(0, 60, 10)]
-    # the last unit of the best string, and where it began
-    assert [unit for unit, _, _ in last[::10]] == sequence
+    # the last phone of the best string, and where it began
+    assert [phone for phone, _, _ in last[::10]] == sequence
     assert last[25][:2] == (30, 20)
     assert all(0 < confidence <= 1 for _, _, confidence in last)
 
@@ -138,74 +136,75 @@ def test_speech_cut_off_inside_a_unit_keeps_what_came_before() -> None:
     assert decoder.finish() == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 23)]
 
 
-def test_what_was_said_tells_what_is_heard() -> None:
-    """Of 30 and 31 nothing is heard; after 3 comes the one, after 4 the other."""
-    units: dict[Gram, float] = {(unit,): -4.0 for unit in range(NUM_UNITS)}
-    language = Table(units | {(3, 30): -0.1, (4, 31): -0.1}, {(3,): -3.0, (4,): -3.0}).tree()
+def test_the_phones_before_decide_between_equal_scores() -> None:
+    """30 and 31 score the same; after 3 comes the one, after 4 the other."""
+    singles: dict[Gram, float] = {(phone,): -4.0 for phone in range(NUM_PHONES)}
+    language = Table(singles | {(3, 30): -0.1, (4, 31): -0.1}, {(3,): -3.0, (4,): -3.0}).tree()
     model = topology(3, np.random.default_rng(0), language)
     decoder = Decoder(model)
     scores = clear_scores([3, 30, 4, 30], model, frames_per_state=2)
-    for unit in (30, 31):
-        states = slice(model.first_state[unit], model.first_state[unit + 1])
+    for phone in (30, 31):
+        states = slice(model.first_state[phone], model.first_state[phone + 1])
         scores[6:12, states] = scores[18:, states] = 0.0
     for row in scores:
         decoder.accept(row)
-    assert [segment.unit for segment in decoder.finish()] == [3, 30, 4, 31]
+    assert [segment.phone for segment in decoder.finish()] == [3, 30, 4, 31]
 
 
 def test_endless_speech_keeps_its_memory_and_its_result() -> None:
     rng = np.random.default_rng(1)
     model = topology(5, rng)
-    sequence = rng.permutation(np.arange(SIL)).tolist() * 8  # 472 units, 4720 frames
+    sequence = rng.permutation(np.arange(SIL)).tolist() * 8  # 472 phones, 4720 frames
     decoder = Decoder(model)
     for row in clear_scores(sequence, model, frames_per_state=2, contrast=2.0):
         decoder.accept(row)
-    assert len(decoder._settled) > 300
-    assert len(decoder._records) < 2 * search._ROOM
-    assert [segment.unit for segment in decoder.finish()] == sequence
-    assert [segment.unit for segment in decoder.path_since(4000)] == sequence[400:-1]
+    assert len(decoder._shared) > 300
+    assert len(decoder._records) < 2 * search._RECORD_CAPACITY
+    assert [segment.phone for segment in decoder.finish()] == sequence
+    assert [segment.phone for segment in decoder.path_since(4000)] == sequence[400:-1]
 
 
-def crowded_language() -> UnitLanguage:
-    """Know all strings of three units but for pauses, and one more after each, all as likely."""
-    units = [np.zeros(1, np.uint8)]
-    children = [np.array([NUM_UNITS], np.uint8)]
-    for num_children in (NUM_UNITS, NUM_UNITS, 1, 0):
+def crowded_language() -> PhoneLanguageModel:
+    """Know all strings of three phones but for pauses, and one more after each, all as likely."""
+    levels = [np.zeros(1, np.uint8)]
+    children = [np.array([NUM_PHONES], np.uint8)]
+    for num_children in (NUM_PHONES, NUM_PHONES, 1, 0):
         parents = children[-1]
-        units.append(np.concatenate([np.arange(n) for n in parents]).astype(np.uint8))
-        begins = (units[-1] != SIL) | (len(units) == 2)
+        levels.append(np.concatenate([np.arange(n) for n in parents]).astype(np.uint8))
+        begins = (levels[-1] != SIL) | (len(levels) == 2)
         children.append(np.where(begins, num_children, 0).astype(np.uint8))
-    unit = np.concatenate(units)
-    return UnitLanguage(
+    phone = np.concatenate(levels)
+    return PhoneLanguageModel(
+        inventory=MANDARIN,
         num_children=np.concatenate(children),
-        unit=unit,
-        log_share=np.full(len(unit), -np.log(NUM_UNITS), np.float32),
-        log_back_off=np.zeros(len(unit), np.float32),
+        phone=phone,
+        log_prob=np.full(len(phone), -np.log(NUM_PHONES), np.float32),
+        log_backoff=np.zeros(len(phone), np.float32),
     )
 
 
 def test_a_crowd_of_paths_stays_within_its_bound() -> None:
     language = crowded_language()
-    assert len(language.graph.last_unit) > 200_000
+    assert len(language.graph.last_phone) > 200_000
     model = topology(1, np.random.default_rng(0), language)
     decoder = Decoder(model)
     most = 0
     for _ in range(60):
-        unit, start, confidence = decoder.accept(np.zeros(model.num_states, np.float32))
-        assert 0 <= unit < NUM_UNITS
+        phone, start, confidence = decoder.accept(np.zeros(model.num_states, np.float32))
+        assert 0 <= phone < NUM_PHONES
         assert 0 <= start < decoder.num_frames
         assert 0 < confidence <= 1
         most = max(most, decoder._num_tokens)
-        assert len(decoder._records) <= 2 * search._ROOM
-        in_use = np.flatnonzero(decoder._token_of != search._NOWHERE)
+        assert len(decoder._records) <= 2 * search._RECORD_CAPACITY
+        in_use = np.flatnonzero(decoder._token_of != search._NO_TOKEN)
         assert sorted(decoder._context[: decoder._num_tokens]) == in_use.tolist()
-    assert most == search._MOST_TOKENS
+    assert most == search._MAX_TOKENS
     path = decoder.finish()
     assert (path[0].start, path[-1].end) == (0, 60)
     assert all(one.end == two.start for one, two in pairwise(path))
 
 
-def test_path_since_gives_the_units_before_the_last() -> None:
+def test_path_since_gives_the_phones_before_the_last() -> None:
     model = topology(5, np.random.default_rng(0))
     decoder = Decoder(model)
     for row in clear_scores([3, 30, 12, 45], model, frames_per_state=2)[:35]:
@@ -215,7 +214,7 @@ def test_path_since_gives_the_units_before_the_last() -> None:
     assert segments_after([Segment(1, 0, 4)], 4) == []
 
 
-def test_reset_and_nothing_heard() -> None:
+def test_reset_and_no_frames() -> None:
     rng = np.random.default_rng(0)
     model = topology(2, rng, Table.draw(rng, [1, 2, SIL], order=3).tree())
     decoder = Decoder(model)

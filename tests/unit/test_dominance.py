@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from services.synthesizer.dominance import (
+from services.synthesizer.lips.dynamic_visemes.dominance import (
     log_closure,
     log_dominance,
     log_left_silence,
@@ -21,14 +21,14 @@ def array(*values: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def test_viseme_by_hand() -> None:
-    # alpha 2, theta 3 before the centre and 5 after it, c 1.5
+    # alpha 2, theta 3 before the apex and 5 after it, c 1.5
     got = np.exp(log_dominance(array(0.25, 0.0, -0.25), array(2.0), array(3.0), array(5.0), 1.5))
     want = [2.0 * math.exp(-3.0 * 0.125), 2.0, 2.0 * math.exp(-5.0 * 0.125)]
     np.testing.assert_allclose(got, want)
 
 
 def test_left_silence_falls_with_time_by_hand() -> None:
-    # sigma = t_l - t: positive before the centre
+    # sigma = t_l - t: positive before the apex
     got = np.exp(log_left_silence(array(0.25, 0.0, -0.25), array(2.0), array(3.0), 1.5))
     np.testing.assert_allclose(got, [2.0 * math.exp(0.375), 2.0, 2.0 * math.exp(-0.375)])
 

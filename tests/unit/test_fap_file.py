@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shared.errors import UserError
-from shared.fap_file import FapAnimation, read_fap, write_fap
+from shared.face.fap_file import FapAnimation, read_fap, write_fap
 
 pytestmark = pytest.mark.unit
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from services.recognizer.features import (
+from services.recognizer.front_end.features import (
     LOG_FLOOR,
     NUM_BANDS,
     NUM_FEATURES,

@@ -9,6 +9,7 @@ import pytest
 
 from services.gateway import wire
 from shared.errors import UserError
+from shared.face.lip_models import LipModelName
 
 pytestmark = pytest.mark.unit
 
@@ -44,6 +45,31 @@ def test_a_hello_describes_the_audio() -> None:
 def test_a_wrong_hello_names_its_field(fields: object, named: str) -> None:
     with pytest.raises(UserError, match=named):
         wire.parse_hello(json.dumps(fields))
+
+
+def test_a_microphone_may_interrupt_and_leave_samples_out() -> None:
+    flush, skip = wire.parse_command('{"flush": true}'), wire.parse_command('{"skip": 960}')
+
+    assert (flush.flush, flush.num_skipped) == (True, 0)
+    assert (skip.flush, skip.num_skipped) == (False, 960)
+    assert flush.lips == skip.lips == ""
+
+
+@pytest.mark.parametrize("lips", [str(name) for name in LipModelName])
+def test_a_microphone_may_choose_its_lips(lips: str) -> None:
+    assert wire.parse_command(json.dumps({"lips": lips})).lips == lips
+
+
+@pytest.mark.parametrize("lips", ["ferguson", 1, None, ["learnt"]])
+def test_there_are_no_other_lips(lips: object) -> None:
+    with pytest.raises(UserError, match="lips must be one of dynamic-visemes, learnt"):
+        wire.parse_command(json.dumps({"lips": lips}))
+
+
+@pytest.mark.parametrize("num_skipped", [-1, 1.5, True, "1", wire.MAX_SKIPPED + 1])
+def test_what_is_left_out_must_be_a_number_of_samples(num_skipped: object) -> None:
+    with pytest.raises(UserError, match="skip must be a whole number"):
+        wire.parse_command(json.dumps({"skip": num_skipped}))
 
 
 @pytest.mark.parametrize("message", ["", "{", "[" * 100_000, "null", '"text"'])

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.driver.arkit import ARKIT, ARKIT_NAMES, OCULUS_NAMES
-from services.driver.glb import export_glb
-from services.driver.glb_head import read_glb
-from services.driver.head import Head, neutral_faps
-from services.driver.high_level import VISEMES
-from services.driver.render import Renderer
-from services.driver.scene import camera, load_head
+from services.driver.head.glb_export import export_glb
+from services.driver.head.glb_head import read_glb
+from services.driver.head.head import Head, neutral_faps
+from services.driver.render.renderer import Renderer
+from services.driver.render.scene import camera, load_head
 from shared.errors import UserError
-from shared.faps import NUM_FAPS
+from shared.face.blendshapes import ARKIT, ARKIT_NAMES, OCULUS_NAMES
+from shared.face.faps import NUM_FAPS
+from shared.face.high_level import VISEMES
 from tests.glb_writer import Mesh, write_glb
 from tests.meshes import meshes
 

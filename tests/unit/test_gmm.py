@@ -5,32 +5,31 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from services.recognizer.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.features import NUM_BANDS, NUM_FEATURES, NUM_STATIC
-from services.recognizer.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
-from services.recognizer.load import MODEL_PATH, load_model
-from services.recognizer.model_file import read_archive, write_archive
-from services.recognizer.voice_warp import VoiceWarp, without_pitch
+from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from services.recognizer.acoustic.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
+from services.recognizer.acoustic.load import MODEL_PATH, load_model
+from services.recognizer.acoustic.model_file import read_archive, write_archive
+from services.recognizer.front_end.features import NUM_BANDS, NUM_FEATURES, NUM_STATIC
+from services.recognizer.front_end.vtln import VocalTractNormalizer, without_pitch
 from shared.errors import UserError
-from shared.phones import UNITS
-from tests.languages import random_language
+from tests.languages import MANDARIN, NUM_PHONES, random_language
 
 pytestmark = pytest.mark.unit
 
-NUM_STATES = 2 * len(UNITS)
+NUM_STATES = 2 * NUM_PHONES
 
 
 def random_topology(rng: np.random.Generator) -> Topology:
     stay = rng.uniform(0.2, 0.8, NUM_STATES)
     return Topology(
-        first_state=np.arange(len(UNITS) + 1) * 2,
+        first_state=np.arange(NUM_PHONES + 1) * 2,
         log_stay=np.log(stay).astype(np.float32),
         log_leave=np.log(1 - stay).astype(np.float32),
-        language=random_language(rng),
-        language_scale=1.5,
-        unit_penalty=-0.25,
-        duration_mean_s=np.full((NUM_POSITIONS, len(UNITS)), 0.1, np.float32),
-        duration_spread_s=np.full((NUM_POSITIONS, len(UNITS)), 0.1, np.float32),
+        phone_lm=random_language(rng),
+        lm_scale=1.5,
+        phone_penalty=-0.25,
+        duration_mean_s=np.full((NUM_POSITIONS, NUM_PHONES), 0.1, np.float32),
+        duration_spread_s=np.full((NUM_POSITIONS, NUM_PHONES), 0.1, np.float32),
     )
 
 
@@ -93,8 +92,8 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     assert expected.shape == (len(frames), NUM_STATES)
     np.testing.assert_allclose(found, expected, rtol=2e-2, atol=2e-2)
     again = loaded.topology
-    assert (again.language_scale, again.unit_penalty) == (1.5, -0.25)
-    np.testing.assert_array_equal(again.language.unit, model.topology.language.unit)
+    assert (again.lm_scale, again.phone_penalty) == (1.5, -0.25)
+    np.testing.assert_array_equal(again.phone_lm.phone, model.topology.phone_lm.phone)
 
 
 def test_a_stream_scores_the_same_in_any_pieces_and_after_reset() -> None:
@@ -118,14 +117,14 @@ def low_voice(num_samples: int) -> np.ndarray:
     return voice.astype(np.float32)
 
 
-def test_low_voices_are_warped_and_the_pitch_is_known_in_the_next_segment() -> None:
+def test_low_voices_are_normalised_and_the_pitch_is_known_in_the_next_segment() -> None:
     model = random_gmm()
     frames = model.front_end().accept_waveform(low_voice(16_000))
     assert frames.shape[1] == 1 + NUM_BANDS + 2
-    warp = VoiceWarp()
+    vtln = VocalTractNormalizer()
     live, given = model.stream(), model.stream()
     for segment in (frames[:60], frames[60:]):
-        warped = warp.accept(segment[:, :-2], segment[:, -2], segment[:, -1])
+        warped = vtln.accept(segment[:, :-2], segment[:, -2], segment[:, -1])
         assert not np.array_equal(warped[-1], segment[-1, :-2])
         found = np.concatenate([live.accept(segment), live.finish()])
         expected = np.concatenate([given.accept(without_pitch(warped)), given.finish()])
@@ -168,14 +167,15 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"format": np.array("gmm 99")}, "gmm 99"),
-        ({"units": np.array(UNITS[::-1])}, "units"),
-        ({"first_state": np.zeros(len(UNITS) + 1, np.int64)}, "not numbered upwards"),
+        ({"phones": np.array(MANDARIN.phones[::-1])}, "phones are not those"),
+        ({"language": np.array("klingon")}, "language 'klingon' is not installed"),
+        ({"first_state": np.zeros(NUM_PHONES + 1, np.int64)}, "not numbered upwards"),
         ({"means": np.zeros((3, 3, 3), np.float32)}, r"means has shape \(3, 3, 3\)"),
-        ({"log_stay": np.full(NUM_STATES, np.nan, np.float32)}, "no numbers"),
-        ({"language_children": np.zeros(99, np.uint8)}, "its language is no tree"),
-        ({"language_unit": np.zeros(3, np.uint8)}, r"language_unit has shape \(3,\)"),
-        ({"language_scale": np.array(np.inf)}, "language_scale holds values that are no numbers"),
-        ({"unit_penalty": np.zeros(2)}, r"unit_penalty has shape \(2,\)"),
+        ({"log_stay": np.full(NUM_STATES, np.nan, np.float32)}, "not finite"),
+        ({"lm_children": np.zeros(99, np.uint8)}, "its phone language model is no tree"),
+        ({"lm_phone": np.zeros(3, np.uint8)}, r"lm_phone has shape \(3,\)"),
+        ({"lm_scale": np.array(np.inf)}, "lm_scale holds values that are not finite"),
+        ({"phone_penalty": np.zeros(2)}, r"phone_penalty has shape \(2,\)"),
         ({"covars": np.zeros((NUM_STATES, 3, NUM_FEATURES), np.float32)}, "negative"),
         ({"weights": np.zeros((NUM_STATES, 0), np.float32)}, "0 mixture components"),
         ({"half_width": np.array(9)}, "half width"),

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.driver.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
+from services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
 from shared.errors import UserError
-from shared.faps import FAPS, NUM_FAPS
+from shared.face.faps import FAPS, NUM_FAPS
 from tests import heads
 
 pytestmark = pytest.mark.unit
@@ -172,7 +172,7 @@ def test_broken_asset(tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPat
         elif damage == "texture_skin":
             del arrays[damage]
         elif damage == "huge":
-            monkeypatch.setattr("services.driver.head.MAX_BYTES", 100_000)
+            monkeypatch.setattr("services.driver.head.head.MAX_BYTES", 100_000)
         elif damage in arrays:
             arrays[damage] = arrays[damage][:1]
         else:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from services.driver import arkit
-from services.driver.arkit import (
+from services.driver.head.head import Head, neutral_faps
+from shared.face import blendshapes as arkit
+from shared.face.blendshapes import (
     ARKIT,
     ARKIT_NAMES,
     OCULUS_NAMES,
@@ -15,9 +16,8 @@ from services.driver.arkit import (
     arkit_weights,
     oculus_weights,
 )
-from services.driver.head import Head, neutral_faps
-from services.driver.high_level import EXPRESSIONS, VISEMES
-from shared.faps import FAP_NUMBER, NUM_FAPS
+from shared.face.faps import FAP_NUMBER, NUM_FAPS
+from shared.face.high_level import EXPRESSIONS, VISEMES
 from tests import heads
 
 pytestmark = pytest.mark.unit

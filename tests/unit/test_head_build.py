@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from services.driver import picture
-from services.driver.build_head import hair, paint_parts, parts, people, surface, texture, zones
+from services.driver.head import surface
+from training.heads import hair, paint_parts, parts, people, texture, zones
 
 pytestmark = pytest.mark.unit
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.driver.head import Head
-from services.driver.high_level import (
+from services.driver.head.head import Head
+from shared.errors import UserError
+from shared.face.high_level import (
     EXPRESSION_NAMES,
     EXPRESSIONS,
     VISEME_NAMES,
@@ -14,7 +15,6 @@ from services.driver.high_level import (
     expression_faps,
     viseme_faps,
 )
-from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

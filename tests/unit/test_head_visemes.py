@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.driver import high_level
-from services.driver.head import Head
-from shared.faps import NUM_FAPS
+from services.driver.head.head import Head
+from shared.face import high_level
+from shared.face.faps import NUM_FAPS
 from tests import heads
 
 pytestmark = pytest.mark.unit

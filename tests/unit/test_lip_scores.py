@@ -1,106 +1,230 @@
 """Scores of lips, the fit report and the pictures, on made-up speakers."""
 
 import json
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from rich.console import Console
 
-from evaluation.figures import new_figure, save_figure
-from evaluation.lips import (
-    ClipLips,
+from corpora.figures import new_figure, save_figure
+from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
+from evaluation.lips.clip_scores import score_clip
+from evaluation.lips.report import print_scores
+from evaluation.lips.schemes import (
+    DEFAULT_DELAY_S,
+    DELAYS_S,
+    HeardClip,
+    Scheme,
     acoustic_closures,
-    clips_to_score,
+    is_speech,
     loudness_frames,
-    score_clips,
 )
-from evaluation.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
-from evaluation.viseme_plots import dominance_figure, faces_figure, sentence_figure
-from services.synthesizer.blending import blend
-from services.synthesizer.parameters import clips_seen, load_parameters, save_parameters
-from services.synthesizer.timeline import EDGE_S, build_timeline
-from services.synthesizer.visemes import MOUTH_FAPS
+from evaluation.lips.scores import LipScore, clips_to_score, pool
+from evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
+from evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
+from services.synthesizer.lips.dynamic_visemes.blending import blend
+from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from services.synthesizer.lips.dynamic_visemes.parameters import (
+    clips_seen,
+    load_parameters,
+    save_parameters,
+)
+from services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.faps import NUM_FAPS
-from tests.lips import clip_of, utterance
-from training.lip_clips import SAMPLE_RATE_HZ
-from training.viseme_start import starting_parameters
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from shared.phones.events import Phone, SoundEvent, SpeechChange
+from tests.lips import INVENTORY, LIPS, clip_of, utterance
 
 pytestmark = pytest.mark.unit
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
-START = starting_parameters()
+START = initial_parameters()
+MOUTH = np.array(MOUTH_FAPS) - 1
+
+
+def heard(
+    clip: LipClip, phones: Sequence[Phone] = (), events: Sequence[SoundEvent] = ()
+) -> HeardClip:
+    return HeardClip(
+        clip=clip,
+        num_frames=0,
+        levels=level_track(clip.samples),
+        events={delay_s: list(events) for delay_s in DELAYS_S},
+        recognised=list(phones),
+        aligned=None,
+    )
+
+
+def make_scheme(name: str, frames: NDArray[np.float64], delay_s: float = 0.05) -> Scheme:
+    return Scheme(name, delay_s, lambda _heard: frames)
+
+
+def scores_of(lips: HeardClip, schemes: dict[str, NDArray[np.float64]]) -> list[LipScore]:
+    """Score made frames under their names."""
+    found = [score_clip(lips, make_scheme(name, frames)) for name, frames in schemes.items()]
+    return pool([score for score in found if score is not None])
 
 
 def test_late_lips_are_found_late_and_closures_met() -> None:
     phones = utterance(1, 40)
     time_s = np.arange(0.0, phones[-1].onset_s + 1.0, 0.02)
-    curve = blend(START, build_timeline(phones), time_s)
+    curve = blend(START, build_timeline(phones, INVENTORY), time_s)
     made = np.zeros((len(time_s), NUM_FAPS))
-    made[:, np.array(MOUTH_FAPS) - 1] = blend(START, build_timeline(phones), time_s - 0.05)
+    made[:, MOUTH] = blend(START, build_timeline(phones, INVENTORY), time_s - 0.05)
     true = np.zeros_like(made)
-    true[:, np.array(MOUTH_FAPS) - 1] = curve
+    true[:, MOUTH] = curve
     still = np.zeros_like(made)
 
-    centres_s = np.array([p.onset_s + min(p.duration_s / 2.0, EDGE_S) for p in phones])
-    closures_s = centres_s[[phone.unit == "b" for phone in phones]]
-    lips = ClipLips(
-        clip_of(time_s, curve), {"late": made, "true": true, "still": still}, closures_s
-    )
-    scores = score_clips("all", [lips])
+    # quietest where the lips of a b are: half way, or at its edge
+    samples = np.full(int(time_s[-1] * SAMPLE_RATE_HZ), 0.1, dtype=np.float32)
+    for phone in phones:
+        apex = round(SAMPLE_RATE_HZ * (phone.onset_s + min(phone.duration_s / 2.0, EDGE_S)))
+        samples[apex - 160 : apex + 160] = 0.0
+    clip = replace(clip_of(time_s, curve), samples=samples)
+    scores = scores_of(heard(clip, phones), {"late": made, "true": true, "still": still})
+    assert {(score.kind, score.group) for score in scores} == {
+        ("all", "all"),
+        ("language", "zh"),
+        ("source", "made"),
+        ("speaker", "nobody"),
+    }
+    found = {score.scheme: score for score in scores if score.kind == "all"}
 
-    late = {score.measure: score for score in scores if score.scheme == "late"}
-    assert late["opening"].best_lag_ms == 50
-    assert late["opening"].best_correlation == pytest.approx(1.0, abs=0.01)
-    assert late["opening"].correlation is not None
-    assert late["opening"].correlation < 0.95
-    assert [score.correlation for score in scores if score.scheme == "still"] == [None] * 3
-    found = {score.scheme: score for score in scores if score.measure == "opening"}
-    assert found["true"].closures >= 3
-    assert found["true"].bpm == len(closures_s) >= 3
-    assert found["true"].closures_met == found["true"].closures
+    late = found["late"].curves["opening"]
+    assert late.best_lag_ms == 50
+    assert late.best_correlation == pytest.approx(1.0, abs=0.01)
+    assert late.correlation is not None
+    assert late.correlation < 0.95
+    assert found["late"].opening_delay_p50_ms == pytest.approx(50.0, abs=2.0)
+    assert found["late"].opening_delay_p95_ms == pytest.approx(50.0, abs=5.0)
+    assert [curve.correlation for curve in found["still"].curves.values()] == [None] * 3
+    assert found["true"].opening_delay_p95_ms == pytest.approx(0.0)
+    assert found["true"].openings_met == found["true"].openings >= 5
+    assert found["true"].closures.real >= 3
+    assert found["true"].closures.recall == 1.0
+    assert found["true"].bpm == sum(phone.symbol == "b" for phone in phones) >= 3
     assert found["true"].bpm_met == found["true"].bpm
+    # the made curve has 50 frames a second, as this clip
+    for each in found["true"].curves.values():
+        assert each.turns_per_s == pytest.approx(each.real_turns_per_s, rel=0.02)
+        assert each.turns_per_s_at_50_hz == pytest.approx(each.turns_per_s)
     # a mouth that never opens closes nothing
-    assert found["still"].bpm_met == found["still"].closures_met == 0
-    assert found["true"].rmse < 1e-6 < found["late"].rmse
+    assert (
+        found["still"].bpm_met == found["still"].closures.met == found["still"].closures.made == 0
+    )
+    assert found["still"].closures.f1 == 0.0
+    true_rmse, late_rmse = found["true"].curves["opening"].rmse, late.rmse
+    assert true_rmse is not None
+    assert late_rmse is not None
+    assert true_rmse < 1e-3 < late_rmse
 
 
 def test_what_a_clip_does_not_measure_is_not_scored() -> None:
     time_s = np.arange(0.0, 1.0, 0.04)
-    jaw_only, all_faps = np.full((2, len(time_s), len(MOUTH_FAPS)), np.nan)
-    all_faps[:] = jaw_only[:, MOUTH_FAPS.index(3)] = 10.0
+    jaw_only = np.full((len(time_s), len(MOUTH_FAPS)), np.nan)
+    jaw_only[:, MOUTH_FAPS.index(3)] = 10.0
     made = {"made": np.random.default_rng(0).normal(size=(51, NUM_FAPS))}
-    lips = [ClipLips(clip_of(time_s, faps), made, np.zeros(0)) for faps in (jaw_only, all_faps)]
-    found = {score.measure: score.num_clips for score in score_clips("all", lips)}
-    assert found == {"opening": 1, "width": 1, "jaw": 2}
-    assert [score.measure for score in score_clips("all", lips[:1])] == ["jaw"]
+    score = scores_of(heard(clip_of(time_s, jaw_only)), made)[0]
+    assert list(score.curves) == ["jaw"]
+    assert score.closures.real == score.openings == 0
+    assert score.closures.recall is None
+
+
+def test_clips_out_of_sync_count_for_shapes_alone() -> None:
+    phones = utterance(1, 20)
+    time_s = np.arange(0.0, phones[-1].onset_s + 1.0, 0.02)
+    curve = blend(START, build_timeline(phones, INVENTORY), time_s)
+    true = np.zeros((len(time_s), NUM_FAPS))
+    true[:, MOUTH] = curve
+    clip = replace(clip_of(time_s, curve), is_in_sync=False)
+    score = scores_of(heard(clip, phones), {"true": true})[0]
+    assert score.curves["opening"].correlation == pytest.approx(1.0)
+    assert score.curves["opening"].best_lag_ms is None
+    assert score.closures.real == score.openings == score.bpm == 0
+
+
+def test_speech_is_loud_voice_activity() -> None:
+    samples = np.full(3 * SAMPLE_RATE_HZ, 0.1, dtype=np.float32)
+    samples[SAMPLE_RATE_HZ : 2 * SAMPLE_RATE_HZ] = 1e-4  # a pause that voice activity spans
+    clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
+    events = [SpeechChange(active=True, time_s=0.5), SpeechChange(active=False, time_s=2.5)]
+    times_s = np.array([0.2, 0.6, 1.05, 1.5, 1.95, 2.4, 2.6])
+    found = is_speech(heard(clip, events=events), times_s)
+    assert found.tolist() == [False, True, True, False, True, True, False]
+    assert not is_speech(heard(clip), times_s).any()
+
+
+def test_closures_outside_speech_are_told_apart() -> None:
+    time_s = np.arange(0.0, 4.0, 0.02)
+    frames = np.zeros((len(time_s), NUM_FAPS))
+    frames[:, 4] = -300.0
+    for moment_s in (0.5, 1.5, 3.5):
+        frames[np.abs(time_s - moment_s) < 0.05] = 0.0
+    clip = clip_of(time_s, frames[:, MOUTH])
+    samples = np.full(4 * SAMPLE_RATE_HZ, 0.1, dtype=np.float32)
+    events = [SpeechChange(active=True, time_s=0.0), SpeechChange(active=False, time_s=2.0)]
+    score = scores_of(heard(replace(clip, samples=samples), events=events), {"made": frames})[0]
+    assert (score.closures.met, score.closures.real, score.closures.made) == (3, 3, 3)
+    spoken = score.closures_in_speech
+    assert (spoken.met, spoken.real, spoken.true, spoken.made) == (2, 2, 2, 2)
+
+
+def test_scores_are_printed_for_all_and_each_speaker() -> None:
+    time_s = np.arange(0.0, 2.0, 0.04)
+    rng = np.random.default_rng(0)
+    clip = clip_of(time_s, rng.normal(0.0, 100.0, (len(time_s), len(MOUTH_FAPS))))
+    frames = rng.normal(0.0, 100.0, (101, NUM_FAPS))
+    found = [
+        score_clip(
+            heard(replace(clip, speaker=speaker, language=language)),
+            make_scheme("dynamic-visemes", frames, DEFAULT_DELAY_S),
+        )
+        for speaker, language in (("one", "zh"), ("somebody_with_a_name", "en"))
+    ]
+    scores = pool([score for score in found if score is not None])
+    console = Console(record=True, width=80, file=StringIO())
+    print_scores(scores, console)
+    text = console.export_text()
+    for name in ("all: 2", "zh: 1", "en: 1", "one: 1", "somebody_with_a_name: 1"):
+        assert name in text
+    opening = next(score for score in scores if score.kind == "all").curves["opening"]
+    assert f"{opening.correlation:.2f}" in text
+    assert "…" not in text  # nothing is cut off in 80 columns
 
 
 def test_loudness_opens_the_mouth() -> None:
     samples = np.zeros(16_000, dtype=np.float32)
     samples[6_000:10_000] = np.random.default_rng(0).normal(0.0, 0.1, 4_000)
-    faps = loudness_frames(samples)
+    faps = loudness_frames(samples, 0.1)
     assert faps[25, 4] < -500.0
     assert abs(faps[5, 4]) < 1.0
+    # at 17 frames, 35 ms before the sound, a mouth that knows 60 ms opens already
+    assert faps[17, 4] < -100.0
+    assert abs(loudness_frames(samples, 0.0)[17, 4]) < 1.0
+    np.testing.assert_array_equal(loudness_frames(samples, 0.3), faps)
 
 
-def test_acoustic_closures_are_where_the_unit_is_quietest() -> None:
+def test_acoustic_closures_are_where_the_phone_is_quietest() -> None:
     phones = utterance(4, 20)
-    labials = [phone for phone in phones if phone.unit == "b"]
+    labials = [phone for phone in phones if phone.symbol == "b"]
     samples = np.random.default_rng(0).normal(0.0, 0.1, 8 * SAMPLE_RATE_HZ).astype(np.float32)
     quiet_s = [phone.onset_s + 0.3 * phone.duration_s for phone in labials]
     for time_s in quiet_s:
         middle = round(time_s * SAMPLE_RATE_HZ)
         samples[middle - 200 : middle + 200] = 0.0
-    clip = clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS))))
-    object.__setattr__(clip, "samples", samples)
+    clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
     np.testing.assert_allclose(acoustic_closures(clip, phones), quiet_s, atol=0.011)
 
 
-def write_clip(folder: Path, name: str, column: str = "F3_open_jaw") -> None:
-    (folder / f"{name}.json").write_text(json.dumps({"language": "zh", "licence": "MIT"}))
+def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: str = "zh") -> None:
+    (folder / f"{name}.json").write_text(json.dumps({"language": language, "licence": "MIT"}))
     (folder / f"{name}.csv").write_text(f"t,{column}\n0.0,1\n")
     (folder / f"{name}.flac").write_bytes(b"")
 
@@ -108,21 +232,34 @@ def write_clip(folder: Path, name: str, column: str = "F3_open_jaw") -> None:
 def test_clips_that_were_learnt_from_are_not_scored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "parameters.json"
-    save_parameters(START, path, "a test", learnt_from=["one"], chosen_with=["two"])
-    assert clips_seen(path) == {"one", "two"}
-    for name in ("one", "two"):
-        write_clip(tmp_path, name)
-    path.rename(path.with_suffix(".text"))
-    path = path.with_suffix(".text")
-    monkeypatch.setattr("training.lip_clips.read_audio", lambda _path: np.zeros(1600, np.float32))
+    parameters = tmp_path / "parameters.text"
+    save_parameters(START, parameters, "a test", learnt_from=["a_one"], chosen_with=["a_two"])
+    assert clips_seen(parameters) == {"a_one", "a_two"}
+    clips = tmp_path / "clips"
+    clips.mkdir()
+    for name in ("a_one", "a_two"):
+        write_clip(clips, name)
+    monkeypatch.setattr("corpora.lip_clips.read_audio", lambda _path: np.zeros(1600, np.float32))
+    with pytest.raises(UserError, match=r"held\.txt"):
+        clips_to_score(clips, parameters)
+    (clips / "held.txt").write_text("a_one a_two a_three b_four")
     with pytest.raises(UserError, match="give other clips"):
-        clips_to_score(tmp_path, path)
-    write_clip(tmp_path, "three", "F5_raise_b_midlip")
+        clips_to_score(clips, parameters)
+    write_clip(clips, "a_three", "F12_raise_l_cornerlip")
     with pytest.raises(UserError, match="no clip measures"):
-        clips_to_score(tmp_path, path)
-    write_clip(tmp_path, "three")
-    assert [clip.name for clip in clips_to_score(tmp_path, path)] == ["three"]
+        clips_to_score(clips, parameters)
+    write_clip(clips, "a_three")
+    write_clip(clips, "b_four", language="en")
+
+    def names(sources: Collection[str] = (), language: str | None = None) -> list[str]:
+        found = clips_to_score(clips, parameters, language=language, sources=sources)
+        return [clip.name for clip in found]
+
+    assert names() == ["a_three", "b_four"]
+    assert names(language="zh") == ["a_three"]
+    assert names(["b"]) == ["b_four"]
+    with pytest.raises(UserError, match="no clip is from c"):
+        names(["c"])
 
 
 def test_shipped_parameters_say_what_they_have_seen() -> None:
@@ -135,9 +272,10 @@ def test_the_fit_report_finds_who_made_the_curves() -> None:
     phones = utterance(5, 60)
     time_s = np.arange(0.0, phones[-1].onset_s + 1.0, 0.04)
     learnt = load_parameters()
-    clip = clip_of(time_s, blend(learnt, build_timeline(phones), time_s))
+    clip = clip_of(time_s, blend(learnt, build_timeline(phones, INVENTORY), time_s))
     object.__setattr__(clip, "samples", np.zeros(int(time_s[-1] * SAMPLE_RATE_HZ), np.float32))
-    fitted = [fit_clip(clip, phones, learnt, START)]
+    lips = [DynamicVisemes(parameters, INVENTORY) for parameters in (learnt, START)]
+    fitted = [fit_clip(clip, phones, *lips)]
     errors = errors_of_visemes(fitted)
     assert {error.measure for error in errors} == {"opening", "width", "jaw"}
     assert {"all", "rest", "a", "i", "u", "b"} <= {error.viseme for error in errors}
@@ -153,8 +291,9 @@ def test_the_fit_report_finds_who_made_the_curves() -> None:
     assert len(fit_figure(fitted).axes) == 8
 
 
+@pytest.mark.slow
 def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
-    figure = faces_figure(load_parameters())
+    figure = faces_figure(LIPS)
     titles = [axis.get_title() for axis in figure.axes if axis.images]
     assert len(titles) == 26
     assert titles[0] == "rest"
@@ -162,20 +301,22 @@ def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
     assert all(face.std() > 10.0 for face in faces)
     vowel = titles.index("a ang\n")
     assert np.abs(faces[vowel].astype(float) - faces[0]).max() > 60.0
-    save_figure(dominance_figure(load_parameters()), tmp_path / "dominance.png")
+    save_figure(dominance_figure(LIPS), tmp_path / "dominance.png")
     assert (tmp_path / "dominance.png").read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(UserError, match="cannot be written"):
         save_figure(figure, tmp_path / "no" / "such.png")
 
 
+@pytest.mark.slow
 def test_a_sentence_is_drawn_with_the_parameters_given() -> None:
     samples, _ = read_audio(DEMO / "vowels-male.wav")
     still = replace(START, target=np.zeros_like(START.target))
     for parameters, moves in ((START, True), (still, False)):
-        jaw = sentence_figure(parameters, samples[:24_000, 0]).axes[1]
+        lips = DynamicVisemes(parameters, INVENTORY)
+        jaw = sentence_figure(lips, samples[:24_000, 0]).axes[1]
         full, live = (np.asarray(line.get_ydata()) for line in jaw.get_lines()[:2])
         assert (np.ptp(full) > 100.0, np.ptp(live) > 100.0) == (moves, moves)
-    assert len(sentence_figure(START, np.zeros(10, np.float32)).axes) == 6
+    assert len(sentence_figure(LIPS, np.zeros(10, np.float32)).axes) == 6
 
 
 def test_pictures_without_matplotlib_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

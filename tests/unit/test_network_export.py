@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from services.recognizer.load import load_model, model_path
-from services.recognizer.neural import NUM_INPUTS, NeuralModel
-from training.network import Network, Shape
-from training.network_export import network_of, onnx_of
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.acoustic.network import NUM_INPUTS
+from services.recognizer.acoustic.neural import NeuralModel
+from training.neural.export import network_of, onnx_of
+from training.neural.network import Network, Shape
 
-pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 SHAPE = Shape(num_states=180, look_aheads=(2, 7), width=64, heads=4, layers=2, inner=80)
 
@@ -23,12 +24,12 @@ def some_network() -> Network:
     return network
 
 
-def log_shares_of(network: Network, frames: np.ndarray, output: int) -> np.ndarray:
-    """Whole segment in PyTorch, (frames said, states), from the first that a position says."""
+def log_posteriors_of(network: Network, frames: np.ndarray, output: int) -> np.ndarray:
+    """A whole segment in PyTorch, (frames, states), from the first position's first frame."""
     with torch.no_grad():
-        shares = network.log_shares(network(torch.from_numpy(frames)[None]), output)[0]
-    rows: np.ndarray = shares.reshape(-1, SHAPE.num_states).numpy()
-    return rows[max(0, SHAPE.look_aheads[output] - 2) :]
+        rows = network.log_posteriors(network(torch.from_numpy(frames)[None]), output)[0]
+    flat: np.ndarray = rows.reshape(-1, SHAPE.num_states).numpy()
+    return flat[max(0, SHAPE.look_aheads[output] - 2) :]
 
 
 def scores_of(file: np.ndarray, frames: np.ndarray, output: int) -> np.ndarray:
@@ -39,8 +40,8 @@ def scores_of(file: np.ndarray, frames: np.ndarray, output: int) -> np.ndarray:
         network=file,
         look_aheads=np.array(SHAPE.look_aheads),
         log_prior=np.zeros(SHAPE.num_states, np.float32),
-        kappa=1.0,
-        head=output,
+        acoustic_scale=1.0,
+        output_layer=output,
     )
     return model.stream().accept(frames)
 
@@ -50,7 +51,7 @@ def scores_of(file: np.ndarray, frames: np.ndarray, output: int) -> np.ndarray:
 def test_onnxruntime_computes_what_pytorch_does(output: int, exact: bool, atol: float) -> None:
     frames = np.random.default_rng(0).normal(0.3, 0.3, (301, NUM_INPUTS)).astype(np.float32)
     file = onnx_of(some_network(), exact=exact)
-    expected = log_shares_of(network_of(file, SHAPE.look_aheads).eval(), frames, output)
+    expected = log_posteriors_of(network_of(file, SHAPE.look_aheads).eval(), frames, output)
     found = scores_of(file, frames, output)
     assert found.shape == expected.shape
     np.testing.assert_allclose(found, expected, atol=atol)

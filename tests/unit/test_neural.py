@@ -8,24 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.recognizer import neural as neural_module
-from services.recognizer.acoustic_model import listen
-from services.recognizer.load import load_model, model_path
-from services.recognizer.model_file import read_archive, write_archive
-from services.recognizer.neural import (
-    FORMAT,
-    MOST_POSITIONS,
-    NUM_INPUTS,
-    WINDOW,
-    NeuralModel,
-    positions_of,
-)
-from services.recognizer.pipeline import Recognizer
-from services.recognizer.whisper_mel import WhisperMel
+from services.recognizer.acoustic import neural as neural_module
+from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.acoustic.model_file import read_archive, write_archive
+from services.recognizer.acoustic.network import MAX_POSITIONS, NUM_INPUTS, WINDOW, position_table
+from services.recognizer.acoustic.neural import FORMAT, NeuralModel
+from services.recognizer.front_end.whisper_mel import WhisperMel
+from services.recognizer.recognizer import Recognizer
 from shared.audio_file import read_audio
 from shared.errors import UserError
 
-pytestmark = pytest.mark.unit
+pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
@@ -52,7 +46,7 @@ def test_every_look_ahead_has_scores_of_its_own() -> None:
         assert stream.look_ahead_frames == frames
         early = stream.accept(FRAMES)
         num_early = len(early) - (len(FRAMES) - frames)
-        assert num_early in (0, 1)  # a position says two frames, the second as soon as the first
+        assert num_early in (0, 1)  # a position scores two frames, the second as soon as the first
         found[int(frames)] = np.concatenate([early, stream.finish()])
         assert found[int(frames)].shape == (len(FRAMES), model.topology.num_states)
     assert len({scores.tobytes() for scores in found.values()}) == len(found)
@@ -60,8 +54,8 @@ def test_every_look_ahead_has_scores_of_its_own() -> None:
 
 @pytest.mark.parametrize("num_frames", range(8))
 def test_short_segments_have_scores_of_all_their_frames(num_frames: int) -> None:
-    for head in range(len(neural().look_aheads)):
-        stream = neural(10.0 * neural().look_aheads[head]).stream()
+    for frames in neural().look_aheads:
+        stream = neural(10.0 * frames).stream()
         for _ in range(2):
             rows = [*stream.accept(FRAMES[:num_frames]), *stream.finish()]
             assert len(rows) == num_frames
@@ -93,7 +87,7 @@ def test_the_last_frame_is_repeated_at_the_end() -> None:
         np.testing.assert_array_equal(scores_of(model, FRAMES), again)
 
 
-def test_a_frame_is_heard_as_far_as_the_look_ahead_and_no_further() -> None:
+def test_scores_depend_on_the_look_ahead_and_on_nothing_later() -> None:
     model = neural(30.0)
     other = FRAMES.copy()
     other[50:] += 0.5
@@ -106,7 +100,7 @@ def test_a_frame_is_heard_as_far_as_the_look_ahead_and_no_further() -> None:
 def test_only_the_window_counts() -> None:
     """What lies before the window of every layer and the frames around it changes nothing."""
     model = neural(10.0)
-    layers = model.sizes.layers
+    layers = model.session.sizes.num_layers
     reach = 2 * layers * (WINDOW - 1) + 5
     frames = np.resize(FRAMES, (reach + 40, NUM_INPUTS))
     other = frames.copy()
@@ -128,12 +122,12 @@ def test_a_segment_begins_afresh() -> None:
     np.testing.assert_array_equal(again, first)
 
 
-def test_speech_beyond_the_table_of_positions_goes_on_with_an_empty_past(
+def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model = neural(10.0)
     whole = scores_of(model, FRAMES)
-    monkeypatch.setattr(neural_module, "MOST_POSITIONS", 20)
+    monkeypatch.setattr(neural_module, "MAX_POSITIONS", 20)
     short = scores_of(model, FRAMES)
     assert short.shape == whole.shape
     np.testing.assert_array_equal(short[:41], whole[:41])
@@ -143,7 +137,7 @@ def test_speech_beyond_the_table_of_positions_goes_on_with_an_empty_past(
     np.testing.assert_array_equal(scores_of(model, later)[41:81], short[41:81])
 
 
-def test_sessions_that_listen_together_hear_what_each_hears_alone() -> None:
+def test_sessions_scored_together_give_what_each_gives_alone() -> None:
     model = neural()
     sounds = [HELLO, HELLO[8000:], HELLO[:9000], np.zeros(4000, np.float32)]
     alone = []
@@ -151,9 +145,9 @@ def test_sessions_that_listen_together_hear_what_each_hears_alone() -> None:
         recognizer = Recognizer(model, sample_rate_hz=16_000)
         alone.append(recognizer.accept_waveform(sound) + recognizer.input_finished())
     recognizers = [Recognizer(model, sample_rate_hz=16_000) for _ in sounds]
-    heard = [r.hear(sound) for r, sound in zip(recognizers, sounds, strict=True)]
-    together = listen(model, heard)
-    ends = listen(model, [recognizer.hear_end() for recognizer in recognizers])
+    tasks = [r.process(sound) for r, sound in zip(recognizers, sounds, strict=True)]
+    together = run_scoring_tasks(model, tasks)
+    ends = run_scoring_tasks(model, [recognizer.finish() for recognizer in recognizers])
     assert [events + end for events, end in zip(together, ends, strict=True)] == alone
     assert alone[0]
 
@@ -177,8 +171,8 @@ def test_scores_are_the_same_whoever_comes_and_goes() -> None:
 
 
 def test_positions_are_sinusoids() -> None:
-    table = positions_of(512)
-    assert table.shape == (MOST_POSITIONS, 512)
+    table = position_table(512)
+    assert table.shape == (MAX_POSITIONS, 512)
     np.testing.assert_array_equal(table[0], np.repeat([0, 1], 256))
     np.testing.assert_allclose(table[7, [0, 256]], [np.sin(7), np.cos(7)], rtol=1e-6)
     np.testing.assert_allclose(table[1000, 255], np.sin(0.1), rtol=1e-6)  # the longest wave
@@ -209,9 +203,9 @@ def test_a_gmm_has_one_look_ahead() -> None:
         ({"look_aheads": np.array([1, 0])}, "look-aheads"),
         ({"look_aheads": np.array([1, 101])}, "look-aheads"),
         ({"look_aheads": np.arange(1, 50)}, "its network scores"),
-        ({"head": np.array(77)}, "output layer 77"),
+        ({"output_layer": np.array(77)}, "output layer 77"),
         ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),
-        ({"kappa": np.array(np.nan, np.float32)}, "no numbers"),
+        ({"acoustic_scale": np.array(np.nan, np.float32)}, "not finite"),
     ],
 )
 def test_files_are_checked(change: dict[str, np.ndarray], message: str, tmp_path: Path) -> None:
@@ -235,9 +229,9 @@ def with_network(change: Callable[[Any], None], path: Path) -> Path:
 
 
 def test_a_network_of_another_form_is_refused(tmp_path: Path) -> None:
-    def without_head(graph: Any) -> None:
+    def without_inputs(graph: Any) -> None:
         del graph.node[:], graph.output[1:], graph.input[:]
-        graph.node.add(op_type="Identity", input=["norm.bias"], output=["shares"])
+        graph.node.add(op_type="Identity", input=["norm.bias"], output=["log_posteriors"])
 
     def of_no_width(graph: Any) -> None:
         graph.input[1].type.tensor_type.shape.dim[1].dim_param = "any"
@@ -245,15 +239,15 @@ def test_a_network_of_another_form_is_refused(tmp_path: Path) -> None:
     def of_other_past(graph: Any) -> None:
         graph.input[3].type.tensor_type.shape.dim[3].dim_param = "any"
 
-    def of_no_numbers(graph: Any) -> None:
+    def of_nan(graph: Any) -> None:
         (bias,) = (tensor for tensor in graph.initializer if tensor.name == "norm.bias")
         bias.raw_data = np.full(bias.dims[0], np.nan, np.float32).tobytes()
 
     for change, message in (
-        (without_head, "has the inputs"),
+        (without_inputs, "has the inputs"),
         (of_no_width, "has the width any"),
-        (of_other_past, "has past of"),
-        (of_no_numbers, "are no numbers"),
+        (of_other_past, "has past_mask of"),
+        (of_nan, "are not finite"),
     ):
         with pytest.raises(UserError, match=message):
             load_model(with_network(change, tmp_path / "model.npz"))

@@ -1,4 +1,4 @@
-"""Whisper's weights, changed sounds, and the training of the network."""
+"""Whisper's weights, augmentation, and the training of the network."""
 
 import struct
 from collections.abc import Sequence
@@ -11,41 +11,35 @@ import pytest
 import soundfile
 import torch
 
-from services.recognizer.features import LogMel
-from services.recognizer.load import load_model, model_path
-from services.recognizer.neural import WINDOW, NeuralModel
-from services.recognizer.whisper_mel import NUM_MELS, WhisperMel
+from corpora.feature_cache import as_floats, samples_of
+from corpora.speech_corpus import RowErrors, read_corpus
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.acoustic.network import WINDOW
+from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.front_end.features import LogMel
+from services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.phones import SILENCE, UNIT_INDEX
+from tests.languages import MANDARIN, SIL
 from tests.tones import burst, tones
-from training import network_training, sound_change, teacher
-from training.corpus import RowErrors, read_corpus
-from training.examples import load_examples, load_untranscribed
-from training.feature_cache import as_floats, samples_of
-from training.network import Network, Shape, said_frames
-from training.network_export import network_of, onnx_of
-from training.network_training import (
-    Recording,
-    Targets,
-    Trainer,
-    batches_of,
-    cross_entropy,
-    due_targets,
-    heard_anew,
-    log_shares_of,
-)
-from training.neural_recipe import first_said_error_rate, train_neural
-from training.sound_change import (
-    changed_sound,
-    changed_tempo,
-    frames_before,
-    levelled,
+from training.neural import augmentation, batches, teacher, trainer
+from training.neural.augmentation import (
+    augment_samples,
+    change_tempo,
     mask,
+    scale_level,
+    source_frames,
 )
-from training.whisper_weights import load_whisper
+from training.neural.batches import Recording, Targets, augment, batches_of
+from training.neural.export import network_of, onnx_of
+from training.neural.network import Network, Shape, output_frames
+from training.neural.recipe import train_neural
+from training.neural.scoring import first_hypothesis_error_rate, log_posteriors_of
+from training.neural.trainer import Trainer, cross_entropy, shift_targets
+from training.neural.whisper_weights import load_whisper
+from training.training_set import load_examples, load_untranscribed
 
-pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
 HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
@@ -189,13 +183,13 @@ def test_files_of_other_kinds_and_sizes_are_named(tmp_path: Path) -> None:
     write_whisper(tmp_path, encoder_arrays(), name="TransformerSpec")
     refused("holds a 'TransformerSpec'")
     write_whisper(tmp_path, encoder_arrays(), version=3)
-    refused("version 3 of it is too old")
+    refused("its version 3 is too old")
     unclear = encoder_arrays()
     unclear["encoder/conv2/bias"][3] = np.nan
     write_whisper(tmp_path, unclear)
-    refused("conv2/bias holds what is no number")
+    refused("conv2/bias holds values that are no numbers")
     for scale, message in (
-        (np.zeros(32), "what is no number"),
+        (np.zeros(32), "values that are no numbers"),
         (np.ones(5), "_scale has 5 values"),
     ):
         scaled = encoder_arrays() | {"encoder/conv1/weight_scale": scale.astype(np.float32)}
@@ -225,15 +219,15 @@ def test_no_size_in_the_file_is_believed(tmp_path: Path) -> None:
             load_whisper(Network(SHAPE), tmp_path)
 
 
-# --- changed sounds
+# --- augmentation
 
 
-def test_the_same_generator_changes_a_sound_in_the_same_way() -> None:
+def test_the_same_generator_augments_in_the_same_way() -> None:
     results = []
     for seed in (*range(40), *range(40)):
         rng = np.random.default_rng(seed)
-        sound, speed = changed_sound(HELLO, rng)
-        results.append(levelled(sound, rng))
+        sound, speed = augment_samples(HELLO, rng)
+        results.append(scale_level(sound, rng))
         assert len(sound) == pytest.approx(len(HELLO) / speed, abs=1)
         assert np.isfinite(results[-1]).all()
         assert 10 ** (-36.1 / 20) < np.abs(results[-1]).max() <= 1.001
@@ -242,16 +236,16 @@ def test_the_same_generator_changes_a_sound_in_the_same_way() -> None:
     assert len({len(sound) for sound in results}) == 8  # speeds
     silence = np.zeros(4000, np.float32)
     for seed in range(40):
-        assert np.abs(changed_sound(silence, np.random.default_rng(seed))[0]).max() < 1e-3
+        assert np.abs(augment_samples(silence, np.random.default_rng(seed))[0]).max() < 1e-3
 
 
 def test_speed_moves_the_pitch(monkeypatch: pytest.MonkeyPatch) -> None:
-    for share in ("_ROOM_SHARE", "_NOISE_SHARE", "_TELEPHONE_SHARE", "_CODEC_SHARE"):
-        monkeypatch.setattr(sound_change, share, 0.0)
+    for share in ("_ROOM_PROB", "_NOISE_PROB", "_TELEPHONE_PROB", "_CODEC_PROB"):
+        monkeypatch.setattr(augmentation, share, 0.0)
     tone = burst(0.0, 1.0, 1.0)
     speeds = set()
     for seed in range(30):
-        sound, speed = changed_sound(tone, np.random.default_rng(seed))
+        sound, speed = augment_samples(tone, np.random.default_rng(seed))
         spectrum = np.abs(np.fft.rfft(sound))
         pitch_hz = spectrum.argmax() * 16_000 / len(sound)
         assert pitch_hz == pytest.approx(1000 * speed, rel=0.01)
@@ -260,13 +254,13 @@ def test_speed_moves_the_pitch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_noise_is_as_loud_as_it_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    for share in ("_SPEED_SHARE", "_ROOM_SHARE", "_TELEPHONE_SHARE", "_CODEC_SHARE"):
-        monkeypatch.setattr(sound_change, share, 0.0)
-    monkeypatch.setattr(sound_change, "_COLOUR_SHARE", 0.0)
-    monkeypatch.setattr(sound_change, "_NOISE_SHARE", 1.0)
+    for share in ("_SPEED_PROB", "_ROOM_PROB", "_TELEPHONE_PROB", "_CODEC_PROB"):
+        monkeypatch.setattr(augmentation, share, 0.0)
+    monkeypatch.setattr(augmentation, "_COLOUR_PROB", 0.0)
+    monkeypatch.setattr(augmentation, "_NOISE_PROB", 1.0)
     snr_db = []
     for seed in range(60):
-        sound, _ = changed_sound(HELLO, np.random.default_rng(seed))
+        sound, _ = augment_samples(HELLO, np.random.default_rng(seed))
         snr_db.append(10 * np.log10(np.mean(HELLO**2) / np.mean((sound - HELLO) ** 2)))
     assert 2.9 < min(snr_db) < 8
     assert 25 < max(snr_db) < 30.1
@@ -274,44 +268,44 @@ def test_noise_is_as_loud_as_it_is_drawn(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_targets_stay_at_their_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a tone begins and ends, its targets do, whatever the speed and the tempo."""
-    for share in ("_ROOM_SHARE", "_NOISE_SHARE"):
-        monkeypatch.setattr(sound_change, share, 0.0)
-    monkeypatch.setattr(sound_change, "_MOST_MASKS", 0)
+    for share in ("_ROOM_PROB", "_NOISE_PROB"):
+        monkeypatch.setattr(augmentation, share, 0.0)
+    monkeypatch.setattr(augmentation, "_MAX_MASKS", 0)
     sound = burst(1.0, 1.8, 3.0)
     middle_s = (np.arange(298) * 160 + 200) / 16_000
     inside = (middle_s >= 1.0) & (middle_s < 1.8)
     tone = Targets(
-        np.outer(inside, [3, 5]).astype(np.uint8), np.full((298, 2), [0.75, 0.25], np.float16)
+        np.outer(inside, [3, 5]).astype(np.uint16), np.full((298, 2), [0.75, 0.25], np.float16)
     )
-    targets = Targets.hard(inside.astype(np.int64)).halved_with(tone)
+    targets = Targets.hard(inside.astype(np.int64)).averaged_with(tone)
     samples = np.rint(32767 * sound).astype(np.int16)
     recording = Recording(samples=samples, targets=targets, weight=1.0)
     lengths = []
     for seed in range(60):
-        frames, changed = heard_anew(recording, np.random.default_rng(seed))
+        frames, changed = augment(recording, np.random.default_rng(seed))
         assert frames.shape == (len(changed), NUM_MELS)
         loud = frames.max(axis=1) > frames.max() - 0.5
-        at, due = np.flatnonzero(loud), np.flatnonzero(changed.states[:, 0])
+        at, target = np.flatnonzero(loud), np.flatnonzero(changed.states[:, 0])
         np.testing.assert_array_equal(changed.states, changed.states[:, :1] * np.array([1, 3, 5]))
-        np.testing.assert_array_equal(changed.shares[7], [0.5, 0.375, 0.125])
-        assert abs(at[0] - due[0]) <= 2
-        assert abs(at[-1] - due[-1]) <= 2
+        np.testing.assert_array_equal(changed.probs[7], [0.5, 0.375, 0.125])
+        assert abs(at[0] - target[0]) <= 2
+        assert abs(at[-1] - target[-1]) <= 2
         lengths.append(len(frames))
     assert min(lengths) < 250
     assert max(lengths) > 350
 
 
-def test_frames_know_what_they_were() -> None:
-    assert frames_before(5, 1.0, 5).tolist() == [0, 1, 2, 3, 4]
+def test_frames_know_their_source() -> None:
+    assert source_frames(5, 1.0, 5).tolist() == [0, 1, 2, 3, 4]
     # the middle of frame 100 was at 2 * (16000 + 200) samples: frame 201.25
-    assert frames_before(101, 2.0, 500)[100] == 201
-    assert frames_before(101, 2.0, 150)[100] == 149
+    assert source_frames(101, 2.0, 500)[100] == 201
+    assert source_frames(101, 2.0, 150)[100] == 149
     frames = np.arange(100, dtype=np.float32)[:, None]
     for seed in range(20):
-        changed, were = changed_tempo(frames, np.random.default_rng(seed))
-        assert 77 <= len(changed) == len(were) <= 123
-        np.testing.assert_allclose(changed[:, 0], were, atol=0.51)
-        assert (were[0], were[-1]) == (0, 99)
+        changed, source = change_tempo(frames, np.random.default_rng(seed))
+        assert 77 <= len(changed) == len(source) <= 123
+        np.testing.assert_allclose(changed[:, 0], source, atol=0.51)
+        assert (source[0], source[-1]) == (0, 99)
 
 
 def test_masks_hide_few_frames_and_bands() -> None:
@@ -351,8 +345,8 @@ def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
 def test_examples_have_the_samples_of_their_frames(tmp_path: Path) -> None:
     late = np.concatenate([np.zeros(20_000, np.float32), HELLO, np.zeros(20_000, np.float32)])
     corpus = write_corpus(tmp_path / "corpus", {"a": late, "b": HELLO})
-    plain = load_examples([corpus], RowErrors())
-    examples = load_examples([corpus], RowErrors(), with_samples=True)
+    plain = load_examples([corpus], RowErrors(), MANDARIN)
+    examples = load_examples([corpus], RowErrors(), MANDARIN, with_samples=True)
     assert [example.samples for example in plain] == [None, None]
     for example, one in zip(examples, plain, strict=True):
         assert example.samples is not None
@@ -367,12 +361,10 @@ def test_examples_have_the_samples_of_their_frames(tmp_path: Path) -> None:
 def test_samples_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO[:8000]})
     soundfile.write(corpus / "c.wav", HELLO, 16_000)
-    rows = read_corpus(corpus, RowErrors())
+    rows = read_corpus(corpus, RowErrors(), MANDARIN)
     (corpus / "b.wav").write_bytes(b"no sound")
     first = samples_of(rows)
-    monkeypatch.setattr(
-        "training.feature_cache.read_audio", lambda _: pytest.fail("computed again")
-    )
+    monkeypatch.setattr("corpora.feature_cache.read_audio", lambda _: pytest.fail("computed again"))
     for found in (first, samples_of(rows)):
         np.testing.assert_allclose(as_floats(found[0]), HELLO, atol=2**-16)
         assert len(found[1]) == 0
@@ -396,12 +388,12 @@ def test_the_future_does_not_change_the_past() -> None:
     hidden = network(frames)
     assert hidden.shape == (1, 20, 32)
     for position in (0, 7, 18):
-        heard = 2 * position + 2
+        last_seen = 2 * position + 2
         changed = frames.clone()
-        changed[:, heard + 1 :] = 3.0
+        changed[:, last_seen + 1 :] = 3.0
         torch.testing.assert_close(network(changed)[:, : position + 1], hidden[:, : position + 1])
         changed = frames.clone()
-        changed[:, heard] += 3.0
+        changed[:, last_seen] += 3.0
         assert (network(changed)[0, position] - hidden[0, position]).abs().max() > 1e-3
 
 
@@ -412,37 +404,37 @@ def test_a_position_attends_to_the_window_and_no_further() -> None:
     frames = random_frames(2 * WINDOW + 21)
     hidden = network(frames)
     changed = frames.clone()
-    changed[:, :5] += 3.0  # positions 0 to 3 have heard it
+    changed[:, :5] += 3.0  # positions 0 to 3 have seen it
     difference = (network(changed) - hidden).abs().amax(dim=(0, 2))
     assert (difference[: WINDOW + 3] > 1e-6).all()
     assert (difference[WINDOW + 3 :] < 1e-6).all()
 
 
-def test_shares_sum_to_one_when_products_are_short() -> None:
+def test_posteriors_sum_to_one_in_mixed_precision() -> None:
     network = Network(SHAPE)
     with torch.autocast("cpu", torch.bfloat16):
-        log_shares = network.log_shares(network(random_frames(41)), 0)
-    assert log_shares.dtype == torch.float32
-    torch.testing.assert_close(log_shares.exp().sum(dim=-1), torch.ones(1, 20, 2))
+        log_posteriors = network.log_posteriors(network(random_frames(41)), 0)
+    assert log_posteriors.dtype == torch.float32
+    torch.testing.assert_close(log_posteriors.exp().sum(dim=-1), torch.ones(1, 20, 2))
 
 
-def test_positions_owe_the_frames_of_their_look_ahead() -> None:
-    assert said_frames(3, 1).tolist() == [[1, 2], [3, 4], [5, 6]]
-    assert said_frames(3, 6).tolist() == [[-4, -3], [-2, -1], [0, 1]]
+def test_targets_are_shifted_by_the_look_ahead() -> None:
+    assert output_frames(3, 1).tolist() == [[1, 2], [3, 4], [5, 6]]
+    assert output_frames(3, 6).tolist() == [[-4, -3], [-2, -1], [0, 1]]
     states = torch.arange(100, 109)[None, :, None] + torch.tensor([0, 50])
-    shares = torch.tensor([0.75, 0.25]).expand(1, 9, 2)
-    due, of_due = due_targets(states, shares, 4, 1)
-    assert due[0, ..., 0].tolist() == [[101, 102], [103, 104], [105, 106], [107, 108]]
-    assert (due[..., 1] == due[..., 0] + 50).all()
-    assert (of_due == shares[0, 0]).all()
-    due, of_due = due_targets(states, shares, 4, 3)
-    assert due[0, ..., 0].flatten().tolist()[1:] == [100, 101, 102, 103, 104, 105, 106]
-    assert of_due[0, 0].tolist() == [[0, 0], [0.75, 0.25]]
-    assert not due_targets(states, shares, 6, 1)[1][0, 4].any()
+    probs = torch.tensor([0.75, 0.25]).expand(1, 9, 2)
+    shifted, of_shifted = shift_targets(states, probs, 4, 1)
+    assert shifted[0, ..., 0].tolist() == [[101, 102], [103, 104], [105, 106], [107, 108]]
+    assert (shifted[..., 1] == shifted[..., 0] + 50).all()
+    assert (of_shifted == probs[0, 0]).all()
+    shifted, of_shifted = shift_targets(states, probs, 4, 3)
+    assert shifted[0, ..., 0].flatten().tolist()[1:] == [100, 101, 102, 103, 104, 105, 106]
+    assert of_shifted[0, 0].tolist() == [[0, 0], [0.75, 0.25]]
+    assert not shift_targets(states, probs, 6, 1)[1][0, 4].any()
 
 
 @pytest.mark.parametrize("num_samples", [8000, 8160, 560])
-def test_whole_recordings_are_heard_as_the_recognizer_hears_them(num_samples: int) -> None:
+def test_whole_recordings_are_scored_as_by_the_recognizer(num_samples: int) -> None:
     torch.manual_seed(0)
     network = Network(SHAPE).eval()
     samples = np.rint(32767 * HELLO[4000 : 4000 + num_samples]).astype(np.int16)
@@ -451,13 +443,13 @@ def test_whole_recordings_are_heard_as_the_recognizer_hears_them(num_samples: in
         network=onnx_of(network, exact=True),
         look_aheads=np.array(SHAPE.look_aheads),
         log_prior=np.zeros(6, np.float32),
-        kappa=1.0,
+        acoustic_scale=1.0,
     )
     for output, look_ahead in enumerate(SHAPE.look_aheads):
         stream = model.with_look_ahead(10.0 * look_ahead).stream()
         frames = WhisperMel().accept_waveform(as_floats(samples))
         expected = np.concatenate([stream.accept(frames), stream.finish()])
-        found = log_shares_of(network, output, samples)
+        found = log_posteriors_of(network, output, samples)
         assert found.shape == (len(frames), 6)
         np.testing.assert_allclose(found, expected, atol=1e-4)
 
@@ -465,32 +457,33 @@ def test_whole_recordings_are_heard_as_the_recognizer_hears_them(num_samples: in
 # --- training
 
 
-def test_the_loss_is_the_cross_entropy_of_shares() -> None:
-    shares_said = torch.tensor([[0.5, 0.25, 0.25], [0.125, 0.125, 0.75], [1 / 3, 1 / 3, 1 / 3]])
+def test_the_loss_is_the_cross_entropy_of_soft_targets() -> None:
+    posteriors = torch.tensor([[0.5, 0.25, 0.25], [0.125, 0.125, 0.75], [1 / 3, 1 / 3, 1 / 3]])
     states = torch.tensor([[0, 1], [2, 0], [1, 1]])
-    shares = torch.tensor([[1.0, 0.0], [0.75, 0.25], [0.0, 0.0]])  # of the last nothing is known
+    probs = torch.tensor([[1.0, 0.0], [0.75, 0.25], [0.0, 0.0]])  # the last has no target
     expected = (np.log(2) + 0.75 * np.log(4 / 3) + 0.25 * np.log(8)) / 2
-    found = cross_entropy(shares_said.log(), states, shares)
+    found = cross_entropy(posteriors.log(), states, probs)
     assert float(found) == pytest.approx(expected, rel=1e-6)
-    assert float(cross_entropy(shares_said.log(), states, 0 * shares)) == 0.0
+    assert float(cross_entropy(posteriors.log(), states, 0 * probs)) == 0.0
 
 
 def test_batches_hold_recordings_with_one_state_a_frame_and_with_several() -> None:
     hard = Targets.hard(np.array([4, 5]))
-    soft = hard.halved_with(Targets.hard(np.array([6, 6])))
+    soft = hard.averaged_with(Targets.hard(np.array([6, 6])))
     kinds = iter([hard, soft] * 100)
     rows = np.arange(6, dtype=np.float32).reshape(2, 3)
-    batches = batches_of(lambda: (rows, next(kinds)), 4, np.random.default_rng(0))
-    inputs, states, shares = next(batches)
+    inputs, states, probs = next(
+        batches_of(lambda: (rows, next(kinds)), 4, np.random.default_rng(0))
+    )
     assert inputs.tolist() == [[*rows.tolist(), rows[1].tolist()]] * 2
     assert states.tolist() == [[[4, 0], [5, 0]], [[4, 6], [5, 6]]]
-    assert shares.tolist() == [[[1.0, 0.0]] * 2, [[0.5, 0.5]] * 2]
+    assert probs.tolist() == [[[1.0, 0.0]] * 2, [[0.5, 0.5]] * 2]
 
 
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(network_training, "_BATCH_FRAMES", 300)
-    monkeypatch.setattr(network_training, "_POOL_BATCHES", 2)
-    monkeypatch.setattr(network_training, "_WARM_UP_STEPS", 2)
+    monkeypatch.setattr(trainer, "_BATCH_FRAMES", 300)
+    monkeypatch.setattr(batches, "_POOL_BATCHES", 2)
+    monkeypatch.setattr(trainer, "_WARM_UP_STEPS", 2)
     monkeypatch.setattr(teacher, "_BATCH_POSITIONS", 200)
     monkeypatch.setattr(teacher, "_NUM_STEPS", 5)
 
@@ -500,62 +493,62 @@ def trained(
 ) -> tuple[Trainer, list[float]]:
     torch.manual_seed(seed)
     network = Network(SHAPE)
-    with torch.no_grad():  # convolutions that have learnt say more than those just made
+    with torch.no_grad():  # trained convolutions differ more than new ones
         network.first.weight *= 6
         network.second.weight *= 6
-    trainer = Trainer(network, recordings, main_output=main_output, seed=seed)
+    learner = Trainer(network, recordings, main_output=main_output, seed=seed)
     losses: list[float] = []
-    trainer.train(num_steps, lambda _, loss: losses.append(loss))
-    return trainer, losses
+    learner.train(num_steps, lambda _, loss: losses.append(loss))
+    return learner, losses
 
 
 @pytest.mark.parametrize("main_output", [0, 1])
 def test_the_network_learns_which_tone_is_when(
     main_output: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The loss falls, and an output says the states of the frames that it looks back to."""
+    """The loss falls, and an output layer tells the states of its frames."""
     quick(monkeypatch)
-    monkeypatch.setattr(sound_change, "_MOST_MASKS", 0)
-    monkeypatch.setattr(network_training, "_RATE", 5e-3)
-    monkeypatch.setattr(network_training, "_NEW_RATE", 5e-3)
-    monkeypatch.setattr(network_training, "_CHANGED_SHARE", 0.0)
+    monkeypatch.setattr(augmentation, "_MAX_MASKS", 0)
+    monkeypatch.setattr(trainer, "_RATE", 5e-3)
+    monkeypatch.setattr(trainer, "_NEW_RATE", 5e-3)
+    monkeypatch.setattr(batches, "_AUGMENT_PROB", 0.0)
     recordings = [tones(seed) for seed in range(8)]
-    trainer, losses = trained(recordings, 100, main_output=main_output)
+    learner, losses = trained(recordings, 100, main_output=main_output)
     assert np.mean(losses[-10:]) < 0.2 * np.mean(losses[:10])
-    unheard = tones(100)
-    said = log_shares_of(trainer.mean, main_output, unheard.samples).argmax(axis=1)
-    assert np.mean(said == unheard.targets.states[:, 0]) > 0.94  # two frames late would be 0.9
+    unseen = tones(100)
+    found = log_posteriors_of(learner.mean, main_output, unseen.samples).argmax(axis=1)
+    assert np.mean(found == unseen.targets.states[:, 0]) > 0.94  # two frames late would be 0.9
 
 
-def test_convolutions_stay_and_all_else_learns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_convolutions_are_frozen_and_all_else_is_trained(monkeypatch: pytest.MonkeyPatch) -> None:
     quick(monkeypatch)
-    begun = {k: v.clone() for k, v in trained([tones(0)], 0)[0].network.state_dict().items()}
-    trainer, losses = trained([tones(0)], 4)
+    before = {k: v.clone() for k, v in trained([tones(0)], 0)[0].network.state_dict().items()}
+    learner, losses = trained([tones(0)], 4)
     assert all(np.isfinite(losses))
-    for network in (trainer.network, trainer.mean):
+    for network in (learner.network, learner.mean):
         for name, tensor in network.state_dict().items():
-            stays = name.startswith(("first.", "second."))
-            assert torch.equal(tensor, begun[name]) == stays, name
-    weights, mean = (floats(n.norm.weight) for n in (trainer.network, trainer.mean))
+            is_frozen = name.startswith(("first.", "second."))
+            assert torch.equal(tensor, before[name]) == is_frozen, name
+    weights, mean = (floats(n.norm.weight) for n in (learner.network, learner.mean))
     assert not np.array_equal(weights, mean)
 
 
 def test_the_rate_rises_and_stays_and_late_weights_count_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(network_training, "_WARM_UP_STEPS", 4)
-    monkeypatch.setattr(network_training, "_BATCH_FRAMES", 300)
-    monkeypatch.setattr(network_training, "_MOST_WARM_UP", 0.5)
+    monkeypatch.setattr(trainer, "_WARM_UP_STEPS", 4)
+    monkeypatch.setattr(trainer, "_BATCH_FRAMES", 300)
+    monkeypatch.setattr(trainer, "_MAX_WARM_UP", 0.5)
     rates: list[float] = []
     step = Trainer._step
 
-    def noted(trainer: Trainer, number: int, share: float) -> float:
-        rates.append(share)
-        return step(trainer, number, share)
+    def noted(learner: Trainer, number: int, rate_factor: float) -> float:
+        rates.append(rate_factor)
+        return step(learner, number, rate_factor)
 
     monkeypatch.setattr(Trainer, "_step", noted)
     network = Network(SHAPE)
-    trainer = Trainer(network, [tones(0)], main_output=1, seed=0)
+    learner = Trainer(network, [tones(0)], main_output=1, seed=0)
     weights: list[np.ndarray] = []
 
     def watch(number: int, loss: float) -> None:
@@ -563,11 +556,11 @@ def test_the_rate_rises_and_stays_and_late_weights_count_more(
         assert number == len(weights)
         assert np.isfinite(loss)
 
-    trainer.train(10, watch)
+    learner.train(10, watch)
     assert rates == [0.25, 0.5, 0.75, *[1.0] * 7]
     counted = [8, *(n * (n + 1) for n in range(3, 12))]
     expected = np.average(weights, axis=0, weights=counted)
-    np.testing.assert_allclose(floats(trainer.mean.norm.weight), expected, rtol=1e-5)
+    np.testing.assert_allclose(floats(learner.mean.norm.weight), expected, rtol=1e-5)
 
 
 def test_the_same_seed_gives_the_same_network(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -578,7 +571,7 @@ def test_the_same_seed_gives_the_same_network(monkeypatch: pytest.MonkeyPatch) -
     assert not torch.equal(first["outputs.0.weight"], other["outputs.0.weight"])
 
 
-def test_long_recordings_are_cut_and_speech_may_have_begun_before(
+def test_long_recordings_are_cropped_and_start_at_any_position(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     long = Recording(
@@ -586,7 +579,7 @@ def test_long_recordings_are_cut_and_speech_may_have_begun_before(
         targets=Targets.hard(np.arange(1198) % 6),
         weight=1.0,
     )
-    frames, targets = heard_anew(long, np.random.default_rng(0))
+    frames, targets = augment(long, np.random.default_rng(0))
     assert frames.shape == (800, NUM_MELS)
     assert len(targets) == 800
     starts = []
@@ -610,7 +603,7 @@ def test_long_recordings_are_cut_and_speech_may_have_begun_before(
 def corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Two recordings of a sentence, one of them for dev; networks and batches are small."""
     quick(monkeypatch)
-    monkeypatch.setattr("training.neural_recipe.Shape", SMALL)
+    monkeypatch.setattr("training.neural.initial_network.Shape", SMALL)
     return write_corpus(tmp_path / "corpus", {"a": HELLO, "d": HELLO})
 
 
@@ -638,9 +631,9 @@ def test_the_recipe_writes_model_card_and_curves(
     conv1 = encoder_arrays(6)["encoder/conv1/weight"].astype(np.float32)
     np.testing.assert_allclose(learnt["first.weight"], conv1, atol=np.abs(conv1).max() / 120)
     assert sum("dev phone error" in line for line in lines) >= 10
-    assert "step 5: aligned anew" in lines
+    assert "step 5: realigned" in lines
     assert lines.count("1 of 1 recordings aligned") == 2
-    assert "1 of 1 recordings heard by the teacher, to learn" in lines
+    assert "1 of 1 recordings encoded for the teacher" in lines
     assert "1 of 1 recordings labelled by the teacher" in lines
     assert sum("teacher, step" in line for line in lines) == 5
     card = output.with_suffix(".md").read_text()
@@ -650,28 +643,28 @@ def test_the_recipe_writes_model_card_and_curves(
     assert output.with_suffix(".png").stat().st_size > 1000
 
 
-def test_the_search_is_judged_by_what_is_first_said(corpus: Path) -> None:
-    """Scores that leave no doubt make no errors; a unit that is not there is one."""
-    (example,) = load_examples([corpus], RowErrors())
+def test_the_error_rate_of_the_first_hypothesis(corpus: Path) -> None:
+    """Clear scores make no errors; a phone that is not there is one."""
+    (example,) = load_examples([corpus], RowErrors(), MANDARIN)
     model = load_model(model_path("gmm"))
-    spoken = [UNIT_INDEX[SILENCE], *example.units, UNIT_INDEX[SILENCE]]
-    own = np.diff(model.topology.first_state)
+    path = [SIL, *example.phones, SIL]
+    num_states = np.diff(model.topology.first_state)
     rows = []
-    for unit in spoken:
-        for state in range(own[unit]):
+    for phone in path:
+        for state in range(num_states[phone]):
             row = np.full(model.topology.num_states, -60.0, np.float32)
-            row[model.topology.first_state[unit] + state] = 0.0
+            row[model.topology.first_state[phone] + state] = 0.0
             rows += [row] * 4
     scores = [np.array(rows)]
-    assert first_said_error_rate(model, scores, [example]) == 0.0
-    fewer = replace(example, units=example.units[1:])
-    assert first_said_error_rate(model, scores, [fewer]) == 1 / len(fewer.units)
+    assert first_hypothesis_error_rate(model, scores, [example]) == 0.0
+    fewer = replace(example, phones=example.phones[1:])
+    assert first_hypothesis_error_rate(model, scores, [fewer]) == 1 / len(fewer.phones)
 
 
 def test_the_teacher_labels_recordings_without_text(
     corpus: Path, whisper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A sentence's share is half the teacher's, before and after it is aligned anew."""
+    """Half of a sentence's targets are the teacher's, before and after it is realigned."""
     folder = tmp_path / "other" / "deep"
     folder.mkdir(parents=True)
     soundfile.write(folder / "x.wav", HELLO[:16_000], 16_000)
@@ -679,9 +672,9 @@ def test_the_teacher_labels_recordings_without_text(
     learnt: list[list[Recording]] = []
     replace_recordings = Trainer.replace_recordings
 
-    def noted(trainer: Trainer, recordings: Sequence[Recording]) -> None:
+    def noted(learner: Trainer, recordings: Sequence[Recording]) -> None:
         learnt.append(list(recordings))
-        replace_recordings(trainer, recordings)
+        replace_recordings(learner, recordings)
 
     monkeypatch.setattr(Trainer, "replace_recordings", noted)
     lines: list[str] = []
@@ -694,12 +687,12 @@ def test_the_teacher_labels_recordings_without_text(
     assert len(learnt) == 2
     for sentence, other in learnt:
         assert sentence.targets.states.shape[1] == 9
-        assert (sentence.targets.shares[:, 0] == 0.5).all()
+        assert (sentence.targets.probs[:, 0] == 0.5).all()
         assert other.targets.states.shape[1] == 8
-        for one, share in ((sentence, 0.33), (other, 0.29)):
-            sums = one.targets.shares.sum(axis=1, dtype=np.float32)
+        for one, mix in ((sentence, 0.33), (other, 0.29)):
+            sums = one.targets.probs.sum(axis=1, dtype=np.float32)
             np.testing.assert_allclose(sums, 1.0, atol=2e-3)
-            assert one.weight * len(one.targets) == pytest.approx(share)
+            assert one.weight * len(one.targets) == pytest.approx(mix)
     for first, again in zip(*learnt, strict=True):
         np.testing.assert_array_equal(first.targets.states[:, 1:], again.targets.states[:, 1:])
     assert "2 of 2 recordings labelled by the teacher" in lines
@@ -707,7 +700,7 @@ def test_the_teacher_labels_recordings_without_text(
     assert "also on 0.0 minutes without text" in output.with_suffix(".md").read_text()
     train(tmp_path / "further.npz", whisper=whisper, start=output, num_steps=1, report=lines.append)
     card = (tmp_path / "further.md").read_text()
-    assert "begun with `neural.npz`" in card
+    assert "started with `neural.npz`" in card
     assert "taught by" in card
 
 
@@ -740,7 +733,7 @@ def test_folders_without_usable_recordings_are_named(tmp_path: Path) -> None:
 def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     corpus: Path, whisper: Path, tmp_path: Path
 ) -> None:
-    manifest = corpus / "manifest.tsv"  # nothing to judge by
+    manifest = corpus / "manifest.tsv"  # nothing to test on
     manifest.write_text(manifest.read_text().replace("\tdev\t", "\ttest\t"))
     paths = [tmp_path / f"{name}.npz" for name in ("first", "second", "other")]
     lines: list[str] = []
@@ -754,10 +747,10 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     assert torch.get_num_threads() == 1
     further = tmp_path / "further.npz"
     train_neural(
-        [corpus], further, start=paths[0], language=model_path("gmm"),
+        [corpus], further, start=paths[0], phone_lm=model_path("gmm"),
         num_steps=2, num_threads=1, report=lines.append,
     )  # fmt: skip
-    assert [line for line in lines if "aligned anew" in line] == ["step 2: aligned anew"] * 3
+    assert [line for line in lines if "realigned" in line] == ["step 2: realigned"] * 3
     before, after = load_model(paths[0]), load_model(further)
     assert isinstance(before, NeuralModel)
     assert isinstance(after, NeuralModel)
@@ -768,14 +761,14 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
     for name, weights in old.items():
         torch.testing.assert_close(new[name], weights, atol=0.02, rtol=0.05)
     card = further.with_suffix(".md").read_text()
-    assert "begun with `first.npz`" in card
+    assert "started with `first.npz`" in card
     assert "aligned by the same" in card
-    shipped = load_model(model_path("gmm")).topology.language
-    np.testing.assert_array_equal(after.topology.language.unit, shipped.unit)
-    assert len(before.topology.language.unit) < len(shipped.unit)
+    shipped = load_model(model_path("gmm")).topology.phone_lm
+    np.testing.assert_array_equal(after.topology.phone_lm.phone, shipped.phone)
+    assert len(before.topology.phone_lm.phone) < len(shipped.phone)
 
 
-def test_training_begins_with_something(corpus: Path, tmp_path: Path) -> None:
+def test_training_needs_a_start(corpus: Path, tmp_path: Path) -> None:
     train = partial(train_neural, [corpus], tmp_path / "n.npz", aligner=model_path("gmm"))
     with pytest.raises(UserError, match="give --whisper, --start-from or both"):
         train(num_threads=1)

@@ -3,7 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.recognizer.pcm import SLICE, BadAudio, level_db, pcm16_of, samples_of, slices
+from services.recognizer.front_end.pcm import (
+    SLICE,
+    BadAudio,
+    level_db,
+    pcm16_of,
+    samples_of,
+    slices,
+)
 
 pytestmark = pytest.mark.unit
 
@@ -29,7 +36,7 @@ def test_what_is_no_number_is_refused(value: float) -> None:
     ("num_bytes", "encoding", "channels"), [(3, "s16le", 1), (6, "s16le", 2), (5, "f32le", 1)]
 )
 def test_half_frames_are_refused(num_bytes: int, encoding: str, channels: int) -> None:
-    with pytest.raises(BadAudio, match="no whole number"):
+    with pytest.raises(BadAudio, match="not a whole number"):
         samples_of(b"\0" * num_bytes, encoding, channels)
 
 

@@ -1,8 +1,8 @@
 import pytest
 
 from shared.errors import UserError
-from shared.phones import FINALS, INITIALS, UNITS
-from shared.pinyin import pinyin_of_text, units_of_pinyin, units_of_syllable
+from shared.phones.mandarin.pinyin import phones_of_syllable, pinyin_of_text
+from tests.languages import MANDARIN
 
 pytestmark = pytest.mark.unit
 
@@ -49,27 +49,27 @@ def test_table_is_whole() -> None:
 @pytest.mark.parametrize("initial", list(SYLLABLES))
 def test_every_legal_syllable_has_initial_and_final(initial: str) -> None:
     for syllable in SYLLABLES[initial].split():
-        units = units_of_syllable(syllable)
-        if initial in INITIALS:
-            assert units[0] == initial, syllable
-            assert len(units) == 2, syllable
-        assert units[-1] in FINALS, syllable
-        assert all(unit in UNITS for unit in units)
+        phones = phones_of_syllable(syllable)
+        if initial in MANDARIN.initials:
+            assert phones[0] == initial, syllable
+            assert len(phones) == 2, syllable
+        assert phones[-1] in MANDARIN.vowels, syllable
+        assert all(phone in MANDARIN.phones for phone in phones)
 
 
-def test_all_units_occur() -> None:
-    seen = {unit for syllable in LEGAL for unit in units_of_syllable(syllable)}
-    assert seen == set(UNITS) - {"sil"}
+def test_all_phones_occur() -> None:
+    seen = {phone for syllable in LEGAL for phone in phones_of_syllable(syllable)}
+    assert seen == set(MANDARIN.phones) - {"sil"}
 
 
-def test_different_syllables_have_different_units() -> None:
-    same = {"you": "yo", "yo": "yo"}  # yo is said iou
-    units = [units_of_syllable(syllable) for syllable in LEGAL if syllable not in same]
-    assert len(units) == len(set(units))
+def test_different_syllables_have_different_phones() -> None:
+    same = {"you": "yo", "yo": "yo"}  # yo is pronounced iou
+    phones = [phones_of_syllable(syllable) for syllable in LEGAL if syllable not in same]
+    assert len(phones) == len(set(phones))
 
 
 @pytest.mark.parametrize(
-    ("syllable", "units"),
+    ("syllable", "phones"),
     [
         ("zhuang1", "zh uang"),
         ("yi1", "i"),
@@ -120,8 +120,8 @@ def test_different_syllables_have_different_units() -> None:
         ("de0", "d e"),
     ],
 )
-def test_spellings(syllable: str, units: str) -> None:
-    assert units_of_syllable(syllable) == tuple(units.split())
+def test_spellings(syllable: str, phones: str) -> None:
+    assert phones_of_syllable(syllable) == tuple(phones.split())
 
 
 @pytest.mark.parametrize(
@@ -129,12 +129,12 @@ def test_spellings(syllable: str, units: str) -> None:
 )
 def test_unknown_syllables_are_named(wrong: str) -> None:
     with pytest.raises(UserError, match=f"'{wrong}'"):
-        units_of_syllable(wrong)
+        phones_of_syllable(wrong)
 
 
 def test_text() -> None:
     assert pinyin_of_text("你好，世界！") == ("ni3", "hao3", "shi4", "jie4")
-    assert units_of_pinyin("ni3 hao3") == ("n", "i", "h", "ao")
+    assert MANDARIN.pronounce("ni3 hao3") == [("n", "i"), ("h", "ao")]
     assert pinyin_of_text("绿") == ("lv4",)
     with pytest.raises(UserError, match="'abc'"):
         pinyin_of_text("你abc")

@@ -5,21 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.recognizer import first_said, is_put_out
-from services.recognizer import decoder
-from services.recognizer.acoustic_model import FIRST, INSIDE
-from services.recognizer.decoder import Segment
-from services.recognizer.load import load_model
-from services.recognizer.pipeline import Recognizer, recognize, warm_up
+from corpora.scoring import first_hypothesis, is_emitted
+from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.offline import recognize
+from services.recognizer.recognizer import Emission, Recognizer, warm_up
+from services.recognizer.search import decoder
+from services.recognizer.search.decoder import Segment
 from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.phones import UNIT_INDEX, Phone, SpeechChange
-from shared.pinyin import pinyin_of_text, units_of_syllable
+from shared.phones.events import Phone, SpeechChange
+from tests.languages import MANDARIN
 
-pytestmark = pytest.mark.unit
+pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
-Event = Phone | SpeechChange
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +27,24 @@ def hello() -> np.ndarray:
     return read_audio(DEMO / "hello-female.wav")[0][:, 0]
 
 
-def feed(recognizer: Recognizer, samples: np.ndarray, chunk: int = 320) -> list[Event]:
-    events: list[Event] = []
+def feed(recognizer: Recognizer, samples: np.ndarray, chunk: int = 320) -> list[Emission]:
+    events: list[Emission] = []
     for start in range(0, len(samples), chunk):
         events += recognizer.accept_waveform(samples[start : start + chunk])
     return events
 
 
-def run(samples: np.ndarray, chunk: int = 320) -> list[Event]:
+def run(samples: np.ndarray, chunk: int = 320) -> list[Emission]:
     recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
     return [*feed(recognizer, samples, chunk), *recognizer.input_finished()]
 
 
-def finals(events: Sequence[Event]) -> list[Phone]:
+def finals(events: Sequence[Emission]) -> list[Phone]:
     return [event for event in events if isinstance(event, Phone) and event.final]
 
 
-def units_in(text: str) -> list[str]:
-    return [unit for syllable in pinyin_of_text(text) for unit in units_of_syllable(syllable)]
+def phones_in(text: str) -> list[str]:
+    return [phone for syllable in MANDARIN.pronounce(text) for phone in syllable]
 
 
 def share_found(wanted: list[str], heard: list[str]) -> float:
@@ -57,9 +57,9 @@ def share_found(wanted: list[str], heard: list[str]) -> float:
 
 
 def test_most_of_a_clear_sentence_is_recognised(hello: np.ndarray) -> None:
-    wanted = units_in("你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。")
-    offline = [phone.unit for phone in recognize(load_model(), hello, 16_000)]
-    live = [phone.unit for phone in finals(run(hello))]
+    wanted = phones_in("你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。")
+    offline = [phone.symbol for phone in recognize(load_model(), hello, 16_000)]
+    live = [phone.symbol for phone in finals(run(hello))]
     assert share_found(wanted, offline) > 0.6
     assert share_found(wanted, live) > 0.6
     assert len(offline) < 1.3 * len(wanted)
@@ -72,7 +72,7 @@ def test_silence_and_noise_give_nothing() -> None:
     assert recognize(load_model(), noise, 16_000) == []
 
 
-def test_order_and_times_of_what_is_put_out(hello: np.ndarray) -> None:
+def test_order_and_times_of_emitted_phones(hello: np.ndarray) -> None:
     events = run(hello)
     assert isinstance(events[0], SpeechChange)
     assert events[0].active
@@ -82,7 +82,7 @@ def test_order_and_times_of_what_is_put_out(hello: np.ndarray) -> None:
     known: set[int] = set()
     closed: set[int] = set()
     for phone in phones:
-        assert phone.index not in closed  # nothing is said of a unit once it is final
+        assert phone.index not in closed  # nothing is emitted of a phone once it is final
         assert phone.index <= max(known, default=-1) + 1
         known.add(phone.index)
         assert 0 <= phone.confidence <= 1
@@ -98,7 +98,7 @@ def test_order_and_times_of_what_is_put_out(hello: np.ndarray) -> None:
     assert done[-1].onset_s + done[-1].duration_s <= events[-1].time_s + 1e-9
 
 
-def test_provisional_units_come_soon(hello: np.ndarray) -> None:
+def test_provisional_phones_come_soon(hello: np.ndarray) -> None:
     recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
     num_early = 0
     provisional = 0
@@ -111,43 +111,44 @@ def test_provisional_units_come_soon(hello: np.ndarray) -> None:
     assert num_early > 0.8 * provisional
 
 
-def test_provisional_durations_are_the_mean_of_unit_and_position(hello: np.ndarray) -> None:
+def test_provisional_durations_are_the_mean_of_phone_and_position(hello: np.ndarray) -> None:
     mean_s = load_model().topology.duration_mean_s
     positions = []
-    said: dict[int, str] = {}
+    emitted: dict[int, str] = {}
     events = run(hello)
     for event, after in zip_longest(events, events[1:]):
         if isinstance(event, SpeechChange):
-            said.clear()
+            emitted.clear()
+        if not isinstance(event, Phone):
             continue
-        said[event.index] = event.unit
-        if is_put_out(event, after):
-            after_pause = said.get(event.index - 1, "sil") == "sil"
+        emitted[event.index] = event.symbol
+        if is_emitted(event, after):
+            after_pause = emitted.get(event.index - 1, "sil") == "sil"
             positions.append(FIRST if after_pause else INSIDE)
-            wanted = mean_s[positions[-1], UNIT_INDEX[event.unit]]
+            wanted = mean_s[positions[-1], MANDARIN.index[event.symbol]]
             assert event.duration_s == pytest.approx(float(wanted))
     assert set(positions) == {FIRST, INSIDE}
 
 
-def test_units_are_corrected_until_nothing_more_changes(hello: np.ndarray) -> None:
-    whole = [phone.unit for phone in recognize(load_model(), hello, 16_000)]
+def test_phones_are_corrected_until_nothing_more_changes(hello: np.ndarray) -> None:
+    whole = [phone.symbol for phone in recognize(load_model(), hello, 16_000)]
     events = run(hello)
-    first = [phone.unit for phone in first_said(events, set())]
-    last = [phone.unit for phone in finals(events)]
-    right = [share_found(whole, units) for units in (first, last)]
+    first = [phone.symbol for phone in first_hypothesis(events, set())]
+    last = [phone.symbol for phone in finals(events)]
+    right = [share_found(whole, symbols) for symbols in (first, last)]
     assert right[1] > 0.95
     assert right[1] > right[0]
     assert abs(len(last) - len(whole)) <= 2
 
 
-def test_what_the_search_inserts_or_gives_up_keeps_the_indices_in_order() -> None:
+def test_what_the_search_inserts_or_drops_keeps_the_indices_in_order() -> None:
     recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
     a, b, x = Segment(30, 0, 10), Segment(3, 10, 20), Segment(31, 12, 15)
-    said = [phone.index for phone in recognizer._revise([a, b], num_following=1)]
-    assert said == [0, 1]
+    indices = [phone.index for phone in recognizer._revise([a, b], num_following=1)]
+    assert indices == [0, 1]
     assert recognizer._revise([a, b], num_following=1) == []  # nothing new
     inserted = recognizer._revise([a, Segment(3, 10, 12), x, Segment(30, 15, 20)], num_following=1)
-    assert [(phone.index, phone.unit) for phone in inserted] == [(1, "f"), (2, "ei"), (3, "ai")]
+    assert [(phone.index, phone.symbol) for phone in inserted] == [(1, "f"), (2, "ei"), (3, "ai")]
     rest = recognizer._revise([Segment(30, 0, 18), Segment(5, 18, 22)], num_following=0)
     assert [phone.index for phone in rest] == [0, 1, 2, 3]
     assert all(one.onset_s + one.duration_s <= two.onset_s + 1e-9 for one, two in pairwise(rest))
@@ -164,20 +165,6 @@ def test_time_goes_on_and_never_back(hello: np.ndarray) -> None:
         before = recognizer.time_s
 
 
-def test_flush_ends_speech_and_the_clock_goes_on(hello: np.ndarray) -> None:
-    recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
-    events = feed(recognizer, hello[:32_000])
-    ended = recognizer.flush()
-    assert isinstance(ended[-1], SpeechChange)
-    assert not ended[-1].active
-    assert recognizer.flush() == []
-    later = [*feed(recognizer, hello[32_000:]), *recognizer.input_finished()]
-    assert isinstance(later[0], SpeechChange)
-    assert later[0].time_s >= ended[-1].time_s
-    indices = [phone.index for phone in finals([*events, *ended, *later])]
-    assert indices == list(range(len(indices)))
-
-
 def test_reset_gives_the_same_again(hello: np.ndarray) -> None:
     recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
     first = [*feed(recognizer, hello), *recognizer.input_finished()]
@@ -189,8 +176,8 @@ def test_stereo_at_48_khz(hello: np.ndarray) -> None:
     recognizer = Recognizer(load_model(), sample_rate_hz=48_000, num_channels=2)
     stereo = np.repeat(np.repeat(hello, 3)[:, None], 2, axis=1)
     heard = finals([*feed(recognizer, stereo, 960), *recognizer.input_finished()])
-    same = [phone.unit for phone in finals(run(hello))]
-    assert share_found(same, [phone.unit for phone in heard]) > 0.8
+    same = [phone.symbol for phone in finals(run(hello))]
+    assert share_found(same, [phone.symbol for phone in heard]) > 0.8
 
 
 def test_two_stretches_of_speech(hello: np.ndarray) -> None:
@@ -199,11 +186,11 @@ def test_two_stretches_of_speech(hello: np.ndarray) -> None:
     changes = [event.active for event in events if isinstance(event, SpeechChange)]
     assert changes == [True, False] * (len(changes) // 2)
     assert len(changes) >= 4
-    # the second time the voice is known, which may change a unit here and there
+    # the second time the voice is known, which may change a phone here and there
     phones = finals(events)
     middle_s = (len(hello) + 12_000) / 16_000
-    first = [phone.unit for phone in phones if phone.onset_s < middle_s]
-    second = [phone.unit for phone in phones if phone.onset_s > middle_s]
+    first = [phone.symbol for phone in phones if phone.onset_s < middle_s]
+    second = [phone.symbol for phone in phones if phone.onset_s > middle_s]
     assert share_found(first, second) > 0.7
 
 
@@ -211,7 +198,7 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(UserError, match="4000 Hz"):
         Recognizer(load_model(), sample_rate_hz=4_000)
     recognizer = Recognizer(load_model(), sample_rate_hz=16_000)
-    with pytest.raises(UserError, match="no numbers"):
+    with pytest.raises(UserError, match="not finite"):
         recognizer.accept_waveform(np.array([np.inf], np.float32))
 
 

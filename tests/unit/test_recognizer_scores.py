@@ -5,20 +5,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from evaluation.recognizer import (
-    ErrorCounts,
+from corpora.scoring import ErrorCounts, count_errors, first_hypothesis, matched_pairs
+from evaluation.recognizer.confusions import Confusions, draw_confusions
+from evaluation.recognizer.error_rates import (
     bootstrap_interval,
-    count_errors,
     evaluate_recognizer,
-    first_said,
-    matched_pairs,
-    most_confused,
     mouth_shapes,
 )
-from evaluation.recognizer_report import draw_confusions, print_figures
-from services.recognizer.load import load_model
+from evaluation.recognizer.report import print_figures
+from services.recognizer.acoustic.load import load_model
 from shared.errors import UserError
-from shared.phones import UNIT_INDEX, UNITS, Phone, SpeechChange
+from shared.phones.events import Phone, SpeechChange
+from tests.languages import MANDARIN
 
 pytestmark = pytest.mark.unit
 
@@ -26,7 +24,7 @@ DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
 
 @pytest.mark.parametrize(
-    ("said", "heard", "errors"),
+    ("reference", "recognized", "errors"),
     [
         ("n i h ao", "n i h ao", (0, 0, 0)),
         ("n i h ao", "n i h a", (0, 0, 1)),
@@ -36,26 +34,26 @@ DEMO = Path(__file__).parents[2] / "shared" / "demo"
         ("", "n i", (2, 0, 0)),
     ],
 )
-def test_errors(said: str, heard: str, errors: tuple[int, int, int]) -> None:
-    counts = count_errors(said.split(), heard.split())
+def test_errors(reference: str, recognized: str, errors: tuple[int, int, int]) -> None:
+    counts = count_errors(reference.split(), recognized.split())
     assert (counts.insertions, counts.deletions, counts.substitutions) == errors
 
 
-def test_what_is_said_first_and_what_revises_it() -> None:
-    def say(index: int, unit: str, final: bool = False) -> Phone:
+def test_the_first_hypothesis_leaves_out_revisions() -> None:
+    def emit(index: int, symbol: str, final: bool = False) -> Phone:
         return Phone(
-            index=index, unit=unit, onset_s=0.0, duration_s=0.1, confidence=1.0, final=final
+            index=index, symbol=symbol, onset_s=0.0, duration_s=0.1, confidence=1.0, final=final
         )
 
     known: set[int] = set()
     chunks: list[list[Phone | SpeechChange]] = [
-        [SpeechChange(active=True, time_s=0.0), say(0, "n")],
-        [say(0, "l")],  # put out in the place of the one before
-        [say(0, "n"), say(1, "i"), say(2, "h")],  # a correction, one passed over, one put out
-        [say(0, "n", True), say(2, "x"), say(3, "ao"), say(3, "ou", True)],
+        [SpeechChange(active=True, time_s=0.0), emit(0, "n")],
+        [emit(0, "l")],  # emitted in the place of the one before
+        [emit(0, "n"), emit(1, "i"), emit(2, "h")],  # a correction, one passed over, one emitted
+        [emit(0, "n", True), emit(2, "x"), emit(3, "ao"), emit(3, "ou", True)],
     ]
-    heard = [[phone.unit for phone in first_said(chunk, known)] for chunk in chunks]
-    assert heard == [["n"], ["l"], ["i", "h"], ["ao"]]
+    first = [[phone.symbol for phone in first_hypothesis(chunk, known)] for chunk in chunks]
+    assert first == [["n"], ["l"], ["i", "h"], ["ao"]]
     assert known == {0, 1, 2, 3}
 
 
@@ -83,9 +81,9 @@ def test_fewest_errors_for_random_strings() -> None:
 
 
 def test_shapes_of_the_mouth() -> None:
-    assert mouth_shapes(["b", "iao"]) == ["b", "i", "ao"]
-    assert mouth_shapes(["sh", "iii"]) == ["zh"]  # the vowel holds the shape
-    assert mouth_shapes(["p", "a", "sil", "m", "ang"]) == ["b", "a", "b", "a"]
+    assert mouth_shapes(["b", "iao"], MANDARIN) == ["b", "i", "ao"]
+    assert mouth_shapes(["sh", "iii"], MANDARIN) == ["zh"]  # the vowel holds the shape
+    assert mouth_shapes(["p", "a", "sil", "m", "ang"], MANDARIN) == ["b", "a", "b", "a"]
 
 
 def test_interval_holds_the_rate_and_closes_for_equal_speakers() -> None:
@@ -97,17 +95,22 @@ def test_interval_holds_the_rate_and_closes_for_equal_speakers() -> None:
     assert bounds is not None
     low, high = bounds
     assert 0.2 < low < 0.45 < high < 0.7
-    assert bootstrap_interval(mixed[:1], rng) is None  # one speaker says nothing about others
+    assert bootstrap_interval(mixed[:1], rng) is None  # one speaker tells nothing about others
 
 
 def test_confusions_are_ranked() -> None:
-    confusion = np.zeros((len(UNITS), len(UNITS)), np.int64)
-    confusion[UNIT_INDEX["in"], UNIT_INDEX["ing"]] = 4
-    confusion[UNIT_INDEX["a"], UNIT_INDEX["a"]] = 99
-    first = most_confused(confusion)[0]
-    assert first == {"said": "in", "heard": "ing", "times": 4}
+    confusions = Confusions(MANDARIN)
+    for _ in range(99):
+        confusions.add(["a"], ["a"])
+    for _ in range(4):
+        confusions.add(["in", "a"], ["ing", "a"])
+    confusions.add(["a"], ["a", "b"])
+    first, second, *_ = confusions.most_frequent()
+    assert first == {"reference": "in", "recognized": "ing", "count": 4}
+    assert second == {"reference": "sil", "recognized": "b", "count": 1}  # an insertion
 
 
+@pytest.mark.slow
 def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     vowels = DEMO / "vowels-male.wav"
     (tmp_path / "noise.wav").write_bytes(b"no sound")
@@ -137,7 +140,7 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     reasons = (
         "row 3 (none): no audio file",
         "row 4 (unknown): unknown pinyin syllable",
-        "row 5 (long): 90 units cannot be said in 2.20 s",
+        "row 5 (long): 90 phones do not fit into 2.20 s",
         "lying: 2.2",
         "broken: cannot read",
         "5 rows skipped",

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from services.recognizer.service import MOST_WAITING_S, RecognizerService
-from shared.config import RecognizerConfig
-from shared.messages import MAX_AUDIO_BYTES, AudioChunk, StartSession
-from tests.system import free_port
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.config import RecognizerConfig
+from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for
+from services.recognizer.service import MAX_QUEUED_S, RecognizerService
+from services.recognizer.stream import SpeechStream
+from shared.phones.events import LipFrame
+from shared.wire.audio import AudioChunk
+from shared.wire.control import StartSession
+from shared.wire.message import MAX_AUDIO_BYTES
+from tests.e2e.following import samples_of_file
+from tests.system import DEMO, free_port
 
 pytestmark = pytest.mark.unit
 RATE_HZ = 8000
@@ -22,10 +31,10 @@ class Watched(RecognizerService):
         local = "tcp://127.0.0.1:*"
         nobody = f"tcp://127.0.0.1:{free_port()}"
         super().__init__(RecognizerConfig(control=nobody, audio=local, phones=local))
-        self.heard: list[int] = [0]
+        self.media_times: list[int] = [0]
 
     def beat_if_due(self) -> None:
-        self.heard += [stream.media_time for stream in self._streams.values()]
+        self.media_times += [session.stream.media_time for session in self._sessions.values()]
 
 
 @pytest.fixture
@@ -35,7 +44,7 @@ def service() -> Iterator[Watched]:
     made.bus.close()
 
 
-def test_the_longest_chunk_is_heard_in_pieces_with_heartbeats_between(service: Watched) -> None:
+def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(service: Watched) -> None:
     start = StartSession(
         session="s",
         epoch=1,
@@ -46,17 +55,60 @@ def test_the_longest_chunk_is_heard_in_pieces_with_heartbeats_between(service: W
         num_channels=1,
         record=False,
         paced=False,
-        phone_input=f"tcp://127.0.0.1:{free_port()}",
-        phones="",
-        faps="",
+        language="mandarin",
+        endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
     )
     service.start_session(start)
     pcm = bytes(MAX_AUDIO_BYTES)
     service._on_audio(AudioChunk(session="s", token="t", sequence=1, pcm=pcm), b"")
-    service._hear_waiting()
+    service._process_queued()
     service.beat_if_due()
     steps = [
-        after - before for before, after in zip(service.heard, service.heard[1:], strict=False)
+        after - before
+        for before, after in zip(service.media_times, service.media_times[1:], strict=False)
     ]
-    assert max(steps) <= MOST_WAITING_S * 16000 + 320
-    assert service.heard[-1] == pytest.approx(MAX_AUDIO_BYTES, abs=320)  # 2 bytes at half the rate
+    assert max(steps) <= MAX_QUEUED_S * 16000 + 320
+    assert service.media_times[-1] == pytest.approx(
+        MAX_AUDIO_BYTES, abs=320
+    )  # 2 bytes at half the rate
+
+
+def tiny_lips(num_features: int) -> LipPredictor:
+    rng = np.random.default_rng(1)
+
+    def weights(*shape: int) -> np.ndarray:
+        return rng.normal(0.0, 0.1, shape).astype(np.float32)
+
+    return LipPredictor(
+        delays=np.array([0.0, 0.1], np.float32),
+        feature_mean=weights(num_features),
+        projection=weights(num_features, 3),
+        entry_weights=weights(3, 4),
+        entry_bias=weights(4),
+        input_weights=weights(4, 12),
+        input_bias=weights(12),
+        state_weights=weights(4, 12),
+        state_bias=weights(12),
+        history_weights=weights(2, 3, 2, NUM_OUTPUTS),
+        output_weights=weights(8, 2, NUM_OUTPUTS),
+        output_bias=weights(2, NUM_OUTPUTS),
+    )
+
+
+def test_the_shipped_lips_are_used_with_the_network_that_they_were_trained_on(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "lips.npz"
+    neural = load_model()
+    width = 2 * 80 + 2 * 512
+    tiny_lips(width + 2).save(path)
+    assert lips_for(neural, path) is None
+    tiny_lips(width).save(path)
+    assert lips_for(load_model(model_path("gmm")), path) is None
+    lips = lips_for(neural, path)
+    assert lips is not None
+    stream = SpeechStream(neural, lips=lips, face_delay_s=0.2)
+    events = stream.accept_waveform(samples_of_file(DEMO / "vowels-male.wav"))
+    frames = [event for event in events if isinstance(event, LipFrame)]
+    assert len(frames) > 50
+    assert {frame.delay_s for frame in frames} == {0.1}

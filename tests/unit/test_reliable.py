@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 from shared.bus import Bus, Socket
-from shared.messages import Acknowledge, Message, Progress
 from shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
+from shared.wire.message import Message
+from shared.wire.speech import Acknowledge, Progress
 
 pytestmark = pytest.mark.unit
 

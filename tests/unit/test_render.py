@@ -8,10 +8,10 @@ import moderngl
 import numpy as np
 import pytest
 
-from services.driver import render
-from services.driver.head import Head, neutral_faps
-from services.driver.render import Renderer
-from services.driver.window import Window
+from services.driver.head.head import Head, neutral_faps
+from services.driver.render import renderer as render
+from services.driver.render.renderer import Renderer
+from services.driver.render.window import Window
 from shared.errors import UserError
 from tests.heads import OPEN
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.driver.arkit import ARKIT, ARKIT_NAMES
-from services.driver.glb import export_glb
+from services.driver.head.glb_export import export_glb
 from shared.errors import UserError
-from shared.faps import FAPS
+from shared.face.blendshapes import ARKIT, ARKIT_NAMES
+from shared.face.faps import FAPS
 from tests import heads
 
 pytestmark = pytest.mark.unit

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from services.recognizer.resample import Resampler, to_16_khz
+from services.recognizer.front_end.resample import Resampler, to_16_khz
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
@@ -60,5 +60,5 @@ def test_wrong_samples_are_refused() -> None:
         Resampler(16_000, 2).accept_waveform(np.zeros(10, np.float32))
     with pytest.raises(UserError, match="shape"):
         Resampler(16_000).accept_waveform(np.zeros((10, 2), np.float32))
-    with pytest.raises(UserError, match="no numbers"):
+    with pytest.raises(UserError, match="not finite"):
         Resampler(16_000).accept_waveform(np.array([np.nan], np.float32))

@@ -1,4 +1,4 @@
-"""What disturbs speech does so by the stated amount, and the figures count what was heard."""
+"""Disturbances have the stated amount, and the figures count what is recognised."""
 
 import io
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from evaluation import robustness
-from evaluation.disturbances import (
+from evaluation.recognizer import robustness
+from evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
     faster,
@@ -17,8 +17,8 @@ from evaluation.disturbances import (
     telephone,
     with_noise,
 )
-from evaluation.robustness import evaluate_robustness, print_robustness
-from services.recognizer.load import load_model
+from evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+from services.recognizer.acoustic.load import load_model
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
@@ -78,6 +78,7 @@ def test_sounds_are_the_same_every_time(name: str) -> None:
     np.testing.assert_array_equal(sound, SOUNDS[name](1.5))
 
 
+@pytest.mark.slow
 def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = "utt_id\tpath\tspeaker\tsplit\tseconds\tpinyin\n"
     (tmp_path / "manifest.tsv").write_text(
@@ -88,7 +89,7 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
     figures = evaluate_robustness(load_model(), tmp_path, "dev", other_language=DEMO)
     assert set(figures["speech"]) == set(conditions)
-    assert figures["speech"]["as recorded"]["full"] > 0  # the text is too short
+    assert figures["speech"]["as recorded"]["offline"] > 0  # the text is too short
     assert figures["sounds"]["noise"] == 0
     assert figures["sounds"]["other language"] > 60
     output = io.StringIO()

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.driver.head import Head, neutral_faps
-from services.driver.render import BACKGROUND, Camera, Renderer
-from services.driver.scene import Framing, background, camera, load_head
+from services.driver.config import Framing
+from services.driver.head.head import Head, neutral_faps
+from services.driver.render.camera import Camera
+from services.driver.render.renderer import BACKGROUND, Renderer
+from services.driver.render.scene import background, camera, load_head
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit

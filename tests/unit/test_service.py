@@ -8,9 +8,11 @@ from collections.abc import Iterator
 import pytest
 
 from shared.bus import Bus
-from shared.config import Config
-from shared.messages import Done, Heartbeat, Progress, Speech
+from shared.config import ServiceConfig
 from shared.service import Service
+from shared.wire.control import Heartbeat
+from shared.wire.session import Done
+from shared.wire.speech import Progress, Speech
 
 pytestmark = pytest.mark.unit
 
@@ -19,12 +21,13 @@ class Slow(Service):
     """Takes 5 ms for a message; counts what its loop does."""
 
     name = "slow"
+    role = "worker"
 
     def __init__(self) -> None:
-        super().__init__(Config(), control=False)
+        super().__init__(ServiceConfig(), control=False)
         self.num_ticks = self.num_beats = self.num_handled = 0
         self.input = self.bus.bind_router("tcp://127.0.0.1:*", "slow.input")
-        self.listen(self.input, {Progress: self._on_progress})
+        self.register(self.input, {Progress: self._on_progress})
 
     def on_tick(self, now_s: float) -> None:
         self.num_ticks += 1

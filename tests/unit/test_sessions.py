@@ -6,129 +6,264 @@ import dataclasses
 
 import pytest
 
-from services.control.sessions import Refusal, Registry
-from shared.messages import Heartbeat, OpenSession
+from services.control.registry import Refusal, Registry
+from services.control.sessions import SessionRecord, Sessions
+from shared.wire.control import Heartbeat, SessionInput
+from shared.wire.session import OpenSession
 
 pytestmark = pytest.mark.unit
 
+PROVIDES = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
+NEEDS = {"recognizer": ["phone_input"], "synthesizer": []}
 
-def heartbeat(service: str, instance: str, state: str = "ready") -> Heartbeat:
+
+def worker(service: str, instance: str, state: str = "ready") -> Heartbeat:
     return Heartbeat(
         service=service,
         instance=instance,
+        role="worker",
         state=state,
         sent_ns=0,
-        endpoints={
-            "audio": f"tcp://{instance}:5560",
-            "phones": f"tcp://{instance}:5561",
-        },
+        endpoints={name: f"tcp://{instance}:{name}" for name in PROVIDES[service]},
+        needs=NEEDS[service],
+        language="mandarin" if service == "recognizer" else "",
+        frame_rate_hz=50.0 if service == "synthesizer" else 0.0,
+        delay_ms=100.0 if service == "synthesizer" else 0.0,
     )
 
 
-def registry(max_sessions: int = 8) -> Registry:
-    made = Registry(max_sessions, lost_after_s=3.0)
-    for service in ("recognizer", "synthesizer"):
-        made.beat(heartbeat(service, f"{service}-1"), service.encode(), 0.0)
-    return made
+def observer(instance: str) -> Heartbeat:
+    return Heartbeat(
+        service="lamp", instance=instance, role="observer", state="ready", sent_ns=0, needs=["faps"]
+    )
 
 
-def opening(session: str = "") -> OpenSession:
-    return OpenSession(session=session, request="r")
+class Made:
+    """A registry with one recognizer and one synthesizer, and no sessions yet."""
+
+    def __init__(self, max_sessions: int = 8) -> None:
+        self.registry = Registry(lost_after_s=3.0)
+        self.sessions = Sessions(self.registry, max_sessions)
+        for service in PROVIDES:
+            self.add(worker(service, f"{service}-1"))
+
+    def add(self, heartbeat: Heartbeat, now_s: float = 0.0) -> None:
+        self.registry.add(heartbeat, heartbeat.instance.encode(), now_s)
+
+    def open(self, name: str = "") -> SessionRecord:
+        return self.sessions.open(OpenSession(session=name, request="r"), b"client", 0.0)
 
 
-def test_a_session_gets_a_name_a_token_and_its_services() -> None:
-    record = registry().open(opening(), b"client", 0.0)
+@pytest.fixture
+def made() -> Made:
+    return Made()
+
+
+def test_a_session_gets_a_name_a_token_and_its_services(made: Made) -> None:
+    record = made.open()
     assert record.name
     assert len(record.token) >= 32
     assert record.waiting_for == {"recognizer-1", "synthesizer-1"}
+    assert record.workers == {
+        "audio": "recognizer-1",
+        "phones": "recognizer-1",
+        "phone_input": "synthesizer-1",
+        "faps": "synthesizer-1",
+    }
 
 
-def test_names_and_tokens_differ() -> None:
-    made = registry()
-    records = [made.open(opening(), b"client", 0.0) for _ in range(5)]
+def test_the_services_are_told_the_delay_of_the_face_and_the_lips_that_were_chosen(
+    made: Made,
+) -> None:
+    record = made.open()
+    start = made.sessions.start_message(record)
+    assert (start.delay_ms, start.lips) == (100.0, "")
+    record.lips = "learnt"
+    made.registry.remove("synthesizer-1")
+    made.add(dataclasses.replace(worker("synthesizer", "synthesizer-2"), delay_ms=40.0))
+    assert made.sessions.replace(record, 1.0)
+    start = made.sessions.start_message(record)
+    assert (start.delay_ms, start.lips) == (40.0, "learnt")
+
+
+def test_the_client_and_the_services_are_told_the_endpoints(made: Made) -> None:
+    record = made.open()
+    opened = made.sessions.opened_message(record, "tcp://control:events")
+    assert opened.audio == "tcp://recognizer-1:audio"
+    assert opened.phones == "tcp://recognizer-1:phones"
+    assert opened.faps == "tcp://synthesizer-1:faps"
+    assert (opened.language, opened.frame_rate_hz) == ("mandarin", 50.0)
+    start = made.sessions.start_message(record)
+    assert start.endpoints["phone_input"] == "tcp://synthesizer-1:phone_input"
+    assert start.language == "mandarin"
+
+
+def test_names_and_tokens_differ(made: Made) -> None:
+    records = [made.open() for _ in range(5)]
     assert len({record.name for record in records} | {record.token for record in records}) == 10
 
 
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
-def test_a_missing_service_is_named(service: str) -> None:
-    made = registry()
-    del made.services[f"{service}-1"]
+def test_a_missing_service_is_named(made: Made, service: str) -> None:
+    made.registry.remove(f"{service}-1")
     with pytest.raises(Refusal, match=f"no {service} is running") as caught:
-        made.open(opening(), b"client", 0.0)
+        made.open()
     assert caught.value.code == "no-service"
 
 
-def test_a_name_is_taken_once() -> None:
-    made = registry()
-    made.open(opening("demo"), b"one", 0.0)
+def test_a_worker_of_an_unknown_kind_is_placed_where_another_needs_it(made: Made) -> None:
+    gazing = dataclasses.replace(worker("synthesizer", "synthesizer-1"), needs=["gaze"])
+    made.add(gazing)
+    with pytest.raises(Refusal, match="provides 'gaze'"):
+        made.open()
+    made.add(
+        Heartbeat(
+            service="eyes",
+            instance="eyes-1",
+            role="worker",
+            state="ready",
+            sent_ns=0,
+            endpoints={"gaze": "tcp://eyes-1:gaze"},
+        )
+    )
+    record = made.open()
+    assert record.workers["gaze"] == "eyes-1"
+    assert "eyes-1" in record.waiting_for
+    assert made.sessions.start_message(record).endpoints["gaze"] == "tcp://eyes-1:gaze"
+
+
+def test_observers_of_any_kind_take_part(made: Made) -> None:
+    made.add(observer("lamp-1"))
+    record = made.open()
+    assert record.waiting_for == {"recognizer-1", "synthesizer-1", "lamp-1"}
+    made.add(observer("lamp-2"))
+    assert made.sessions.participants(record) >= {"lamp-1", "lamp-2"}
+
+
+def test_a_name_is_taken_once(made: Made) -> None:
+    made.open("demo")
     with pytest.raises(Refusal) as caught:
-        made.open(opening("demo"), b"two", 0.0)
+        made.open("demo")
     assert caught.value.code == "session-exists"
 
 
 def test_there_is_a_limit() -> None:
-    made = registry(max_sessions=1)
-    made.open(opening(), b"one", 0.0)
+    made = Made(max_sessions=1)
+    made.open()
     with pytest.raises(Refusal) as caught:
-        made.open(opening(), b"two", 0.0)
+        made.open()
     assert caught.value.code == "too-many-sessions"
 
 
-def test_only_the_token_opens_the_door() -> None:
-    made = registry()
-    record = made.open(opening("demo"), b"one", 0.0)
-    assert made.owned("demo", record.token) is record
+def test_a_session_is_only_given_for_its_token(made: Made) -> None:
+    record = made.open("demo")
+    assert made.sessions.owned("demo", record.token) is record
     with pytest.raises(Refusal) as caught:
-        made.owned("demo", "guess")
+        made.sessions.owned("demo", "guess")
     assert caught.value.code == "bad-token"
     with pytest.raises(Refusal) as caught:
-        made.owned("other", record.token)
+        made.sessions.owned("other", record.token)
     assert caught.value.code == "unknown-session"
 
 
-def test_sessions_go_to_the_least_loaded() -> None:
-    made = registry()
-    made.beat(heartbeat("recognizer", "recognizer-2"), b"r2", 0.0)
-    used = [made.open(opening(), b"client", 0.0).recognizer for _ in range(4)]
+def test_sessions_go_to_the_least_loaded(made: Made) -> None:
+    made.add(worker("recognizer", "recognizer-2"))
+    records = [made.open() for _ in range(4)]
+    used = [record.workers["audio"] for record in records]
     assert sorted(used) == ["recognizer-1", "recognizer-1", "recognizer-2", "recognizer-2"]
+    assert all(record.workers["audio"] == record.workers["phones"] for record in records)
 
 
-def test_a_draining_service_gets_nothing_new() -> None:
-    made = registry()
-    made.beat(heartbeat("recognizer", "recognizer-2"), b"r2", 0.0)
-    made.beat(heartbeat("recognizer", "recognizer-1", state="draining"), b"r1", 0.0)
-    assert made.open(opening(), b"client", 0.0).recognizer == "recognizer-2"
+def test_a_draining_service_gets_nothing_new(made: Made) -> None:
+    made.add(worker("recognizer", "recognizer-2"))
+    made.add(worker("recognizer", "recognizer-1", state="draining"))
+    assert made.open().workers["audio"] == "recognizer-2"
 
 
-def test_silence_is_noticed_after_the_limit() -> None:
-    made = registry()
-    made.beat(heartbeat("recognizer", "recognizer-1"), b"r1", 2.5)
-    assert made.silent(2.9) == []
-    assert made.silent(3.1) == ["synthesizer-1"]
+def test_a_service_without_heartbeat_is_lost_after_the_limit(made: Made) -> None:
+    made.add(worker("recognizer", "recognizer-1"), 2.5)
+    assert made.registry.silent(2.9) == []
+    assert made.registry.silent(3.1) == ["synthesizer-1"]
 
 
-def test_a_lost_recognizer_is_replaced_with_a_greater_epoch() -> None:
-    made = registry()
-    record = made.open(opening(), b"client", 0.0)
-    del made.services["recognizer-1"]
-    assert not made.replace(record, 1.0)
-    made.beat(heartbeat("recognizer", "elsewhere"), b"r2", 1.0)
-    assert not made.replace(record, 1.0), "the client goes on sending to where it was told to"
-    again = dataclasses.replace(heartbeat("recognizer", "recognizer-1"), instance="recognizer-2")
-    made.beat(again, b"r3", 1.0)
-    assert made.replace(record, 1.0)
-    assert (record.recognizer, record.synthesizer, record.epoch) == (
-        "recognizer-2",
-        "synthesizer-1",
-        2,
+def take_input(made: Made, record: SessionRecord, sequence: int, idle_s: float = 0.0) -> float:
+    """Take a heartbeat of the session's recognizer; return the idle time that counts."""
+    beat = dataclasses.replace(
+        worker("recognizer", record.workers["audio"]),
+        sessions={record.name: SessionInput(idle_s=idle_s, sequence=sequence)},
     )
+    return made.sessions.take_input(record, beat)
 
 
-def test_a_service_at_the_same_endpoint_displaces_the_one_that_crashed() -> None:
-    made = registry()
-    old = made.services["recognizer-1"].heartbeat
-    again = Heartbeat(
-        service="recognizer", instance="recognizer-9", state="ready", sent_ns=0,
-        endpoints=old.endpoints,
-    )  # fmt: skip
-    assert made.displaced_by(again) == ["recognizer-1"]
+def test_a_session_moves_to_another_recognizer_and_goes_on_where_the_lost_one_was(
+    made: Made,
+) -> None:
+    record = made.open()
+    take_input(made, record, sequence=120)
+    made.registry.remove("recognizer-1")
+    assert made.sessions.lost_workers(record) == ["recognizer-1"]
+    assert not made.sessions.replace(record, 1.0)
+    assert made.sessions.state(record, 1.0).endpoints["audio"] == "tcp://recognizer-1:audio"
+    made.add(worker("recognizer", "elsewhere"))
+    assert made.sessions.replace(record, 1.0)
+    assert (record.workers["audio"], record.workers["faps"]) == ("elsewhere", "synthesizer-1")
+    moved = made.sessions.moved_message(record)
+    assert (moved.epoch, moved.next_sequence) == (2, 121)
+    assert (moved.audio, moved.faps) == ("tcp://elsewhere:audio", "tcp://synthesizer-1:faps")
+
+
+def test_a_new_recognizer_that_has_no_audio_yet_does_not_set_the_session_back(made: Made) -> None:
+    record = made.open()
+    take_input(made, record, sequence=120)
+    made.registry.remove("recognizer-1")
+    made.add(worker("recognizer", "elsewhere"))
+    made.sessions.replace(record, 1.0)
+    take_input(made, record, sequence=0)
+    assert record.next_sequence == 121
+
+
+def test_a_session_moves_to_no_recognizer_of_another_language(made: Made) -> None:
+    record = made.open()
+    made.registry.remove("recognizer-1")
+    made.add(dataclasses.replace(worker("recognizer", "elsewhere"), language="english"))
+    assert not made.sessions.replace(record, 1.0)
+
+
+def test_audio_goes_on_where_it_was_when_only_the_synthesizer_is_lost(made: Made) -> None:
+    record = made.open()
+    take_input(made, record, sequence=120)
+    made.registry.remove("synthesizer-1")
+    made.add(worker("synthesizer", "synthesizer-2"))
+    assert made.sessions.replace(record, 1.0)
+    moved = made.sessions.moved_message(record)
+    assert (moved.epoch, moved.next_sequence) == (2, 0)
+    assert moved.faps == "tcp://synthesizer-2:faps"
+
+
+def test_only_the_recognizer_knows_how_long_there_was_no_audio(made: Made) -> None:
+    record = made.open()
+    assert take_input(made, record, sequence=1, idle_s=70.0) == 70.0
+    beat = dataclasses.replace(
+        worker("synthesizer", "synthesizer-1"), sessions={record.name: SessionInput(idle_s=99.0)}
+    )
+    assert made.sessions.take_input(record, beat) == 0.0
+
+
+def test_a_worker_at_the_same_endpoints_displaces_the_one_that_crashed(made: Made) -> None:
+    old = worker("recognizer", "recognizer-1")
+    again = dataclasses.replace(old, instance="recognizer-9")
+    made.add(again)
+    assert made.registry.displaced_by(again) == ["recognizer-1"]
+
+
+def test_observers_displace_no_other(made: Made) -> None:
+    made.add(observer("lamp-1"))
+    made.add(observer("lamp-2"))
+    assert made.registry.displaced_by(observer("lamp-2")) == []
+
+
+def test_an_instance_that_provides_something_else_now_is_another_one(made: Made) -> None:
+    same = worker("recognizer", "recognizer-1", state="draining")
+    assert not made.registry.differs(same)
+    assert made.registry.differs(dataclasses.replace(same, endpoints={"audio": "tcp://new:1"}))
+    assert not made.registry.differs(worker("recognizer", "unknown"))

@@ -9,15 +9,15 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import erf, softmax
 
-from services.recognizer.features import frames_in
-from services.recognizer.neural import positions_of
-from services.recognizer.whisper_mel import NUM_MELS, mel_bands
+from services.recognizer.acoustic.network import position_table
+from services.recognizer.front_end.features import frames_in
+from services.recognizer.front_end.whisper_mel import NUM_MELS, mel_bands
 from tests.tones import tones
-from training import teacher
-from training.network import Shape
-from training.teacher import Teacher, WholeEncoder, all_heard, centred_mel, train_teacher
+from training.neural import teacher
+from training.neural.network import Shape
+from training.neural.teacher import Teacher, WholeEncoder, centred_mel, process_all, train_teacher
 
-pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
 SHAPE = Shape(num_states=6, look_aheads=(), width=32, heads=2, layers=4, inner=48)
 
@@ -25,7 +25,7 @@ SHAPE = Shape(num_states=6, look_aheads=(), width=32, heads=2, layers=4, inner=4
 def whole_encoder() -> WholeEncoder:
     torch.manual_seed(0)
     encoder = WholeEncoder(SHAPE).eval()
-    with torch.no_grad():  # convolutions that have learnt say more than those just made
+    with torch.no_grad():  # trained convolutions differ more than new ones
         encoder.first.weight *= 6
         encoder.second.weight *= 6
     return encoder
@@ -74,7 +74,7 @@ def test_all_positions_attend_to_all() -> None:
         return np.asarray(x * weights[f"{name}.weight"] + weights[f"{name}.bias"])
 
     hidden = gelu(convolved(gelu(convolved(bands.T, "first", 1)), "second", 2))
-    hidden = hidden + positions_of(32)[:6]
+    hidden = hidden + position_table(32)[:6]
     after = []
     for layer in (f"layers.{number}" for number in range(4)):
         parts = product(normed(hidden, f"{layer}.attention_norm"), f"{layer}.query_key_value")
@@ -90,7 +90,7 @@ def test_all_positions_attend_to_all() -> None:
 
 
 @pytest.mark.parametrize("num_frames", [1, 2, 19, 20, 21, 45])
-def test_long_recordings_are_heard_in_pieces(
+def test_long_recordings_are_cut_into_pieces(
     num_frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(teacher, "_PIECE_FRAMES", 20)
@@ -104,8 +104,8 @@ def test_long_recordings_are_heard_in_pieces(
         np.testing.assert_array_equal(features[start // 2 : start // 2 + 10], alone)
 
 
-def test_a_position_hears_its_two_frames() -> None:
-    """A click in the middle of two frames is loudest in the position that says them."""
+def test_a_position_encodes_its_two_frames() -> None:
+    """A click in the middle of two frames is largest in the position whose output they are."""
     encoder = whole_encoder()
     with torch.no_grad():
         for parameter in encoder.parameters():
@@ -133,14 +133,14 @@ def taught(num_steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Teacher, li
 
 def test_the_teacher_learns_which_tone_is_when(monkeypatch: pytest.MonkeyPatch) -> None:
     learnt, lines = taught(100, monkeypatch)
-    unheard = tones(100)
-    targets = learnt.targets_of(unheard.samples)
-    assert targets.states.shape == targets.shares.shape == (98, 6)
-    np.testing.assert_allclose(targets.shares.sum(axis=1, dtype=np.float32), 1.0, atol=2e-3)
-    assert (np.diff(targets.shares, axis=1) <= 0).all()
+    unseen = tones(100)
+    targets = learnt.targets_of(unseen.samples)
+    assert targets.states.shape == targets.probs.shape == (98, 6)
+    np.testing.assert_allclose(targets.probs.sum(axis=1, dtype=np.float32), 1.0, atol=2e-3)
+    assert (np.diff(targets.probs, axis=1) <= 0).all()
     # a frame early or late would be 0.95
-    assert np.mean(targets.states[:, 0] == unheard.targets.states[:, 0]) > 0.97
-    assert "12 of 12 recordings heard by the teacher, to learn" in lines
+    assert np.mean(targets.states[:, 0] == unseen.targets.states[:, 0]) > 0.97
+    assert "12 of 12 recordings encoded for the teacher" in lines
     assert lines[-1].startswith("teacher, step 100: ")
 
 
@@ -148,16 +148,16 @@ def test_the_same_seed_gives_the_same_teacher(monkeypatch: pytest.MonkeyPatch) -
     samples = tones(100).samples
     first, second = (taught(3, monkeypatch)[0].targets_of(samples) for _ in range(2))
     np.testing.assert_array_equal(first.states, second.states)
-    np.testing.assert_array_equal(first.shares, second.shares)
+    np.testing.assert_array_equal(first.probs, second.probs)
 
 
 # --- many recordings
 
 
-def test_two_recordings_at_a_time_are_heard_in_order() -> None:
+def test_two_recordings_at_a_time_are_processed_in_order() -> None:
     together = threading.Barrier(2, timeout=10.0)
 
-    def hear(samples: NDArray[np.int16]) -> int:
+    def process(samples: NDArray[np.int16]) -> int:
         assert torch.get_num_threads() == 1
         together.wait()
         return len(samples)
@@ -165,23 +165,23 @@ def test_two_recordings_at_a_time_are_heard_in_order() -> None:
     lines: list[str] = []
     recordings = [np.zeros(num, np.int16) for num in (5, 3, 4, 1)]
     torch.set_num_threads(2)
-    assert all_heard(hear, recordings, "heard", lines.append) == [5, 3, 4, 1]
-    assert lines[-1] == "4 of 4 recordings heard"
+    assert process_all(process, recordings, "processed", lines.append) == [5, 3, 4, 1]
+    assert lines[-1] == "4 of 4 recordings processed"
     assert torch.get_num_threads() == 2
 
 
-def test_an_error_ends_the_hearing() -> None:
-    heard: list[int] = []
+def test_an_error_ends_the_processing() -> None:
+    processed: list[int] = []
 
-    def hear(samples: NDArray[np.int16]) -> None:
-        heard.append(len(samples))
+    def process(samples: NDArray[np.int16]) -> None:
+        processed.append(len(samples))
         if len(samples) == 0:
-            raise ValueError("nothing to hear")
+            raise ValueError("no samples")
         time.sleep(0.01)
 
     recordings = [np.zeros(num, np.int16) for num in range(300)]
     torch.set_num_threads(2)
-    with pytest.raises(ValueError, match="nothing to hear"):
-        all_heard(hear, recordings, "heard", lambda _: None)
-    assert len(heard) < 150
+    with pytest.raises(ValueError, match="no samples"):
+        process_all(process, recordings, "processed", lambda _: None)
+    assert len(processed) < 150
     assert torch.get_num_threads() == 2

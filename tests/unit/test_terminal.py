@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from services.terminal import check_output
+from services.cli.terminal import check_output
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit

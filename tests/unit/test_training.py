@@ -1,4 +1,4 @@
-"""Corpora, augmentation, estimation and alignment on small made-up speech."""
+"""Corpora, estimation and alignment on small made-up speech."""
 
 import itertools
 import json
@@ -9,58 +9,51 @@ import numpy as np
 import pytest
 import soundfile
 
-from services.recognizer.acoustic_model import FIRST, INSIDE, LAST
-from services.recognizer.features import NUM_BANDS
-from services.recognizer.load import load_model
+from corpora import feature_cache
+from corpora.speech_corpus import RowErrors, may_ship, read_corpus
+from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.alignment import align_text
+from services.recognizer.front_end.features import NUM_BANDS
+from services.recognizer.search.decoder import Segment
+from services.recognizer.search.forced_path import segments_of_path, utterance_graph, viterbi_path
 from shared.errors import UserError
-from shared.phones import UNIT_INDEX, UNITS
-from training import feature_cache
-from training.align import align_text
-from training.augmentation import Augmentation
-from training.corpus import RowErrors, may_ship, read_corpus
-from training.durations import AlignedUnit, UnitDurations, positions_of
-from training.examples import Example, load_examples, speech_span
-from training.gmm import (
-    SIL,
-    FrameSet,
-    decorrelate,
-    estimate,
-    first_estimate,
-    flat_path,
-    split,
-    units_of_path,
-    utterance_graph,
-    viterbi_path,
-)
-from training.recipes import train_gmm
-from training.unit_language import load_language, train_language
+from tests.languages import MANDARIN, SIL
+from training.durations import PhoneDurations, positions_of
+from training.gmm.decorrelation import decorrelate
+from training.gmm.estimation import estimate, first_estimate, split
+from training.gmm.frames import Copy, FrameSet, flat_path
+from training.gmm.recipe import train_gmm
+from training.phone_lm.recipe import load_phone_lm, train_phone_lm
+from training.training_set import Example, load_examples, speech_span
 
 pytestmark = pytest.mark.unit
 
-FIRST_STATE = np.arange(len(UNITS) + 1) * 3
+INDEX = MANDARIN.index
+FIRST_STATE = np.arange(len(MANDARIN) + 1) * 3
 SYLLABLES = ("ma", "ti", "sou", "lan")
 
 
-def spectrum(unit: str) -> np.ndarray:
-    rng = np.random.default_rng(UNIT_INDEX[unit])
+def spectrum(phone: str) -> np.ndarray:
+    rng = np.random.default_rng(INDEX[phone])
     return np.concatenate([[14.0], rng.normal(12, 3, NUM_BANDS)])
 
 
 def made_up_speech(num: int, seed: int = 0) -> list[Example]:
-    """Each unit has a spectrum of its own; silence is weak."""
+    """Each phone has a spectrum of its own; silence is weak."""
     rng = np.random.default_rng(seed)
     examples = []
     for _ in range(num):
         names = [str(name) for name in rng.choice(SYLLABLES, 3)]
-        units = [unit for name in names for unit in (name[0], name[1:])]
+        phones = [phone for name in names for phone in (name[0], name[1:])]
         rows = [np.full((15, 41), 7.0)]
-        rows += [np.tile(spectrum(unit), (int(rng.integers(6, 14)), 1)) for unit in units]
+        rows += [np.tile(spectrum(phone), (int(rng.integers(6, 14)), 1)) for phone in phones]
         rows.append(np.full((15, 41), 7.0))
         log_mel = np.concatenate(rows)
         examples.append(
             Example(
                 log_mel=(log_mel + rng.normal(0, 0.7, log_mel.shape)).astype(np.float16),
-                units=tuple(UNIT_INDEX[unit] for unit in units),
+                phones=tuple(INDEX[phone] for phone in phones),
                 syllables=(2, 2, 2),
                 weight=1.0,
             )
@@ -99,14 +92,14 @@ def test_manifest_and_its_bad_rows(tmp_path: Path) -> None:
         ],
     )
     errors = RowErrors()
-    good = read_corpus(tmp_path, errors)
-    assert read_corpus(tmp_path / "manifest.tsv", RowErrors()) == good
+    good = read_corpus(tmp_path, errors, MANDARIN)
+    assert read_corpus(tmp_path / "manifest.tsv", RowErrors(), MANDARIN) == good
     assert [u.utterance_id for u in good] == ["a", "e"]
-    assert [UNITS[unit] for unit in good[0].units] == ["n", "i", "h", "ao"]
+    assert [MANDARIN.phones[phone] for phone in good[0].phones] == ["n", "i", "h", "ao"]
     assert good[0].syllables == (2, 2)
-    assert [UNITS[unit] for unit in good[1].units] == ["i", "g", "e"]
+    assert [MANDARIN.phones[phone] for phone in good[1].phones] == ["i", "g", "e"]
     for message, part in zip(
-        errors.messages, ("row 3 (b): no audio", "row 4 (c)", "row 5 (d): 4 units", "no text"),
+        errors.messages, ("row 3 (b): no audio", "row 4 (c)", "row 5 (d): 4 phones", "no text"),
         strict=True,
     ):  # fmt: skip
         assert part in message
@@ -118,8 +111,8 @@ def test_kaldi_folder(tmp_path: Path) -> None:
     (tmp_path / "wav.scp").write_text(f"u1 0.wav\nu2 {tmp_path}/1.wav\n")
     (tmp_path / "text").write_text("u1 你好\nu2 你 好 吗\n", encoding="utf-8")
     (tmp_path / "utt2spk").write_text("u1 anna\nu2 bob\n")
-    rows = read_corpus(tmp_path, RowErrors())
-    assert [(u.utterance_id, u.speaker, len(u.units)) for u in rows] == [
+    rows = read_corpus(tmp_path, RowErrors(), MANDARIN)
+    assert [(u.utterance_id, u.speaker, len(u.phones)) for u in rows] == [
         ("u1", "anna", 4),
         ("u2", "bob", 6),
     ]
@@ -128,17 +121,17 @@ def test_kaldi_folder(tmp_path: Path) -> None:
     (tmp_path / "wav.scp").write_text("u1 0.wav\nu2 sph2pipe 1.sph |\nu3 1.wav\n")
     errors = RowErrors()
     held_out = tmp_path.rename(tmp_path.with_name("test"))
-    rows = read_corpus(held_out, errors, split="test")
+    rows = read_corpus(held_out, errors, MANDARIN, split="test")
     assert [u.utterance_id for u in rows] == ["u1"]
     assert "line 2 (u2): no audio file" in errors.messages[0]
     assert "line 3 (u3): no text" in errors.messages[1]
-    assert read_corpus(held_out, RowErrors(), split="train") == []
+    assert read_corpus(held_out, RowErrors(), MANDARIN, split="train") == []
     (held_out / "text").unlink()
     with pytest.raises(UserError, match="text: cannot be read"):
-        read_corpus(held_out, RowErrors())
+        read_corpus(held_out, RowErrors(), MANDARIN)
     (held_out / "segments").write_text("u1-1 u1 0 1\n")
     with pytest.raises(UserError, match="segments"):
-        read_corpus(held_out, RowErrors())
+        read_corpus(held_out, RowErrors(), MANDARIN)
 
 
 def test_aishell_folder(tmp_path: Path) -> None:
@@ -149,27 +142,27 @@ def test_aishell_folder(tmp_path: Path) -> None:
     transcript = tmp_path / "transcript" / "aishell_transcript_v0.8.txt"
     transcript.write_text("BAC009S0002W0122 而 对\nBAC009S0002W0123 无声\n", encoding="utf-8")
     errors = RowErrors()
-    rows = read_corpus(tmp_path, errors, split="train")
+    rows = read_corpus(tmp_path, errors, MANDARIN, split="train")
     assert [(u.speaker, u.split, u.licence) for u in rows] == [("S0002", "train", "Apache-2.0")]
     assert "BAC009S0002W0123" in errors.messages[0]
 
 
 def test_no_corpus_and_no_columns(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no corpus"):
-        read_corpus(tmp_path, RowErrors())
+        read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
-    with pytest.raises(UserError, match="lacks the columns pinyin"):
-        read_corpus(tmp_path, RowErrors())
+    with pytest.raises(UserError, match="lacks the columns pinyin or text"):
+        read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_bytes("utt_id\tpath\tpinyin\n你".encode("gb18030"))
     with pytest.raises(UserError, match="not UTF-8"):
-        read_corpus(tmp_path, RowErrors())
+        read_corpus(tmp_path, RowErrors(), MANDARIN)
 
 
 @pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "long"])
 def test_lengths_that_are_none_are_reported(seconds: str, tmp_path: Path) -> None:
     write_corpus(tmp_path, [f"a\t0.wav\tA\tx\tMIT\ttrain\t{seconds}\t你\tni3"])
     errors = RowErrors()
-    assert read_corpus(tmp_path, errors) == []
+    assert read_corpus(tmp_path, errors, MANDARIN) == []
     assert len(errors.messages) == 1
 
 
@@ -183,10 +176,9 @@ def test_the_given_pinyin_counts(tmp_path: Path) -> None:
             "c\t2.wav\tA\tx\tMIT\ttrain\t9\t女儿花儿玩\tnv3 er2 huar1 hua1 er5 wan2 lü4",
         ],
     )
-    units = [
-        " ".join(UNITS[unit] for unit in row.units) for row in read_corpus(tmp_path, RowErrors())
-    ]
-    assert units == ["in h ang h ang zh ang", "x ing", "n v er h ua er h ua er uan l v"]
+    rows = read_corpus(tmp_path, RowErrors(), MANDARIN)
+    phones = [" ".join(MANDARIN.phones[phone] for phone in row.phones) for row in rows]
+    assert phones == ["in h ang h ang zh ang", "x ing", "n v er h ua er h ua er uan l v"]
 
 
 @pytest.mark.parametrize(
@@ -220,15 +212,15 @@ def test_weights_and_licence_filter(tmp_path: Path) -> None:
         ],
     )
     errors = RowErrors()
-    examples = load_examples([tmp_path], errors, synthetic_weight=0.5)
+    examples = load_examples([tmp_path], errors, MANDARIN, synthetic_weight=0.5)
     assert [example.weight for example in examples] == [3.0, 1.5]  # rare speakers count most
     assert any("CC BY-NC" in message for message in errors.messages)
-    assert len(load_examples([tmp_path], RowErrors(), shipping=False)) == 3
+    assert len(load_examples([tmp_path], RowErrors(), MANDARIN, shipping=False)) == 3
     with pytest.raises(UserError, match="no usable recordings of split 'test'"):
-        load_examples([tmp_path], RowErrors(), split="test")
+        load_examples([tmp_path], RowErrors(), MANDARIN, split="test")
     write_corpus(tmp_path, ["b\t1.wav\tB\tx\tCC BY-NC\ttrain\t1.25\t你好\tni3 hao3"])
     with pytest.raises(UserError, match=r"last of them: b: its licence \(CC BY-NC\)"):
-        load_examples([tmp_path], RowErrors())
+        load_examples([tmp_path], RowErrors(), MANDARIN)
 
 
 def test_cache_is_used_and_unreadable_audio_is_noted(
@@ -239,7 +231,7 @@ def test_cache_is_used_and_unreadable_audio_is_noted(
         [f"{n}\t{n}.wav\tA\tx\tCC0\ttrain\t1.25\t你好\tni3 hao3" for n in range(3)],
     )
     (tmp_path / "1.wav").write_bytes(b"no sound")
-    rows = read_corpus(tmp_path, RowErrors())
+    rows = read_corpus(tmp_path, RowErrors(), MANDARIN)
     errors = RowErrors()
     first = feature_cache.log_mel_of(rows, errors)
     assert [block is None for block in first] == [False, True, False]
@@ -257,28 +249,6 @@ def test_long_silence_is_trimmed() -> None:
     assert len(log_mel[speech_span(log_mel)]) == 150
 
 
-# --- augmentation
-
-
-def test_augmentation_is_repeatable_and_finite() -> None:
-    log_mel = made_up_speech(1)[0].log_mel.astype(np.float32)
-    for seed in range(20):
-        change = Augmentation.draw(np.random.default_rng(seed))
-        heard = change.apply(log_mel)
-        assert heard.shape == (len(change.positions(len(log_mel))), 41)
-        assert np.isfinite(heard).all()
-        np.testing.assert_array_equal(heard, change.apply(log_mel))
-
-
-def test_no_change_changes_little() -> None:
-    log_mel = made_up_speech(1)[0].log_mel.astype(np.float32)
-    nothing = Augmentation(
-        speed=1.0, warp=1.0, level=0.0, noise_below=30.0, noise_tilt=0.0,
-        colour=(0.0,) * 6, decay=0.0, narrow=False, seed=0,
-    )  # fmt: skip
-    np.testing.assert_allclose(nothing.apply(log_mel), np.maximum(log_mel, 6), atol=0.02)
-
-
 # --- paths
 
 
@@ -289,11 +259,11 @@ def every_path(num_frames: int, graph_length: int) -> Iterator[tuple[int, ...]]:
 @pytest.mark.parametrize("seed", range(5))
 def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    first_state = np.arange(len(UNITS) + 1)  # one state each: sil a sil b sil
-    graph = utterance_graph([22, 30], [1, 1], first_state)
+    first_state = np.arange(len(MANDARIN) + 1)  # one state each: sil a sil b sil
+    graph = utterance_graph([22, 30], [1, 1], first_state, silence=SIL)
     num_frames = 6
     scores = rng.normal(0, 2, (num_frames, len(graph.states))).astype(np.float32)
-    stay = rng.uniform(0.2, 0.8, len(UNITS))
+    stay = rng.uniform(0.2, 0.8, len(MANDARIN))
     log_stay, log_leave = np.log(stay), np.log(1 - stay)
     allowed = {(0, 1), (1, 2), (1, 3), (2, 3), (3, 4)}
     best = -np.inf
@@ -316,14 +286,14 @@ def test_alignment_is_the_best_of_all_paths(seed: int) -> None:
     assert len(path) == num_frames
 
 
-def test_pauses_are_optional_and_units_are_not() -> None:
-    graph = utterance_graph([0, 21], [2], FIRST_STATE)
+def test_pauses_are_optional_and_phones_are_not() -> None:
+    graph = utterance_graph([0, 21], [2], FIRST_STATE, silence=SIL)
     wanted = np.repeat([0, 1, 2, 3, 4, 5], 2)  # the positions of b and a, no pause
     scores = np.full((12, len(graph.states)), -20.0, np.float32)
     scores[np.arange(12), wanted + 3] = 0.0
-    half = np.full(len(UNITS) * 3, np.log(0.5), np.float32)
+    half = np.full(len(MANDARIN) * 3, np.log(0.5), np.float32)
     path, _ = viterbi_path(scores, graph, half, half)
-    assert [(UNITS[u.unit], u.start, u.end) for u in units_of_path(path, graph)] == [
+    assert [(MANDARIN.phones[u.phone], u.start, u.end) for u in segments_of_path(path, graph)] == [
         ("b", 0, 6),
         ("a", 6, 12),
     ]
@@ -332,24 +302,25 @@ def test_pauses_are_optional_and_units_are_not() -> None:
     assert likelihood == -np.inf
 
 
-def test_flat_path_goes_through_all_units() -> None:
+def test_flat_path_goes_through_all_phones() -> None:
     example = made_up_speech(1)[0]
-    graph = utterance_graph(example.units, example.syllables, FIRST_STATE)
+    graph = utterance_graph(example.phones, example.syllables, FIRST_STATE, silence=SIL)
     path = flat_path(graph, example.log_mel[:, 0].astype(np.float32))
-    found = [u.unit for u in units_of_path(path, graph)]
-    assert found == [SIL, *example.units, SIL]
+    found = [u.phone for u in segments_of_path(path, graph)]
+    assert found == [SIL, *example.phones, SIL]
     assert (np.diff(path) >= 0).all()
 
 
 # --- estimation
 
 
-def prior_mean() -> np.ndarray:
-    return np.zeros(13, np.float32)
+def frame_set(num: int) -> FrameSet:
+    copies = [Copy(example, 1.0) for example in made_up_speech(num)]
+    return FrameSet.build(copies, MANDARIN, FIRST_STATE, np.zeros(13, np.float32), 1)
 
 
 def test_likelihood_never_falls() -> None:
-    frames = FrameSet.build(made_up_speech(30), FIRST_STATE, prior_mean(), 1)
+    frames = frame_set(30)
     hmm = first_estimate(frames, FIRST_STATE)
     before = frames.realign(hmm)
     for num_mixtures in (1, 2, 4):
@@ -364,7 +335,7 @@ def test_likelihood_never_falls() -> None:
 
 
 def test_estimates_of_one_gaussian_are_mean_and_variance() -> None:
-    frames = FrameSet.build(made_up_speech(10), FIRST_STATE, prior_mean(), 1)
+    frames = frame_set(10)
     hmm = estimate(frames, first_estimate(frames, FIRST_STATE))
     state = int(FIRST_STATE[SIL])
     x = frames.features[frames.states == state]
@@ -375,14 +346,14 @@ def test_estimates_of_one_gaussian_are_mean_and_variance() -> None:
 
 
 def test_splitting_keeps_the_weights_whole() -> None:
-    frames = FrameSet.build(made_up_speech(20), FIRST_STATE, prior_mean(), 1)
+    frames = frame_set(20)
     hmm = split(first_estimate(frames, FIRST_STATE), frames, 4)
     np.testing.assert_allclose(hmm.mixtures.weights.sum(axis=1), 1, rtol=1e-5)
     assert (hmm.mixtures.weights[FIRST_STATE[SIL]] > 0).all()
 
 
 def test_decorrelating_raises_the_likelihood() -> None:
-    frames = FrameSet.build(made_up_speech(40), FIRST_STATE, prior_mean(), 1)
+    frames = frame_set(40)
     hmm = first_estimate(frames, FIRST_STATE)
     for _ in range(3):
         frames.realign(hmm)
@@ -395,26 +366,26 @@ def test_decorrelating_raises_the_likelihood() -> None:
 
 
 def test_durations_by_position() -> None:
-    a, b, i = (UNIT_INDEX[unit] for unit in ("a", "b", "i"))
-    assert positions_of([SIL, b, a, b, i, SIL, a, SIL]) == [
+    a, b, i = (INDEX[phone] for phone in ("a", "b", "i"))
+    assert positions_of([SIL, b, a, b, i, SIL, a, SIL], SIL) == [
         FIRST, FIRST, INSIDE, INSIDE, LAST, INSIDE, LAST, LAST,
     ]  # fmt: skip
-    assert positions_of([b, a]) == [FIRST, LAST]  # no pauses around
-    durations = UnitDurations()
+    assert positions_of([b, a], SIL) == [FIRST, LAST]  # no pauses around
+    durations = PhoneDurations(MANDARIN)
     for lengths in ((5, 7, 9, 20), (7, 9, 11, 24)) * 500:
         ends = np.cumsum([*lengths, *lengths]).tolist()
-        units = [b, a, b, a, b, a, b, a]
+        phones = [b, a, b, a, b, a, b, a]
         starts = [0, *ends[:-1]]
-        aligned = [AlignedUnit(*unit) for unit in zip(units, starts, ends, strict=True)]
+        aligned = [Segment(*phone) for phone in zip(phones, starts, ends, strict=True)]
         durations.add(aligned, 0.5)
-    durations.add([AlignedUnit(a, 0, 90)], 1.0)  # a vowel said alone hardly counts
+    durations.add([Segment(a, 0, 90)], 1.0)  # a vowel alone has little weight
     mean_s, spread_s = durations.mean_and_spread_s()
-    assert mean_s.shape == spread_s.shape == (3, len(UNITS))
+    assert mean_s.shape == spread_s.shape == (3, len(MANDARIN))
     assert mean_s[FIRST, b] == pytest.approx(0.06, abs=0.002)
     assert spread_s[FIRST, b] == pytest.approx(0.01, abs=0.003)
     assert mean_s[LAST, a] == pytest.approx(0.22, abs=0.005)
     assert mean_s[INSIDE, a] == pytest.approx((0.08 * 2 + 0.22) / 3, abs=0.003)
-    # b is never last: the mean of all b; i was never heard
+    # b is never last: the mean of all b; i is in no recording
     assert mean_s[LAST, b] == pytest.approx(0.0825, abs=0.003)
     assert mean_s[:, i] == pytest.approx(0.1, abs=1e-4)
     assert (spread_s > 0).all()
@@ -431,26 +402,26 @@ def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
     write_corpus(tmp_path / "corpus", [*rows, "bad\tbad.wav\tS\tx\tCC0\ttrain\t1\t你\tni3"], 6)
     lines: list[str] = []
     gmm = tmp_path / "gmm.npz"
-    train_gmm([tmp_path / "corpus"], gmm, num_mixtures=2, report=lines.append)
+    train_gmm([tmp_path / "corpus"], gmm, MANDARIN, num_mixtures=2, report=lines.append)
     assert "1 rows skipped" in lines[-1]
     assert "CC0-1.0" in gmm.with_suffix(".md").read_text()
     again = tmp_path / "again.npz"
-    train_gmm([tmp_path / "corpus"], again, num_mixtures=2, report=lines.append)
+    train_gmm([tmp_path / "corpus"], again, MANDARIN, num_mixtures=2, report=lines.append)
     assert again.read_bytes() == gmm.read_bytes()  # the same seed, the same model
     text = tmp_path / "text.txt"
     text.write_text("欢迎来到口型。\n" * 3, encoding="utf-8")
-    train_language([], [text], tmp_path / "language.npz", report=lines.append)
+    train_phone_lm([], [text], tmp_path / "lm.npz", MANDARIN, report=lines.append)
     train_gmm(
-        [tmp_path / "corpus"], again, language=tmp_path / "language.npz",
+        [tmp_path / "corpus"], again, MANDARIN, phone_lm=tmp_path / "lm.npz",
         num_mixtures=1, report=lines.append,
     )  # fmt: skip
-    welcome = load_language(tmp_path / "language.npz")
-    known = {path: load_model(path).topology.language for path in (gmm, again)}
-    np.testing.assert_array_equal(known[again].unit, welcome.unit)
-    np.testing.assert_array_equal(known[again].log_share, welcome.log_share)
-    assert len(known[gmm].unit) < len(welcome.unit)
+    welcome = load_phone_lm(tmp_path / "lm.npz", MANDARIN)
+    known = {path: load_model(path).topology.phone_lm for path in (gmm, again)}
+    np.testing.assert_array_equal(known[again].phone, welcome.phone)
+    np.testing.assert_array_equal(known[again].log_prob, welcome.log_prob)
+    assert len(known[gmm].phone) < len(welcome.phone)
     with pytest.raises(UserError, match="power of two"):
-        train_gmm([tmp_path / "corpus"], gmm, num_mixtures=3)
+        train_gmm([tmp_path / "corpus"], gmm, MANDARIN, num_mixtures=3)
 
 
 def test_alignment_refuses_what_cannot_be() -> None:
@@ -460,4 +431,4 @@ def test_alignment_refuses_what_cannot_be() -> None:
         align_text(model, sound, 16_000, "。")
     with pytest.raises(UserError, match="too short"):
         align_text(model, sound, 16_000, "你听到的每一个字都由我说出来")
-    assert json.dumps([phone.unit for phone in align_text(model, sound, 16_000, "a1")])
+    assert json.dumps([phone.symbol for phone in align_text(model, sound, 16_000, "a1")])

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.recognizer.vad import BLOCK_SAMPLES, VoiceActivityDetector, VoiceState
+from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector, VoiceState
 from shared.audio_file import read_audio
 
 pytestmark = pytest.mark.unit
@@ -38,15 +38,6 @@ def test_four_states() -> None:
     ending = [detector.accept_probability(0.1) for _ in range(16)]
     assert ending == [STOPPING] * 15 + [QUIET]
     assert [state.is_speech for state in VoiceState] == [False, False, True, True]
-
-
-def test_quieten_ends_speech_at_once() -> None:
-    detector = VoiceActivityDetector()
-    detector.accept_probability(0.9)
-    detector.accept_probability(0.9)
-    detector.quieten()
-    assert detector.state is QUIET
-    assert detector.accept_probability(0.9) is STARTING
 
 
 def test_reset_gives_the_same_again() -> None:

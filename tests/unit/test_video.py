@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from services.driver.video import VideoWriter
+from services.driver.video.writer import VideoWriter
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit

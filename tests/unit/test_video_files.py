@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from services.driver.video import VideoWriter, open_writer, write_picture
+from services.driver.video.writer import VideoWriter, open_writer, write_picture
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.driver.head import Head, neutral_faps
-from services.driver.render import Renderer
-from services.driver.virtual_camera import VirtualCamera
+from services.driver.head.head import Head, neutral_faps
+from services.driver.render.renderer import Renderer
+from services.driver.video.virtual_camera import VirtualCamera
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit

@@ -8,20 +8,27 @@ import numpy as np
 import pytest
 import soundfile
 
-from services.synthesizer.blending import blend
-from services.synthesizer.timeline import build_timeline
-from services.synthesizer.visemes import MOUTH_FAPS, VISEME_INDEX
+from corpora.lip_clips import SAMPLE_RATE_HZ, part_of, read_clips
+from services.synthesizer.lips.dynamic_visemes.blending import blend
+from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.inventory import load_inventory
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
-from training.lip_clips import SAMPLE_RATE_HZ, part_of, read_clips
-from training.viseme_start import starting_parameters
-from training.visemes import closure_reach, estimate, frames_of, train, usual_levels
+from training.visemes.fit import estimate
+from training.visemes.frames import frames_of
+from training.visemes.recipe import closure_reach, train_visemes, usual_levels
 
 pytestmark = pytest.mark.unit
 
-START = starting_parameters()
+INVENTORY = load_inventory()
+
+START = initial_parameters()
 
 
+@pytest.mark.slow
 def test_estimation_finds_what_made_the_curves() -> None:
     phones = utterance(0, 160)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
@@ -29,13 +36,13 @@ def test_estimation_finds_what_made_the_curves() -> None:
     true.target[VISEME_INDEX["i"], JAW] = 150.0  # this speaker's own
     faps = np.full((len(time_s), len(MOUTH_FAPS)), np.nan)
     measured = [JAW, LOWER_LIP, WIDTH]
-    curve = blend(true, build_timeline(phones), time_s)
+    curve = blend(true, build_timeline(phones, INVENTORY), time_s)
     faps[:, measured] = curve[:, measured]
 
-    found = estimate(frames_of([clip_of(time_s, faps)], [phones]))
+    found = estimate(frames_of([clip_of(time_s, faps)], [phones], INVENTORY))
 
-    again = blend(found, build_timeline(phones), time_s)
-    before = blend(START, build_timeline(phones), time_s)
+    again = blend(found, build_timeline(phones, INVENTORY), time_s)
+    before = blend(START, build_timeline(phones, INVENTORY), time_s)
     for column in measured:
         error, start_error = (
             float(np.sqrt(np.mean((each[:, column] - curve[:, column]) ** 2)))
@@ -56,18 +63,20 @@ def test_estimation_finds_what_made_the_curves() -> None:
 def test_short_clips_and_few_measures_are_learnt_from() -> None:
     phones = utterance(0, 2)
     time_s = np.arange(0.0, 1.5, 0.04)
-    curve = blend(replace(START, target=0.5 * START.target), build_timeline(phones), time_s)
+    curve = blend(
+        replace(START, target=0.5 * START.target), build_timeline(phones, INVENTORY), time_s
+    )
     faps = np.full_like(curve, np.nan)
     faps[:, LOWER_LIP] = curve[:, LOWER_LIP]
     clip = clip_of(time_s, faps)
-    frames = frames_of([clip, clip], [phones, []])  # nothing was heard in one of them
+    frames = frames_of([clip, clip], [phones, []], INVENTORY)  # one of them has no speech
     assert len(frames.faps) == len(time_s)
     found = estimate(frames)
-    vowel = VISEME_INDEX[phones[1].unit]
+    vowel = VISEME_INDEX[phones[1].symbol]
     assert abs(found.target[vowel, LOWER_LIP]) < 0.8 * abs(START.target[vowel, LOWER_LIP])
     np.testing.assert_array_equal(found.target[:, JAW], START.target[:, JAW])
-    with pytest.raises(UserError, match="no speech"):
-        frames_of([clip], [[]])
+    with pytest.raises(UserError, match="have no speech"):
+        frames_of([clip], [[]], INVENTORY)
 
 
 def test_usual_levels_tell_vowels_from_consonants() -> None:
@@ -78,19 +87,21 @@ def test_usual_levels_tell_vowels_from_consonants() -> None:
     for phone in phones:
         first = round(phone.onset_s * SAMPLE_RATE_HZ)
         last = first + round(phone.duration_s * SAMPLE_RATE_HZ)
-        samples[first:last] = noise[first:last] * (1.0 if phone.unit in "aiu" else 0.2)
+        samples[first:last] = noise[first:last] * (1.0 if phone.symbol in "aiu" else 0.2)
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    found = usual_levels([clip], [phones])
+    found = usual_levels([clip], [phones], INVENTORY)
     assert 8.0 < found[VISEME_INDEX["a"]] - found[VISEME_INDEX["g"]] < 18.0
-    assert found[VISEME_INDEX["er"]] == START.level_db[VISEME_INDEX["er"]]  # never said
+    assert found[VISEME_INDEX["er"]] == START.level_db[VISEME_INDEX["er"]]  # in no recording
 
 
 def test_closures_are_as_long_as_the_lips_are_shut() -> None:
     phones = utterance(3, 80)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.02)
     for reach_s in (0.05, 0.1):
-        curve = blend(replace(START, closure_reach_s=reach_s), build_timeline(phones), time_s)
-        assert closure_reach(START, [clip_of(time_s, curve)], [phones]) == reach_s
+        curve = blend(
+            replace(START, closure_reach_s=reach_s), build_timeline(phones, INVENTORY), time_s
+        )
+        assert closure_reach(START, [clip_of(time_s, curve)], [phones], INVENTORY) == reach_s
 
 
 def write_clip(
@@ -155,7 +166,7 @@ def test_a_rule_says_what_clips_are_for(tmp_path: Path) -> None:
         write_clip(tmp_path, name, "zh", header, row, licence="academic use only")
     assert "train" not in {clip.part for clip in read_clips(tmp_path)}
     with pytest.raises(UserError, match="--any-licence"):
-        train(tmp_path, tmp_path / "out.json")
+        train_visemes(tmp_path, tmp_path / "out.json")
     clips = read_clips(tmp_path, any_licence=True)
     assert {clip.name: clip.part for clip in clips} == {
         name: part for name, part in zip(names, free, strict=True) if name in names[:12]
@@ -164,4 +175,4 @@ def test_a_rule_says_what_clips_are_for(tmp_path: Path) -> None:
 
 def test_folders_without_clips_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no Mandarin clips"):
-        train(tmp_path, tmp_path / "out.json")
+        train_visemes(tmp_path, tmp_path / "out.json")

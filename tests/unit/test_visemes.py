@@ -1,75 +1,125 @@
-"""Units to visemes: table 1 of Li et al. 2011."""
+"""Phones to visemes: table 1 of Li et al. 2011."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from services.synthesizer.parameters import load_parameters
-from services.synthesizer.visemes import (
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
-    MOUTH_FAPS,
     REST,
-    SHAPES,
     VISEME_INDEX,
     VISEMES,
-    shapes_of,
+    check_visemes,
     static_targets,
+    visemes_of,
 )
-from shared.faps import NUM_FAPS
-from shared.phones import INITIALS, SILENCE, UNITS
+from services.synthesizer.offline import synthesize
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from shared.phones.events import Phone
+from shared.phones.inventory import PhoneInventory, load_inventory
 from tests import heads
 
 pytestmark = pytest.mark.unit
 
-
-def test_every_unit_has_shapes_that_fill_it() -> None:
-    assert set(SHAPES) == set(UNITS)
-    for unit in UNITS:
-        shapes = shapes_of(unit, None)
-        assert all(shape in VISEME_INDEX for shape, _ in shapes)
-        assert sum(share for _, share in shapes) == pytest.approx(1.0)
-        assert len(shapes) <= 2
+INVENTORY = load_inventory()
+REST_ALL = ((REST, 1.0),)
 
 
-def test_every_unit_moves_the_face_by_a_millimetre_or_is_silence() -> None:
+def visemes(phone: str, next_phone: str | None) -> tuple[tuple[str, float], ...]:
+    return visemes_of(phone, next_phone, INVENTORY)
+
+
+def test_every_phone_has_visemes_that_fill_it() -> None:
+    for phone in INVENTORY.phones:
+        shares = visemes(phone, None)
+        assert all(viseme in VISEME_INDEX for viseme, _ in shares)
+        assert sum(share for _, share in shares) == pytest.approx(1.0)
+        assert len(shares) <= 2
+
+
+def test_a_language_with_other_visemes_is_refused() -> None:
+    check_visemes(INVENTORY)
+    for change in (
+        {"visemes": {**INVENTORY.visemes, "a": (("th", 1.0),)}},
+        {"before_rounded": {"d": "th"}},
+    ):
+        with pytest.raises(UserError, match="visemes th; known: rest, b"):
+            check_visemes(replace(INVENTORY, **change))
+
+
+def test_another_language_moves_the_same_lips() -> None:
+    syllables = PhoneInventory(
+        language="toy",
+        phones=("ta", "pu", "hush"),
+        kinds=("vowel", "vowel", "silence"),
+        visemes={"ta": (("d", 0.3), ("a", 0.7)), "pu": (("b", 0.5), ("u", 0.5)), "hush": REST_ALL},
+        before_rounded={},
+        pronounce=lambda _text: [],
+    )
+    spoken = [
+        Phone(
+            index=index,
+            symbol=symbol,
+            onset_s=0.4 * index,
+            duration_s=0.4,
+            confidence=1.0,
+            final=True,
+        )
+        for index, symbol in enumerate(("ta", "pu", "hush"))
+    ]
+    lips = DynamicVisemes(load_parameters(), syllables)
+    faps = synthesize(lips, spoken, 80)
+    jaw, protrusion = faps[:, 2], faps[:, 16]
+    assert jaw[:20].max() > 200.0
+    assert np.abs(faps[23:27, [3, 4]]).max(axis=1).min() < 12.0  # lips shut
+    assert protrusion[28:40].max() > protrusion[:20].max() + 50.0
+    assert not faps[-1].round(1).any()
+
+
+def test_every_phone_moves_the_face_by_a_millimetre_or_is_silence() -> None:
     head, target = heads.load("woman"), load_parameters().target
     skin = head.part("skin").vertices
 
-    def moved_mm(shape: str) -> float:
+    def moved_mm(viseme: str) -> float:
         faps = np.zeros(NUM_FAPS, dtype=np.float32)
-        faps[np.array(MOUTH_FAPS) - 1] = target[VISEME_INDEX[shape]]
+        faps[np.array(MOUTH_FAPS) - 1] = target[VISEME_INDEX[viseme]]
         return 1e3 * float(np.linalg.norm((head.deform(faps) - head.vertices)[skin], axis=1).max())
 
-    by_shape = {shape: moved_mm(shape) for shape in VISEMES}
-    for unit in UNITS:
-        moves = max(by_shape[shape] for shape, _ in SHAPES[unit])
-        assert moves == 0.0 if unit == SILENCE else moves > 1.0, unit
+    by_viseme = {viseme: moved_mm(viseme) for viseme in VISEMES}
+    for phone in INVENTORY.phones:
+        moves = max(by_viseme[viseme] for viseme, _ in INVENTORY.visemes[phone])
+        assert moves == 0.0 if phone == INVENTORY.silence else moves > 1.0, phone
 
 
 @pytest.mark.parametrize(
     "group", ["b p m", "f", "d t n", "l", "g k h", "j q x", "zh ch sh r", "z c s"]
 )
 def test_initials_of_a_group_look_alike(group: str) -> None:
-    assert len({shapes_of(unit, "a") for unit in group.split()}) == 1
+    assert len({visemes(phone, "a") for phone in group.split()}) == 1
 
 
 def test_groups_of_initials_differ() -> None:
-    assert len({shapes_of(unit, "a") for unit in INITIALS}) == 8
+    assert len({visemes(phone, "a") for phone in INVENTORY.initials}) == 8
 
 
 @pytest.mark.parametrize(
-    ("unit", "shapes"),
+    ("phone", "split"),
     [("iao", "i ao"), ("uai", "u ai"), ("iong", "v u"), ("ang", "a"), ("eng", "e"), ("vn", "v ei")],
 )
-def test_compound_finals_are_split(unit: str, shapes: str) -> None:
-    assert [shape for shape, _ in shapes_of(unit, None)] == shapes.split()
+def test_compound_finals_are_split(phone: str, split: str) -> None:
+    assert [viseme for viseme, _ in visemes(phone, None)] == split.split()
 
 
 def test_initials_round_before_rounded_finals_only() -> None:
-    assert shapes_of("d", "u") == shapes_of("t", "uan") == (("d_rounded", 1.0),)
-    assert shapes_of("j", "van") == (("j_rounded", 1.0),)
-    assert shapes_of("d", "i") == shapes_of("d", None) == (("d", 1.0),)
-    assert shapes_of("b", "u") == (("b", 1.0),)  # closed lips have one shape
-    assert shapes_of("a", "u") == (("a", 1.0),)
+    assert visemes("d", "u") == visemes("t", "uan") == (("d_rounded", 1.0),)
+    assert visemes("j", "van") == (("j_rounded", 1.0),)
+    assert visemes("d", "i") == visemes("d", None) == (("d", 1.0),)
+    assert visemes("b", "u") == (("b", 1.0),)  # closed lips have one shape
+    assert visemes("a", "u") == (("a", 1.0),)
 
 
 def test_targets_close_the_lips_for_labials_and_open_them_for_vowels() -> None:

@@ -1,4 +1,4 @@
-"""The window on a display of its own (Xvfb): drawn, resized, closed, and what its title says."""
+"""The window on a display of its own (Xvfb): drawn, resized, closed; its title, its keys."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from tests.system import ONE_THREAD, ROOT
 
-pytestmark = pytest.mark.unit
+pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,7 @@ def display() -> Iterator[str]:
         server.wait()
 
 
-@pytest.mark.parametrize("check", ["size_and_close", "lost_stream"])
+@pytest.mark.parametrize("check", ["size_and_close", "lost_stream", "switch"])
 def test_on_a_display(display: str, check: str) -> None:
     environment = {**os.environ, **ONE_THREAD, "DISPLAY": display}
     environment.pop("WAYLAND_DISPLAY", None)

@@ -1,4 +1,4 @@
-// The head: a GLB whose morph targets and joints are named by FAPs (services/driver/glb.py).
+// The head: a GLB whose morph targets and joints are named by FAPs (services/driver/head/glb_export.py).
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
@@ -11,7 +11,7 @@ const SLOW_MS = 45; // for a picture
 const PAUSE_MS = 1000; // without a change, which is no slowness
 const JUDGE_EVERY_MS = 1500;
 const COARSER = 0.5;
-const LEAST_PIXEL_RATIO = 0.6;
+const MIN_PIXEL_RATIO = 0.6;
 const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
@@ -101,8 +101,8 @@ export class Head {
     if (intervalMs < PAUSE_MS) this.frameMs += 0.1 * (intervalMs - this.frameMs);
     if (nowMs - this.#judgedMs > JUDGE_EVERY_MS) {
       this.#judgedMs = nowMs;
-      if (this.frameMs > SLOW_MS && this.#pixelRatio > LEAST_PIXEL_RATIO) {
-        this.#pixelRatio = Math.max(LEAST_PIXEL_RATIO, COARSER * this.#pixelRatio);
+      if (this.frameMs > SLOW_MS && this.#pixelRatio > MIN_PIXEL_RATIO) {
+        this.#pixelRatio = Math.max(MIN_PIXEL_RATIO, COARSER * this.#pixelRatio);
         this.#resize();
       }
     }

@@ -1,9 +1,7 @@
 // The WebSocket to the gateway that brings everything to be seen and heard; proto/GATEWAY.md.
 
-const FAP_TYPE = 1;
-const SOUND_TYPE = 2;
-const HEADER_BYTES = 16;
-export const NUM_FAPS = 68;
+import { readMessage } from "./messages.js";
+
 const RETRY_MS = [300, 5000];
 
 export function socketUrl(path) {
@@ -34,13 +32,13 @@ export class Link {
     this.#send({ follow: session });
   }
 
-  /** Have the gateway speak the sample sentence, and look at it. */
-  play(what) {
-    this.#send({ play: what });
+  /** Have the gateway speak the sample sentence, and look at it; lips: the lip model, or null. */
+  play(what, lips) {
+    this.#send(lips === null ? { play: what } : { play: what, lips });
   }
 
-  #send(wish) {
-    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(wish));
+  #send(command) {
+    if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
   }
 
   #connect() {
@@ -65,15 +63,8 @@ export class Link {
       this.#handlers.text(JSON.parse(data));
       return;
     }
-    const header = new DataView(data);
-    const mediaTime = header.getFloat64(8, true);
-    switch (header.getUint8(0)) {
-      case FAP_TYPE:
-        this.#handlers.fap(mediaTime, new Float32Array(data, HEADER_BYTES, NUM_FAPS));
-        break;
-      case SOUND_TYPE:
-        this.#handlers.sound(mediaTime, new Int16Array(data, HEADER_BYTES));
-        break;
-    }
+    const message = readMessage(data);
+    if (message?.faps) this.#handlers.fap(message.mediaTime, message.faps);
+    else if (message?.samples) this.#handlers.sound(message.mediaTime, message.samples);
   }
 }

@@ -1,24 +1,25 @@
 // Puts the page together: what arrives, when it is due, and what the buttons do.
 
 import { Head } from "./head.js";
-import { Link, NUM_FAPS } from "./link.js";
+import { LevelMeter, SILENT_DB } from "./level.js";
+import { Link } from "./link.js";
+import { NUM_FAPS } from "./messages.js";
 import { Microphone } from "./microphone.js";
+import { PhoneTrack } from "./phones.js";
 import { FapTrack, Playout } from "./playout.js";
+import { Presence } from "./presence.js";
 import { Sound } from "./sound.js";
+import { missingHint, stateKind, stateText } from "./status.js";
 
-const STALL_MS = 500; // without frames the face goes to rest
-const REST_MS = 80; // time constant of going there and coming back
-const NUM_PAST = 8; // phones shown beside the current one
-const MAX_PHONES = 100;
-const MAX_LOUDNESS = 500; // chunks
-const STALE = 8 * 16000; // samples after which the last phone is no longer shown
-const SILENCE = "sil";
 const LABEL_EVERY_MS = 250;
 const ERROR_MS = 8000; // for which an error stays to be read
 
 const element = (id) => document.getElementById(id);
 const playout = new Playout();
 const track = new FapTrack();
+const phones = new PhoneTrack();
+const meter = new LevelMeter();
+const presence = new Presence();
 const sound = new Sound(onSoundState);
 let head = null; // until it is loaded
 
@@ -26,12 +27,8 @@ let connected = false;
 let session = null; // the one we look at
 let missing = []; // services that do not run
 let ownSession = null; // the one our microphone feeds
-let phones = []; // { index, unit, mediaTime }, by index
-let arrivedMs = -Infinity; // when the newest frame came
+let lips = null; // the lip model that was chosen here
 let numFrames = 0;
-let presence = 0; // 1: the face is the stream's, 0: at rest
-let loudness = []; // { mediaTime, level } of the sound that is still to be heard
-let level = 0; // as the meter shows it
 const faps = new Float32Array(NUM_FAPS);
 
 /** What the page knows, for whoever embeds or tests it: see proto/GATEWAY.md. */
@@ -51,6 +48,7 @@ window.kouxing = {
       soundSamplesPlayed: sound.numPlayed,
       soundMinusPictureMs: heardMs === null ? null : heardMs - playout.offsetMs,
       microphone: element("microphone").getAttribute("aria-pressed") === "true",
+      lips,
       phone: element("phone").value,
     };
   },
@@ -61,8 +59,8 @@ window.kouxing = {
 function forget() {
   playout.reset();
   track.reset();
-  phones = [];
-  loudness = [];
+  phones.reset();
+  meter.reset();
 }
 
 const link = new Link(new URLSearchParams(location.search).get("session") ?? "", {
@@ -75,7 +73,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     const nowMs = performance.now();
     const offsetMs = playout.offsetMs;
     if (track.push(mediaTime, values)) playout.frameArrived(nowMs, mediaTime);
-    arrivedMs = nowMs;
+    presence.frameArrived(nowMs);
     numFrames++;
     if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
   },
@@ -85,8 +83,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     playout.soundArrived(nowMs, mediaTime, samples.length);
     if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
     sound.push(mediaTime, samples);
-    loudness.push({ mediaTime, level: rms(samples) });
-    if (loudness.length > MAX_LOUDNESS) loudness.shift();
+    meter.push(mediaTime, samples);
   },
   text(message) {
     switch (message.type) {
@@ -101,7 +98,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
         showState();
         break;
       case "phone":
-        hear(message);
+        phones.accept(message);
         break;
       case "error":
         showError(message.text);
@@ -110,32 +107,13 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
   },
 });
 
-function hear({ index, unit, media_time: mediaTime, duration }) {
-  const phone = { index, unit, mediaTime, end: mediaTime + duration };
-  const known = phones.findIndex((other) => other.index === index);
-  if (known >= 0) phones[known] = phone;
-  else phones.push(phone);
-  if (phones.length > MAX_PHONES) phones.shift();
-}
-
-function rms(samples) {
-  let squares = 0;
-  for (const sample of samples) squares += sample * sample;
-  return Math.sqrt(squares / samples.length) / 32768;
-}
-
 // --- every display frame -------------------------------------------------------------------------
 
 const wanted = new Float32Array(NUM_FAPS);
-let drawnMs = performance.now();
 let labelledMs = 0;
 
 function draw(nowMs) {
   requestAnimationFrame(draw);
-  const elapsedMs = nowMs - drawnMs;
-  drawnMs = nowMs;
-  // While this page was busy nothing could arrive, which is no stall of the stream.
-  if (elapsedMs > STALL_MS / 2) arrivedMs = Math.min(nowMs, arrivedMs + elapsedMs);
   playout.displayFrameMs = Math.min(100, head?.frameMs ?? playout.displayFrameMs);
   playout.outputLatencyMs = sound.outputLatencyMs;
   const heardMs = sound.offsetMs(nowMs);
@@ -143,11 +121,8 @@ function draw(nowMs) {
   if (playout.adjust(nowMs)) sound.align(nowMs, playout.offsetMs);
 
   const mediaTime = playout.mediaAt(nowMs);
-  const isThere = mediaTime !== null && track.sample(mediaTime, wanted);
-  const isLive = isThere && nowMs - arrivedMs < STALL_MS;
-  presence += ((isLive ? 1 : 0) - presence) * (1 - Math.exp(-elapsedMs / REST_MS));
-  if (Math.abs(presence - isLive) < 0.001) presence = isLive ? 1 : 0;
-  if (settle()) head?.pose(faps);
+  const hasFace = mediaTime !== null && track.sample(mediaTime, wanted);
+  if (scaleFace(presence.update(nowMs, hasFace))) head?.pose(faps);
   head?.draw(nowMs);
 
   showLevel(mediaTime);
@@ -158,11 +133,11 @@ function draw(nowMs) {
   }
 }
 
-/** Bring the face to what is wanted; return whether it changed. */
-function settle() {
+/** Set the face to a share of what is wanted; return whether it changed. */
+function scaleFace(share) {
   let changed = false;
   for (let i = 0; i < NUM_FAPS; i++) {
-    const value = Math.fround(presence * wanted[i]);
+    const value = Math.fround(share * wanted[i]);
     changed ||= value !== faps[i];
     faps[i] = value;
   }
@@ -173,25 +148,13 @@ function settle() {
 
 function showState() {
   const nowMs = performance.now();
-  const isLive = connected && nowMs - arrivedMs < STALL_MS;
-  element("status").dataset.state = !connected ? "lost" : isLive ? "live" : "waiting";
-  let text = "live 直播";
-  if (!connected) text = "connecting … 连接中";
-  else if (session === null) text = "waiting for speech 等待语音";
-  else if (!isLive) text = "paused 暂停";
-  if (isLive && session !== null) {
-    const ageMs = microphone.ageMs(nowMs, playout.mediaAt(nowMs));
-    const delayMs = ageMs ?? playout.delayMs;
-    if (delayMs !== null) text += ` · ${Math.round(delayMs / 5) * 5} ms`;
-  }
+  const isLive = connected && presence.isLive(nowMs);
+  const delayMs = microphone.ageMs(nowMs, playout.mediaAt(nowMs)) ?? playout.delayMs;
+  element("status").dataset.state = stateKind({ connected, isLive });
+  const text = stateText({ connected, session, isLive, delayMs });
   setText(element("status").lastElementChild, text);
   element("status").title = session === null ? "" : `session ${session}`;
-  if (errorTimer === null) {
-    const isControl = missing[0] === "control";
-    const start = isControl ? "kouxing run" : missing.map((name) => `kouxing ${name}`).join("; ");
-    const hint = `no ${missing.join(", no ")} is running; start: ${start}`;
-    showNotice(connected && missing.length > 0 ? hint : "", "hint");
-  }
+  if (errorTimer === null) showNotice(connected ? missingHint(missing) : "", "hint");
 }
 
 let errorTimer = null;
@@ -213,14 +176,8 @@ function showNotice(text, kind) {
 }
 
 function showPhones(mediaTime) {
-  let current = phones.length - 1;
-  while (current >= 0 && phones[current].mediaTime > mediaTime) current--;
-  const phone = phones[current];
-  const isOver = phone === undefined || phone.unit === SILENCE || mediaTime > phone.end + STALE;
-  setText(element("phone"), isOver ? "" : phone.unit);
-  const past = phones
-    .slice(Math.max(0, current - NUM_PAST), isOver ? current + 1 : Math.max(0, current))
-    .map(({ unit }) => (unit === SILENCE ? "·" : unit));
+  const { current, past } = phones.at(mediaTime);
+  setText(element("phone"), current);
   const key = past.join(" ");
   if (element("past").dataset.key !== key) {
     element("past").dataset.key = key;
@@ -235,14 +192,11 @@ function listItem(text) {
 }
 
 function showLevel(mediaTime) {
-  while (mediaTime !== null && loudness[0]?.mediaTime <= mediaTime) {
-    const heard = loudness.shift();
-    if (ownSession === null) level = Math.max(level, heard.level);
-  }
-  const db = Math.max(-60, 20 * Math.log10(level + 1e-6));
-  element("meter").firstElementChild.style.transform = `scaleX(${(1 + db / 60).toFixed(3)})`;
+  // One's own voice is shown as it is recorded, not once more as it comes back.
+  if (mediaTime !== null) meter.advance(mediaTime, ownSession === null);
+  const db = meter.decibels();
+  element("meter").firstElementChild.style.transform = `scaleX(${(1 - db / SILENT_DB).toFixed(3)})`;
   element("meter").setAttribute("aria-valuenow", Math.round(db));
-  level *= 0.9;
 }
 
 function setText(target, text) {
@@ -278,7 +232,7 @@ const microphone = new Microphone({
     }
   },
   level(value) {
-    level = Math.max(level, value);
+    meter.raise(value);
   },
   session(name) {
     ownSession = name;
@@ -292,8 +246,14 @@ const microphone = new Microphone({
 });
 
 element("sample").onclick = () => {
-  link.play("sample");
+  link.play("sample", lips);
   if (sound.state === "blocked") sound.turnOn();
+};
+
+element("lips").onclick = () => {
+  lips = lips === "learnt" ? "dynamic-visemes" : "learnt";
+  element("lips").setAttribute("aria-pressed", lips === "learnt");
+  microphone.chooseLips(lips);
 };
 
 element("microphone").onclick = () => {

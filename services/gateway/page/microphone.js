@@ -1,16 +1,17 @@
 // The browser's microphone as a session's audio.
 
 import { socketUrl } from "./link.js";
+import { Uplink } from "./uplink.js";
 
 const MAX_RATE_HZ = 48000;
-const MAX_BUFFERED_BYTES = 1 << 18; // a network slower than speech must not be felt for ever
 
 export class Microphone {
   #handlers;
   #socket = null;
   #stream = null;
   #context = null;
-  #firstMs = null; // page's clock at media time 0
+  #uplink = null; // while it streams
+  #lips = null; // the lip model that was chosen
 
   /**
    * @param handlers { state("off" | "starting" | "on"), level(rms), session(name),
@@ -26,7 +27,13 @@ export class Microphone {
 
   /** How long ago media time m was spoken, ms; null if this is not our session. */
   ageMs(nowMs, mediaTime) {
-    return this.#firstMs === null ? null : nowMs - this.#firstMs - mediaTime / 16;
+    return this.#uplink?.ageMs(nowMs, mediaTime) ?? null;
+  }
+
+  /** Let another lip model move the mouth, now and in later sessions. */
+  chooseLips(name) {
+    this.#lips = name;
+    if (this.#uplink) this.#socket.send(JSON.stringify({ lips: name }));
   }
 
   async start() {
@@ -90,19 +97,12 @@ export class Microphone {
       channelCount: 1,
       channelCountMode: "explicit",
     });
-    let numSent = 0;
+    const uplink = new Uplink(socket, this.#context.sampleRate);
+    this.#uplink = uplink;
+    if (this.#lips !== null) this.chooseLips(this.#lips);
     node.port.onmessage = ({ data: { chunk, rms } }) => {
       this.#handlers.level(rms);
-      if (socket.readyState !== WebSocket.OPEN) return;
-      if (socket.bufferedAmount > MAX_BUFFERED_BYTES) {
-        this.#firstMs = null; // what is left out here moves media time
-        return;
-      }
-      socket.send(chunk.buffer);
-      numSent += chunk.length;
-      // The least difference seen is the truest: a chunk can be handed over late, never early.
-      const firstMs = performance.now() - (1000 * numSent) / this.#context.sampleRate;
-      this.#firstMs = Math.min(this.#firstMs ?? Infinity, firstMs);
+      uplink.send(performance.now(), chunk);
     };
     this.#context.createMediaStreamSource(this.#stream).connect(node);
     this.#context.resume();
@@ -116,7 +116,7 @@ export class Microphone {
   #release() {
     for (const track of this.#stream?.getTracks() ?? []) track.stop();
     this.#context?.close();
-    this.#socket = this.#stream = this.#context = this.#firstMs = null;
+    this.#socket = this.#stream = this.#context = this.#uplink = null;
     this.#handlers.level(0);
     this.#handlers.state("off");
   }

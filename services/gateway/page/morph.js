@@ -13,7 +13,7 @@ export class MorphedMesh {
   #normal;
   #restPosition;
   #restNormal;
-  #corners; // of the triangles that can turn: three offsets into the positions each
+  #corners; // three offsets into the positions for each triangle that can turn
   #turning; // offsets of the normals that can turn
   #sums; // the triangles' normals summed up at every vertex
   #restSums;

@@ -7,9 +7,9 @@ const DEAD_ZONE_MS = 30;
 const ADJUST_EVERY_MS = 500;
 const WINDOW_MS = 10000; // that the percentiles are taken over: a single hiccup must not count
 const ENOUGH = 20; // frames before the percentile is believed
-const JUMP_MS = 300; // a stream that is later, or earlier, by this: begin anew
+const JUMP_MS = 300; // a stream that is later, or earlier, by this: start again
 const SURE_MS = 100; // for which it must be late; less than the delay, so that no sound is lost
-const MAX_BEHIND_MS = 3000; // media time that leaps ahead by this: begin anew at once
+const MAX_BEHIND_MS = 3000; // media time that leaps ahead by this: start again at once
 const MAX_FRAMES = 1000;
 
 /** Lateness (arrival - media time, ms) over the last seconds. */
@@ -52,7 +52,7 @@ class Lateness {
  */
 export class Playout {
   displayFrameMs = 1000 / 60;
-  outputLatencyMs = 0; // of the loudspeaker; sound must leave that much earlier
+  outputLatencyMs = 0; // from the audio thread to the loudspeaker; sound must leave so much earlier
   #offsetMs = null;
   #begunMs = 0; // when the first offset was set
   #adjustedMs = 0;
@@ -140,7 +140,7 @@ export class Playout {
   }
 
   /**
-   * Begin anew if the sender paused, or media time leapt ahead. What was held up on the way, or by
+   * Start again if the sender paused, or media time leapt ahead. What was held up on the way, or by
    * this page being busy, comes in one burst whose end is on time again: that is no pause.
    */
   #resyncIfFar(nowMs, latenessMs) {

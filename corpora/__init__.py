@@ -1,0 +1,1 @@
+"""Corpora, error counts and pictures: what training and evaluation share."""

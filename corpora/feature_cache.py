@@ -1,0 +1,175 @@
+"""Log-mel features and samples of corpora, kept on disk so that a second run starts at once.
+
+One file per corpus and kind, of 16-bit floats or integers, in the user's cache folder
+(``$XDG_CACHE_HOME/kouxing`` or ``~/.cache/kouxing``). It is memory-mapped, so it may be larger than
+the memory. Deleting it is always safe.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import soundfile
+from numpy.typing import NDArray
+from rich.progress import track
+
+from corpora.speech_corpus import RowErrors, Utterance
+from services.recognizer.front_end.features import NUM_BANDS, LogMel
+from services.recognizer.front_end.resample import to_16_khz
+
+_FORMAT = "3"  # raise when the front end's log-mel stage changes
+_FULL_SCALE = 32768.0  # samples are kept as 16-bit sound files keep them
+
+
+def cache_folder() -> Path:
+    """Return the cache folder, which holds nothing that cannot be computed again."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "kouxing"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def read_audio(path: Path) -> NDArray[np.float32]:
+    """Read a recording as 16 kHz mono.
+
+    Raises
+    ------
+    ValueError
+        If the file is no audio that libsndfile reads.
+    """
+    try:
+        samples, rate_hz = soundfile.read(path, dtype="float32", always_2d=True)
+    except (soundfile.LibsndfileError, OSError) as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+    return to_16_khz(samples, rate_hz)
+
+
+def log_mel_of(
+    utterances: Sequence[Utterance], errors: RowErrors
+) -> list[NDArray[np.float16] | None]:
+    """Log-mel features of every utterance, from the cache or computed.
+
+    Returns
+    -------
+    list
+        Shape (frames, 41) each; None where the audio cannot be read (noted in ``errors``).
+    """
+    out: list[NDArray[np.float16] | None] = []
+    none = np.empty((0, 1 + NUM_BANDS), dtype=np.float16)
+    for utterance, block in zip(
+        utterances, _cached(utterances, "log_mel", none, _log_mel), strict=True
+    ):
+        if len(block) == 0:
+            errors.add(utterance.utterance_id, f"no audio in {utterance.path}")
+        out.append(block if len(block) else None)
+    return out
+
+
+def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
+    """Return the samples of every utterance, 16 kHz; none where the audio cannot be read."""
+    return _cached(utterances, "samples", np.empty(0, dtype=np.int16), _as_integers)
+
+
+def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
+    """Convert cached samples to floats in [-1, 1]."""
+    return samples.astype(np.float32) / np.float32(_FULL_SCALE)
+
+
+def _log_mel(samples: NDArray[np.float32]) -> NDArray[np.float16]:
+    return LogMel().accept_waveform(samples).astype(np.float16)
+
+
+def _as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
+    whole = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
+    integers: NDArray[np.int16] = whole.astype(np.int16)
+    return integers
+
+
+def _cached(
+    utterances: Sequence[Utterance],
+    kind: str,
+    none: NDArray[Any],
+    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+) -> list[NDArray[Any]]:
+    """Blocks of every utterance, from the cache or computed.
+
+    Parameters
+    ----------
+    utterances
+        Recordings; the cache knows them by path, size and time.
+    kind
+        Part of the file's name: one file per kind of block.
+    none
+        A block without rows, for a recording that cannot be read.
+    block_of
+        Computes a block from the samples at 16 kHz, shape (n,).
+
+    Returns
+    -------
+    list
+        A memory-mapped block per utterance, its rows as those of ``none``.
+    """
+    if not utterances:
+        return []
+    key = hashlib.sha256(_FORMAT.encode())
+    for utterance in utterances:
+        state = utterance.path.stat()
+        key.update(f"{utterance.path}|{state.st_size}|{state.st_mtime_ns}\n".encode())
+    stem = cache_folder() / f"{kind}_{key.hexdigest()[:20]}"
+    rows, bounds = stem.with_suffix(".npy"), stem.with_suffix(".bounds.npy")
+    if not (rows.is_file() and bounds.is_file()):
+        _write(rows, bounds, utterances, none, block_of)
+    ends = np.load(bounds, allow_pickle=False)
+    starts = np.concatenate([[0], ends[:-1]])
+    if not ends[-1]:
+        return [none] * len(ends)
+    kept = np.load(rows, mmap_mode="r", allow_pickle=False)
+    return [kept[start:end] for start, end in zip(starts, ends, strict=True)]
+
+
+def _write(
+    rows: Path,
+    bounds: Path,
+    utterances: Sequence[Utterance],
+    none: NDArray[Any],
+    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+) -> None:
+    """Write all blocks one after the other, and the row where each ends."""
+    ends = []
+    num_rows = 0
+    with rows.open("wb") as file:
+        _write_header(file, none, 0)  # numpy pads it, so that any number of rows fits later
+        for utterance in track(utterances, description=rows.stem.rpartition("_")[0]):
+            block = _computed(utterance, none, block_of)
+            file.write(np.ascontiguousarray(block).tobytes())
+            num_rows += len(block)
+            ends.append(num_rows)
+        file.seek(0)
+        _write_header(file, none, num_rows)
+    np.save(bounds, np.array(ends, dtype=np.int64))
+
+
+def _write_header(file: BinaryIO, none: NDArray[Any], num_rows: int) -> None:
+    header = {
+        "descr": np.lib.format.dtype_to_descr(none.dtype),
+        "fortran_order": False,
+        "shape": (num_rows, *none.shape[1:]),
+    }
+    np.lib.format.write_array_header_1_0(file, header)
+
+
+def _computed(
+    utterance: Utterance,
+    none: NDArray[Any],
+    block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
+) -> NDArray[Any]:
+    try:
+        samples = read_audio(utterance.path)
+    except ValueError:
+        return none
+    return block_of(samples)

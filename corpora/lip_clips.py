@@ -1,0 +1,230 @@
+"""Clips of real lips with their sound: tracked video, or an animator's rig.
+
+A folder of clips holds for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame
+with ``t`` in seconds) and ``<clip>.json`` (licence, speaker, language, transcript). Columns are
+FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig
+(``mouth_stretch_c``). A clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
+
+Every clip serves one purpose only: to learn parameters from (``train``), to choose settings with
+(``choice``), or to score with (``held``). The rule `part_of` decides, so that nobody picks clips;
+``held.txt`` in the folder names further clips and speakers to hold out.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.feature_cache import read_audio
+from corpora.speech_corpus import may_ship
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.alignment import align_text
+from services.recognizer.front_end.pcm import level_db
+from services.recognizer.offline import recognize
+from services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, columns
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import Phone
+
+Array = NDArray[np.float64]
+
+SAMPLE_RATE_HZ = 16_000
+LEVEL_STEP_S = 0.02
+_OUT_OF_SYNC_GRADES = ("C",)  # the sound was recorded or processed apart from the picture
+
+# Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
+# name of MakeHuman's face (CC0), left and right of a pair together. The rig's jaw opens wider than
+# a speaker's, so it is scaled: its continuous clip opens as far as filmed speakers do. Its pursed
+# lips are scaled to half a centimetre. Real pursed lips nearly touch, those of the shapes do not:
+# their lip heights are those of the filmed speakers' u. The jaw's swing backwards is left to the
+# head.
+_RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
+_JAW_SCALE = 0.6
+_DEPTH_SCALE = 0.6
+_DEPTH_FAPS = (16, 17)
+_RIG_DELAY_S = 0.04  # by which its lips lag behind those of filmed speakers
+_RIG = {
+    "mouth_stretch_c": [
+        _JAW_SCALE * value
+        for value in (1021, -47, -1995, -41, 153, -1649, -739, 0, 0, 129, -1884, -50, 276, -1438,
+                      -716)
+    ],
+    "mouth_lowerLipDepress": [-58, 0, -222, 3, 0, -264, -53, 70, 0, 0, -188, 3, 0, -206, -23],
+    "mouth_upperLipRaise": [0, -294, 0, -9, -311, 12, 76, 0, 24, -222, 0, -9, -270, 18, 82],
+    "mouth_press": [24, -46, 188, 146, -141, 158, 270, 0, 24, 24, 246, 135, -35, 258, 288],
+    "mouth_suck_d": [-65, 0, 188, 2, 0, 59, -41, -270, 0, 0, 317, -2, 0, 153, 0],
+    "mouth_suck_u": [0, 70, 0, 9, 29, 0, 35, 0, -563, 434, 0, 2, 311, 0, 6],
+    "mouth_pucker": [0, 60, 250, -130, 40, 190, 6, 511, 481, -106, 200, -125, -94, 140, -18],
+    "mouth_funnel": [0, -100, -250, -70, 40, -100, -18, 293, 581, -150, -100, -86, -12, 20, 0],
+    "mouth_oo_c": [0, 60, 250, -140, 40, 190, 6, 511, 481, -106, 200, -135, -94, 140, -18],
+    "mouth_oh_c": [0, 60, 250, -130, 40, 190, 0, 450, 500, -100, 200, -120, -70, 140, -14],
+    "mouth_lipStretch": [0, 12, -46, 121, 65, -77, -147, 0, 36, 46, -24, 121, 94, -41, -158],
+    "mouth_lipCornerPull": [0, -188, 352, 169, -311, 393, 739, 24, 24, -130, 410, 168, -229, 511,
+                            768],
+    "mouth_dimple": [0, -46, 18, 118, -94, 71, 164, 12, 12, 24, 70, 121, -41, 135, 176],
+    "mouth_chinRaise_u": [6, 0, 293, -2, 0, 170, 35, 246, 0, 0, 311, -2, 0, 164, 18],
+}  # fmt: skip
+MIRROR = {
+    7: 6, 9: 8, 11: 10, 13: 12, 54: 53, 56: 55, 58: 57, 60: 59,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LipClip:
+    """A recording with the motion of its speaker's mouth."""
+
+    name: str
+    speaker: str
+    licence: str
+    language: str  # "zh", "en", ...
+    part: str  # "train", "choice" or "held"
+    is_in_sync: bool  # else shapes may be compared, but not times
+    transcript: str  # empty where unknown
+    time_s: Array  # (num_frames,)
+    faps: Array  # (num_frames, num_mouth_faps), FAP units, NaN where not measured
+    samples: NDArray[np.float32]  # 16 kHz mono
+
+    @property
+    def source(self) -> str:
+        """Where the clip comes from: the first part of its name."""
+        return self.name.partition("_")[0]
+
+
+def level_track(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
+    """Return times in seconds and levels in dB of full scale, as the live system measures them."""
+    step = round(LEVEL_STEP_S * SAMPLE_RATE_HZ)
+    ends = range(step, len(samples) + 1, step)
+    return [(end / SAMPLE_RATE_HZ, level_db(samples[end - step : end])) for end in ends]
+
+
+def part_of(name: str, *, may_train: bool) -> str:
+    """Decide a clip's purpose by the CRC-32 of its name modulo 4.
+
+    2: held. Odd: train, if the licence allows it. All others: choice.
+    """
+    remainder = zlib.crc32(name.encode()) % 4
+    if remainder == 2:
+        return "held"
+    return "train" if may_train and remainder % 2 else "choice"
+
+
+def read_clips(
+    folder: Path, *, any_licence: bool = False, language: str | None = "zh"
+) -> list[LipClip]:
+    """Read all clips of a folder in one language.
+
+    Parameters
+    ----------
+    folder : Path
+    any_licence : bool
+        Train also on clips whose licence forbids giving the parameters away.
+    language : str, optional
+        None: clips in all languages.
+
+    Raises
+    ------
+    UserError
+        The folder holds no clips, or one of them cannot be read.
+    """
+    held = folder / "held.txt"
+    left_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
+    clips = []
+    for path in sorted(folder.glob("*.json")):
+        try:
+            about = json.loads(path.read_text(encoding="utf-8"))
+            spoken = str(about.get("language", "zh"))[:2]
+            if language not in (None, spoken):
+                continue
+            licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
+            with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
+                rows = list(csv.DictReader(file))
+            if not rows or None in rows[0]:
+                raise ValueError("its table has no rows, or rows longer than its head")
+            values = {
+                name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]
+            }
+            if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
+                raise ValueError("its times do not rise")
+            is_rig = "mouth_stretch_c" in values
+            faps = _rig_faps(values) if is_rig else _tracked_faps(values)
+            if np.isnan(faps).all():
+                raise ValueError("it measures no FAP of the mouth")
+            part = part_of(path.stem, may_train=any_licence or may_ship(licence))
+            clips.append(
+                LipClip(
+                    name=path.stem,
+                    speaker=speaker,
+                    licence=licence,
+                    language=spoken,
+                    part="held" if {path.stem, speaker} & left_out else part,
+                    is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
+                    transcript=about.get("transcript") or "",
+                    time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
+                    faps=faps,
+                    samples=read_audio(path.with_suffix(".flac")),
+                )
+            )
+        except KeyError as error:
+            raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
+        except (OSError, ValueError, AttributeError, csv.Error) as error:
+            raise UserError(f"cannot read the clip {path.stem}: {error}") from error
+    if not clips:
+        what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
+        raise UserError(f"no {what} in {folder}; give a folder of .flac, .csv and .json")
+    return clips
+
+
+def _tracked_faps(tracks: dict[str, Array]) -> Array:
+    faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
+    for name, values in tracks.items():
+        number = name[1:].partition("_")[0]
+        if name.startswith("F") and number.isdigit() and int(number) in MOUTH_FAPS:
+            faps[:, MOUTH_FAPS.index(int(number))] = values
+    faps[tracks.get("ok", np.ones(len(faps))) == 0.0] = np.nan
+    return faps
+
+
+def _rig_faps(tracks: dict[str, Array]) -> Array:
+    faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
+    faps[:, columns(_RIG_FAPS)] = 0.0
+    for shape, effect in _RIG.items():
+        # up to three letters name the side: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
+        sides = [
+            values
+            for name, values in tracks.items()
+            if name.startswith(shape) and len(name) - len(shape) <= 3
+        ]
+        if not sides:
+            raise KeyError(shape)
+        weight = np.mean(np.stack(sides), axis=0)
+        faps[:, columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
+    faps[:, columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
+    for upper, lower in columns((4, 5)), columns((8, 10)):
+        # lips that meet do not pass through each other
+        crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)
+        faps[:, upper] -= 0.5 * crossed
+        faps[:, lower] -= 0.5 * crossed
+    for right, left in MIRROR.items():
+        faps[:, MOUTH_FAPS.index(right)] = faps[:, MOUTH_FAPS.index(left)]
+    return faps
+
+
+def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
+    """Phones of a clip by its text; None where that is unknown, unreadable or not Mandarin."""
+    if not clip.transcript or clip.language != "zh":
+        return None
+    try:
+        return align_text(model, clip.samples, SAMPLE_RATE_HZ, clip.transcript)
+    except UserError:
+        return None
+
+
+def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
+    """Phones of a clip: aligned where its text is known, else recognised."""
+    return aligned_phones(model, clip) or recognize(model, clip.samples, SAMPLE_RATE_HZ)

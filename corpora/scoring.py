@@ -1,0 +1,119 @@
+"""Errors of recognised phones against a reference, and the hypotheses that are counted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+
+import numpy as np
+
+from services.recognizer.recognizer import Emission
+from shared.phones.events import Phone
+
+
+@dataclass(slots=True, kw_only=True)
+class ErrorCounts:
+    """Errors of recognised phones against the reference."""
+
+    insertions: int = 0
+    deletions: int = 0
+    substitutions: int = 0
+    reference: int = 0
+
+    @property
+    def rate(self) -> float:
+        """Errors per reference phone."""
+        return (self.insertions + self.deletions + self.substitutions) / max(1, self.reference)
+
+    def __add__(self, other: ErrorCounts) -> ErrorCounts:
+        return ErrorCounts(
+            insertions=self.insertions + other.insertions,
+            deletions=self.deletions + other.deletions,
+            substitutions=self.substitutions + other.substitutions,
+            reference=self.reference + other.reference,
+        )
+
+
+def matched_pairs(
+    reference: Sequence[str], recognized: Sequence[str]
+) -> list[tuple[int | None, int | None]]:
+    """Align two strings with the fewest errors (Levenshtein 1966).
+
+    Returns
+    -------
+    list of tuple
+        Pairs of positions; None in the first place is an insertion, in the second a deletion.
+
+    Examples
+    --------
+    >>> matched_pairs(["n", "i"], ["n", "i", "h"])
+    [(0, 0), (1, 1), (None, 2)]
+    """
+    rows, columns = len(reference) + 1, len(recognized) + 1
+    cost = np.zeros((rows, columns), dtype=np.int64)
+    cost[:, 0] = np.arange(rows)
+    cost[0] = np.arange(columns)
+    for i in range(1, rows):
+        for j in range(1, columns):
+            change = reference[i - 1] != recognized[j - 1]
+            cost[i, j] = min(cost[i - 1, j - 1] + change, cost[i - 1, j] + 1, cost[i, j - 1] + 1)
+    pairs: list[tuple[int | None, int | None]] = []
+    i, j = rows - 1, columns - 1
+    while i or j:
+        change = bool(i and j and reference[i - 1] != recognized[j - 1])
+        if i and j and cost[i, j] == cost[i - 1, j - 1] + change:
+            i, j = i - 1, j - 1
+            pairs.append((i, j))
+        elif i and cost[i, j] == cost[i - 1, j] + 1:
+            i -= 1
+            pairs.append((i, None))
+        else:
+            j -= 1
+            pairs.append((None, j))
+    return pairs[::-1]
+
+
+def count_errors(reference: Sequence[str], recognized: Sequence[str]) -> ErrorCounts:
+    """Count the fewest insertions, deletions and substitutions between two strings."""
+    counts = ErrorCounts(reference=len(reference))
+    for i, j in matched_pairs(reference, recognized):
+        if i is None:
+            counts.insertions += 1
+        elif j is None:
+            counts.deletions += 1
+        elif reference[i] != recognized[j]:
+            counts.substitutions += 1
+    return counts
+
+
+def is_emitted(phone: Phone, after: Emission | None) -> bool:
+    """Tell whether the output rule emitted a phone, by the event that came after it.
+
+    The rule emits a phone after the revisions of all phones before it.
+    """
+    return not phone.final and not (isinstance(after, Phone) and after.index > phone.index)
+
+
+def first_hypothesis(events: Sequence[Emission], known: set[int]) -> list[Phone]:
+    """Pick each phone as it was emitted first, by the rule or along with the next one.
+
+    Parameters
+    ----------
+    events
+        A live recognizer's output, in order.
+    known
+        Indices of the phones emitted before; those of ``events`` are added.
+    """
+    first = []
+    for event, after in zip_longest(events, events[1:]):
+        if isinstance(event, Phone):
+            if event.index not in known or is_emitted(event, after):
+                first.append(event)
+            known.add(event.index)
+    return first
+
+
+def final_hypothesis(events: Iterable[Emission]) -> list[Phone]:
+    """Pick the phones that will not change any more from a live recognizer's output."""
+    return [event for event in events if isinstance(event, Phone) and event.final]

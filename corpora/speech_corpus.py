@@ -1,0 +1,247 @@
+"""Speech corpora: rows with audio and phones, in three layouts.
+
+Layouts, told apart by the files in the folder:
+
+- ``manifest.tsv``: columns ``utt_id path speaker source licence split seconds text pinyin``;
+  ``pinyin`` gives the pronunciation where the text leaves it open, and either of the two columns
+  may be missing;
+- a Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``); one called ``dev`` or ``test`` is that
+  split;
+- AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
+
+The inventory of the corpus's language turns text into phones. Bad rows are reported by row,
+skipped and counted, never fatal: a corpus of a thousand hours always has some.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory
+
+# Licences that allow a model trained on the data to be given away.
+_FREE_LICENCE = re.compile(
+    r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
+)
+_CLOSED_LICENCE = re.compile(r"\bnc\b|\bnd\b|non-?commercial|no-?deriv", re.I)
+_MIN_PHONE_S = 0.03
+_AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
+_KALDI_SPLITS = ("train", "dev", "test")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Utterance:
+    """One recording with its phones."""
+
+    utterance_id: str
+    path: Path
+    speaker: str
+    source: str
+    licence: str
+    split: str
+    seconds: float
+    phones: tuple[int, ...]  # indices into the inventory's phones
+    syllables: tuple[int, ...]  # number of phones in each syllable
+
+
+@dataclass(slots=True)
+class RowErrors:
+    """Rows that were skipped, and why."""
+
+    messages: list[str] = field(default_factory=list)
+
+    def add(self, place: str, what: str) -> None:
+        """Note one bad row."""
+        self.messages.append(f"{place}: {what}; row skipped")
+
+    def print_to(self, report: Callable[[str], None]) -> None:
+        """Report each skipped row, then their number."""
+        for message in self.messages:
+            report(message)
+        if self.messages:
+            report(f"{len(self.messages)} rows skipped")
+
+    def nothing_left(self, where: str) -> UserError:
+        """Make the error that no recording can be used; it says why the last one cannot."""
+        last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
+        return UserError(f"no usable recordings {where}{last}; give others")
+
+
+def may_ship(licence: str) -> bool:
+    """Whether a model trained on rows under this licence may be given away."""
+    return bool(_FREE_LICENCE.search(licence)) and not _CLOSED_LICENCE.search(licence)
+
+
+def is_synthetic(licence: str) -> bool:
+    """Whether rows under this licence are synthetic speech."""
+    return "synthetic" in licence.lower()
+
+
+def read_corpus(
+    folder: Path, errors: RowErrors, inventory: PhoneInventory, *, split: str | None = None
+) -> list[Utterance]:
+    """Read a corpus folder in any of the three layouts.
+
+    Parameters
+    ----------
+    folder
+        The corpus, or its manifest.
+    errors
+        Receives a message for every row that cannot be used.
+    inventory
+        The corpus's language.
+    split
+        Read only the rows of this split; None reads all.
+
+    Raises
+    ------
+    UserError
+        If the folder holds none of the layouts, or a list is missing or no UTF-8 text.
+    """
+    if folder.suffix == ".tsv" and folder.is_file():
+        rows = _manifest_rows(folder)
+    elif (folder / "manifest.tsv").is_file():
+        rows = _manifest_rows(folder / "manifest.tsv")
+    elif (folder / "wav.scp").is_file():
+        rows = _kaldi_rows(folder)
+    elif (folder / "transcript").is_dir() and (folder / "wav").is_dir():
+        rows = _aishell_rows(folder)
+    else:
+        raise UserError(
+            f"{folder} holds no corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
+            "text, or with AISHELL's wav and transcript folders"
+        )
+    try:
+        chosen = [(place, row) for place, row in rows if split in (None, _split_of(row))]
+    except UnicodeDecodeError as error:
+        raise UserError(f"{folder}: its list is not UTF-8 text ({error}); convert it") from error
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    utterances = [_utterance(place, row, errors, inventory) for place, row in chosen]
+    return [utterance for utterance in utterances if utterance]
+
+
+def audio_files(folder: Path) -> list[Path]:
+    """Find the recordings below a folder, in order of their names; UserError if there is none."""
+    found = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
+    if not found:
+        raise UserError(f"{folder} holds no wav, flac, ogg or opus files; give another folder")
+    return found
+
+
+def _split_of(row: dict[str, str]) -> str:
+    return row.get("split") or "train"
+
+
+def _utterance(
+    place: str, row: dict[str, str], errors: RowErrors, inventory: PhoneInventory
+) -> Utterance | None:
+    path = Path(row["path"])
+    if not path.is_file():
+        errors.add(place, f"no audio file {path}")
+        return None
+    try:
+        syllables = inventory.pronounce(row.get("pinyin") or row["text"])
+        seconds = float(row.get("seconds") or _duration_s(path))
+    except (UserError, ValueError) as error:
+        errors.add(place, str(error))
+        return None
+    phones = tuple(inventory.index[phone] for syllable in syllables for phone in syllable)
+    if not phones:
+        errors.add(place, "no text")
+        return None
+    if not len(phones) * _MIN_PHONE_S <= seconds < math.inf:
+        errors.add(place, f"{len(phones)} phones do not fit into {seconds:.2f} s")
+        return None
+    return Utterance(
+        utterance_id=row["utt_id"],
+        path=path,
+        speaker=row.get("speaker") or row["utt_id"],
+        source=row.get("source", ""),
+        licence=row.get("licence", ""),
+        split=_split_of(row),
+        seconds=seconds,
+        phones=phones,
+        syllables=tuple(len(syllable) for syllable in syllables),
+    )
+
+
+def _duration_s(path: Path) -> float:
+    import soundfile  # noqa: PLC0415  (manifests state the length; only bare layouts need to ask)
+
+    try:
+        return float(soundfile.info(path).duration)
+    except soundfile.LibsndfileError as error:
+        raise ValueError(f"cannot read {path}: {error}") from error
+
+
+def _manifest_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    with path.open(encoding="utf-8-sig", newline="") as lines:
+        reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
+        columns = set(reader.fieldnames or ())
+        missing = sorted({"utt_id", "path"} - columns)
+        if not columns & {"pinyin", "text"}:
+            missing.append("pinyin or text")
+        if missing:
+            raise UserError(f"{path} lacks the columns {', '.join(missing)}; add them")
+        for number, row in enumerate(reader, start=2):
+            place = f"{path.name} row {number} ({row['utt_id']})"
+            cells = {"text": "", **{key: value or "" for key, value in row.items() if key}}
+            yield place, {**cells, "path": str(path.parent / cells["path"])}
+
+
+def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    if (folder / "segments").is_file():
+        raise UserError(
+            f"{folder} cuts its recordings with 'segments'; write each segment as a file"
+        )
+    split = folder.name if folder.name in _KALDI_SPLITS else "train"
+    speakers = dict(_pairs(folder / "utt2spk")) if (folder / "utt2spk").is_file() else {}
+    texts = dict(_pairs(folder / "text"))
+    for number, (utterance_id, where) in enumerate(_pairs(folder / "wav.scp"), start=1):
+        path = Path(where) if Path(where).is_absolute() else folder / where
+        yield (
+            f"wav.scp line {number} ({utterance_id})",
+            {
+                "utt_id": utterance_id,
+                "path": str(path),
+                "speaker": speakers.get(utterance_id, ""),
+                "split": split,
+                "text": texts.get(utterance_id, ""),
+            },
+        )
+
+
+def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    audio = {path.stem: path for path in sorted((folder / "wav").rglob("*.wav"))}
+    for transcript in sorted((folder / "transcript").glob("*.txt")):
+        for number, (utterance_id, text) in enumerate(_pairs(transcript), start=1):
+            path = audio.get(utterance_id, folder / "wav" / f"{utterance_id}.wav")
+            yield (
+                f"{transcript.name} line {number} ({utterance_id})",
+                {
+                    "utt_id": utterance_id,
+                    "path": str(path),
+                    "speaker": path.parent.name,
+                    "source": "AISHELL-1",
+                    "licence": "Apache-2.0",
+                    # A missing file has no known split: it is reported once, under train.
+                    "split": path.relative_to(folder / "wav").parts[0]
+                    if utterance_id in audio
+                    else "train",
+                    "text": text,
+                },
+            )
+
+
+def _pairs(path: Path) -> Iterator[tuple[str, str]]:
+    for line in path.read_text(encoding="utf-8").splitlines():
+        key, _, value = line.strip().partition(" ")
+        if key:
+            yield key, value.strip()

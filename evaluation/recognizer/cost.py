@@ -1,0 +1,77 @@
+"""CPU cost of the recognizer, by stage and with many sessions."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from services.recognizer.front_end.resample import Resampler
+from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from services.recognizer.search.decoder import Decoder
+
+CHUNK_SAMPLES = 160  # 10 ms, as sound arrives live
+_BATCH_SIZE = 16  # sessions that are scored together
+
+
+def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, float]:
+    """CPU seconds per second of sound of each stage, on chunks of 10 ms."""
+    chunks = [samples[at : at + CHUNK_SAMPLES] for at in range(0, len(samples), CHUNK_SAMPLES)]
+    blocks = [
+        samples[at : at + BLOCK_SAMPLES]
+        for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
+    ]
+    front_end, stream, decoder = model.front_end(), model.stream(), Decoder(model.topology)
+    detector, resampler = VoiceActivityDetector(), Resampler(48_000)
+    at_48_khz = np.repeat(samples, 3)
+    frames = model.front_end().accept_waveform(samples)
+    scores = model.stream().accept(frames)  # compiles, before the clock starts
+    decoder.accept(scores[0])
+    decoder.reset()
+
+    def run(
+        stage: Callable[[NDArray[np.float32]], object], pieces: Iterable[NDArray[np.float32]]
+    ) -> float:
+        begin = time.process_time()
+        for piece in pieces:
+            stage(piece)
+        return (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples)
+
+    return {
+        "resampler_from_48_khz": run(
+            resampler.accept_waveform, np.array_split(at_48_khz, len(chunks))
+        ),
+        "voice_activity": run(detector.accept_block, blocks),
+        "front_end": run(front_end.accept_waveform, chunks),
+        "acoustic_model": run(stream.accept, np.split(frames, len(frames))),
+        "decoder": run(decoder.accept, scores),
+    }
+
+
+def sessions_per_core(
+    model: AcousticModel, samples: NDArray[np.float32], cost: dict[str, float]
+) -> float:
+    """Sessions that one core can recognise when 16 are scored together, on chunks of 10 ms.
+
+    Parameters
+    ----------
+    model
+        The acoustic model.
+    samples
+        A recording, shape (n,), 16 kHz.
+    cost
+        Result of :func:`cpu_by_stage`. The resampler is left out, because sound at 16 kHz does not
+        need it.
+    """
+    frames = model.front_end().accept_waveform(samples)
+    streams = [model.stream() for _ in range(_BATCH_SIZE)]
+    begin = time.process_time()
+    for frame in range(len(frames)):
+        model.score([(stream, frames[frame : frame + 1]) for stream in streams])
+    scoring = (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples) / _BATCH_SIZE
+    other_stages = ("voice_activity", "front_end", "decoder")
+    return 1 / (scoring + sum(cost[stage] for stage in other_stages))

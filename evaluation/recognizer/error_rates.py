@@ -1,0 +1,302 @@
+"""Error rates, delays, confusions and cost of the recognizer.
+
+Measured for offline decoding (full traceback) and for the live output rule, N = 1 to 6 (Li et al.
+2011, eq. 4):
+
+- phone error rate (insertions + deletions + substitutions per reference phone, silence not
+  counted), by speaker, with a bootstrap interval over speakers;
+- viseme error rate: phones as mouth shapes (Li 2011, table 1), compound vowels split, equal
+  neighbours counted once because the mouth does not move between them;
+- emission delay: media time when a phone is first emitted, minus its true onset by forced
+  alignment;
+- CPU seconds per second of sound, by stage.
+
+A live recognizer has two hypotheses. The first hypothesis holds each phone as it was first emitted:
+by the rule or, unlike in the paper, along with the next phone. The final hypothesis holds the
+corrected phones. Every recording is a session of its own, so the live mean starts from the prior
+each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from corpora.feature_cache import read_audio
+from corpora.scoring import (
+    ErrorCounts,
+    count_errors,
+    final_hypothesis,
+    first_hypothesis,
+    matched_pairs,
+)
+from corpora.speech_corpus import RowErrors, Utterance, read_corpus
+from evaluation.recognizer.confusions import Confusions
+from evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage, sessions_per_core
+from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from services.recognizer.alignment import align_phones, spoken
+from services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from services.recognizer.offline import decode_offline
+from services.recognizer.recognizer import DEFAULT_RULE, Recognizer
+from services.recognizer.speech_scores import ScoreEvent, SpeechScores
+from shared.errors import UserError
+from shared.phones.events import Phone
+from shared.phones.inventory import PhoneInventory
+
+# Output rules, N and the confidence that a frame needs: the paper's, its N = 3 with confident
+# frames only, and the recognizer's own.
+RULES = (
+    *((num_stable_frames, 0.0) for num_stable_frames in (1, 2, 3, 4, 5, 6)),
+    (3, 0.95),
+    (3, 0.99),
+    DEFAULT_RULE,
+)
+_NUM_RESAMPLES = 2000
+
+
+@dataclass(slots=True, kw_only=True)
+class Score:
+    """Errors and delays of one output on all recordings; live, of its first hypothesis."""
+
+    name: str
+    phones: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
+    visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
+    final_phones: dict[str, ErrorCounts] = field(default_factory=dict)  # of the final hypothesis
+    final_visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # likewise
+    delays_s: list[float] = field(default_factory=list)
+
+    def summary(self, rng: np.random.Generator) -> dict[str, object]:
+        """Rates, intervals and delay percentiles, for a JSON file."""
+        out: dict[str, object] = {"output": self.name}
+        measures = {
+            "phone": self.phones,
+            "viseme": self.visemes,
+            "final_phone": self.final_phones,
+            "final_viseme": self.final_visemes,
+        }
+        for measure, by_speaker in measures.items():
+            if not by_speaker:
+                continue
+            total = sum(by_speaker.values(), ErrorCounts())
+            out[f"{measure}_error_rate"] = total.rate
+            out[f"{measure}_interval_95"] = bootstrap_interval(list(by_speaker.values()), rng)
+            out[f"{measure}_errors"] = asdict(total)
+            out[f"{measure}_errors_by_speaker"] = {
+                speaker: {"rate": counts.rate, **asdict(counts)}
+                for speaker, counts in sorted(by_speaker.items())
+            }
+        if self.delays_s:
+            p50, p95 = np.percentile(self.delays_s, [50, 95])
+            out["delay_ms"] = {"p50": 1000 * float(p50), "p95": 1000 * float(p95)}
+        return out
+
+
+def mouth_shapes(phones: Iterable[str], inventory: PhoneInventory) -> list[str]:
+    """Shapes that the mouth goes through (Li 2011, table 1), equal neighbours once."""
+    shapes = [
+        viseme
+        for phone in phones
+        if phone != inventory.silence
+        for viseme, _ in inventory.visemes[phone]
+    ]
+    return [shape for shape, _ in groupby(shapes)]
+
+
+def bootstrap_interval(
+    by_speaker: Sequence[ErrorCounts], rng: np.random.Generator
+) -> tuple[float, float] | None:
+    """95 % interval of the error rate when speakers are resampled (Efron 1979).
+
+    None for a single speaker, who tells nothing about others.
+    """
+    if len(by_speaker) < 2:
+        return None
+    errors = np.array([c.insertions + c.deletions + c.substitutions for c in by_speaker])
+    lengths = np.array([c.reference for c in by_speaker])
+    picks = rng.integers(len(by_speaker), size=(_NUM_RESAMPLES, len(by_speaker)))
+    rates = errors[picks].sum(axis=1) / np.maximum(1, lengths[picks].sum(axis=1))
+    low, high = np.percentile(rates, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def evaluate_recognizer(
+    model: AcousticModel,
+    corpus: Path,
+    split: str,
+    *,
+    rules: Sequence[tuple[int, float]] = RULES,
+) -> dict[str, object]:
+    """Measure a model on one split of a corpus.
+
+    Parameters
+    ----------
+    model
+        The acoustic model.
+    corpus
+        A corpus folder, or a manifest, that :func:`corpora.speech_corpus.read_corpus` reads, in
+        the model's language.
+    split
+        Its split, such as ``dev`` or ``test``.
+    rules
+        Output rules to try: N, and the confidence that a frame needs.
+
+    Returns
+    -------
+    dict
+        Figures for a JSON file. ``confusions`` counts reference phones (rows) against recognised
+        phones (columns), in the order of ``phones``; the row of ``silence`` counts insertions, its
+        column deletions. Rows that could not be used are in ``bad_rows``.
+
+    Raises
+    ------
+    UserError
+        If there is no such corpus, or no usable recording in the split.
+    """
+    inventory = model.inventory
+    errors = RowErrors()
+    utterances = read_corpus(corpus, errors, inventory, split=split)
+    offline = Score(name="full traceback")
+    live = [Score(name=_rule_name(rule)) for rule in rules]
+    confusions = Confusions(inventory)
+    used: list[Utterance] = []
+    seconds = 0.0
+    for utterance in track(utterances, description=f"recognising {split}"):
+        try:
+            samples = read_audio(utterance.path)
+            truth = _align(model, utterance, samples)
+        except (UserError, ValueError) as error:
+            errors.add(utterance.utterance_id, str(error))
+            continue
+        used.append(utterance)
+        seconds += len(samples) / SAMPLE_RATE_HZ
+        reference = _Reference(truth, utterance.speaker, inventory)
+        scored = _scores(model, samples)
+        decoded = decode_offline(model, (event for _, events in scored for event in events))
+        recognized = spoken(decoded, inventory)
+        confusions.add(reference.phones, [phone.symbol for phone in recognized])
+        reference.count(recognized, offline.phones, offline.visemes)
+        # Offline decoding emits everything when the recording ends.
+        offline.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
+        for score, rule in zip(live, rules, strict=True):
+            output = _decode_live(model, scored, rule)
+            reference.count(output.first, score.phones, score.visemes)
+            reference.count(output.final, score.final_phones, score.final_visemes)
+            score.delays_s += reference.delays_s(output)
+    if not used:
+        raise UserError(
+            f"{corpus} has no usable recordings in the split {split!r}; name another split"
+            + "".join(f"\n{message}" for message in errors.messages[:5])
+        )
+    rng = np.random.default_rng(0)
+    return {
+        "split": split,
+        "recordings": len(used),
+        "speakers": len({utterance.speaker for utterance in used}),
+        "seconds": seconds,
+        "num_bad_rows": len(errors.messages),
+        "bad_rows": errors.messages,
+        "scores": [score.summary(rng) for score in (offline, *live)],
+        "most_confused": confusions.most_frequent(),
+        "phones": list(inventory.phones),
+        "silence": inventory.silence,
+        "confusions": confusions.counts.tolist(),
+        "cpu_per_audio_second": (cost := cpu_by_stage(model, read_audio(used[0].path))),
+        "sessions_per_core": sessions_per_core(model, read_audio(used[0].path), cost),
+    }
+
+
+def _rule_name(rule: tuple[int, float]) -> str:
+    num_stable_frames, min_confidence = rule
+    return f"N = {num_stable_frames}" + (f", conf. {min_confidence}" if min_confidence else "")
+
+
+def _align(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float32]) -> list[Phone]:
+    """Find the true onsets of the utterance's phones."""
+    phones = iter(model.inventory.phones[phone] for phone in utterance.phones)
+    syllables = [tuple(next(phones) for _ in range(length)) for length in utterance.syllables]
+    return spoken(align_phones(model, samples, SAMPLE_RATE_HZ, syllables), model.inventory)
+
+
+def _scores(
+    model: AcousticModel, samples: NDArray[np.float32]
+) -> list[tuple[float, list[ScoreEvent]]]:
+    """Score a recording as it arrives: media time in seconds, and the new events by then."""
+    scores = SpeechScores(model, SAMPLE_RATE_HZ)
+    scored = []
+    for start in range(0, len(samples), CHUNK_SAMPLES):
+        chunk = samples[start : start + CHUNK_SAMPLES]
+        (events,) = run_scoring_tasks(model, [scores.process(chunk)])
+        scored.append(((start + len(chunk)) / SAMPLE_RATE_HZ, events))
+    (rest,) = run_scoring_tasks(model, [scores.finish()])
+    return [*scored, (len(samples) / SAMPLE_RATE_HZ, rest)]
+
+
+@dataclass(slots=True)
+class _LiveOutput:
+    """Output of a live recognizer."""
+
+    first: list[Phone] = field(default_factory=list)
+    emitted_s: list[float] = field(default_factory=list)  # media time, of each of ``first``
+    final: list[Phone] = field(default_factory=list)
+
+
+def _decode_live(
+    model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: tuple[int, float]
+) -> _LiveOutput:
+    num_stable_frames, min_confidence = rule
+    recognizer = Recognizer(
+        model,
+        sample_rate_hz=SAMPLE_RATE_HZ,
+        num_stable_frames=num_stable_frames,
+        min_confidence=min_confidence,
+    )
+    output = _LiveOutput()
+    known: set[int] = set()
+    for time_s, scores in scored:
+        events = recognizer.decode(scores)
+        output.final += spoken(final_hypothesis(events), model.inventory)
+        new = spoken(first_hypothesis(events, known), model.inventory)
+        output.first += new
+        output.emitted_s += [time_s] * len(new)
+    return output
+
+
+class _Reference:
+    """The true phones of a recording."""
+
+    def __init__(self, truth: Sequence[Phone], speaker: str, inventory: PhoneInventory) -> None:
+        self._truth = truth
+        self._speaker = speaker
+        self._inventory = inventory
+        self.phones = [phone.symbol for phone in truth]
+        self._shapes = mouth_shapes(self.phones, inventory)
+
+    def count(
+        self,
+        recognized: Sequence[Phone],
+        phones: dict[str, ErrorCounts],
+        visemes: dict[str, ErrorCounts],
+    ) -> None:
+        """Add the errors of recognised phones to the speaker's counts."""
+        symbols = [phone.symbol for phone in recognized]
+        shapes = mouth_shapes(symbols, self._inventory)
+        for counts, new in (
+            (phones, count_errors(self.phones, symbols)),
+            (visemes, count_errors(self._shapes, shapes)),
+        ):
+            counts[self._speaker] = counts.get(self._speaker, ErrorCounts()) + new
+
+    def delays_s(self, output: _LiveOutput) -> list[float]:
+        """Emission delays of the phones that are correct in the first hypothesis."""
+        symbols = [phone.symbol for phone in output.first]
+        return [
+            output.emitted_s[j] - self._truth[i].onset_s
+            for i, j in matched_pairs(self.phones, symbols)
+            if i is not None and j is not None and self.phones[i] == symbols[j]
+        ]

@@ -1,0 +1,131 @@
+"""Robustness: phone errors in disturbed speech, and phones recognised in sounds without speech.
+
+Both come from :mod:`evaluation.recognizer.disturbances`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from corpora.feature_cache import read_audio
+from corpora.scoring import ErrorCounts, count_errors, final_hypothesis, first_hypothesis
+from corpora.speech_corpus import RowErrors, audio_files, read_corpus
+from evaluation.recognizer.disturbances import SOUNDS, SPEECH_CONDITIONS
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.alignment import spoken
+from services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from services.recognizer.offline import decode_offline
+from services.recognizer.recognizer import Emission, Recognizer
+from services.recognizer.speech_scores import ScoreEvent, score_recording
+
+_SOUND_S = 60.0
+_OTHER_RECORDINGS = 40  # of another language
+_OUTPUTS = {  # key in the figures, column of the table
+    "offline": "full traceback",
+    "first_hypothesis": "first hypothesis",
+    "final_hypothesis": "final hypothesis",
+}
+
+
+def evaluate_robustness(
+    model: AcousticModel, corpus: Path, split: str, *, other_language: Path | None = None
+) -> dict[str, Any]:
+    """Measure a model on disturbed speech and on sounds without its language.
+
+    Parameters
+    ----------
+    model
+        The acoustic model.
+    corpus
+        A corpus folder, or a manifest, that :func:`corpora.speech_corpus.read_corpus` reads, in
+        the model's language.
+    split
+        Its split, such as ``dev`` or ``test``.
+    other_language
+        Folder of recordings in another language, of which forty are used.
+
+    Returns
+    -------
+    dict
+        ``speech``: by condition, the phone error rates of offline decoding (full traceback), of the
+        first and of the final hypothesis; ``sounds``: phones per minute by sound.
+
+    Raises
+    ------
+    UserError
+        If there is no such corpus or split, or no recording in the other folder.
+    """
+    phones = model.inventory.phones
+    utterances = read_corpus(corpus, RowErrors(), model.inventory, split=split)
+    recordings = [
+        ([phones[phone] for phone in utterance.phones], read_audio(utterance.path))
+        for utterance in utterances
+    ]
+    speech = {}
+    for name, disturbed in track(SPEECH_CONDITIONS.items(), description="disturbed speech"):
+        totals = {output: ErrorCounts() for output in _OUTPUTS}
+        for reference, samples in recordings:
+            for output, recognized in _outputs(model, disturbed(samples)).items():
+                totals[output] += count_errors(reference, recognized)
+        speech[name] = {output: counts.rate for output, counts in totals.items()}
+    sounds = {name: _phones_per_minute(model, [make(_SOUND_S)]) for name, make in SOUNDS.items()}
+    if other_language is not None:
+        sounds["other language"] = _phones_per_minute(model, recordings_in(other_language))
+    return {"split": split, "recordings": len(recordings), "speech": speech, "sounds": sounds}
+
+
+def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> None:
+    """Print the figures of several models as two tables."""
+    for name, figures in results.items():
+        table = Table("phone error %", *_OUTPUTS.values(), title=f"{name}, {figures['split']}")
+        for condition, rates in figures["speech"].items():
+            cells = (f"{100 * rates[output]:.1f}" for output in _OUTPUTS)
+            table.add_row(condition, *cells)
+        console.print(table)
+        table = Table("sound without speech", "phones per minute", title=name)
+        for sound, rate in figures["sounds"].items():
+            table.add_row(sound, f"{rate:.1f}")
+        console.print(table)
+
+
+def _outputs(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, list[str]]:
+    """Recognise a recording offline and live; return the phones of each of ``_OUTPUTS``."""
+    scores = score_recording(model, samples, SAMPLE_RATE_HZ)
+    events = _decode_live(model, scores)
+    outputs = {
+        "offline": decode_offline(model, scores),
+        "first_hypothesis": first_hypothesis(events, set()),
+        "final_hypothesis": final_hypothesis(events),
+    }
+    return {
+        name: [phone.symbol for phone in spoken(phones, model.inventory)]
+        for name, phones in outputs.items()
+    }
+
+
+def _decode_live(model: AcousticModel, scores: Sequence[ScoreEvent]) -> list[Emission]:
+    return Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ).decode(scores)
+
+
+def _phones_per_minute(model: AcousticModel, sounds: Sequence[NDArray[np.float32]]) -> float:
+    minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
+    num_phones = 0
+    for samples in sounds:
+        events = _decode_live(model, score_recording(model, samples, SAMPLE_RATE_HZ))
+        num_phones += len(spoken(final_hypothesis(events), model.inventory))
+    return num_phones / minutes
+
+
+def recordings_in(folder: Path) -> list[NDArray[np.float32]]:
+    """Read some of the recordings in a folder, evenly spread; UserError if there is none."""
+    found = audio_files(folder)
+    step = max(1, len(found) // _OTHER_RECORDINGS)
+    return [read_audio(path) for path in found[::step][:_OTHER_RECORDINGS]]

@@ -1,0 +1,1 @@
+"""Measure the running system: latency, cost, drawing."""

@@ -1,0 +1,160 @@
+"""Latency and CPU cost of the chain, with real processes and real sockets.
+
+The services run as under ``kouxing run``, on ports of their own. A sentence is streamed in real
+time in 20 ms chunks. Two delays are measured for each FAP frame:
+
+- *chunk to frame*: from sending the chunk that completes the synthesizer's input for the frame to
+  receiving the frame: the time that processes and sockets add;
+- *sound to frame*: from sending the last sample of the frame's own chunk: the same plus the
+  synthesizer's delay. A page that delays the sound by this much is in sync.
+
+CPU time is measured by the processes' own clocks, per second of audio.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from services.cli.supervisor import Supervisor
+from services.kinds import free_addresses
+from services.synthesizer.config import SynthesizerConfig
+from shared.audio_file import read_audio
+from shared.client import Client
+from shared.errors import UserError
+from shared.wire.face import EndOfFaps, FapFrame
+
+CHUNK_S = 0.02
+END_LIMIT_S = 30.0  # the last frame must come within this time
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Figures of one run, ready for a table or JSON."""
+
+    chunk_to_frame_ms: dict[str, float]
+    sound_to_frame_ms: dict[str, float]
+    delay_ms: float
+    num_frames: int
+    cpu_s_per_audio_s: dict[str, float]
+
+
+def measure(path: Path, num_repeats: int, console: Console) -> Latency:
+    """Start the services, stream the file, stop them; return the figures.
+
+    Raises
+    ------
+    UserError
+        If the file is no audio or the services cannot start.
+    """
+    samples, rate_hz = read_audio(path)
+    environment = {
+        **free_addresses(),
+        "KOUXING_DRIVER_VIEW": "none",
+        "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
+    }
+    delay_s = SynthesizerConfig().delay_ms / 1e3
+    with tempfile.TemporaryDirectory() as folder:
+        supervisor = Supervisor([], Path(folder), console, environment)
+        try:
+            supervisor.start()
+            supervisor.wait_ready(environment["KOUXING_CONTROL"])
+            with Client(environment["KOUXING_CONTROL"]) as client:
+                before = _cpu_s(client)
+                delays = [
+                    _stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)
+                    for _ in range(num_repeats)
+                ]
+                time.sleep(1.0)  # until the last heartbeats
+                after = _cpu_s(client)
+        finally:
+            supervisor.stop()
+    audio_s = num_repeats * len(samples) / rate_hz
+    to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
+    return Latency(
+        chunk_to_frame_ms=_percentiles(to_frame_ms),
+        sound_to_frame_ms=_percentiles(from_sound_ms),
+        delay_ms=delay_s * 1e3,
+        num_frames=len(to_frame_ms),
+        cpu_s_per_audio_s={name: (after[name] - before[name]) / audio_s for name in after},
+    )
+
+
+def show(latency: Latency, console: Console) -> None:
+    """Print the figures as tables."""
+    delays = Table("delay", "p50 ms", "p95 ms", "p99 ms")
+    for name, row in (
+        ("chunk to frame", latency.chunk_to_frame_ms),
+        (f"sound to frame ({latency.delay_ms:g} ms delay)", latency.sound_to_frame_ms),
+    ):
+        delays.add_row(name, *(f"{row[key]:.1f}" for key in ("p50", "p95", "p99")))
+    console.print(delays)
+    costs = Table("service", "CPU s per s of audio")
+    for name, value in latency.cpu_s_per_audio_s.items():
+        costs.add_row(name, f"{value:.3f}")
+    console.print(costs)
+
+
+def _stream(
+    client: Client, samples: NDArray[np.float32], rate_hz: int, delay_s: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Stream in real time; return both delays of every frame in seconds."""
+    session = client.open_session(
+        encoding="f32le", sample_rate_hz=rate_hz, num_channels=samples.shape[1]
+    )
+    output = session.subscribe(FapFrame, EndOfFaps)
+    chunk = round(CHUNK_S * rate_hz)
+    sent_s: list[float] = []
+    arrived: list[tuple[float, float]] = []  # media time, arrival
+
+    def take() -> bool:
+        now_s = time.perf_counter()
+        for received in output.receive():
+            if isinstance(received.message, EndOfFaps):
+                return True
+            if isinstance(received.message, FapFrame):
+                arrived.append((received.message.media_time / 16000, now_s))
+        return False
+
+    begin_s = time.perf_counter()
+    for number, begin in enumerate(range(0, len(samples) - chunk + 1, chunk), start=1):
+        while (left_s := begin_s + number * CHUNK_S - time.perf_counter()) > 0:
+            if left_s > 0.001:
+                output.wait(left_s)
+            take()
+        if not session.send(samples[begin : begin + chunk]):
+            raise UserError("the recognizer takes no audio; this machine is too busy to measure on")
+        sent_s.append(time.perf_counter())
+    live_until_s = time.perf_counter()
+    session.finish()
+    end_s = time.perf_counter() + END_LIMIT_S
+    while not take():
+        output.wait(1.0)
+        if time.perf_counter() > end_s:
+            raise UserError("the last frame did not come; this machine is too busy to measure on")
+    session.close()
+    to_frame, from_sound = [], []
+    for media_s, arrival_s in arrived:
+        last_needed = math.ceil((media_s + delay_s) / CHUNK_S - 1e-6) - 1
+        last_shown = max(0, round(media_s / CHUNK_S) - 1)
+        if arrival_s < live_until_s and last_needed < len(sent_s):
+            to_frame.append(arrival_s - sent_s[max(0, last_needed)])
+            from_sound.append(arrival_s - sent_s[last_shown])
+    return np.array(to_frame), np.array(from_sound)
+
+
+def _percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:
+    return {f"p{percent}": float(np.percentile(values_ms, percent)) for percent in (50, 95, 99)}
+
+
+def _cpu_s(client: Client) -> dict[str, float]:
+    return {state.service: state.metrics.get("cpu_s", 0.0) for state in client.status().services}

@@ -1,0 +1,51 @@
+"""The commands under ``kouxing head``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from services.cli.terminal import print_message
+from services.driver.config import DriverConfig
+
+DEFAULT_HEAD = DriverConfig().head
+HeadName = Annotated[
+    str, typer.Option("--head", help="woman, man, elder, child, an .npz, or a .glb with morphs.")
+]
+
+app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")
+
+
+@app.command("export")
+def export_head(
+    glb: Annotated[Path, typer.Argument(help="File to write (.glb).")],
+    head: HeadName = DEFAULT_HEAD,
+) -> None:
+    """Write a head as a GLB with a morph target for every FAP."""
+    from services.driver.head.glb_export import export_glb
+    from services.driver.render.scene import load_head
+
+    export_glb(load_head(head), glb)
+    print_message(f"wrote {glb} ({glb.stat().st_size / 1e6:.1f} MB)")
+
+
+@app.command("import")
+def import_mesh(
+    mesh: Annotated[Path, typer.Argument(help="Mesh of a head at rest (.obj, .glb, .ply).")],
+    points: Annotated[
+        Path,
+        typer.Option(
+            help="MPEG-4 feature points: lines 'point x y z' or 'point vertex' (from 0), or an"
+            " XfaceEd .fdp file."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Head to write (.npz).")],
+) -> None:
+    """Turn a mesh into a head that FAPs move; use it with --head."""
+    from services.driver.head.import_head import import_head
+
+    for remark in import_head(mesh, points, output):
+        print_message(remark)
+    print_message(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB)")

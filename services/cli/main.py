@@ -1,0 +1,75 @@
+"""The command ``kouxing``."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from importlib.metadata import entry_points
+from io import TextIOWrapper
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from services.cli import clients, configuration, offline, run
+from services.cli.heads import app as head_app
+from services.cli.services import service_command
+from services.cli.terminal import CONSOLE
+from services.kinds import KINDS
+from shared.errors import UserError
+
+ENTRY_POINTS = "kouxing.commands"  # each a typer.Typer, such as those of training and evaluation
+
+
+class CommandGroup(TyperGroup):
+    """The commands of this package, and those that others add as entry points.
+
+    Entry points are imported only if the command is none of this package, or help lists all.
+    """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands."""
+        self._add_entry_points()
+        return super().list_commands(ctx)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, or None."""
+        if cmd_name not in self.commands:
+            self._add_entry_points()
+        return super().get_command(ctx, cmd_name)
+
+    def _add_entry_points(self) -> None:
+        for entry_point in entry_points(group=ENTRY_POINTS):
+            if entry_point.name not in self.commands:
+                command = typer.main.get_command(entry_point.load())
+                command.name = entry_point.name
+                self.add_command(command)
+
+
+app = typer.Typer(
+    cls=CommandGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Live Mandarin speech in, a talking 3-D face out.",
+)
+for kind in KINDS.values():
+    app.command(kind.name, help=kind.summary)(service_command(kind))
+for command in (
+    run.run, clients.speak, clients.listen, clients.status, configuration.config,
+    offline.render, offline.phones, offline.align,
+):  # fmt: skip
+    app.command()(command)
+app.add_typer(head_app, name="head")
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is one line on standard error and status 2."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file, too
+    try:
+        app()
+    except UserError as error:
+        CONSOLE.print(f"kouxing: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(2)

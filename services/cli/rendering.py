@@ -1,0 +1,165 @@
+"""Videos and pictures of a sound or FAP file, without running services."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from services.cli.sound_file import read_mono_16k
+from services.cli.terminal import CONSOLE, print_message
+from services.driver.config import Framing
+from services.driver.render import scene
+from services.driver.render.renderer import Renderer
+from services.driver.video import film
+from services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_sequence
+from services.live_chain import LiveChain
+from services.recognizer.acoustic.load import load_model
+from services.synthesizer.face import Frame
+from services.synthesizer.lips.load import load_lip_model
+from shared.clock import MEDIA_RATE_HZ
+from shared.errors import UserError
+from shared.face.fap_file import read_fap
+from shared.phones.events import Phone
+
+FRAME_RATE_HZ = 25.0  # of the video of a sound
+MAX_FRAME_RATE_HZ = 240.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shot:
+    """How the head is shown; the fields are the options of ``kouxing render``."""
+
+    head: str
+    size: str
+    background: str
+    camera: Framing
+    yaw_deg: float
+    pitch_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Animation:
+    """What is rendered."""
+
+    frames: list[Frame]
+    frame_rate_hz: float
+    samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
+    num_phones: int | None = None  # None: the source is no sound
+
+
+def render_file(
+    source: Path,
+    output: Path,
+    shot: Shot,
+    *,
+    rate_hz: float | None = None,
+    sound: Path | None = None,
+    at_s: float | None = None,
+) -> None:
+    """Make a video, one picture or a picture for every image.
+
+    Parameters
+    ----------
+    source
+        A sound, or a ``.fap`` file.
+    output
+        Its name tells what is made.
+    rate_hz
+        Images per second; None: as the source has.
+    sound
+        Sound for a ``.fap`` file.
+    at_s
+        Time of the one picture.
+
+    Raises
+    ------
+    UserError
+        If a file cannot be read or written, or options do not fit each other.
+    """
+    is_picture = output.suffix == ".png" and not is_sequence(output)
+    if at_s is not None and not is_picture:
+        raise UserError("--at says when one picture is taken; give the name of one (.png)")
+    if sound is not None and not _is_fap(source):
+        raise UserError(f"--sound is for a .fap file; {source} brings its own")
+    if not is_picture:
+        check_name(output)
+    renderer = _make_renderer(shot, output)
+    with Progress(console=CONSOLE, transient=True) as progress:
+        if _is_fap(source):
+            animation = _read_animation(source, sound)
+        else:
+            animation = _animate(source, progress)
+        if not animation.frames:
+            raise UserError(f"{source}: it has no frames")
+        if is_picture:
+            film.render_picture(animation.frames, output, renderer, at_s or 0.0)
+            num_images = 1
+        else:
+            drawing = progress.add_task("drawing", total=1.0)
+            num_images = film.render_video(
+                animation.frames,
+                output,
+                renderer,
+                frame_rate_hz=rate_hz or animation.frame_rate_hz,
+                samples=animation.samples,
+                on_progress=lambda share: progress.update(drawing, completed=share),
+            )
+    renderer.close()
+    if animation.num_phones == 0:
+        print_message(f"{source}: no speech was found; the mouth stays closed")
+    images = "1 image" if num_images == 1 else f"{num_images} images"
+    phones = "" if animation.num_phones is None else f", {animation.num_phones} phones"
+    print_message(f"wrote {output}: {images}{phones}")
+
+
+def _is_fap(source: Path) -> bool:
+    return source.suffix.lower() == ".fap"
+
+
+def _make_renderer(shot: Shot, output: Path) -> Renderer:
+    width_px, height_px = _parse_size(shot.size, even=output.suffix in VIDEO_SUFFIXES)
+    background = scene.background(shot.background)
+    if background is None and output.suffix == ".mp4":
+        raise UserError("MP4 has no transparency; write .mov, .webm, or pictures (.png)")
+    head = scene.load_head(shot.head)
+    camera = scene.camera(head, shot.camera, shot.yaw_deg, shot.pitch_deg)
+    return Renderer(head, width_px, height_px, background=background, camera=camera)
+
+
+def _read_animation(source: Path, sound: Path | None) -> _Animation:
+    animation = read_fap(source)
+    return _Animation(
+        film.frames_of(animation),
+        min(animation.frame_rate_hz, MAX_FRAME_RATE_HZ),
+        None if sound is None else read_mono_16k(sound),
+    )
+
+
+def _animate(source: Path, progress: Progress) -> _Animation:
+    """Make the frames that the services, by their defaults, would make of a sound."""
+    samples = read_mono_16k(source)
+    task = progress.add_task("recognising", total=len(samples))
+    chain = LiveChain(load_model(), load_lip_model())
+    frames: list[Frame] = []
+    for begin in range(0, len(samples), MEDIA_RATE_HZ):
+        frames += chain.accept_waveform(samples[begin : begin + MEDIA_RATE_HZ])
+        progress.update(task, completed=begin + MEDIA_RATE_HZ)
+    frames += chain.input_finished()
+    num_phones = len({event.index for event in chain.events if isinstance(event, Phone)})
+    return _Animation(frames, FRAME_RATE_HZ, samples, num_phones)
+
+
+def _parse_size(text: str, *, even: bool) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise UserError(f"--size {text}: write WIDTHxHEIGHT, for example 1280x720")
+    width_px, height_px = int(width), int(height)
+    if not (16 <= width_px <= 7680 and 16 <= height_px <= 4320):
+        raise UserError(f"--size {text}: 16x16 to 7680x4320")
+    if even and (width_px % 2 or height_px % 2):
+        raise UserError(f"--size {text}: both must be even for a video")
+    return width_px, height_px

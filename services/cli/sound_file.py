@@ -1,0 +1,35 @@
+"""Sound files as the commands read them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.cli.terminal import print_message
+from services.recognizer.front_end.resample import Resampler
+from shared.audio_file import clipping_remarks, num_clipped, open_audio
+
+
+def read_mono_16k(path: Path) -> NDArray[np.float32]:
+    """Return a file's samples as the recognizer processes them: 16 kHz mono, shape ``(n,)``.
+
+    Tells the user if the file is cut off or clipped.
+
+    Raises
+    ------
+    UserError
+        As ``shared.audio_file.open_audio``.
+    """
+    source = open_audio(path, block_s=1.0)
+    resampler = Resampler(source.sample_rate_hz, source.num_channels)
+    parts = []
+    num_samples = clipped = 0
+    for block in source.blocks:
+        parts.append(resampler.accept_waveform(block))
+        num_samples += block.size
+        clipped += num_clipped(block)
+    for remark in (*source.remarks, *clipping_remarks(str(path), clipped / max(1, num_samples))):
+        print_message(remark)
+    return np.concatenate([*parts, resampler.finish()])

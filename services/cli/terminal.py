@@ -1,0 +1,78 @@
+"""What commands share: the console, and writing results."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from shared.errors import UserError
+
+CONSOLE = Console(stderr=True)
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the figures here.")]
+
+
+def print_message(text: str) -> None:
+    """Print a line for the user on standard error, apart from a command's results."""
+    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def write_output(text: str, output: Path | None) -> None:
+    """Write a command's result to a file, or to standard output if there is none."""
+    if output is None:
+        sys.stdout.write(text)
+    else:
+        write_text(output, text)
+
+
+def write_json(path: Path | None, figures: object) -> None:
+    """Write figures if there is a file for them."""
+    if path is not None:
+        write_text(path, json.dumps(figures, indent=1, ensure_ascii=False, default=_plain))
+
+
+def check_output(*paths: Path | None) -> None:
+    """Check before long work that files can be written; None stands for no file.
+
+    Raises
+    ------
+    UserError
+        If one of them cannot be written.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        is_new = not path.exists()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("a"):
+                pass
+            if is_new:
+                path.unlink()
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file and the folders it lies in.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _plain(value: object) -> object:
+    if hasattr(value, "item"):  # a NumPy scalar; NumPy would make every command slow to start
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no JSON form")

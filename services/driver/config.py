@@ -1,0 +1,47 @@
+"""The driver's configuration."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from shared.config import Form, ServiceConfig, Switch
+
+
+class Framing(StrEnum):
+    """What fills the picture."""
+
+    FACE = "face"
+    HEAD = "head"
+    MOUTH = "mouth"
+
+
+class DriverConfig(ServiceConfig):
+    """The driver's own keys."""
+
+    view: Literal["auto", "window", "none"] = "auto"
+    """Whether to open a window; auto: where there is a display."""
+    session: Annotated[
+        str,
+        Field(pattern="^[A-Za-z0-9_-]{1,64}$"),
+        Form("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
+    ] = "newest"
+    """The session that is shown; "newest": the one that opened last."""
+    out: str = "out"
+    """Folder for recorded videos."""
+    head: str = "woman"
+    """A head of the package (woman, man, elder, child), an .npz, or a .glb with morph targets."""
+    background: str = "studio"
+    """studio, #rrggbb, or the name of a colour."""
+    camera: Framing = Framing.FACE
+    """What fills the picture."""
+    virtual_camera: Switch = False
+    """Also be a camera for other programs."""
+    width_px: Annotated[int, Field(ge=16, le=7680, multiple_of=2)] = 1280
+    """Width of window and video; even, for H.264."""
+    height_px: Annotated[int, Field(ge=16, le=4320, multiple_of=2)] = 720
+    """Height of window and video; even, for H.264."""
+    frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
+    """Images per second."""

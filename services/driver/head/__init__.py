@@ -1,0 +1,1 @@
+"""Heads: loading, deforming, importing, exporting."""

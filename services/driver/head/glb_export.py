@@ -1,0 +1,349 @@
+"""Export a head as a standard binary glTF (GLB) that a browser or an engine can move by FAPs.
+
+Khronos glTF 2.0. Every displacement FAP is a morph target (sparse accessors), named by the FAP,
+and so is each of ARKit's 52 shapes, a sum of FAPs by ``arkit.tsv``; drive the head by the ones or
+by the others. The rotations (FAPs 23 to 26 and 48 to 50) turn nodes. ``extras.kouxing`` of the root
+node and of the scene says how a FAP becomes a weight or an angle:
+
+- weight = FAP / ``unitsPerWeight``, never clamped;
+- angle in rad = FAP * 1e-5 about ``rotation.axis`` of the node ``rotation.node``; several on one
+  node combine as yaw * pitch * roll.
+
+Nodes: ``kouxing`` > ``body`` (joint), ``garment``; ``body`` > ``head`` (joint) > ``eye_left``,
+``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``;
+and ``skin``, a mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face
+looks along z.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head.head import ASSETS, Head, Part
+from services.driver.render.renderer import BACKGROUND
+from services.driver.render.scene import camera
+from shared.errors import UserError
+from shared.face.blendshapes import ARKIT, ARKIT_NAMES
+from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
+
+_COMPONENT = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
+_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
+_MAX_SHORT_VERTICES = 65535  # more need indices of four bytes; 65535 itself is no index
+_MIN_SHIFT_M = 2e-5  # smaller displacements at one FAPU are left out,
+_MIN_SHAPE_SHIFT_M = 1e-4  # and smaller ones of an ARKit shape at weight 1
+_ANGLE_UNITS_PER_WEIGHT = 1 / RADIANS_PER_ANGLE_UNIT  # a weight of 1 is 1 rad
+
+_ROTATION_OF = {
+    23: ("eye_left", (0, 1, 0)),
+    24: ("eye_right", (0, 1, 0)),
+    25: ("eye_left", (1, 0, 0)),
+    26: ("eye_right", (1, 0, 0)),
+    48: ("head", (1, 0, 0)),
+    49: ("head", (0, 1, 0)),
+    50: ("head", (0, 0, 1)),
+}
+_TURNS_EYES = np.isin(np.arange(1, NUM_FAPS + 1), (23, 24, 25, 26))
+
+
+class _Document:
+    """The JSON chunk and the binary chunk while they grow."""
+
+    def __init__(self) -> None:
+        self.json: dict[str, list[Any]] = {
+            key: []
+            for key in (
+                "nodes", "meshes", "materials", "textures", "images", "samplers", "skins",
+                "accessors", "bufferViews",
+            )
+        }  # fmt: skip
+        self.binary = bytearray()
+
+    def add(self, kind: str, item: dict[str, Any]) -> int:
+        """Append to a list of the document and return the index."""
+        self.json[kind].append(item)
+        return len(self.json[kind]) - 1
+
+    def view(self, data: bytes, target: int | None = None) -> int:
+        """Append bytes, aligned to four."""
+        self.binary += b"\0" * (-len(self.binary) % 4)
+        view: dict[str, Any] = {
+            "buffer": 0,
+            "byteOffset": len(self.binary),
+            "byteLength": len(data),
+        }
+        if target is not None:
+            view["target"] = target
+        self.binary += data
+        return self.add("bufferViews", view)
+
+    def accessor(
+        self,
+        array: NDArray[Any],
+        kind: str,
+        *,
+        target: int = _ARRAY_BUFFER,
+        normalized: bool = False,
+        bounds: bool = False,
+    ) -> int:
+        """Store an array (N,) or (N, components)."""
+        item: dict[str, Any] = {
+            "bufferView": self.view(np.ascontiguousarray(array).tobytes(), target),
+            "componentType": _COMPONENT[array.dtype.str[1:]],
+            "count": len(array),
+            "type": kind,
+        }
+        if normalized:
+            item["normalized"] = True
+        if bounds:
+            item["min"], item["max"] = array.min(axis=0).tolist(), array.max(axis=0).tolist()
+        return self.add("accessors", item)
+
+    def sparse_vectors(
+        self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int
+    ) -> int:
+        """Store displacements (N, 3) that are zero but in ``rows``."""
+        number = np.uint16 if count <= _MAX_SHORT_VERTICES else np.uint32
+        padded = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])
+        return self.add(
+            "accessors",
+            {
+                "componentType": _COMPONENT["f4"],
+                "count": count,
+                "type": "VEC3",
+                "min": padded.min(axis=0).tolist(),
+                "max": padded.max(axis=0).tolist(),
+                "sparse": {
+                    "count": len(rows),
+                    "indices": {
+                        "bufferView": self.view(rows.astype(number).tobytes()),
+                        "componentType": _COMPONENT[np.dtype(number).str[1:]],
+                    },
+                    "values": {"bufferView": self.view(values.tobytes())},
+                },
+            },
+        )
+
+    def save(self, path: Path, **rest: Any) -> None:
+        """Write the two chunks."""
+        document = {"asset": {"version": "2.0", "generator": "kouxing"}, **self.json, **rest}
+        document["buffers"] = [{"byteLength": len(self.binary)}]
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
+        length = 12 + 8 + len(text) + 8 + len(binary)
+        try:
+            with path.open("wb") as file:
+                file.write(struct.pack("<4sII", b"glTF", 2, length))
+                file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+                file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+        except OSError as error:
+            raise UserError(
+                f"{path} cannot be written ({error.strerror}); give another path"
+            ) from error
+
+
+def export_glb(head: Head, path: str | Path) -> None:
+    """Write a head as GLB.
+
+    Parameters
+    ----------
+    head
+        The head; a fine one has more triangles.
+    path
+        File to write.
+
+    Raises
+    ------
+    UserError
+        If the name does not end in ``.glb``, or the file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".glb":
+        raise UserError(f"{path}: give a name that ends in .glb")
+    document = _Document()
+    sampler = document.add(
+        "samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+    )
+    textures: dict[str, int] = {}
+    for name, encoded in head.textures.items():
+        kind = "image/png" if encoded.startswith(b"\x89PNG") else "image/jpeg"
+        image = document.add(
+            "images", {"bufferView": document.view(encoded), "mimeType": kind, "name": name}
+        )
+        textures[name] = document.add("textures", {"sampler": sampler, "source": image})
+
+    nodes: dict[str, int] = {}
+    for part in head.parts:
+        nodes[part.name] = _part_node(document, head, part, textures)
+    carriers = {part.name: _carrier(head, part) for part in head.parts}
+    on_head, on_body, skinned = (
+        [nodes[name] for name, carrier in carriers.items() if carrier == kind]
+        for kind in ("head", "body", "both")
+    )
+    nodes["head"] = document.add("nodes", _parent("head", on_head))
+    nodes["body"] = document.add("nodes", _parent("body", [nodes["head"]]))
+    extras = {"kouxing": _description(head)}
+    nodes["kouxing"] = document.add(
+        "nodes", _parent("kouxing", [nodes["body"], *on_body]) | {"extras": extras}
+    )
+    identity = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)).reshape(2, 16)
+    matrices = document.accessor(identity, "MAT4")
+    del document.json["bufferViews"][-1]["target"]  # matrices are no vertex attribute
+    joints = [nodes["body"], nodes["head"]]
+    document.add(
+        "skins",
+        {"joints": joints, "skeleton": nodes["body"], "inverseBindMatrices": matrices},
+    )
+    document.save(
+        Path(path),
+        scene=0,
+        scenes=[{"name": head.name, "nodes": [nodes["kouxing"], *skinned], "extras": extras}],
+    )
+
+
+def _carrier(head: Head, part: Part) -> str:
+    """Say what carries a part: the head, the body, or both, as the neck."""
+    share = np.round(head.head_weight[part.vertices] * 255)
+    return "head" if share.min() == 255 else "body" if share.max() == 0 else "both"
+
+
+def _parent(name: str, children: list[int]) -> dict[str, Any]:
+    return {"name": name} | ({"children": children} if children else {})
+
+
+def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, int]) -> int:
+    vertices = head.vertices[part.vertices]
+    node: dict[str, Any] = {"name": part.name}
+    if part.name in ("eye_left", "eye_right"):
+        centre = head.eye_centres[int(part.name == "eye_right")]
+        node["translation"] = centre.tolist()
+        vertices = vertices - centre
+    colors = np.ones((len(vertices), 4))
+    colors[:, :3] = head.colors[part.vertices]
+    attributes = {
+        "POSITION": document.accessor(vertices, "VEC3", bounds=True),
+        "NORMAL": document.accessor(head.normals[part.vertices], "VEC3"),
+        "TEXCOORD_0": document.accessor(head.uv[part.vertices], "VEC2"),
+        "COLOR_0": document.accessor(
+            np.round(colors * 65535).astype(np.uint16), "VEC4", normalized=True
+        ),
+    }
+    if _carrier(head, part) == "both":
+        share = np.round(head.head_weight[part.vertices] * 255).astype(np.uint8)
+        joints, weights = np.zeros((2, len(vertices), 4), np.uint8)
+        joints[:, 1] = share > 0  # an unused joint must be 0
+        weights[:, 0], weights[:, 1] = 255 - share, share
+        attributes["JOINTS_0"] = document.accessor(joints, "VEC4")
+        attributes["WEIGHTS_0"] = document.accessor(weights, "VEC4", normalized=True)
+        node["skin"] = 0
+    indices = (head.triangles[part.triangles] - part.vertices.start).ravel()
+    if len(vertices) <= _MAX_SHORT_VERTICES:
+        indices = indices.astype(np.uint16)
+    primitive: dict[str, Any] = {
+        "attributes": attributes,
+        "indices": document.accessor(indices, "SCALAR", target=_ELEMENT_BUFFER),
+        "material": document.add("materials", _material(part, textures)),
+    }
+    mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive]}
+    targets, names = _targets(document, head, part)
+    if targets:
+        primitive["targets"] = targets
+        mesh["weights"] = [0.0] * len(targets)
+        mesh["extras"] = {"targetNames": names}
+    node["mesh"] = document.add("meshes", mesh)
+    return document.add("nodes", node)
+
+
+def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
+    material: dict[str, Any] = {
+        "name": part.name,
+        "pbrMetallicRoughness": {
+            "baseColorTexture": {"index": textures[part.texture]},
+            "metallicFactor": 0.0,
+            "roughnessFactor": part.roughness,
+        },
+    }
+    if part.transparent:
+        material["alphaMode"] = "BLEND"
+    if part.double_sided:
+        material["doubleSided"] = True
+    return material
+
+
+def _targets(document: _Document, head: Head, part: Part) -> tuple[list[dict[str, int]], list[str]]:
+    """Morph targets of a part, and their names."""
+    count = part.vertices.stop - part.vertices.start
+    fields = head.basis[3 * part.vertices.start : 3 * part.vertices.stop].T.toarray()  # (68, 3 V)
+    shapes = ARKIT @ fields
+    targets: list[dict[str, int]] = []
+    names = []
+
+    def add(name: str, shift: NDArray[np.float32], finest_m: float) -> None:
+        moved = np.flatnonzero(np.abs(shift).max(axis=1) > finest_m)
+        if len(moved):
+            accessor = document.sparse_vectors(moved, shift[moved], count)
+            targets.append({"POSITION": accessor})
+            names.append(name)
+
+    for fap in FAPS:
+        shift = fields[fap.number - 1] * np.float32(_units_per_weight(fap.fapu))
+        add(fap.name, shift.reshape(count, 3), _MIN_SHIFT_M)
+    for name, faps, shape in zip(ARKIT_NAMES, ARKIT, shapes, strict=True):
+        shift = shape.reshape(count, 3)
+        turn = np.where(_TURNS_EYES, faps, 0).astype(np.float32)
+        if part.name.startswith("eye") and turn.any():  # engines may know shapes alone
+            shift = shift + (head.deform(turn) - head.vertices)[part.vertices]
+        add(name, shift, _MIN_SHAPE_SHIFT_M)
+    return targets, names
+
+
+def _units_per_weight(fapu: str) -> float:
+    return _ANGLE_UNITS_PER_WEIGHT if fapu == "AU" else FAP_UNITS_PER_FAPU
+
+
+def _description(head: Head) -> dict[str, Any]:
+    """Say what a viewer needs to turn FAPs into weights and angles."""
+    faps: list[dict[str, Any]] = []
+    turning = {"head"} | {part.name for part in head.parts}
+    for fap in FAPS[2:]:
+        entry: dict[str, Any] = {"number": fap.number, "name": fap.name, "fapu": fap.fapu}
+        node, axis = _ROTATION_OF.get(fap.number, ("", ()))
+        if node in turning:
+            entry["rotation"] = {"node": node, "axis": axis}
+        else:
+            entry["unitsPerWeight"] = _units_per_weight(fap.fapu)
+        faps.append(entry)
+    view = camera(head)
+    own = (ASSETS / f"{head.name}.npz").is_file()
+    return {
+        "version": 1,
+        "faps": faps,
+        "fapu": head.fapu,
+        "featurePoints": {
+            name: [round(float(c), 6) for c in head.vertices[vertex]]
+            for name, vertex in head.feature_points.items()
+        },
+        "camera": {
+            "position": view.position,
+            "target": view.target,
+            "fovYDegrees": view.field_of_view_deg,
+        },
+        "background": BACKGROUND[0],
+        "visemes": _shapes(VISEME_NAMES, VISEMES),
+        "expressions": _shapes(EXPRESSION_NAMES, EXPRESSIONS),
+        "arkit": _shapes(ARKIT_NAMES, ARKIT),
+    } | ({"licence": "CC0-1.0"} if own else {})
+
+
+def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:
+    """List shapes as low-level FAPs."""
+    return [
+        {"name": name, "faps": {FAPS[i].name: round(float(row[i]), 1) for i in np.flatnonzero(row)}}
+        for name, row in zip(names, values, strict=True)
+    ]

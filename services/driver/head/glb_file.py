@@ -1,0 +1,195 @@
+"""Read binary glTF (GLB): every size is checked before anything is read by it.
+
+Khronos glTF 2.0, sections 3.6 (accessors), 3.7 (geometry, skins, morph targets) and 4.4 (GLB).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+
+MAX_BYTES = 512 * 1024 * 1024
+MAX_COUNT = 2_000_000  # elements of an accessor
+MAX_NODES = 20_000
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_UNDERSTOOD = {  # extensions that may be required: their data is plain glTF, or only looks
+    "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform", "EXT_texture_webp",
+    "KHR_materials_specular", "KHR_materials_emissive_strength", "VRM", "VRMC_vrm",
+}  # fmt: skip
+
+Float64 = NDArray[np.float64]
+
+
+class BadGlbError(Exception):
+    """What is wrong in the file."""
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no JSON")
+
+
+class Glb:
+    """The two chunks of a file.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read.
+    BadGlbError
+        If it is no GLB, or needs an extension that is not understood.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            if path.stat().st_size > MAX_BYTES:
+                raise BadGlbError(f"it is larger than {MAX_BYTES // 2**20} MiB")
+            data = path.read_bytes()
+        except OSError as error:
+            raise UserError(f"cannot read {path}: {error.strerror}") from error
+        if len(data) < 20 or data[:4] != b"glTF":
+            raise BadGlbError("it is no binary glTF")
+        version, length = struct.unpack_from("<II", data, 4)
+        if version != 2 or length > len(data):
+            raise BadGlbError(f"version {version}, {length} of {len(data)} bytes")
+        chunks: dict[bytes, bytes] = {}
+        at = 12
+        while at + 8 <= length:
+            size, kind = struct.unpack_from("<I4s", data, at)
+            if at + 8 + size > length:
+                raise BadGlbError("a chunk is cut off")
+            chunks.setdefault(kind, data[at + 8 : at + 8 + size])
+            at += 8 + size
+        try:
+            self.json: dict[str, Any] = json.loads(chunks[b"JSON"], parse_constant=_no_number)
+            missing = set(self.json.get("extensionsRequired", ())) - _UNDERSTOOD
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise BadGlbError("it has no intact glTF description") from error
+        if missing:
+            raise BadGlbError(f"it needs {', '.join(sorted(missing))}; save it uncompressed")
+        self._binary = chunks.get(b"BIN\0", b"")
+
+    def item(self, kind: str, index: object) -> dict[str, Any]:
+        """Return an entry of one of the description's lists."""
+        entries = self.json.get(kind, [])
+        if not isinstance(index, int) or not 0 <= index < len(entries):
+            raise BadGlbError(f"there is no {kind} {index}")
+        entry: dict[str, Any] = entries[index]
+        return entry
+
+    def view(self, index: object) -> bytes:
+        """Return the bytes of a buffer view."""
+        view = self.item("bufferViews", index)
+        start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
+        if view.get("buffer", 0) != 0 or start < 0 or size < 0 or start + size > len(self._binary):
+            raise BadGlbError("a buffer view lies outside the file")
+        return self._binary[start : start + size]
+
+    def accessor(self, index: object) -> Float64:
+        """Return an accessor's values (N, components), normalized ones as -1 to 1."""
+        item = self.item("accessors", index)
+        width, count = _COMPONENTS[item["type"]], int(item["count"])
+        kind = np.dtype(_TYPES[item["componentType"]])
+        if not 0 <= count <= MAX_COUNT:
+            raise BadGlbError(f"an accessor of {count} elements")
+        values = np.zeros((count, width), kind)
+        if "bufferView" in item:
+            stride = int(self.item("bufferViews", item["bufferView"]).get("byteStride", 0))
+            values = self._strided(
+                item["bufferView"], int(item.get("byteOffset", 0)), (count, width), kind, stride
+            ).copy()
+        if "sparse" in item:
+            sparse = item["sparse"]
+            size = int(sparse["count"])
+            where, what = sparse["indices"], sparse["values"]
+            rows = self._strided(
+                where["bufferView"],
+                int(where.get("byteOffset", 0)),
+                (size, 1),
+                np.dtype(_TYPES[where["componentType"]]),
+            )
+            if size and rows.max() >= count:
+                raise BadGlbError("a sparse accessor writes outside itself")
+            values[rows[:, 0]] = self._strided(
+                what["bufferView"], int(what.get("byteOffset", 0)), (size, width), kind
+            )
+        out = values.astype(np.float64)
+        if item.get("normalized"):
+            out = np.maximum(out / np.iinfo(kind).max, -1.0)
+        if not np.isfinite(out).all():
+            raise BadGlbError("a number is not finite")
+        return out
+
+    def image(self, texture: object) -> bytes:
+        """Return the encoded image of a texture, or nothing if it lies outside the file."""
+        entry = self.item("textures", texture)
+        source = entry.get("source")
+        for extension in entry.get("extensions", {}).values():
+            source = extension.get("source", source)
+        image = self.item("images", source)
+        if "bufferView" in image:
+            return self.view(image["bufferView"])
+        prefix, _, encoded = str(image.get("uri", "")).partition(";base64,")
+        if not prefix.startswith("data:"):
+            return b""
+        try:
+            return base64.b64decode(encoded)
+        except binascii.Error:
+            return b""
+
+    def nodes(self) -> list[tuple[int, Float64]]:
+        """List the nodes of the scene with their places in the world (4, 4), parents first."""
+        scenes = self.json.get("scenes", [])
+        scene = scenes[self.json.get("scene", 0)] if scenes else {}
+        roots = scene.get("nodes", range(len(self.json.get("nodes", []))))
+        waiting = [(int(root), np.eye(4)) for root in roots]
+        found: dict[int, Float64] = {}
+        while waiting:
+            number, above = waiting.pop(0)
+            node = self.item("nodes", number)
+            if number in found or len(found) > MAX_NODES:
+                raise BadGlbError("its nodes form no tree")
+            found[number] = above @ _placed(node)
+            waiting += [(int(child), found[number]) for child in node.get("children", [])]
+        return list(found.items())
+
+    def _strided(
+        self, view: object, start: int, shape: tuple[int, int], kind: np.dtype[Any], stride: int = 0
+    ) -> NDArray[Any]:
+        data = self.view(view)
+        width = shape[1] * kind.itemsize
+        stride = stride or width
+        if (
+            start < 0
+            or stride < width
+            or (shape[0] and start + stride * (shape[0] - 1) + width > len(data))
+        ):
+            raise BadGlbError("an accessor is larger than its buffer view")
+        return np.ndarray(shape, kind, data, start, (stride, kind.itemsize))
+
+
+def _placed(node: dict[str, Any]) -> Float64:
+    """Matrix (4, 4) of a node in its parent."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    placed = np.eye(4)
+    placed[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    placed[:3, 3] = node.get("translation", (0, 0, 0))
+    return placed

@@ -1,0 +1,357 @@
+"""The talking head: one mesh, one linear basis of facial animation parameters.
+
+Every FAP but the rotations is a displacement field over the vertices, so a face is
+
+    v(f) = v_0 + sum_k f_k * B_k
+
+followed by the turns of the eyeballs (FAPs 23 to 26) and of the head (FAPs 48 to 50).
+
+======  ===========================================  =====  ==============
+symbol  meaning                                      unit   shape
+======  ===========================================  =====  ==============
+v_0     vertices of the neutral face                 m      (V, 3)
+f       facial animation parameters                  FAP    (68,)
+B       displacement by one FAP unit                 m      (68, V, 3)
+======  ===========================================  =====  ==============
+
+ISO/IEC 14496-2 annex C (FAPs, FAPUs and feature points); Li 2011, section 2.1 (zones of influence
+round the feature points). Deviation: a zone is weighted by distances along the surface, and the
+lips between their feature points by a smooth (biharmonic) interpolation, see ``training.heads``.
+
+Axes: x to the subject's left, y up, z to the front; the origin is the pivot of the head.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from services.driver.head.shading import Shading
+from shared.errors import UserError
+from shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+
+FORMAT = "kouxing head 1"
+ASSETS = Path(__file__).parent / "assets"
+DEFAULT_HEAD = "woman"
+MAX_BYTES = 512 * 1024 * 1024  # size of an unpacked file
+
+Detail = Literal["fine", "coarse"]
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A run of vertices and triangles with a material of its own."""
+
+    name: str
+    vertices: slice  # rows of Head.vertices
+    triangles: slice  # rows of Head.triangles
+    texture: str  # key of Head.textures
+    roughness: float  # 0 to 1
+    transparent: bool  # the texture's alpha counts
+    double_sided: bool  # its inside is seen, too
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """A head that FAPs move.
+
+    Attributes
+    ----------
+    name
+        The asset's name.
+    parts
+        Skin, garment, eyes, teeth, tongue, hair and lashes.
+    vertices
+        Neutral face (V, 3), m.
+    triangles
+        Vertex numbers (F, 3), counter-clockwise seen from outside.
+    uv
+        Texture coordinates (V, 2), v downwards.
+    colors
+        Linear factors on the texture (V, 3), 0 to 1: baked ambient occlusion and tint.
+    head_weight
+        Share of the head's turn that a vertex follows (V,), 0 on the shoulders.
+    basis
+        Displacement of the coordinates by one FAP unit, sparse (3 V, 68), m.
+    fapu
+        ``MNS MW ENS ES IRISD`` in m, ``AU`` in rad.
+    feature_points
+        Vertex of each MPEG-4 feature point on the mesh, by its name ("2.1").
+    eye_centres
+        Left and right (2, 3), m.
+    textures
+        Encoded images (JPEG or PNG) by name.
+    shading
+        How the normals follow the vertices.
+    """
+
+    name: str
+    parts: tuple[Part, ...]
+    vertices: Float32
+    triangles: NDArray[np.uint32]
+    uv: Float32
+    colors: Float32
+    head_weight: Float32
+    basis: sparse.csr_array
+    fapu: dict[str, float]
+    feature_points: dict[str, int]
+    eye_centres: Float32
+    textures: dict[str, bytes]
+    shading: Shading
+
+    @property
+    def normals(self) -> Float32:
+        """Normals of the neutral face (V, 3), unit length."""
+        return self.shading.rest
+
+    @classmethod
+    def load(cls, path: str | Path = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
+        """Read a head.
+
+        Parameters
+        ----------
+        path
+            Name of a head that comes with the package, or path of an ``.npz``.
+        detail
+            "fine" for pictures to keep, "coarse" (a quarter of the skin's triangles) for speed;
+            the feature points move alike in both.
+
+        Raises
+        ------
+        UserError
+            If there is no such head, or the file is no head.
+        """
+        file = Path(path)
+        if file.suffix != ".npz":
+            file = ASSETS / f"{path}.npz"
+        if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
+            known = ", ".join(sorted(asset.stem for asset in ASSETS.glob("*.npz")))
+            raise UserError(f"there is no head {str(path)!r}; give the path of an .npz or: {known}")
+        try:
+            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as asset:
+                if sum(entry.file_size for entry in asset.zip.infolist()) > MAX_BYTES:
+                    raise ValueError(f"more than {MAX_BYTES // 2**20} MiB unpacked")
+                arrays = {key: asset[key] for key in asset.files}
+            return assemble(file.stem, arrays, detail)
+        except (
+            OSError, EOFError, ValueError, TypeError, AttributeError, KeyError, IndexError,
+            MemoryError, RuntimeError, zlib.error, zipfile.BadZipFile,
+        ) as error:  # fmt: skip
+            raise UserError(
+                f"{file} is no intact head ({error}); make one with kouxing head import"
+            ) from error
+
+    def part(self, name: str) -> Part:
+        """Find a part by its name."""
+        return next(part for part in self.parts if part.name == name)
+
+    def deform(self, faps: Float32) -> Float32:
+        """Move the vertices.
+
+        Parameters
+        ----------
+        faps
+            Facial animation parameters (68,), FAP units. FAPs 1 and 2 are ignored.
+
+        Returns
+        -------
+        Vertices (V, 3), m.
+        """
+        return self._turn(self._bend(faps), faps, points=True)
+
+    def pose(self, faps: Float32) -> tuple[Float32, Float32]:
+        """Move the vertices and find their normals, both (V, 3)."""
+        vertices = self._bend(faps)
+        normals = self.shading.normals(vertices)
+        return self._turn(vertices, faps, points=True), self._turn(normals, faps, points=False)
+
+    def _bend(self, faps: Float32) -> Float32:
+        if faps.shape != (NUM_FAPS,):
+            raise ValueError(f"expected FAPs of shape ({NUM_FAPS},), got {faps.shape}")
+        moved: Float32 = self.basis @ np.asarray(faps, dtype=np.float32)
+        return self.vertices + moved.reshape(-1, 3)
+
+    def _turn(self, rows: Float32, faps: Float32, *, points: bool) -> Float32:
+        """Turn eyeballs and head; ``rows`` are points, or normals that no centre shifts."""
+        angle = np.asarray(faps, dtype=np.float64) * RADIANS_PER_ANGLE_UNIT
+        for side, (name, yaw, pitch) in enumerate((("eye_left", 23, 25), ("eye_right", 24, 26))):
+            if angle[yaw - 1] or angle[pitch - 1]:
+                turn = _rotation(angle[yaw - 1], angle[pitch - 1], 0.0)
+                centre = self.eye_centres[side] * np.float32(points)
+                for part in self.parts:  # an eye may have several, or none
+                    if part.name.startswith(name):
+                        where = part.vertices
+                        rows[where] = (rows[where] - centre) @ turn.T + centre
+        pitch, yaw, roll = angle[47:50]
+        if pitch or yaw or roll:
+            turned = rows @ _rotation(yaw, pitch, roll).T
+            rows += self.head_weight[:, None] * (turned - rows)
+        return rows
+
+
+def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
+    """Matrix (3, 3) of a turn: to the subject's left, down, and tilted to the subject's right."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    cr, sr = np.cos(roll), np.sin(roll)
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    about_z = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
+    return np.asarray(about_y @ about_x @ about_z, dtype=np.float32)
+
+
+def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine") -> Head:
+    """Build a head out of the arrays of its file.
+
+    Raises
+    ------
+    ValueError, KeyError, IndexError
+        If they do not fit each other.
+    """
+    if str(arrays["format"]) != FORMAT:
+        raise ValueError(f"format {arrays['format']}, expected {FORMAT}")
+    _check(arrays)
+    coarse = detail == "coarse"
+    # a part's coarse vertices come first, so that the coarse head is a selection of rows
+    first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
+    ends = after_coarse if coarse else after
+    kept = np.concatenate([np.arange(a, b) for a, b in zip(first, ends, strict=True)])
+    place = np.full(int(after[-1]), -1, dtype=np.int64)
+    place[kept] = np.arange(len(kept))
+
+    parts, triangles = [], []
+    num_triangles = 0
+    bounds = arrays["part_triangles"].astype(np.int64)  # fine first, fine end, coarse first, end
+    for row, part_name in enumerate(arrays["part_names"].astype(str)):
+        start, end = bounds[row, 2:] if coarse else bounds[row, :2]
+        own = place[arrays["triangles"][start:end].astype(np.int64)]
+        if len(own) == 0 or own.min() < 0:
+            raise ValueError(f"part {part_name} refers to missing vertices")
+        triangles.append(own.astype(np.uint32))
+        from_vertex = int(place[first[row]])
+        parts.append(
+            Part(
+                name=str(part_name),
+                vertices=slice(from_vertex, from_vertex + int(ends[row] - first[row])),
+                triangles=slice(num_triangles, num_triangles + len(own)),
+                texture=str(arrays["part_textures"][row]),
+                roughness=float(arrays["part_roughness"].astype(float)[row]),
+                transparent=bool(arrays["part_transparent"][row]),
+                double_sided=bool(arrays["part_double_sided"][row]),
+            )
+        )
+        num_triangles += len(own)
+
+    faces = np.concatenate(triangles)
+    vertices = arrays["vertices"].astype(np.float32)[kept]
+    basis = _basis(arrays, place, len(kept))
+    welds = place[arrays["welds"].astype(np.int64)[kept]] if "welds" in arrays else None
+    shading = Shading.of(vertices, faces, basis, welds)
+    centres = arrays["eye_centres"].astype(np.float32)
+    return Head(
+        name=name,
+        parts=tuple(parts),
+        vertices=vertices,
+        shading=shading,
+        triangles=faces,
+        uv=arrays["uv"].astype(np.float32)[kept] / np.float32(65535),
+        colors=(arrays["colors"].astype(np.float32)[kept] / np.float32(255)) ** 2,
+        head_weight=arrays["head_weight"].astype(np.float32)[kept] / np.float32(255),
+        basis=basis,
+        fapu={
+            str(key): float(value)
+            for key, value in zip(
+                arrays["fapu_names"].astype(str), arrays["fapu"].astype(float), strict=True
+            )
+        },
+        feature_points={
+            str(key): int(place[vertex])
+            for key, vertex in zip(
+                arrays["feature_point_names"].astype(str),
+                arrays["feature_points"].astype(np.int64),
+                strict=True,
+            )
+        },
+        eye_centres=centres,
+        textures={
+            key.removeprefix("texture_"): value.astype(np.uint8).tobytes()
+            for key, value in arrays.items()
+            if key.startswith("texture_")
+        },
+    )
+
+
+def _check(arrays: dict[str, NDArray[np.generic]]) -> None:
+    """See whether the arrays fit each other, as far as nothing else finds out."""
+    count, num_parts = len(arrays["vertices"]), len(arrays["part_names"])
+    for key, shape in (
+        ("vertices", (count, 3)), ("uv", (count, 2)), ("colors", (count, 3)),
+        ("head_weight", (count,)), ("eye_centres", (2, 3)), ("part_vertices", (num_parts, 3)),
+        ("part_triangles", (num_parts, 4)), ("part_textures", (num_parts,)),
+        ("triangles", (len(arrays["triangles"]), 3)),
+    ):  # fmt: skip
+        if arrays[key].shape != shape:
+            raise ValueError(f"{key} of shape {arrays[key].shape}, expected {shape}")
+    first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
+    if not (
+        np.array_equal(np.append(first, count), np.append(0, after))
+        and (first <= after_coarse).all()
+        and (after_coarse <= after).all()
+    ):
+        raise ValueError("the parts do not share out the vertices")
+    if len(set(arrays["part_names"].tolist())) < num_parts:
+        raise ValueError("two parts have one name")
+    missing = {f"texture_{name}" for name in arrays["part_textures"].tolist()} - arrays.keys()
+    if missing:
+        raise ValueError(f"{', '.join(sorted(missing))} is missing")
+    left, right = arrays["eye_centres"].astype(np.float64)
+    if not (np.isfinite(arrays["vertices"].astype(np.float32)).all() and left[0] > right[0]):
+        raise ValueError("a vertex is not finite, or the eyes are exchanged")
+
+
+def _basis(
+    arrays: dict[str, NDArray[np.generic]], place: NDArray[np.int64], num_vertices: int
+) -> sparse.csr_array:
+    """Gather the displacement fields as a sparse matrix (3 V, 68)."""
+    bounds = arrays["field_bounds"].astype(np.int64)
+    column = np.repeat(arrays["field_faps"].astype(np.int64) - 1, np.diff(bounds))
+    unit = np.repeat(arrays["field_units"].astype(np.float64), np.diff(bounds))
+    vertex = place[arrays["field_vertices"].astype(np.int64)]
+    shift = arrays["field_shifts"].astype(np.float64) / unit[:, None]
+    kept = vertex >= 0
+    rows = (3 * vertex[kept, None] + np.arange(3)).ravel()
+    basis = sparse.csr_array(
+        (shift[kept].ravel().astype(np.float32), (rows, np.repeat(column[kept], 3))),
+        (3 * num_vertices, NUM_FAPS),
+    )
+    if not np.isfinite(basis.data).all():
+        raise ValueError("a displacement is not finite")
+    return basis
+
+
+def neutral_faps(**values: float) -> Float32:
+    """Make FAPs (68,) that are zero but for the named ones.
+
+    Raises
+    ------
+    UserError
+        If a name is no FAP.
+
+    Examples
+    --------
+    >>> float(neutral_faps(open_jaw=100.0)[2])
+    100.0
+    """
+    faps = np.zeros(NUM_FAPS, dtype=np.float32)
+    for fap_name, value in values.items():
+        if fap_name not in FAP_NUMBER:
+            raise UserError(f"{fap_name!r} is no FAP; the names are in shared/faps.tsv")
+        faps[FAP_NUMBER[fap_name] - 1] = value
+    return faps

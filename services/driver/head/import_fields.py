@@ -1,0 +1,250 @@
+"""Displacement fields of the FAPs on any face, from its feature points.
+
+The same constructions as for the package's own heads (``training.heads.zones``), with all lengths
+measured in the face's own units: zones whose weight falls as a raised cosine of the distances along
+the surface to the moving and to the fixed vertices (Li 2011, section 2.1), and for lips, lids and
+brows the smoothest field that is 1 at its own point and 0 at the others.
+
+A field holds what its FAP does at one FAP unit, m. Points that a file does not give leave their
+FAPs without effect.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head.pieces import Fields
+from services.driver.head.surface import Float, Geodesics, Index, smoothest
+from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS
+
+INNER = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
+OUTER = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")
+LOWER_LIP = ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8")
+UPPER_LIP = ("2.2", "2.6", "2.7", "8.1", "8.5", "8.6")
+AXES = {
+    "down": (1, -1.0),
+    "up": (1, 1.0),
+    "left": (0, 1.0),
+    "right": (0, -1.0),
+    "forward": (2, 1.0),
+}
+CORNER_SLOPE = 0.37  # slope of the lips' curve seen from above, near the corners
+_LID_SLOPE = 0.15  # a closing lid comes forward round the eyeball
+_HINGE = 1.34  # eye distances from the chin back to the jaw's axis
+# FAP, its point, core that moves as a whole and reach, in eye distances
+_ZONES = (
+    (18, "2.10", 0.04, 0.47), (39, "5.1", 0.18, 0.72), (40, "5.2", 0.18, 0.72),
+    (41, "5.3", 0.09, 0.54), (42, "5.4", 0.09, 0.54), (61, "9.1", 0.05, 0.29),
+    (62, "9.2", 0.05, 0.29), (63, "9.3", 0.07, 0.40), (64, "9.3", 0.07, 0.40),
+    (65, "10.1", 0.11, 0.58), (66, "10.2", 0.11, 0.58), (67, "10.3", 0.11, 0.58),
+    (68, "10.4", 0.11, 0.58),
+)  # fmt: skip
+_FACE = (
+    *INNER, *OUTER, "2.1", "3.3", "3.4", "3.7", "3.8", "3.11", "3.12", "9.1", "9.2", "9.3", "9.4",
+    "9.5", "9.15",
+)  # fmt: skip
+
+
+class FaceFields:
+    """All fields of a skin.
+
+    Parameters
+    ----------
+    vertices
+        The skin's vertices (V, 3), m; y is up, the face looks along z.
+    triangles
+        Vertex numbers (F, 3).
+    points
+        Vertex of each feature point on the skin; at least those of ``INNER``, ``OUTER``, 2.1, 2.10.
+    eyes
+        Middles of the left and the right eye (2, 3), m.
+    fapu
+        Lengths, m.
+    """
+
+    def __init__(
+        self,
+        vertices: Float,
+        triangles: Index,
+        points: dict[str, int],
+        eyes: Float,
+        fapu: dict[str, float],
+    ) -> None:
+        self.fields: Fields = {}
+        self._vertices, self._triangles = vertices, triangles
+        self._points, self._eyes, self._fapu = points, eyes, fapu
+        self._unit = fapu["ES"]
+        self._geodesics = Geodesics(vertices, triangles)
+        self._mouth()
+        self._jaw()
+        self._lids()
+        self._brows()
+        self._zones()
+
+    def jaw_fields(self, vertices: Float) -> Fields:
+        """Fields (V, 3) of what moves with the jaw: lower teeth, tongue."""
+        lever = self._lever(vertices[:, 2])
+        whole = np.ones(len(vertices))
+        moved = {3: lever, 14: whole, 15: lever}
+        return {fap: self._along(fap, weight) for fap, weight in moved.items()}
+
+    def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> Fields:
+        """Fields (R, 3) of a tongue, without its share of the jaw's motion.
+
+        Parameters
+        ----------
+        vertices
+            Of the whole mesh (V, 3), m.
+        rows
+            Vertices of the tongue (R,).
+        tip, body
+            Vertices of 6.1 and, if it is known, 6.2.
+        """
+        z = vertices[rows, 2]
+        root = z.min()
+        along = np.clip((z - root) / max(vertices[tip, 2] - root, 1e-9), 0, 1)
+        middle = 0.5 if body is None else (vertices[body, 2] - root) / (vertices[tip, 2] - root)
+        beyond = np.clip((along - middle) / max(1 - middle, 1e-9), 0, 1)
+        at_tip = 0.5 - 0.5 * np.cos(np.pi * beyond)
+        hump = 0.5 + 0.5 * np.cos(np.pi * np.clip((along - middle) / max(middle, 1e-9), -1, 0))
+        fields = {fap: self._along(fap, at_tip) for fap in (43, 44, 45)}
+        fields[46] = self._along(46, hump * (1 - at_tip))
+        return fields
+
+    def _at(self, name: str) -> Float:
+        place: Float = self._vertices[self._points[name]]
+        return place
+
+    def _all(self, *names: str) -> Index:
+        return np.array([self._points[name] for name in names if name in self._points], np.int64)
+
+    def _distance(self, *names: str) -> Float:
+        return self._geodesics.distance(self._all(*names))
+
+    def _along(self, fap: int, weight: Float) -> Float:
+        """Field (V, 3) that moves along the axis of a FAP."""
+        entry = FAPS[fap - 1]
+        axis, sign = AXES[entry.direction]
+        field = np.zeros((len(weight), 3))
+        field[:, axis] = sign * weight * self._fapu[entry.fapu] / FAP_UNITS_PER_FAPU
+        return field
+
+    def _add(self, fap: int, weight: Float) -> None:
+        self.fields[fap] = self._along(fap, weight)
+
+    def _smoothest(self, points: Index, fixed: NDArray[np.bool_]) -> Float:
+        held = np.setdiff1d(np.flatnonzero(fixed), points)
+        return smoothest(self._vertices, self._triangles, points, held)
+
+    def _mouth(self) -> None:
+        x, y, z = self._vertices.T
+        unit, width = self._unit, self._fapu["MW"]
+        lips = self._at("2.2")
+        # what lies behind the lips: the palate, the cheeks' inside, the floor of the mouth
+        self._behind = (np.abs(x - lips[0]) < 0.62 * width) & (z < lips[2] - 0.41 * unit)
+        nose = (
+            y > self._at("8.1")[1] + 0.75 * (lips[1] + self._fapu["MNS"] - self._at("8.1")[1])
+        ) & (np.abs(x - lips[0]) < 0.6 * width)
+        far = self._distance(*INNER, *OUTER) > 0.72 * width
+        fixed = far | nose | (y < self._at("2.10")[1]) | self._behind
+        names = INNER + OUTER
+        self._lip_y = dict(zip(names, self._smoothest(self._all(*names), fixed).T, strict=True))
+        for fap in FAPS[2:]:
+            if fap.direction in ("up", "down") and set(fap.feature_points) & set(names):
+                self._add(fap.number, self._lip_y[fap.feature_points[0]])
+        # halfway points follow their corner by half, so that a narrowed mouth keeps its shape
+        corners = ("2.4", "2.5", "8.3", "8.4")
+        between = ("2.6", "2.8", "2.7", "2.9", "8.5", "8.7", "8.6", "8.8")
+        middles = ("2.2", "2.3", "8.1", "8.2")
+        single = self._smoothest(self._all(*corners, *between, *middles), fixed)
+        self._lip_x = {}
+        for row, (fap_x, name) in enumerate(zip((6, 7, 53, 54), corners, strict=True)):
+            half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
+            self._lip_x[name] = single[:, row] + 0.45 * half
+            self._add(fap_x, self._lip_x[name])
+            # a corner slides along the curve of the lips: outwards is backwards
+            self.fields[fap_x][:, 2] = (
+                -CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
+            )
+        pushed = self._smoothest(self._all("2.3", "2.2", *corners), fixed)[:, :2]
+        self._lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
+        self._add(16, self._lip_z["2.3"])
+        self._add(17, self._lip_z["2.2"])
+
+    def _jaw(self) -> None:
+        _, y, z = self._vertices.T
+        unit, lips, chin = self._unit, self._at("2.2"), self._at("2.1")
+        inside = self._behind & (y > chin[1] + 0.1 * unit)
+        upper = self._distance(*UPPER_LIP) < 0.055 * unit
+        lower = self._distance(*LOWER_LIP) < 0.055 * unit
+        below = (self._distance("2.1", "2.10", "2.11", "2.12") < 0.25 * unit) & ~inside
+        floor = inside & (y < lips[1] - 0.33 * unit) & (z > lips[2] - 0.91 * unit)
+        roof = inside & ((y > lips[1] + 0.24 * unit) | (z < lips[2] - 1.45 * unit))
+        throat = (y < chin[1] + 0.17 * unit) & (z < chin[2] - 0.86 * unit)
+        away = (y > lips[1] + 0.56 * unit) | (z < chin[2] - 1.43 * unit)
+        away |= (y < chin[1] - 0.40 * unit) | throat
+        away &= ~inside
+        moving = np.flatnonzero((below | lower | floor) & ~away & ~upper)
+        weight = self._geodesics.zone(moving, np.flatnonzero((upper | roof | away) & ~lower))
+        lever = self._lever(z)
+        for fap, share, taken_out in (
+            (3, weight * lever, self._lip_y),
+            (14, weight, self._lip_z),
+            (15, weight * lever, self._lip_x),
+        ):
+            left = share / share[self._points["2.1"]]
+            for name, field in taken_out.items():
+                left = left - left[self._points[name]] * field
+            self._add(fap, left)
+
+    def _lever(self, z: Float) -> Float:
+        """How far a place follows the turn of the jaw, 1 at the chin."""
+        chin = self._at("2.1")[2]
+        lever: Float = np.maximum(z - chin + _HINGE * self._unit, 0) / (_HINGE * self._unit)
+        return lever
+
+    def _lids(self) -> None:
+        for upper, lower, corners, faps in (
+            ("3.1", "3.3", ("3.7", "3.11"), (19, 21)),
+            ("3.2", "3.4", ("3.8", "3.12"), (20, 22)),
+        ):
+            names = [name for name in (upper, lower) if name in self._points]
+            if names:
+                still = self._all(*corners)
+                far = self._distance(*names) > 0.45 * self._unit
+                points = np.concatenate([self._all(*names), still])
+                weights = self._smoothest(points, far)
+                for name, weight in zip(names, weights.T, strict=False):
+                    fap = faps[0] if name == upper else faps[1]
+                    self._add(fap, weight)
+                    self.fields[fap][:, 2] = np.abs(self.fields[fap][:, 1]) * _LID_SLOPE
+
+    def _brows(self) -> None:
+        eyes, y = self._eyes.mean(axis=0)[1], self._vertices[:, 1]
+        faps = {"4.1": 31, "4.2": 32, "4.3": 33, "4.4": 34, "4.5": 35, "4.6": 36}
+        names = [name for name in faps if name in self._points]
+        if not names:
+            return
+        fixed = (y < eyes + 0.17 * self._unit) | (y > eyes + 1.13 * self._unit)
+        fixed |= self._distance(*names) > 0.9 * self._unit
+        for name, weight in zip(names, self._smoothest(self._all(*names), fixed).T, strict=True):
+            self._add(faps[name], weight)
+        if {"4.1", "4.2"} <= set(names):
+            ends = self._all("4.1", "4.2", "4.5", "4.6")
+            squeezed = self._smoothest(ends, fixed)
+            self._add(37, squeezed[:, 0])
+            self._add(38, squeezed[:, 1])
+
+    def _zones(self) -> None:
+        for fap, name, core, reach in _ZONES:
+            if name in self._points:
+                # a zone of the nose stops at the nose's other points, one of a cheek at all of them
+                others = [other for other in _FACE if other != name]
+                near = self._geodesics.distance(self._all(name))
+                fixed = np.union1d(np.flatnonzero(near > reach * self._unit), self._all(*others))
+                moving = np.setdiff1d(np.flatnonzero(near <= core * self._unit), fixed)
+                moving = np.union1d(moving, self._all(name))
+                self._add(fap, self._geodesics.zone(moving, np.setdiff1d(fixed, moving)))
+                if name in ("5.1", "5.2"):  # a puffed cheek comes forward, too
+                    self.fields[fap][:, 2] = 0.5 * np.abs(self.fields[fap][:, 0])

@@ -1,0 +1,375 @@
+"""Make a head that FAPs move out of a mesh and its feature points.
+
+The surface on which 8.1 lies is the skin; it gets the fields of ``import_fields``. What hangs
+together apart from it is told by where it lies: eyeballs turn, what lies in the mouth below the
+lips (lower teeth, tongue) goes with the jaw, what lies on the skin (lashes, brows, beard) follows
+it, and the rest keeps still on the head.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
+
+from services.driver.head.glb_file import Float64
+from services.driver.head.glb_head import EYE_DISTANCE_M, PIVOT, fade
+from services.driver.head.import_fields import INNER, LOWER_LIP, OUTER, UPPER_LIP, FaceFields
+from services.driver.head.mesh_file import numbered_vertices, read_mesh
+from services.driver.head.pieces import Fields, Piece, pack, weld
+from services.driver.head.points_file import Points, read_points
+from services.driver.head.surface import Geodesics
+from shared.errors import UserError
+from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
+
+MAX_VERTICES = 65_535  # more would need larger numbers in the GLB for the page
+NEEDED = ("2.1", *sorted(INNER), "2.10", *sorted(OUTER))
+_MOVING = {name for fap in FAPS for name in fap.feature_points}
+_SNAP = 0.15  # eye distances within which a point must lie on the mesh
+_BESIDE = ("3.5", "3.6", "7.1", "3.13", "3.14")  # points that need not lie on it
+
+Index = NDArray[np.int64]
+
+
+def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
+    """Write a head (``.npz``) made of a mesh and its feature points.
+
+    Parameters
+    ----------
+    mesh
+        A face at rest, mouth closed, in one of ``mesh_file.MESH_SUFFIXES``; y is up.
+    points
+        As ``points_file.read_points`` takes them.
+    output
+        Head to write.
+
+    Returns
+    -------
+    Remarks for the user: what will not move, and why.
+
+    Raises
+    ------
+    UserError
+        If a file cannot be read or written, or the mesh and the points make no face.
+    """
+    if output.suffix != ".npz":
+        raise UserError(f"{output}: a head is an .npz file; give such a name")
+    pieces = read_mesh(mesh)
+    count = sum(len(piece.vertices) for piece in pieces)
+    if count > MAX_VERTICES:
+        raise UserError(f"{mesh} has {count} vertices; reduce it to {MAX_VERTICES} at most")
+    given = read_points(points)
+    arrays, remarks = _Import(
+        mesh, points, pieces, _places(mesh, points, pieces, given), given
+    ).run()
+    try:
+        with output.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+    except OSError as error:
+        if output.is_file():  # no half a head
+            output.unlink()
+        raise UserError(f"{output} cannot be written: {error.strerror}") from error
+    return remarks
+
+
+def _places(mesh: Path, path: Path, pieces: list[Piece], points: Points) -> dict[str, Float64]:
+    """Coordinates of every point, in the mesh's own axes."""
+    vertices, named = numbered_vertices(mesh, pieces)
+    places = {}
+    for name, place in points.places.items():
+        if isinstance(place, np.ndarray):
+            places[name] = place
+        else:
+            mesh_name, number = place
+            own = named.get(mesh_name, vertices)
+            if number >= len(own):
+                raise UserError(
+                    f"{path}: {name} is vertex {number}, but there are {len(own)} (from 0)"
+                )
+            places[name] = own[number]
+    return places
+
+
+class _Import:
+    """One import, step by step."""
+
+    def __init__(
+        self, mesh: Path, path: Path, pieces: list[Piece], places: dict[str, Float64], given: Points
+    ) -> None:
+        self._mesh, self._path, self._pieces = mesh, path, pieces
+        self._remarks: list[str] = []
+        self._fapu_given = given.fapu
+        self._find_frame(places)
+        self._join()
+        self._snap(places)
+
+    def run(self) -> tuple[dict[str, NDArray[np.generic]], list[str]]:
+        """Return the arrays of the head's file, and remarks."""
+        fapu = self._measure()
+        skin, local, inside = self._skin
+        points = {name: int(local[v]) for name, v in self._points.items() if local[v] >= 0}
+        face = FaceFields(self._welded[skin], inside, points, self._eyes, fapu)
+        fields, roles = self._move(face, fapu)
+        pieces, rows = self._split(roles)
+        order = np.concatenate(rows)
+        place = np.empty(len(order), np.int64)
+        place[order] = np.arange(len(order))
+        first_of = {int(w): int(v) for v, w in reversed(list(enumerate(self._weld_of)))}
+        self._remark_on(fields, points)
+        height = (self._vertices[order, 1] - self._eyes.mean(axis=0)[1]) / EYE_DISTANCE_M
+        arrays = pack(
+            pieces,
+            fields=[{fap: field[own] for fap, field in fields.items()} for own in rows],
+            head_weight=fade(height),
+            fapu=fapu | {"AU": RADIANS_PER_ANGLE_UNIT},
+            feature_points={
+                name: int(place[first_of[vertex]]) for name, vertex in self._points.items()
+            },
+            eye_centres=self._eyes,
+        )
+        return arrays, self._remarks
+
+    def _fail(self, text: str) -> UserError:
+        return UserError(f"{self._path}: {text}")
+
+    # --- the mesh in the axes of a head ---------------------------------------------------------
+
+    def _find_frame(self, places: dict[str, Float64]) -> None:
+        eyes = {}
+        for name, lids in (("3.5", ("3.1", "3.3")), ("3.6", ("3.2", "3.4"))):
+            if name in places:
+                eyes[name] = places[name]
+            elif all(lid in places for lid in lids):
+                eyes[name] = (places[lids[0]] + places[lids[1]]) / 2
+        missing = [name for name in NEEDED if name not in places]
+        missing += [f"{name} (or its eyelids)" for name in ("3.5", "3.6") if name not in eyes]
+        if "9.15" not in places and "MNS" not in self._fapu_given:
+            missing.append("9.15")
+        if missing:
+            raise self._fail(f"points are missing: {', '.join(missing)}")
+        left, right = eyes["3.5"], eyes["3.6"]
+        middle, unit = (left + right) / 2, float(np.linalg.norm(left - right))
+        down = middle - places["2.1"]
+        sideways = left - right
+        if unit == 0 or down[1] < 0.8 * np.linalg.norm(down) or abs(sideways[0]) < 0.8 * unit:
+            raise self._fail(
+                "the chin (2.1) is not below the eyes (3.5, 3.6); turn the mesh so that y is up and"
+                " the face looks along z"
+            )
+        turn = np.array([1.0, 1.0, 1.0]) if sideways[0] > 0 else np.array([-1.0, 1.0, -1.0])
+        pivot = places.get("7.1", middle + PIVOT * turn * unit)
+        scale = EYE_DISTANCE_M / unit
+        self._pivot, self._turn, self._scale = pivot, turn, scale
+        self._eyes = self._to_head(np.stack([left, right]))
+        for piece in self._pieces:
+            piece.vertices = self._to_head(piece.vertices)
+        self._vertices = np.concatenate([piece.vertices for piece in self._pieces])
+
+    def _to_head(self, rows: Float64) -> Float64:
+        turned: Float64 = (rows - self._pivot) * self._turn * self._scale
+        return turned
+
+    def _join(self) -> None:
+        """Join vertices that stand in one place, and find what hangs together."""
+        first = np.cumsum([0] + [len(piece.vertices) for piece in self._pieces])
+        uv = np.concatenate([piece.uv for piece in self._pieces])
+        flat = np.ptp(uv, axis=0).max() == 0  # without texture places nothing tells a slit
+        same = weld(self._vertices, np.arange(len(uv))[:, None] if flat else uv)
+        _, self._weld_of = np.unique(same, return_inverse=True)
+        count = int(self._weld_of.max()) + 1
+        self._welded = np.zeros((count, 3))
+        self._welded[self._weld_of] = self._vertices
+        triangles = np.concatenate(
+            [p.triangles + at for p, at in zip(self._pieces, first, strict=False)]
+        )
+        triangles = self._weld_of[triangles]
+        a, b, c = triangles.T
+        self._triangles: Index = triangles[(a != b) & (b != c) & (c != a)]
+        if not len(self._triangles):
+            raise UserError(f"{self._mesh} has no faces with an area")
+        edges = np.concatenate([self._triangles[:, [0, 1]], self._triangles[:, [1, 2]]])
+        graph = sparse.coo_array((np.ones(len(edges)), edges.T), (count, count))
+        _, self._component = csgraph.connected_components(graph, directed=False)
+
+    def _snap(self, places: dict[str, Float64]) -> None:
+        """Find the vertex of every point."""
+        used = np.unique(self._triangles)
+        tree = cKDTree(self._welded[used])
+        self._points: dict[str, int] = {}
+        off = []
+        for name, place in places.items():
+            distance, row = tree.query(self._to_head(place))
+            if name in _BESIDE:
+                continue
+            if distance <= _SNAP * EYE_DISTANCE_M:
+                self._points[name] = int(used[row])
+            elif name in _MOVING or name in NEEDED:
+                off.append(f"{name} by {distance / self._scale:.3g}")
+        if off:
+            raise self._fail(f"points lie off the mesh, in its unit: {', '.join(off)}")
+        skin = np.flatnonzero(self._component == self._component[self._points["8.1"]])
+        local = np.full(len(self._welded), -1)
+        local[skin] = np.arange(len(skin))
+        inside = local[self._triangles]
+        self._skin = skin, local, inside[(inside >= 0).all(axis=1)]
+        self._part_lips(places)
+        lips = {name: self._points[name] for name in (*INNER, *OUTER, "2.1", "2.10")}
+        apart = [name for name, vertex in lips.items() if local[vertex] < 0]
+        if apart:
+            raise self._fail(
+                f"{', '.join(apart)} and 8.1 lie on meshes that do not hang together; join them"
+            )
+        seen: dict[int, str] = {}
+        for name, vertex in lips.items():
+            if vertex in seen:
+                raise self._fail(f"{seen[vertex]} and {name} fall on one vertex; set them apart")
+            seen[vertex] = name
+
+    def _part_lips(self, places: dict[str, Float64]) -> None:
+        """Take inner points of closed lips to the lip that they belong to."""
+        skin, local, inside = self._skin
+        if local[self._points["8.2"]] < 0:
+            return
+        geodesics = Geodesics(self._welded[skin], inside)
+        to_upper, to_lower = (
+            geodesics.distance(local[[self._points[name]]]) for name in ("8.1", "8.2")
+        )
+        tree = cKDTree(self._welded[skin])
+        for name in (*UPPER_LIP[:3], *LOWER_LIP[:3]):
+            here = self._to_head(places[name])
+            near = np.array(tree.query_ball_point(here, 0.05 * EYE_DISTANCE_M), dtype=np.int64)
+            own, other = (to_upper, to_lower) if name in UPPER_LIP else (to_lower, to_upper)
+            near = near[own[near] < other[near]]
+            if len(near):
+                best = near[np.argmin(np.linalg.norm(self._welded[skin[near]] - here, axis=1))]
+                self._points[name] = int(skin[best])
+
+    # --- what moves -----------------------------------------------------------------------------
+
+    def _measure(self) -> dict[str, float]:
+        """FAPUs, m."""
+
+        def height(name: str) -> float:
+            return float(self._welded[self._points[name], 1])
+
+        given = {name: length * self._scale for name, length in self._fapu_given.items()}
+        eyes, points = float(self._eyes.mean(axis=0)[1]), self._points
+        corners = self._welded[[points["8.3"], points["8.4"]], 0]
+        nose = height("9.15") if "9.15" in points else height("2.2") + given["MNS"]
+        fapu = {
+            "MNS": nose - height("2.2"),
+            "MW": float(corners[0] - corners[1]),
+            "ENS": eyes - nose,
+            "ES": EYE_DISTANCE_M,
+            "IRISD": height("3.1") - height("3.3") if {"3.1", "3.3"} <= set(points) else 0.0,
+        }
+        if fapu["IRISD"] <= 0:
+            fapu["IRISD"] = given.get("IRISD", 0.163 * EYE_DISTANCE_M)
+        wrong = [name for name, length in fapu.items() if length <= 0]
+        if wrong:
+            raise self._fail(
+                f"{', '.join(wrong)} is not positive: left and right, or above and below, are"
+                " exchanged (left is the face's own left, at positive x)"
+            )
+        return fapu
+
+    def _move(self, face: FaceFields, fapu: dict[str, float]) -> tuple[Fields, NDArray[np.int8]]:
+        """Fields (V, 3) of all vertices, and for each one 1 on the left eye, 2 on the right one."""
+        skin = self._skin[0]
+        fields = {fap: np.zeros_like(self._welded) for fap in face.fields}
+        for fap, field in face.fields.items():
+            fields[fap][skin] = field
+        roles = np.zeros(len(self._welded), np.int8)
+        tree = cKDTree(self._welded[skin])
+        chin, lips = (self._welded[self._points[name]] for name in ("2.1", "2.2"))
+        for component in range(int(self._component.max()) + 1):
+            rows = np.flatnonzero(self._component == component)
+            if component == self._component[skin[0]] or len(rows) < 3:
+                continue
+            low, high = self._welded[rows].min(axis=0), self._welded[rows].max(axis=0)
+            middle, size = (low + high) / 2, high - low
+            eye = self._eye_of(middle, size)
+            if eye:
+                roles[rows] = eye
+                self._eyes[eye - 1] = middle
+                thrust = np.tile([0.0, 0.0, fapu["ES"] / FAP_UNITS_PER_FAPU], (len(rows), 1))
+                fields.setdefault(26 + eye, np.zeros_like(self._welded))[rows] = thrust
+            elif (
+                np.abs(middle[0] - lips[0]) < 0.5 * fapu["MW"]
+                and high[2] < lips[2] + 0.1 * fapu["ES"]
+                and low[2] > lips[2] - 1.6 * fapu["ES"]
+                and size[0] < 1.5 * fapu["MW"]
+                and low[1] > chin[1]
+                and high[1] < lips[1] + 1.5 * fapu["MNS"]
+            ):
+                moved: Fields = {}
+                tip, body = (self._points.get(name) for name in ("6.1", "6.2"))
+                if tip is not None and self._component[tip] == component:
+                    moved = face.tongue_fields(self._welded, rows, tip, body)
+                if moved or middle[1] < lips[1]:
+                    moved |= face.jaw_fields(self._welded[rows])
+                for fap, field in moved.items():
+                    fields.setdefault(fap, np.zeros_like(self._welded))[rows] = field
+            else:
+                distance, nearest = tree.query(self._welded[rows])
+                share = np.clip(1 - distance / (0.25 * fapu["ES"]), 0, 1)[:, None]
+                for fap, field in face.fields.items():
+                    fields[fap][rows] = share * field[nearest]
+        if (roles == 0).all():
+            self._remarks.append("no eyeballs apart from the skin: the eyes do not turn")
+        return {fap: field[self._weld_of] for fap, field in fields.items()}, roles[self._weld_of]
+
+    def _eye_of(self, middle: Float64, size: Float64) -> int:
+        """Say whether a body is the left eyeball (1), the right one (2), or none (0)."""
+        round_enough = size.min() > 0.4 * size.max() and 0.1 < size.max() / EYE_DISTANCE_M < 0.9
+        for number, eye in enumerate(self._eyes, start=1):
+            if round_enough and np.linalg.norm(middle - eye) < 0.35 * EYE_DISTANCE_M:
+                return number
+        return 0
+
+    def _split(self, roles: NDArray[np.int8]) -> tuple[list[Piece], list[Index]]:
+        """Part pieces so that each eyeball is one of its own; rows of the vertices of each."""
+        pieces, rows = [], []
+        first = 0
+        for piece in self._pieces:
+            own = roles[first : first + len(piece.vertices)]
+            for role, name in ((0, piece.name), (1, "eye_left"), (2, "eye_right")):
+                kept = np.flatnonzero(own == role)
+                shown = (own[piece.triangles] == role).all(axis=1)
+                if not shown.any():
+                    continue
+                number = np.full(len(own), -1)
+                number[kept] = np.arange(len(kept))
+                pieces.append(
+                    replace(
+                        piece,
+                        name=name,
+                        vertices=piece.vertices[kept],
+                        triangles=number[piece.triangles[shown]],
+                        uv=piece.uv[kept],
+                        colors=piece.colors[kept],
+                    )
+                )
+                rows.append(kept + first)
+            first += len(own)
+        return pieces, rows
+
+    def _remark_on(self, fields: Fields, points: dict[str, int]) -> None:
+        still = [
+            fap.name
+            for fap in FAPS[2:]
+            if fap.number not in fields and fap.fapu != "AU" and fap.number not in (27, 28)
+        ]
+        if still:
+            self._remarks.append(f"without points, these FAPs move nothing: {', '.join(still)}")
+        skin, _, inside = self._skin
+        along = Geodesics(self._welded[skin], inside).distance(np.array([points["2.2"]]))
+        if along[points["2.3"]] < 0.05 * EYE_DISTANCE_M:
+            self._remarks.append(
+                "the lips are joined between 2.2 and 2.3: the mouth cannot open; cut it open"
+            )

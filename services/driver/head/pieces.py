@@ -1,0 +1,151 @@
+"""The pieces of a mesh in one frame, and how they become the parts of a head."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver import picture
+from services.driver.head.glb_file import Float64
+from services.driver.head.head import FORMAT
+
+_MIN_SHIFT_M = 2e-9  # smaller displacements by one FAP unit are left out
+_WHITE = np.full((2, 2, 3), 255, np.uint8)
+_NODES = ("kouxing", "body", "head")  # nodes of an exported GLB that are no parts
+_MAX_NAME_LENGTH = 60
+
+Fields = dict[int, Float64]  # FAP: displacement (V, 3) by one unit, m
+
+
+@dataclass(slots=True)
+class Piece:
+    """A primitive in the axes of the scene."""
+
+    name: str
+    vertices: Float64
+    triangles: NDArray[np.int64]
+    uv: Float64
+    colors: Float64
+    texture: bytes
+    material: dict[str, Any]
+    head_weight: Float64 | None  # None: no skeleton says
+    shapes: dict[str, Float64] = field(default_factory=dict)  # by lower-case name
+
+
+def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
+    """Find for each vertex (V,) the first one that stands in its place.
+
+    Vertices with the same texture coordinates, too, are kept apart: nothing but a slit, such as
+    between closed lips, makes a program write a vertex twice like that.
+    """
+    _, first, place = np.unique(
+        np.round(vertices / 1e-6).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    place = place.ravel()
+    both = np.concatenate([place[:, None], np.round(uv * 65535)], axis=1)
+    _, kind, count = np.unique(both, axis=0, return_inverse=True, return_counts=True)
+    doubled = np.zeros(len(first), dtype=bool)
+    doubled[place[count[kind.ravel()] > 1]] = True
+    welded: NDArray[np.int64] = np.where(doubled[place], np.arange(len(vertices)), first[place])
+    return welded
+
+
+def part_names(pieces: list[Piece]) -> list[str]:
+    """Name every part differently, eyeballs as the rest of the program knows them."""
+    names: list[str] = []
+    taken, last = set(_NODES), dict[str, int]()
+    for piece in pieces:
+        word = piece.name.lower()
+        name = re.sub(r"[^\w-]", "_", piece.name)[:_MAX_NAME_LENGTH]
+        if "eye" in word and not re.search("brow|lash|lid|wear|glass", word):
+            for side, short in (("left", "l"), ("right", "r")):
+                if side in word or re.search(rf"(^|[_. ]){short}([_. ]|$)", word):
+                    name = f"eye_{side}"
+        unique = name
+        while unique in taken:
+            last[name] = last.get(name, 1) + 1
+            unique = f"{name}_{last[name]}"
+        taken.add(unique)
+        names.append(unique)
+    return names
+
+
+def pack(
+    pieces: list[Piece],
+    *,
+    fields: list[Fields],
+    head_weight: Float64,
+    fapu: dict[str, float],
+    feature_points: dict[str, int],
+    eye_centres: Float64,
+) -> dict[str, NDArray[Any]]:
+    """Arrange pieces as the arrays of a head's file, see ``services.driver.head.head.assemble``.
+
+    Parameters
+    ----------
+    pieces
+        In the head's axes, m.
+    fields
+        The displacement fields of each piece.
+    head_weight
+        Share of the head's turn of all vertices (V,).
+    fapu, feature_points, eye_centres
+        As in ``Head``.
+    """
+    first = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
+    bounds = np.cumsum([0] + [len(piece.triangles) for piece in pieces])
+    faps, ends, moved, shifts = [], [0], [], []
+    for fap in sorted({fap for of_piece in fields for fap in of_piece}):
+        for of_piece, start in zip(fields, first, strict=False):
+            if fap in of_piece:
+                rows = np.flatnonzero(np.abs(of_piece[fap]).max(axis=1) > _MIN_SHIFT_M)
+                moved.append(rows + start)
+                shifts.append(of_piece[fap][rows])
+        faps.append(fap)
+        ends.append(sum(map(len, moved)))
+    textures = {"plain": picture.encode(_WHITE)}
+    names = []
+    for piece in pieces:
+        same = [name for name, data in textures.items() if data == piece.texture]
+        names.append("plain" if not piece.texture else (same or [f"image {len(textures)}"])[0])
+        textures.setdefault(names[-1], piece.texture)
+    surfaces = [piece.material.get("pbrMetallicRoughness", {}) for piece in pieces]
+    vertices = np.concatenate([piece.vertices for piece in pieces]).astype(np.float32)
+    uv = np.concatenate([piece.uv for piece in pieces]).astype(np.float32)
+    colors = np.clip(np.concatenate([piece.colors for piece in pieces]), 0, 1)
+    triangles = [piece.triangles + at for piece, at in zip(pieces, first, strict=False)]
+    return {
+        "format": np.array(FORMAT),
+        "vertices": vertices,
+        "welds": weld(vertices, uv).astype(np.uint32),
+        "uv": uv * np.float32(65535),
+        "colors": (np.sqrt(colors) * 255).astype(np.float32),
+        "head_weight": (head_weight * 255).astype(np.float32),
+        "triangles": np.concatenate(triangles).astype(np.uint32),
+        "part_names": np.array(part_names(pieces)),
+        "part_textures": np.array(names),
+        "part_roughness": np.clip([float(s.get("roughnessFactor", 0.6)) for s in surfaces], 0, 1),
+        "part_transparent": np.array(
+            [piece.material.get("alphaMode", "OPAQUE") != "OPAQUE" for piece in pieces]
+        ),
+        "part_double_sided": np.array(
+            [bool(piece.material.get("doubleSided", False)) for piece in pieces]
+        ),
+        "part_vertices": np.stack([first[:-1], first[1:], first[1:]], axis=1),
+        "part_triangles": np.stack([bounds[:-1], bounds[1:], bounds[:-1], bounds[1:]], axis=1),
+        "fapu_names": np.array(list(fapu)),
+        "fapu": np.array(list(fapu.values())),
+        "feature_point_names": np.array(list(feature_points), dtype=str),
+        "feature_points": np.array(list(feature_points.values()), dtype=np.int64),
+        "eye_centres": eye_centres.astype(np.float32),
+        "field_faps": np.array(faps, dtype=np.int64),
+        "field_units": np.ones(len(faps)),
+        "field_bounds": np.array(ends),
+        "field_vertices": np.concatenate([*moved, np.zeros(0, np.int64)]).astype(np.uint32),
+        "field_shifts": np.concatenate([*shifts, np.zeros((0, 3))]).astype(np.float32),
+        **{f"texture_{key}": np.frombuffer(data, np.uint8) for key, data in textures.items()},
+    }

@@ -1,0 +1,247 @@
+"""Surfaces made of quads: Catmull-Clark subdivision, geodesic distances and zones of influence.
+
+E. Catmull, J. Clark, "Recursively generated B-spline surfaces on arbitrary topological meshes",
+Computer-Aided Design 10(6), 1978.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph, linalg
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def edges_of(quads: Index) -> tuple[Index, Index]:
+    """List the undirected edges.
+
+    Parameters
+    ----------
+    quads
+        Vertex numbers (F, 4), or those of triangles (F, 3).
+
+    Returns
+    -------
+    Edges (E, 2) with the smaller number first, and the edge number (as ``quads``) that follows each
+    corner.
+    """
+    pairs = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
+    edges, which = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
+    return edges, which.reshape(quads.shape)
+
+
+def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, Index]:
+    """Subdivide once.
+
+    Returns
+    -------
+    The matrix (V + E + F, V) that makes the new vertices out of the old ones, in the order moved
+    old vertices, edge points, face points; and the new quads (4 F, 4).
+    """
+    num_faces = len(quads)
+    edges, edge_of_corner = edges_of(quads)
+    num_edges = len(edges)
+    face_rows = np.repeat(np.arange(num_faces), 4)
+    faces = sparse.csr_array(
+        (np.full(4 * num_faces, 0.25), (face_rows, quads.ravel())), (num_faces, num_vertices)
+    )
+    midpoints = sparse.csr_array(
+        (np.full(2 * num_edges, 0.5), (np.repeat(np.arange(num_edges), 2), edges.ravel())),
+        (num_edges, num_vertices),
+    )
+    touching = sparse.csr_array(
+        (np.ones(4 * num_faces), (edge_of_corner.ravel(), face_rows)), (num_edges, num_faces)
+    )
+    interior = touching.sum(axis=1) == 2
+    inside = sparse.diags_array(interior.astype(float))
+    edge_points = inside @ (0.5 * midpoints + 0.25 * (touching @ faces)) + (
+        sparse.diags_array((~interior).astype(float)) @ midpoints
+    )
+
+    # (Q + 2 R + (n - 3) P) / n for an inner vertex, (1/8, 3/4, 1/8) along a border
+    around_faces = _incidence(quads.ravel(), face_rows, (num_vertices, num_faces))
+    edge_rows = np.repeat(np.arange(num_edges), 2)
+    around_edges = _incidence(edges.ravel(), edge_rows, (num_vertices, num_edges))
+    valence = np.maximum(around_edges.sum(axis=1), 1)
+    mean_faces = sparse.diags_array(1 / np.maximum(around_faces.sum(axis=1), 1)) @ around_faces
+    mean_edges = sparse.diags_array(1 / valence) @ around_edges
+    identity = sparse.eye_array(num_vertices)
+    inner = sparse.diags_array(1 / valence) @ (
+        mean_faces @ faces
+        + 2 * (mean_edges @ midpoints)
+        + sparse.diags_array(valence - 3.0) @ identity
+    )
+    border_edges = around_edges @ sparse.diags_array((~interior).astype(float))
+    on_border = border_edges.sum(axis=1) == 2
+    border = 0.5 * identity + 0.25 * (border_edges @ midpoints)
+    vertex_points = (
+        sparse.diags_array((~on_border).astype(float)) @ inner
+        + sparse.diags_array(on_border.astype(float)) @ border
+    )
+
+    before = np.roll(edge_of_corner, 1, axis=1) + num_vertices
+    after = edge_of_corner + num_vertices
+    middle = np.broadcast_to(np.arange(num_faces)[:, None] + num_vertices + num_edges, quads.shape)
+    fine = np.stack([quads, after, middle, before], axis=2).reshape(-1, 4)
+    matrix = sparse.csr_array(sparse.vstack([vertex_points, edge_points, faces]))
+    return matrix, fine
+
+
+def _incidence(rows: Index, columns: Index, shape: tuple[int, int]) -> sparse.csr_array:
+    return sparse.csr_array((np.ones(len(rows)), (rows, columns)), shape)
+
+
+def triangles_of(quads: Index) -> Index:
+    """Split quads (F, 4) into triangles (2 F, 3)."""
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+
+
+def vertex_normals(vertices: Float, triangles: Index) -> Float:
+    """Mean of the touching triangles' normals, weighted by area, of unit length (V, 3)."""
+    a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
+    area = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, triangles[:, corner], area)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    return normals
+
+
+def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, Index]:
+    """Cut away what lies above height 0.
+
+    Parameters
+    ----------
+    height
+        Height of every vertex (V,).
+    triangles
+        Vertex numbers (F, 3).
+    values
+        What to interpolate at the cut (V, D).
+
+    Returns
+    -------
+    Values (W, D) of the old and the new vertices, triangles (G, 3), and the edges (E, 2) along the
+    cut, in the direction of their triangles.
+    """
+    above = height[triangles] > 0
+    kept = triangles[~above.any(axis=1)].tolist()
+    rows = list(values)
+    made: dict[tuple[int, int], int] = {}
+    rim = []
+
+    def cut(i: int, j: int) -> int:
+        key = (min(i, j), max(i, j))
+        if key not in made:
+            share = height[i] / (height[i] - height[j])
+            made[key] = len(rows)
+            rows.append(values[i] + share * (values[j] - values[i]))
+        return made[key]
+
+    for corners, high in zip(triangles, above, strict=True):
+        if not high.any() or high.all():
+            continue
+        # turn the triangle so that the corner that is alone on its side comes first
+        alone = int(np.argmax(high)) if high.sum() == 1 else int(np.argmin(high))
+        a, b, c = (int(vertex) for vertex in np.roll(corners, -alone))
+        p, q = cut(a, b), cut(a, c)
+        if high.sum() == 1:
+            kept += [[p, b, c], [p, c, q]]
+            rim.append([q, p])
+        else:
+            kept.append([a, p, q])
+            rim.append([p, q])
+    return np.array(rows), np.array(kept), np.array(rim)
+
+
+class Geodesics:
+    """Shortest paths along the edges of a surface of triangles or quads, and quad diagonals."""
+
+    def __init__(self, vertices: Float, faces: Index) -> None:
+        pairs, _ = edges_of(faces)
+        if faces.shape[1] == 4:
+            pairs = np.concatenate([pairs, faces[:, [0, 2]], faces[:, [1, 3]]])
+        length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+        self._graph = sparse.csr_array(
+            (np.maximum(length, 1e-9), (pairs[:, 0], pairs[:, 1])), (len(vertices),) * 2
+        )
+
+    def distance(self, sources: Index) -> Float:
+        """Distance (V,) of every vertex from the nearest source; inf where none is reached."""
+        found: Float = csgraph.dijkstra(self._graph, directed=False, indices=sources, min_only=True)
+        return found
+
+    def zone(self, moving: Index, fixed: Index) -> Float:
+        """Weight every vertex (V,): 1 on ``moving``, 0 on ``fixed``, a raised cosine between.
+
+        ``w = 1/2 - 1/2 cos(pi dF / (dF + dM))`` with the geodesic distances ``dM`` and ``dF`` to
+        the two sets. The falloff is that of Li 2011, section 2.1; a distance along the surface
+        keeps the upper lip where it is when the chin, near it in space, moves.
+        """
+        to_moving, to_fixed = self.distance(moving), self.distance(fixed)
+        reached = np.isfinite(to_moving)
+        share = np.where(np.isfinite(to_fixed), 1.0, 0.0)
+        both = reached & (share > 0)
+        share = np.where(reached, 1.0, 0.0)
+        share[both] = to_fixed[both] / np.maximum(to_fixed[both] + to_moving[both], 1e-12)
+        weight: Float = 0.5 - 0.5 * np.cos(np.pi * share)
+        return weight
+
+
+def smoothest(
+    vertices: Float, triangles: Index, points: Index | list[Index], fixed: Index
+) -> Float:
+    """Interpolate between points as smoothly as the surface allows.
+
+    Minimises the squared Laplacian (cotangent weights) integrated over the surface.
+
+    Parameters
+    ----------
+    vertices, triangles
+        The surface.
+    points
+        Vertices (P,), or groups of vertices that move as one.
+    fixed
+        Vertices where every field is 0, but for those among the points.
+
+    Returns
+    -------
+    Fields (V, P): field ``p`` is 1 at ``points[p]`` and 0 at the other points.
+    """
+    num_vertices = len(vertices)
+    laplacian, area = _laplacian(vertices, triangles)
+    energy = (laplacian @ sparse.diags_array(1 / area) @ laplacian).tocsc()
+    is_free = np.ones(num_vertices, dtype=bool)
+    is_free[fixed] = False
+    fields = np.zeros((num_vertices, len(points)))
+    for column, group in enumerate(points):
+        is_free[group] = False
+        fields[group, column] = 1.0
+    free = np.flatnonzero(is_free)
+    right = -(energy[free] @ fields)
+    solve = linalg.splu(energy[free][:, free].tocsc())
+    fields[free] = solve.solve(right)
+    return fields
+
+
+def _laplacian(vertices: Float, triangles: Index) -> tuple[sparse.csr_array, Float]:
+    rows, columns, weights = [], [], []
+    area = np.zeros(len(vertices))
+    for corner in range(3):
+        i, j, k = (triangles[:, (corner + step) % 3] for step in range(3))
+        a, b = vertices[j] - vertices[i], vertices[k] - vertices[i]
+        double_area = np.maximum(np.linalg.norm(np.cross(a, b), axis=1), 1e-9)
+        cotangent = np.clip((a * b).sum(axis=1) / double_area, -5, 5) / 2
+        rows += [j, k]
+        columns += [k, j]
+        weights += [cotangent, cotangent]
+        np.add.at(area, i, double_area / 6)
+    shape = (len(vertices),) * 2
+    adjacency = sparse.csr_array(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape
+    )
+    degree = np.asarray(adjacency.sum(axis=1)).ravel()
+    return sparse.csr_array(sparse.diags_array(degree) - adjacency), np.maximum(area, 1e-8)

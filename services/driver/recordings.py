@@ -1,0 +1,125 @@
+"""The videos of the sessions that are recorded, drawn a little at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.video.recording import Recording
+from shared.errors import UserError
+
+Float32 = NDArray[np.float32]
+
+
+class Recordings:
+    """Feeds each session's frames and sound to its video, and draws when there is time.
+
+    Parameters
+    ----------
+    make
+        Opens the video of a session.
+    on_written
+        Called with the session and its finished video.
+    on_failed
+        Called with the session and the reason why it gets no video.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[str], Recording],
+        *,
+        on_written: Callable[[str, Recording], None],
+        on_failed: Callable[[str, str], None],
+    ) -> None:
+        self._make = make
+        self._on_written = on_written
+        self._on_failed = on_failed
+        self._open: dict[str, Recording] = {}
+        self._ending: list[tuple[str, Recording]] = []  # all frames are in; some are to be drawn
+
+    @property
+    def is_done(self) -> bool:
+        """Whether no video is under way."""
+        return not self._open and not self._ending
+
+    def is_open(self, session: str) -> bool:
+        """Return whether a session's video still takes frames."""
+        return session in self._open
+
+    def begin(self, session: str) -> None:
+        """Open a session's video, unless it is open."""
+        if session in self._open:
+            return
+        try:
+            self._open[session] = self._make(session)
+        except (UserError, OSError) as error:
+            self._on_failed(session, str(error))
+
+    def accept_frame(self, session: str, time_s: float, faps: Float32) -> None:
+        """Take a FAP frame (68,) of a session, recorded or not."""
+        if session in self._open:
+            self._open[session].accept_frame(time_s, faps)
+
+    def accept_sound(self, session: str, media_time: int, samples: Float32) -> None:
+        """Take sound of shape ``(n,)``, 16 kHz, of a session, recorded or not."""
+        if session in self._open:
+            try:
+                self._open[session].accept_sound(media_time, samples)
+            except UserError as error:
+                self._fail(session, self._open.pop(session), error)
+
+    def end(self, session: str) -> None:
+        """Finish a session's video with the frames that have come."""
+        if session in self._open:
+            self._ending.append((session, self._open.pop(session)))
+
+    def draw_until(self, end_s: float) -> None:
+        """Draw the images that are due, in turns, until a time of the monotonic clock."""
+        due = list(self._open)
+        while due and time.monotonic() < end_s:
+            due = [session for session in due if self._draw_image(session)]
+        while self._ending and time.monotonic() < end_s:
+            self._finish_first()
+
+    def close_early(self) -> list[str]:
+        """Keep what has been drawn of every video; return their sessions."""
+        for session in list(self._open):
+            self.end(session)
+        cut_short = [session for session, _ in self._ending]
+        for session, recording in self._ending:
+            self._close(session, recording)
+        self._ending.clear()
+        return cut_short
+
+    def _draw_image(self, session: str) -> bool:
+        try:
+            return self._open[session].step()
+        except UserError as error:
+            self._fail(session, self._open.pop(session), error)
+            return False
+
+    def _finish_first(self) -> None:
+        session, recording = self._ending[0]
+        try:
+            if recording.step():
+                return
+        except UserError as error:
+            self._fail(session, recording, error)
+        else:
+            self._close(session, recording)
+        self._ending.pop(0)
+
+    def _close(self, session: str, recording: Recording) -> None:
+        try:
+            recording.close()
+        except UserError as error:
+            self._fail(session, recording, error)
+        else:
+            self._on_written(session, recording)
+
+    def _fail(self, session: str, recording: Recording, error: UserError) -> None:
+        recording.discard()
+        self._on_failed(session, str(error))

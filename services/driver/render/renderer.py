@@ -1,0 +1,290 @@
+"""Draw a head with OpenGL, without a display (EGL) or into a window that is already there."""
+
+from __future__ import annotations
+
+import ctypes.util
+import time
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver import picture
+from services.driver.head.head import Head, Part
+from services.driver.render import shaders
+from services.driver.render.camera import Camera
+from shared.errors import UserError
+
+UInt8 = NDArray[np.uint8]
+Float32 = NDArray[np.float32]
+
+Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB, middle and edge
+
+BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))  # sRGB, middle and edge
+DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
+
+
+def standalone_context() -> moderngl.Context:
+    """Open OpenGL 3.3 without a display.
+
+    Raises
+    ------
+    UserError
+        If the GL libraries are missing or give no context.
+    """
+    try:
+        settings: dict[str, Any] = {"backend": "egl"}
+        return moderngl.create_standalone_context(require=330, **settings)
+    except Exception as error:  # moderngl raises bare Exception
+        missing = [name for name in ("EGL", "GL") if ctypes.util.find_library(name) is None]
+        found = f"lib{' and lib'.join(missing)} not found" if missing else str(error)
+        raise UserError(
+            f"OpenGL does not start without a display ({found}); install the Debian packages"
+            f" {DEBIAN_PACKAGES}"
+        ) from error
+
+
+class Renderer:
+    """Pictures of one head.
+
+    Parameters
+    ----------
+    head
+        Whom to draw.
+    width_px, height_px
+        Size of a picture.
+    background
+        sRGB colours of the middle and the edge, each 0 to 1; None for transparent pictures.
+    samples
+        Anti-aliasing samples a pixel; 0 for none.
+    camera
+        Where from.
+    context
+        OpenGL context of a window; by default one without a display.
+    on_screen
+        Draw into that window (``draw_on_screen``) and not beside it (``draw``).
+
+    Raises
+    ------
+    UserError
+        If OpenGL cannot start, the size is not positive, or a texture is damaged.
+    """
+
+    def __init__(
+        self,
+        head: Head,
+        width_px: int,
+        height_px: int,
+        *,
+        background: Background = BACKGROUND,
+        samples: int = 4,
+        camera: Camera | None = None,
+        context: moderngl.Context | None = None,
+        on_screen: bool = False,
+    ) -> None:
+        if width_px < 1 or height_px < 1:
+            raise UserError(f"a picture of {width_px} x {height_px} pixels; give a positive size")
+        self.head = head
+        self.transparent = background is None
+        self._background = background
+        self._camera = camera or Camera()
+        self._context = context or standalone_context()
+        self._own_context = context is None
+        self._on_screen = on_screen
+        self._samples = min(samples, self._context.max_samples)
+        self._program = self._context.program(
+            vertex_shader=shaders.VERTEX, fragment_shader=shaders.FRAGMENT
+        )
+        self._eye_program = self._context.program(
+            vertex_shader=shaders.VERTEX, fragment_shader=shaders.EYE_FRAGMENT
+        )
+        self._backdrop_program = self._context.program(
+            vertex_shader=shaders.BACKDROP_VERTEX, fragment_shader=shaders.BACKDROP
+        )
+        corners = np.array([-1, -1, 3, -1, -1, 3], dtype=np.float32)
+        self._backdrop = self._context.vertex_array(
+            self._backdrop_program, [(self._context.buffer(corners), "2f", "corner")]
+        )
+        self._moving = self._context.buffer(reserve=head.vertices.nbytes * 2, dynamic=True)
+        self._stage = np.empty((len(head.vertices), 6), dtype=np.float32)
+        self._load_parts()
+        self._targets: list[Any] = []
+        self.resize(width_px, height_px)
+
+    def _load_parts(self) -> None:
+        head, context = self.head, self._context
+        fixed = np.concatenate([head.uv, head.colors], axis=1).astype(np.float32)
+        fixed_buffer = context.buffer(fixed.tobytes())
+        self._textures: dict[str, Any] = {}
+        for name, encoded in head.textures.items():
+            pixels = picture.decode(encoded, f"{head.name}: {name}")
+            texture = context.texture(pixels.shape[1::-1], 4, pixels.tobytes())
+            texture.build_mipmaps()
+            texture.filter = (moderngl.LINEAR_MIPMAP_NEAREST, moderngl.LINEAR)
+            texture.repeat_x = texture.repeat_y = False
+            self._textures[name] = texture
+        self._arrays = {}
+        for part in head.parts:
+            indices = context.buffer(head.triangles[part.triangles].tobytes())
+            program = self._eye_program if part.name in shaders.EYES else self._program
+            self._arrays[part.name] = context.vertex_array(
+                program,
+                [
+                    (self._moving, "3f 3f", "in_position", "in_normal"),
+                    (fixed_buffer, "2f 3f", "in_uv", "in_color"),
+                ],
+                indices,
+            )
+
+    @property
+    def description(self) -> str:
+        """What draws, as OpenGL names it."""
+        return str(self._context.info["GL_RENDERER"])
+
+    def resize(self, width_px: int, height_px: int) -> None:
+        """Change the size of the pictures."""
+        self.size = (width_px, height_px)
+        for target in self._targets:
+            target.release()
+        self._targets = []
+        if not self._on_screen:
+            self._result = self._framebuffer(0)
+            multi = self._samples > 1
+            self._canvas = self._framebuffer(self._samples) if multi else self._result
+            # copying an empty picture takes less time than clearing and painting the background
+            self._blank = self._framebuffer(self._samples if multi else 0)
+            self._clear(self._blank)
+
+    def _framebuffer(self, samples: int) -> Any:
+        color = self._context.renderbuffer(self.size, 4, samples=samples)
+        depth = self._context.depth_renderbuffer(self.size, samples=samples)
+        target = self._context.framebuffer([color], depth)
+        self._targets += [target, color, depth]
+        return target
+
+    def draw(self, faps: Float32) -> UInt8:
+        """Draw one picture.
+
+        Parameters
+        ----------
+        faps
+            Facial animation parameters (68,), FAP units.
+
+        Returns
+        -------
+        Pixels (H, W, 3), top row first; (H, W, 4) with alpha if the background is transparent.
+        """
+        self._upload(*self.head.pose(faps))
+        self._draw()
+        return self._read()
+
+    def stages_s(self, faps: Float32) -> dict[str, float]:
+        """Draw one picture and say how long deform, upload, draw and read back take, s."""
+        times = [time.perf_counter()]
+
+        def passed() -> None:
+            self._context.finish()
+            times.append(time.perf_counter())
+
+        posed = self.head.pose(faps)
+        passed()
+        self._upload(*posed)
+        passed()
+        self._draw()
+        passed()
+        self._read()
+        passed()
+        names = ("deform", "upload", "draw", "read back")
+        return dict(zip(names, np.diff(times).tolist(), strict=True))
+
+    def _upload(self, vertices: Float32, normals: Float32) -> None:
+        self._stage[:, :3], self._stage[:, 3:] = vertices, normals
+        self._moving.write(self._stage)
+
+    def _draw(self) -> None:
+        self._context.copy_framebuffer(self._canvas, self._blank)
+        self._paint(self._canvas)
+        if self._canvas is not self._result:
+            self._context.copy_framebuffer(self._result, self._canvas)
+
+    def _read(self) -> UInt8:
+        channels = 4 if self.transparent else 3
+        width, height = self.size
+        raw = self._result.read(components=channels, alignment=1)
+        pixels = np.frombuffer(raw, np.uint8).reshape(height, width, channels)[::-1]
+        return _unmixed(pixels) if self.transparent else pixels
+
+    def draw_on_screen(self, faps: Float32) -> None:
+        """Draw into the window the context came from."""
+        screen = self._context.screen
+        screen.viewport = (0, 0, *self.size)
+        self._clear(screen)
+        self._upload(*self.head.pose(faps))
+        self._paint(screen)
+
+    def _clear(self, target: Any) -> None:
+        """Leave nothing but the background."""
+        target.use()
+        target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+        self._context.enable_only(moderngl.NOTHING)
+        if self._background is not None:
+            middle, edge = self._background
+            self._backdrop_program["middle"] = middle
+            self._backdrop_program["edge"] = edge
+            self._backdrop.render()
+
+    def _paint(self, target: Any) -> None:
+        context = self._context
+        target.use()
+        eye = np.array(self._camera.position)
+        matrix = tuple(self._camera.view_projection(*self.size).T.ravel())
+        for program in (self._program, self._eye_program):
+            program["view_projection"] = matrix
+            program["eye"] = self._camera.position
+        half_way = shaders.KEY + eye / np.linalg.norm(eye)
+        self._eye_program["half_way"] = tuple(half_way / np.linalg.norm(half_way))
+        for part in self.head.parts:
+            if not part.transparent:
+                culled = 0 if part.double_sided else moderngl.CULL_FACE
+                context.enable_only(moderngl.DEPTH_TEST | culled)
+                self._draw_part(part)
+        context.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
+        # the second pair keeps the alpha of transparent pictures right
+        factors: Any = (
+            moderngl.SRC_ALPHA,
+            moderngl.ONE_MINUS_SRC_ALPHA,
+            moderngl.ONE,
+            moderngl.ONE_MINUS_SRC_ALPHA,
+        )
+        context.blend_func = factors
+        for part in self.head.parts:
+            if part.transparent:
+                self._draw_part(part)
+
+    def _draw_part(self, part: Part) -> None:
+        program = self._eye_program if part.name in shaders.EYES else self._program
+        wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
+        for name, value in (
+            ("wrap", wrap), ("gloss", gloss), ("shine", shine),
+            ("two_sided", float(part.double_sided)),
+        ):  # fmt: skip
+            if name in program:
+                program[name] = value
+        self._textures[part.texture].use()
+        self._arrays[part.name].render()
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        if self._own_context:
+            self._context.release()
+
+
+def _unmixed(pixels: UInt8) -> UInt8:
+    """Take the black background out of the colours where it shines through (H, W, 4)."""
+    out = pixels.copy()
+    row, column = np.nonzero((pixels[..., 3] > 0) & (pixels[..., 3] < 255))
+    mixed = pixels[row, column].astype(np.float32)
+    pure = mixed[:, :3] * (255 / mixed[:, 3:])
+    out[row, column, :3] = np.minimum(np.round(pure), 255).astype(np.uint8)
+    return out

@@ -1,0 +1,101 @@
+"""How a head is shown: which one, from where, and before what."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from services.driver.config import Framing
+from services.driver.head.glb_head import read_glb
+from services.driver.head.head import DEFAULT_HEAD, Detail, Head
+from services.driver.render.camera import Camera
+from services.driver.render.renderer import BACKGROUND, Background
+from shared.errors import UserError
+
+COLOURS = {
+    "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",
+    "blue": "#0047bb",
+}  # fmt: skip
+
+
+# height of the picture's middle above the eyes and distance of the camera, both in eye distances
+# (FAPU ES)
+_FRAMINGS = {
+    Framing.FACE: (-0.267, 20.0),
+    Framing.HEAD: (-0.25, 26.0),
+    Framing.MOUTH: (-1.20, 6.0),
+}
+_RISE = 0.0114  # height of the camera above the middle, as a share of its distance
+
+
+def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
+    """Read a head that comes with the package, an ``.npz``, or a GLB with morph targets.
+
+    Raises
+    ------
+    UserError
+        If there is no such head, or the file holds none.
+    """
+    path = Path(name)
+    if path.suffix.lower() == ".glb":
+        return read_glb(path)
+    if path.suffix.lower() in (".obj", ".gltf", ".stl", ".ply", ".fbx", ".wrl"):
+        raise UserError(f"{path} has no shapes that move; see kouxing head import --help")
+    return Head.load(path, detail)
+
+
+def camera(
+    head: Head, framing: Framing = Framing.FACE, yaw_deg: float = 0.0, pitch_deg: float = 0.0
+) -> Camera:
+    """Place the camera before a head.
+
+    Parameters
+    ----------
+    head
+        Whom to show.
+    framing
+        What fills the picture.
+    yaw_deg
+        How far the camera goes round to the subject's left.
+    pitch_deg
+        How far it goes up.
+    """
+    eyes = head.eye_centres.mean(axis=0)
+    unit_m = float(head.eye_centres[0, 0] - head.eye_centres[1, 0])
+    height, distance = _FRAMINGS[framing]
+    target = np.array([eyes[0], eyes[1] + height * unit_m, 0.0])
+    yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg) + np.arctan(_RISE)
+    if framing is Framing.MOUTH:  # seen from near, it is the middle and not the pivot of the head
+        target[2] = eyes[2]
+    ahead = [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]
+    position = target + (distance * unit_m) * np.array(ahead)
+    return Camera(position=tuple(position.tolist()), target=tuple(target.tolist()))
+
+
+def background(text: str) -> Background:
+    """Read a background: studio, transparent, a colour's name or ``#rrggbb``.
+
+    Returns
+    -------
+    sRGB colours of the middle and the edge, 0 to 1; None for transparent.
+
+    Raises
+    ------
+    UserError
+        If it is none of these.
+    """
+    word = text.strip().lower()
+    if word == "studio":
+        return BACKGROUND
+    if word == "transparent":
+        return None
+    code = COLOURS.get(word, word).removeprefix("#")
+    if not re.fullmatch(r"[0-9a-f]{6}", code):
+        raise UserError(
+            f"background {text!r}: write studio, transparent, #rrggbb, or one of"
+            f" {', '.join(COLOURS)}"
+        )
+    color = tuple(int(code[i : i + 2], 16) / 255 for i in (0, 2, 4))
+    return color, color

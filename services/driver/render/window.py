@@ -1,0 +1,146 @@
+"""Show a head in a window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import glfw
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.head.head import Head
+from services.driver.render.camera import Camera
+from services.driver.render.renderer import BACKGROUND, Background, Renderer
+from shared.errors import UserError
+
+Float32 = NDArray[np.float32]
+TITLE = "kouxing"
+
+
+class Window:
+    """A resizable window with a head in it; edges are smoothed where a graphics card draws.
+
+    Parameters
+    ----------
+    head
+        Whom to show.
+    width_px, height_px
+        Size at first.
+    background, camera
+        As the renderer takes them.
+    on_switch
+        Called with 1 (Tab, right arrow, a click) or -1 (shift and Tab, left arrow).
+
+    Raises
+    ------
+    UserError
+        If there is no display, or no OpenGL 3.3 on it.
+    """
+
+    def __init__(
+        self,
+        head: Head,
+        width_px: int,
+        height_px: int,
+        *,
+        background: Background = BACKGROUND,
+        camera: Camera | None = None,
+        on_switch: Callable[[int], None] = lambda _step: None,
+    ) -> None:
+        self._on_switch = on_switch
+        self._caption = ""
+        glfw.ERROR_REPORTING = "ignore"  # the results are checked here
+        if not glfw.init():
+            raise UserError(
+                "there is no display to open a window on; set DISPLAY, or write a video instead"
+            )
+        self._open(width_px, height_px, num_samples=0)
+        if not _draws_in_software(self._context):
+            glfw.destroy_window(self._window)
+            self._open(width_px, height_px, num_samples=4)
+        size = glfw.get_framebuffer_size(self._window)
+        self._renderer = Renderer(
+            head,
+            *size,
+            background=background,
+            camera=camera,
+            context=self._context,
+            on_screen=True,
+        )
+        glfw.set_key_callback(self._window, self._on_key)
+        glfw.set_mouse_button_callback(self._window, self._on_mouse_button)
+
+    def _open(self, width_px: int, height_px: int, num_samples: int) -> None:
+        glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 3)
+        glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
+        glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
+        glfw.window_hint(glfw.OPENGL_FORWARD_COMPAT, True)
+        glfw.window_hint(glfw.SAMPLES, num_samples)
+        self._window = glfw.create_window(width_px, height_px, TITLE, None, None)
+        if not self._window:
+            glfw.terminate()
+            raise UserError("the display offers no OpenGL 3.3; update its driver or install Mesa")
+        glfw.make_context_current(self._window)
+        glfw.swap_interval(1)
+        self._context = moderngl.create_context(require=330)
+
+    @property
+    def context(self) -> moderngl.Context:
+        """The window's OpenGL context, for renderers that draw beside it."""
+        return self._context
+
+    def draw(self, faps: Float32) -> bool:
+        """Show one picture and handle what the user did to the window.
+
+        Parameters
+        ----------
+        faps
+            Facial animation parameters (68,), FAP units.
+
+        Returns
+        -------
+        False once the user has closed the window.
+        """
+        glfw.poll_events()
+        if glfw.window_should_close(self._window):
+            return False
+        width_px, height_px = glfw.get_framebuffer_size(self._window)
+        if width_px and height_px:  # both 0 while iconified
+            if (width_px, height_px) != self._renderer.size:
+                self._renderer.resize(width_px, height_px)
+            self._renderer.draw_on_screen(faps)
+        glfw.swap_buffers(self._window)
+        return True
+
+    def set_caption(self, caption: str) -> None:
+        """Show a caption beside the program's name in the title."""
+        if caption != self._caption:
+            self._caption = caption
+            glfw.set_window_title(self._window, f"{TITLE}: {caption}" if caption else TITLE)
+
+    def hide(self) -> None:
+        """Take the window off the screen; its context stays."""
+        glfw.hide_window(self._window)
+
+    def close(self) -> None:
+        """Close the window."""
+        glfw.destroy_window(self._window)
+        glfw.terminate()
+
+    def _on_key(self, _window: object, key: int, _code: int, action: int, modifiers: int) -> None:
+        if action == glfw.RELEASE:
+            return
+        if key == glfw.KEY_LEFT or (key == glfw.KEY_TAB and modifiers & glfw.MOD_SHIFT):
+            self._on_switch(-1)
+        elif key in (glfw.KEY_RIGHT, glfw.KEY_TAB):
+            self._on_switch(1)
+
+    def _on_mouse_button(self, _window: object, _button: int, action: int, _modifiers: int) -> None:
+        if action == glfw.PRESS:
+            self._on_switch(1)
+
+
+def _draws_in_software(context: moderngl.Context) -> bool:
+    renderer = str(context.info["GL_RENDERER"])
+    return "llvmpipe" in renderer or "softpipe" in renderer

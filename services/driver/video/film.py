@@ -1,0 +1,102 @@
+"""FAP frames or a FAP file to a video or pictures, without running services."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.render.renderer import Renderer
+from services.driver.video.recording import Recording, between
+from services.driver.video.writer import write_picture
+from shared.clock import MEDIA_RATE_HZ
+from shared.errors import UserError
+from shared.face.fap_file import FapAnimation
+from shared.face.high_level import expression_faps, viseme_faps
+
+Frame = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+
+
+def frames_of(animation: FapAnimation) -> list[Frame]:
+    """Return the frames of a FAP file with what FAP 1 and FAP 2 select added to the others.
+
+    A frame that defines a viseme or an expression (``viseme_def``, ``expression_def``) holds the
+    whole shape in its other FAPs; there nothing is added.
+    """
+    faps = animation.faps.copy()
+    for number in range(len(faps)):
+        if animation.visemes is not None:
+            select1, select2, blend, is_definition = animation.visemes[number].tolist()
+            if not is_definition:
+                faps[number] += viseme_faps(select1, select2, blend)
+        if animation.expressions is not None:
+            *selected, _, is_definition = animation.expressions[number].tolist()
+            if not is_definition:
+                faps[number] += expression_faps(*selected)
+    return [(number / animation.frame_rate_hz, row) for number, row in enumerate(faps)]
+
+
+def render_video(
+    frames: list[Frame],
+    path: Path,
+    renderer: Renderer,
+    *,
+    frame_rate_hz: float,
+    samples: NDArray[np.float32] | None = None,
+    on_progress: Callable[[float], None] = lambda _share: None,
+) -> int:
+    """Write a video, or a picture for every image of it; return the number of images.
+
+    Parameters
+    ----------
+    frames
+        At least one; the last one is held while the sound goes on.
+    path
+        As ``services.driver.video.open_writer`` takes it.
+    renderer
+        What draws.
+    frame_rate_hz
+        Images a second.
+    samples
+        Sound, 16 kHz mono, shape ``(n,)``.
+    on_progress
+        Told the share that is done.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be written.
+    """
+    recording = Recording(path, renderer, frame_rate_hz, sound=samples is not None)
+    try:
+        if samples is not None:
+            recording.accept_sound(0, samples)
+            if len(samples) / MEDIA_RATE_HZ > frames[-1][0]:
+                frames = [*frames, (len(samples) / MEDIA_RATE_HZ, frames[-1][1])]
+        for time_s, faps in frames:
+            recording.accept_frame(time_s, faps)
+        while recording.step():
+            on_progress(min(1.0, recording.duration_s / max(frames[-1][0], 1e-9)))
+    except BaseException:
+        recording.discard()
+        raise
+    recording.close()
+    return recording.num_images
+
+
+def render_picture(frames: list[Frame], path: Path, renderer: Renderer, at_s: float) -> None:
+    """Write the picture (PNG) at a time.
+
+    Raises
+    ------
+    UserError
+        If the face does not last so long, or the file cannot be written.
+    """
+    last_s = frames[-1][0]
+    if not 0 <= at_s <= last_s:
+        raise UserError(f"--at {at_s:g}: the face lasts from 0 to {last_s:g} s")
+    times_s = [time_s for time_s, _ in frames]
+    after = min(int(np.searchsorted(times_s, at_s, side="right")), len(frames) - 1)
+    write_picture(path, renderer.draw(between(frames[max(after - 1, 0)], frames[after], at_s)))

@@ -1,0 +1,50 @@
+"""Show the head as a camera that other programs (calls, OBS) can choose."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+
+from services.driver.head.head import Float32
+from services.driver.render.renderer import Renderer
+from shared.errors import UserError
+
+
+class VirtualCamera:
+    """Sends pictures to the system's virtual camera, through the library pyvirtualcam.
+
+    Raises
+    ------
+    UserError
+        If the library is not installed or the system has no such camera.
+    """
+
+    def __init__(self, renderer: Renderer, frame_rate_hz: float) -> None:
+        try:
+            library = importlib.import_module("pyvirtualcam")
+        except ImportError:
+            raise UserError(
+                "driver.virtual_camera needs pyvirtualcam; pip install 'kouxing[camera]'"
+            ) from None
+        self._renderer = renderer
+        self._interval_s = 1.0 / frame_rate_hz
+        self._due_s = 0.0
+        try:
+            self._camera = library.Camera(*renderer.size, frame_rate_hz)
+        except RuntimeError as error:
+            raise UserError(
+                f"driver.virtual_camera: this system has none ({error}); on Linux 'modprobe"
+                " v4l2loopback', elsewhere start OBS's virtual camera once"
+            ) from error
+        self.device: str = self._camera.device
+
+    def draw(self, faps: Float32, now_s: float) -> None:
+        """Send a picture of a face (68,) if one is due."""
+        if now_s >= self._due_s:
+            self._due_s = max(self._due_s + self._interval_s, now_s)
+            self._camera.send(np.ascontiguousarray(self._renderer.draw(faps)))
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._camera.close()

@@ -1,0 +1,106 @@
+"""What shows a face live: a window, a virtual camera, both or neither."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.driver.config import DriverConfig
+from services.driver.render.renderer import Renderer
+from services.driver.render.scene import background, camera, load_head
+from services.driver.render.window import Window
+from services.driver.video.virtual_camera import VirtualCamera
+from shared.errors import UserError
+from shared.logs import LOG
+
+
+class View:
+    """Opens what the configuration asks for, and draws a face there.
+
+    Parameters
+    ----------
+    config
+        The driver's configuration.
+    on_switch
+        Called with 1 or -1 when the user asks for the next or the previous session.
+
+    Raises
+    ------
+    UserError
+        If the configuration names no head or background, or what it demands is not there.
+    """
+
+    def __init__(self, config: DriverConfig, on_switch: Callable[[int], None]) -> None:
+        self._config = config
+        self._head = load_head(config.head)
+        self._background = background(config.background)
+        if self._background is None:
+            raise UserError(
+                "driver.background: a window and MP4 have no transparency; give a colour"
+            )
+        self._camera = camera(self._head, config.camera)
+        self._renderer: Renderer | None = None
+        self._window = self._open_window(on_switch)
+        self._is_window_open = self._window is not None
+        self._virtual_camera: VirtualCamera | None = None
+        if config.virtual_camera:
+            self._virtual_camera = VirtualCamera(self.renderer(), config.frame_rate_hz)
+            LOG.info("the virtual camera is %s", self._virtual_camera.device)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether anybody can see the face."""
+        return self._is_window_open or self._virtual_camera is not None
+
+    def show(self, faps: NDArray[np.float32], caption: str, now_s: float) -> None:
+        """Draw a face (68,) and say in the window's title whose it is."""
+        if self._window is not None and self._is_window_open:
+            self._window.set_caption(caption)
+            self._is_window_open = self._window.draw(faps)
+            if not self._is_window_open:
+                LOG.info("the window was closed")
+                self._window.hide()  # videos under way go on drawing in its context
+        if self._virtual_camera is not None:
+            self._virtual_camera.draw(faps, now_s)
+
+    def renderer(self) -> Renderer:
+        """Return what draws beside the window, for videos and the virtual camera; made once."""
+        if self._renderer is None:
+            self._renderer = Renderer(
+                self._head,
+                self._config.width_px,
+                self._config.height_px,
+                background=self._background,
+                camera=self._camera,
+                context=None if self._window is None else self._window.context,
+            )
+        return self._renderer
+
+    def close(self) -> None:
+        """Give the virtual camera back."""
+        if self._virtual_camera is not None:
+            self._virtual_camera.close()
+
+    def _open_window(self, on_switch: Callable[[int], None]) -> Window | None:
+        config = self._config
+        has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        if config.view == "none" or (config.view == "auto" and not has_display):
+            return None
+        head = load_head(config.head, "coarse")  # live, smooth motion is worth more than outlines
+        try:
+            return Window(
+                head,
+                config.width_px,
+                config.height_px,
+                background=self._background,
+                camera=self._camera,
+                on_switch=on_switch,
+            )
+        except UserError as error:
+            if config.view == "window":
+                raise
+            LOG.warning("no window: %s", error)
+            return None

@@ -1,0 +1,198 @@
+"""HTTP: the page's files, who may ask for them, and the WebSockets that are open."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import errno
+import hashlib
+import logging
+import re
+import socket
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from aiohttp import WSCloseCode, web
+from aiohttp.http import HttpProcessingError
+from aiohttp.typedefs import Handler, Middleware
+
+from shared.errors import UserError
+from shared.logs import LOG
+
+PAGE = Path(__file__).parent / "page"
+MODULES = PAGE / "node_modules" / "three"
+SUFFIXES = {".html", ".js", ".css", ".svg", ".glb"}  # files of the page that are served
+PING_S = 20.0  # a browser that has vanished is noticed within this
+MAX_MESSAGE_BYTES = 64 * 1024  # the most audio that one message of a session may carry
+_IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
+
+
+def bind(host: str, port: int) -> socket.socket:
+    """Return a listening socket.
+
+    Raises
+    ------
+    UserError
+        If the address cannot be had, naming the configuration key.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise UserError(
+                f"gateway.port: {port} is in use on {host}; choose another (0: any free one)"
+            ) from None
+        if error.errno == errno.EACCES:
+            raise UserError(f"gateway.port: {port} needs privileges; choose 1024 or more") from None
+        raise UserError(
+            f"gateway.host: cannot listen on {host!r}: {error.strerror}; "
+            "use 127.0.0.1, or an address of this host"
+        ) from None
+
+
+class WebSockets:
+    """The WebSockets that browsers have open."""
+
+    def __init__(self) -> None:
+        self._open: set[web.WebSocketResponse] = set()
+        self._is_closing = False
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    @contextlib.asynccontextmanager
+    async def accept(self, request: web.Request) -> AsyncIterator[web.WebSocketResponse]:
+        """Open a WebSocket for a page of this host, and close it in the end."""
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
+            raise web.HTTPForbidden(text="only this gateway's own page may connect\n")
+        if self._is_closing:
+            raise web.HTTPServiceUnavailable(text="the gateway stops\n")
+        browser = web.WebSocketResponse(
+            heartbeat=PING_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=1.0, compress=False
+        )
+        await browser.prepare(request)
+        self._open.add(browser)
+        try:
+            yield browser
+        finally:
+            self._open.discard(browser)
+            await browser.close()
+
+    async def close_all(self) -> None:
+        """Close every WebSocket, and accept no more."""
+        self._is_closing = True
+        closing = [
+            browser.close(code=WSCloseCode.GOING_AWAY, message=b"the gateway stops")
+            for browser in self._open
+        ]
+        await asyncio.gather(*closing, return_exceptions=True)
+
+
+def make_application(
+    *, page_asset: str, is_loopback: Callable[[str], bool] | None, routes: Mapping[str, Handler]
+) -> web.Application:
+    """Return the web application.
+
+    Parameters
+    ----------
+    page_asset
+        Another GLB to serve as the page's head; empty: the one beside the page.
+    is_loopback
+        Tells whether a host name is this machine's alone; then no other may be asked for. None
+        where any host name may be.
+    routes
+        Handlers of further paths.
+    """
+    application = web.Application(middlewares=[_guard(is_loopback)])
+
+    async def serve_file(request: web.Request) -> web.StreamResponse:
+        return _page_file(request.match_info.get("name", "index.html"), page_asset)
+
+    for path, handler in routes.items():
+        application.router.add_get(path, handler)
+    application.router.add_get("/", serve_file)
+    application.router.add_get("/{name}", serve_file)
+    if MODULES.is_dir():
+        for folder in ("build", "examples/jsm"):
+            application.router.add_static(f"/modules/three/{folder}", MODULES / folder)
+    else:
+        LOG.warning("the page's modules are missing; run 'npm ci' in %s", PAGE)
+    return application
+
+
+async def start(
+    application: web.Application, listener: socket.socket, on_bad_request: Callable[[], None]
+) -> web.AppRunner:
+    """Serve an application; ``on_bad_request`` is called when something that is no HTTP arrives."""
+
+    def is_worth_logging(record: logging.LogRecord) -> bool:
+        """Keep bytes that are no HTTP, and were answered so, from filling the log."""
+        if record.exc_info and isinstance(record.exc_info[1], HttpProcessingError):
+            on_bad_request()
+            return False
+        return True
+
+    log = LOG.getChild("http")
+    log.addFilter(is_worth_logging)
+    runner = web.AppRunner(application, access_log=None, logger=log, shutdown_timeout=0.5)
+    await runner.setup()
+    await web.SockSite(runner, listener).start()
+    return runner
+
+
+def _guard(is_loopback: Callable[[str], bool] | None) -> Middleware:
+    @web.middleware
+    async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+        # A page of a strange host that resolves to this machine (DNS rebinding) shows its own name
+        # here; one that only connects to us shows it as the origin.
+        try:
+            host = urlsplit(f"//{request.headers.get('Host', '')}").hostname or ""
+        except ValueError:
+            host = ""
+        if is_loopback is not None and not is_loopback(host):
+            raise web.HTTPForbidden(text="this gateway only answers as localhost\n")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers["X-Content-Type-Options"] = "nosniff"
+            response.headers["Cache-Control"] = "no-cache"
+        return response
+
+    return guard
+
+
+def _page_file(name: str, page_asset: str) -> web.StreamResponse:
+    path = PAGE / name
+    if name == "head.glb" and page_asset:
+        path = Path(page_asset)
+    elif path.parent != PAGE or path.suffix not in SUFFIXES:
+        raise web.HTTPNotFound
+    if not path.is_file():
+        if name == "head.glb":
+            text = f"the head is missing; make it with 'kouxing head export {path}'\n"
+            raise web.HTTPNotFound(text=text)
+        raise web.HTTPNotFound
+    if not MODULES.is_dir():
+        text = "the page's modules are missing; run 'npm ci' in services/gateway/page\n"
+        raise web.HTTPServiceUnavailable(text=text)
+    response = web.FileResponse(path)
+    if name == "index.html":
+        response.headers["Content-Security-Policy"] = _content_policy(path)
+    return response
+
+
+def _content_policy(index: Path) -> str:
+    """Return the policy that lets the page load nothing but its own files.
+
+    The import map has to stand in the page itself, so it is allowed by its digest.
+    """
+    found = _IMPORT_MAP.search(index.read_text(encoding="utf-8"))
+    digest = hashlib.sha256(found[1].encode() if found else b"").digest()
+    import_map = f"'sha256-{base64.b64encode(digest).decode()}'"
+    return (
+        f"default-src 'self'; script-src 'self' {import_map}; img-src 'self' blob: data:; "
+        "connect-src 'self' blob:; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+    )

@@ -1,0 +1,24 @@
+// What the page's code is checked for; its name keeps it from being served.
+
+import js from "@eslint/js";
+import globals from "globals";
+
+export default [
+  js.configs.recommended,
+  {
+    linterOptions: { reportUnusedDisableDirectives: "error" },
+    rules: {
+      curly: ["error", "multi-line"],
+      eqeqeq: "error",
+      "no-shadow": "error",
+      "no-unused-vars": ["error", { argsIgnorePattern: "^_" }],
+      "no-use-before-define": ["error", { functions: false, variables: false }],
+      "no-var": "error",
+      "object-shorthand": "error",
+      "prefer-const": "error",
+    },
+  },
+  { files: ["*.js"], languageOptions: { globals: globals.browser } },
+  { files: ["*-worklet.js"], languageOptions: { globals: globals.audioWorklet } },
+  { files: ["tests/*.js"], languageOptions: { globals: globals.node } },
+];

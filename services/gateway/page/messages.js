@@ -1,0 +1,26 @@
+// The binary messages that the gateway sends; proto/GATEWAY.md describes them.
+
+export const NUM_FAPS = 68;
+const FAP_TYPE = 1;
+const SOUND_TYPE = 2;
+const HEADER_BYTES = 16;
+
+/**
+ * Read a message.
+ *
+ * @param {ArrayBuffer} data
+ * @returns { mediaTime, faps: Float32Array } for a FAP frame, { mediaTime, samples: Int16Array } for
+ *   sound, null for what a later gateway may send
+ */
+export function readMessage(data) {
+  const header = new DataView(data);
+  const mediaTime = header.getFloat64(8, true);
+  switch (header.getUint8(0)) {
+    case FAP_TYPE:
+      return { mediaTime, faps: new Float32Array(data, HEADER_BYTES, NUM_FAPS) };
+    case SOUND_TYPE:
+      return { mediaTime, samples: new Int16Array(data, HEADER_BYTES) };
+    default:
+      return null;
+  }
+}

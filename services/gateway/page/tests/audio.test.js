@@ -1,0 +1,130 @@
+// The audio worklets, run outside a browser, and the way of a microphone's chunks.
+
+import assert from "node:assert/strict";
+import test from "node:test";
+import { Uplink } from "../uplink.js";
+
+const BLOCK = 128; // samples, as the Web Audio API processes them
+const processors = {};
+
+globalThis.AudioWorkletProcessor = class {
+  port = { posted: [], postMessage: (message) => this.port.posted.push(message) };
+};
+globalThis.registerProcessor = (name, processor) => (processors[name] = processor);
+globalThis.sampleRate = 48000;
+globalThis.currentFrame = 0;
+await import("../microphone-worklet.js");
+await import("../sound-worklet.js");
+
+test("a microphone is cut into chunks of 20 ms, gapless and clipped", () => {
+  const capture = new processors.capture();
+  const input = Float32Array.from({ length: 15 * BLOCK }, (_, i) => (i % 3 === 0 ? 1.5 : i / 4096));
+  for (let begin = 0; begin < input.length; begin += BLOCK) {
+    assert.equal(capture.process([[input.subarray(begin, begin + BLOCK)]]), true);
+  }
+  const { posted } = capture.port;
+  assert.deepEqual(posted.map(({ chunk }) => chunk.length), [960, 960]);
+  const heard = posted.flatMap(({ chunk }) => [...chunk]);
+  const expected = input.slice(0, 1920).map((value) => Math.round(Math.min(1, value) * 32767));
+  assert.deepEqual(heard, [...expected]);
+});
+
+test("a chunk comes with its level", () => {
+  const capture = new processors.capture();
+  for (let i = 0; i < 8; i++) capture.process([[new Float32Array(BLOCK).fill(0.5)]]);
+  assert.equal(capture.port.posted[0].rms, 0.5);
+});
+
+test("a microphone that is not there yet is no error", () => {
+  assert.equal(new processors.capture().process([[]]), true);
+});
+
+/** Play blocks from where the context is; return what sounds. */
+function play(player, numBlocks) {
+  const heard = [];
+  for (let i = 0; i < numBlocks; i++) {
+    const output = new Float32Array(BLOCK);
+    player.process([], [[output]]);
+    globalThis.currentFrame += BLOCK;
+    heard.push(...output);
+  }
+  return heard;
+}
+
+function playerWith(anchor) {
+  globalThis.currentFrame = 0;
+  const player = new processors["sound-player"]();
+  player.port.onmessage({ data: { anchor } });
+  return player;
+}
+
+test("sound is played at its media time, faded in against clicks", () => {
+  const player = playerWith(1000);
+  player.port.onmessage({ data: { mediaTime: 1256, samples: new Int16Array(512).fill(16384) } });
+  const heard = play(player, 8);
+  assert.ok(heard.slice(0, 256).every((value) => value === 0));
+  assert.equal(heard[256], 0.5 / 64);
+  assert.ok(heard.slice(320, 768).every((value) => value === 0.5));
+  assert.ok(heard.slice(768).every((value) => value === 0));
+});
+
+test("a new anchor waits until the sound has faded out", () => {
+  const player = playerWith(0);
+  player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(8000).fill(16384) } });
+  play(player, 4);
+  player.port.onmessage({ data: { anchor: 2000 } });
+  const heard = play(player, 2);
+  for (let i = 1; i < heard.length; i++) {
+    assert.ok(Math.abs(heard[i] - heard[i - 1]) <= 0.5 / 64 + 1e-6, `a click at ${i}`);
+  }
+  assert.ok(heard.includes(0));
+  assert.equal(heard.at(-1), 0.5, "and it goes on at the new place");
+});
+
+test("how much was played is told four times a second", () => {
+  const player = playerWith(0);
+  player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(16000).fill(1) } });
+  play(player, 100);
+  assert.equal(player.port.posted.length, 1);
+  assert.equal(player.port.posted[0], 12160);
+});
+
+class FakeSocket {
+  readyState = 1;
+  bufferedAmount = 0;
+  sent = [];
+  send(message) {
+    this.sent.push(typeof message === "string" ? JSON.parse(message) : message.byteLength);
+  }
+}
+
+test("what a slow network does not take is left out, and the gateway is told", () => {
+  const socket = new FakeSocket();
+  const uplink = new Uplink(socket, 16000);
+  const chunk = () => new Int16Array(320);
+  uplink.send(20, chunk());
+  socket.bufferedAmount = 1 << 20;
+  uplink.send(40, chunk());
+  uplink.send(60, chunk());
+  socket.bufferedAmount = 0;
+  uplink.send(80, chunk());
+  uplink.send(100, chunk());
+  assert.deepEqual(socket.sent, [640, { skip: 640 }, 640, 640]);
+  assert.equal(uplink.ageMs(100, 100 * 16), 0, "media time went on");
+});
+
+test("the age of sound counts from its recording, whatever was late on the way", () => {
+  const uplink = new Uplink(new FakeSocket(), 48000);
+  assert.equal(uplink.ageMs(0, 0), null);
+  uplink.send(1070, new Int16Array(960)); // 50 ms late
+  uplink.send(1041, new Int16Array(960)); // 1 ms late
+  assert.equal(uplink.ageMs(1101, 1600), 0);
+});
+
+test("a socket that is not open gets nothing", () => {
+  const socket = new FakeSocket();
+  socket.readyState = 2;
+  const uplink = new Uplink(socket, 16000);
+  uplink.send(20, new Int16Array(320));
+  assert.deepEqual(socket.sent, []);
+});

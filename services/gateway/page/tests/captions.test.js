@@ -1,0 +1,108 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { LevelMeter, rms, SILENT_DB } from "../level.js";
+import { PhoneTrack } from "../phones.js";
+import { Presence } from "../presence.js";
+import { missingHint, stateKind, stateText } from "../status.js";
+
+function track(...symbols) {
+  const phones = new PhoneTrack();
+  symbols.forEach((symbol, index) => {
+    phones.accept({ index, symbol, media_time: 1600 * index, duration: 1600 });
+  });
+  return phones;
+}
+
+test("the phone of a media time is shown with those before it", () => {
+  const phones = track("sil", "n", "i", "h", "ao");
+  assert.deepEqual(phones.at(-1), { current: "", past: [] });
+  assert.deepEqual(phones.at(0), { current: "", past: ["·"] });
+  assert.deepEqual(phones.at(3300), { current: "i", past: ["·", "n"] });
+});
+
+test("a phone can be revised", () => {
+  const phones = track("n", "i");
+  phones.accept({ index: 1, symbol: "v", media_time: 1600, duration: 800 });
+  assert.deepEqual(phones.at(1700), { current: "v", past: ["n"] });
+});
+
+test("the last phone is shown for a while, then it is past", () => {
+  const phones = track("n", "i");
+  assert.equal(phones.at(3200 + 8 * 16000).current, "i");
+  assert.deepEqual(phones.at(3201 + 8 * 16000), { current: "", past: ["n", "i"] });
+});
+
+test("only the newest phones are kept and shown", () => {
+  const phones = track(...Array.from({ length: 200 }, (_, i) => `p${i}`));
+  const { current, past } = phones.at(199 * 1600);
+  assert.equal(current, "p199");
+  assert.deepEqual(past, ["p191", "p192", "p193", "p194", "p195", "p196", "p197", "p198"]);
+  assert.deepEqual(phones.at(99 * 1600).past, []);
+});
+
+test("the level is that of the sound that is due", () => {
+  const meter = new LevelMeter();
+  meter.push(320, Int16Array.of(16384, -16384));
+  meter.advance(319, true);
+  assert.equal(meter.decibels(), SILENT_DB);
+  meter.advance(320, true);
+  assert.ok(Math.abs(meter.decibels() + 6.02) < 0.01);
+  assert.ok(meter.decibels() < -6.9, "it falls");
+});
+
+test("sound that is not to be shown leaves the level alone", () => {
+  const meter = new LevelMeter();
+  meter.push(0, Int16Array.of(16384));
+  meter.advance(0, false);
+  assert.equal(meter.decibels(), SILENT_DB);
+  meter.raise(1);
+  assert.ok(Math.abs(meter.decibels()) < 0.01);
+});
+
+test("the root mean square of full scale is 1", () => {
+  assert.equal(rms(Int16Array.of(-32768, -32768)), 1);
+});
+
+test("the face comes with frames, goes to rest when they stall", () => {
+  const presence = new Presence();
+  presence.update(0, false);
+  let share = 0;
+  for (let ms = 16; ms <= 1000; ms += 16) {
+    presence.frameArrived(ms);
+    share = presence.update(ms, true);
+  }
+  assert.equal(share, 1);
+  for (let ms = 1016; ms <= 1480; ms += 16) share = presence.update(ms, true);
+  assert.equal(share, 1, "not yet a stall");
+  for (let ms = 1496; ms <= 2600; ms += 16) share = presence.update(ms, true);
+  assert.equal(share, 0);
+});
+
+test("that the page was busy is no stall", () => {
+  const presence = new Presence();
+  presence.update(0, true);
+  presence.frameArrived(0);
+  presence.update(5000, true);
+  assert.ok(presence.isLive(5000));
+});
+
+test("the state is told in words", () => {
+  const state = { connected: true, session: "a", isLive: true, delayMs: 123.4 };
+  assert.equal(stateText(state), "live 直播 · 125 ms");
+  assert.equal(stateText({ ...state, delayMs: null }), "live 直播");
+  assert.equal(stateText({ ...state, isLive: false }), "paused 暂停");
+  assert.equal(stateText({ ...state, session: null }), "waiting for speech 等待语音");
+  assert.equal(stateText({ ...state, connected: false }), "connecting … 连接中");
+  assert.equal(stateKind(state), "live");
+  assert.equal(stateKind({ ...state, isLive: false }), "waiting");
+  assert.equal(stateKind({ ...state, connected: false }), "lost");
+});
+
+test("what is missing is named with the command that starts it", () => {
+  assert.equal(missingHint([]), "");
+  assert.equal(missingHint(["control"]), "no control is running; start: kouxing run");
+  assert.equal(
+    missingHint(["recognizer", "synthesizer"]),
+    "no recognizer, no synthesizer is running; start: kouxing recognizer; kouxing synthesizer",
+  );
+});

@@ -1,0 +1,113 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { Link, socketUrl } from "../link.js";
+import { NUM_FAPS, readMessage } from "../messages.js";
+
+class FakeWebSocket {
+  static OPEN = 1;
+  static made = [];
+  readyState = 0;
+  sent = [];
+  constructor(url) {
+    this.url = url;
+    FakeWebSocket.made.push(this);
+  }
+  send(text) { this.sent.push(JSON.parse(text)); }
+  open() {
+    this.readyState = FakeWebSocket.OPEN;
+    this.onopen();
+  }
+}
+
+/** A binary message as services/gateway/wire.py makes it: <B3xId and the payload. */
+function binary(kind, mediaTime, payload) {
+  const data = new ArrayBuffer(16 + payload.byteLength);
+  const header = new DataView(data);
+  header.setUint8(0, kind);
+  header.setUint32(4, 7, true);
+  header.setFloat64(8, mediaTime, true);
+  new Uint8Array(data, 16).set(new Uint8Array(payload.buffer));
+  return data;
+}
+
+test.beforeEach(() => {
+  FakeWebSocket.made = [];
+  globalThis.WebSocket = FakeWebSocket;
+  globalThis.location = { protocol: "http:", host: "localhost:8080" };
+});
+
+function record() {
+  const calls = [];
+  const names = ["state", "fap", "sound", "text"];
+  const handlers = Object.fromEntries(names.map((name) => [name, (...args) => calls.push([name, ...args])]));
+  return { calls, handlers };
+}
+
+test("a page that came by https connects by wss", () => {
+  assert.equal(socketUrl("/viewer"), "ws://localhost:8080/viewer");
+  globalThis.location.protocol = "https:";
+  assert.equal(socketUrl("/viewer"), "wss://localhost:8080/viewer");
+});
+
+test("binary messages are frames or sound; others of a later gateway are left out", () => {
+  const faps = Float32Array.from({ length: NUM_FAPS }, (_, i) => i);
+  const frame = readMessage(binary(1, 2 ** 40 + 1, faps));
+  assert.equal(frame.mediaTime, 2 ** 40 + 1);
+  assert.deepEqual(frame.faps, faps);
+  const sound = readMessage(binary(2, 320, Int16Array.of(1, -32768)));
+  assert.deepEqual(sound, { mediaTime: 320, samples: Int16Array.of(1, -32768) });
+  assert.equal(readMessage(binary(3, 0, new Uint8Array(4))), null);
+});
+
+test("messages go to their handlers", () => {
+  const { calls, handlers } = record();
+  new Link("", handlers);
+  const [socket] = FakeWebSocket.made;
+  socket.open();
+  socket.onmessage({ data: binary(2, 320, Int16Array.of(5)) });
+  socket.onmessage({ data: binary(9, 320, Int16Array.of(5)) });
+  socket.onmessage({ data: '{"type": "end"}' });
+  assert.deepEqual(calls, [
+    ["state", true],
+    ["sound", 320, Int16Array.of(5)],
+    ["text", { type: "end" }],
+  ]);
+});
+
+test("it connects again by itself, ever more slowly, to the session chosen last", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const { calls, handlers } = record();
+  const link = new Link("", handlers);
+  FakeWebSocket.made[0].open();
+  link.follow("a b");
+  assert.deepEqual(FakeWebSocket.made[0].sent, [{ follow: "a b" }]);
+  FakeWebSocket.made[0].onclose();
+  t.mock.timers.tick(299);
+  assert.equal(FakeWebSocket.made.length, 1);
+  t.mock.timers.tick(1);
+  assert.equal(FakeWebSocket.made[1].url, "ws://localhost:8080/viewer?session=a%20b");
+  FakeWebSocket.made[1].onclose();
+  t.mock.timers.tick(599);
+  assert.equal(FakeWebSocket.made.length, 2);
+  t.mock.timers.tick(1);
+  FakeWebSocket.made[2].open();
+  FakeWebSocket.made[2].onclose();
+  t.mock.timers.tick(300);
+  assert.equal(FakeWebSocket.made.length, 4, "a success makes it quick again");
+  assert.deepEqual(calls.map(([, connected]) => connected), [true, false, false, true, false]);
+});
+
+test("commands are left out while it is not connected", () => {
+  const link = new Link("", record().handlers);
+  link.play("sample", null);
+  assert.deepEqual(FakeWebSocket.made[0].sent, []);
+});
+
+test("the sample sentence is spoken with the lips that were chosen", () => {
+  const link = new Link("", record().handlers);
+  FakeWebSocket.made[0].open();
+  link.play("sample", null);
+  link.play("sample", "learnt");
+  const expected = [{ play: "sample" }, { play: "sample", lips: "learnt" }];
+  assert.deepEqual(FakeWebSocket.made[0].sent, expected);
+});

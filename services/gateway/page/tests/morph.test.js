@@ -1,0 +1,75 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { MorphedMesh } from "../morph.js";
+
+class Attribute {
+  needsUpdate = false;
+  constructor(values) {
+    this.array = Float32Array.from(values);
+    this.count = values.length / 3;
+  }
+  getX(i) { return this.array[3 * i]; }
+  getY(i) { return this.array[3 * i + 1]; }
+  getZ(i) { return this.array[3 * i + 2]; }
+}
+
+const REST = [0, 0, 0, 1, 0, 0, 0, 1, 0, 5, 5, 0, 6, 5, 0, 5, 6, 0];
+const JAW = { name: "jaw", number: 3, unitsPerWeight: 1000 };
+
+/** Two triangles in a plane; the target lifts the first vertex by 1. */
+function twoTriangles() {
+  return {
+    geometry: {
+      attributes: {
+        position: new Attribute(REST),
+        normal: new Attribute([0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1]),
+      },
+      index: { array: [0, 1, 2, 3, 4, 5] },
+      morphAttributes: { position: [new Attribute([0, 0, 1, ...Array(15).fill(0)])] },
+    },
+    morphTargetDictionary: { jaw: 0 },
+    morphTargetInfluences: [0],
+  };
+}
+
+function faceWith(value) {
+  const faps = new Float32Array(68);
+  faps[JAW.number - 1] = value;
+  return faps;
+}
+
+test("a FAP moves its target's vertices in proportion, and no other", () => {
+  const mesh = twoTriangles();
+  const morphed = new MorphedMesh(mesh, [JAW]);
+  morphed.pose(faceWith(500));
+  const expected = [...REST];
+  expected[2] = 0.5;
+  assert.deepEqual([...mesh.geometry.attributes.position.array], expected);
+  assert.ok(mesh.geometry.attributes.position.needsUpdate);
+});
+
+test("at rest the mesh is as in the file", () => {
+  const mesh = twoTriangles();
+  const morphed = new MorphedMesh(mesh, [JAW]);
+  const normals = [...mesh.geometry.attributes.normal.array];
+  morphed.pose(faceWith(500));
+  morphed.pose(faceWith(0));
+  assert.deepEqual([...mesh.geometry.attributes.position.array], REST);
+  assert.deepEqual([...mesh.geometry.attributes.normal.array], normals);
+});
+
+test("normals turn with their triangle, and only there", () => {
+  const mesh = twoTriangles();
+  new MorphedMesh(mesh, [JAW]).pose(faceWith(1000));
+  const normal = mesh.geometry.attributes.normal.array;
+  const third = Math.sqrt(1 / 3); // the lifted triangle's normal is (1, 1, 1) / sqrt(3)
+  for (let i = 0; i < 9; i++) assert.ok(Math.abs(normal[i] - third) < 1e-6);
+  assert.deepEqual([...normal.slice(9)], [0, 0, 1, 0, 0, 1, 0, 0, 1]);
+});
+
+test("three.js is left no targets to move itself", () => {
+  const mesh = twoTriangles();
+  new MorphedMesh(mesh, [JAW, { name: "absent", number: 4, unitsPerWeight: 1 }]);
+  assert.deepEqual(mesh.geometry.morphAttributes, {});
+  assert.equal(mesh.morphTargetInfluences, undefined);
+});

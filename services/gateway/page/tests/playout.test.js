@@ -1,0 +1,100 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { FapTrack, Playout, SAMPLES_PER_MS } from "../playout.js";
+
+const FRAME_MS = 20;
+
+/** Let sound and its frames arrive in real time: each frame frameMs after its sound. */
+function stream(playout, { fromMs = 0, forMs, clockMs = 0, frameMs = 80 }) {
+  for (let ms = fromMs; ms < fromMs + forMs; ms += FRAME_MS) {
+    const nowMs = ms + FRAME_MS + clockMs;
+    playout.soundArrived(nowMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
+    const frame = ms + FRAME_MS - frameMs;
+    if (frame >= 0) playout.frameArrived(nowMs, frame * SAMPLES_PER_MS);
+    playout.adjust(nowMs);
+  }
+}
+
+test("nothing is due before anything arrived", () => {
+  const playout = new Playout();
+  assert.equal(playout.mediaAt(1000), null);
+  assert.equal(playout.delayMs, null);
+});
+
+test("sound waits for its picture and one display frame", () => {
+  const playout = new Playout();
+  playout.displayFrameMs = 16;
+  stream(playout, { forMs: 20000, frameMs: 180 });
+  assert.ok(Math.abs(playout.delayMs - 196) <= 30, `${playout.delayMs}`);
+});
+
+test("the difference between the clocks drops out", () => {
+  const [here, there] = [new Playout(), new Playout()];
+  stream(here, { forMs: 5000 });
+  stream(there, { forMs: 5000, clockMs: 1e6 });
+  assert.equal(there.mediaAt(1e6 + 6000), here.mediaAt(6000));
+});
+
+test("within the dead zone the offset stays", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 5000 });
+  const before = playout.offsetMs;
+  stream(playout, { fromMs: 5000, forMs: 5000, frameMs: 95 });
+  assert.equal(playout.offsetMs, before);
+});
+
+test("one late frame moves nothing", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 5000 });
+  const before = playout.offsetMs;
+  playout.frameArrived(5250, 4900 * SAMPLES_PER_MS);
+  assert.equal(playout.adjust(5600), false);
+  assert.equal(playout.offsetMs, before);
+});
+
+test("after a pause of the sender the stream is on time again", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 3000 });
+  const delayMs = playout.delayMs;
+  stream(playout, { fromMs: 3000, forMs: 3000, clockMs: 5000 });
+  assert.ok(Math.abs(playout.delayMs - delayMs) <= 30, `${playout.delayMs}`);
+});
+
+test("a leap ahead of media time starts again at once", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 1000 });
+  playout.soundArrived(1020, 60000 * SAMPLES_PER_MS, 320);
+  assert.ok(playout.mediaAt(1020) > 59000 * SAMPLES_PER_MS);
+});
+
+test("the sound card's clock is followed slowly", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 1000 });
+  const before = playout.offsetMs;
+  playout.follow(before + 10);
+  assert.ok(Math.abs(playout.offsetMs - before - 0.5) < 1e-9);
+});
+
+test("the face between two frames is mixed of both", () => {
+  const track = new FapTrack();
+  const out = new Float32Array(2);
+  assert.equal(track.sample(0, out), false);
+  track.push(320, Float32Array.of(10, 0));
+  track.push(640, Float32Array.of(20, 100));
+  track.sample(400, out);
+  assert.deepEqual([...out], [12.5, 25]);
+  track.sample(0, out);
+  assert.deepEqual([...out], [10, 0], "before the first frame: the first");
+  track.sample(9999, out);
+  assert.deepEqual([...out], [20, 100], "after the last: the last");
+});
+
+test("a frame of the same media time replaces the last, an older one is left out", () => {
+  const track = new FapTrack();
+  const out = new Float32Array(1);
+  assert.equal(track.push(320, Float32Array.of(1)), true);
+  assert.equal(track.push(320, Float32Array.of(2)), false);
+  assert.equal(track.push(160, Float32Array.of(3)), false);
+  track.sample(320, out);
+  assert.equal(out[0], 2);
+});

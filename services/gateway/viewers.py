@@ -1,0 +1,178 @@
+"""The browsers that look on: which session each of them sees, and what is sent to it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from aiohttp import WSMsgType, web
+
+from services.gateway import wire
+from services.gateway.http import WebSockets
+from services.gateway.outbox import Kind, Outbox
+from shared.errors import UserError
+from shared.metrics import Metrics
+
+MAX_VIEWERS = 64
+SEND_BUFFER_BYTES = 64 * 1024  # what the kernel may hold for a slow viewer, about a second
+_SESSION = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+@dataclass(slots=True, eq=False)
+class Viewer:
+    """One browser that looks on."""
+
+    chosen: str  # the session it asked for; empty: the newest
+    outbox: Outbox = field(default_factory=Outbox)
+    shown: tuple[str, int] | None = None  # session and epoch that it was notified of last
+
+
+class Viewers:
+    """Sends each viewer the session that it asked for, or the newest.
+
+    Parameters
+    ----------
+    web_sockets
+        Opens the browsers' connections.
+    metrics
+        Counts what slow viewers lose.
+    play_sample
+        Starts to speak the sample sentence with a lip model, unless it is being spoken; returns its
+        session, which
+        counts as the newest only if there is no other.
+    """
+
+    def __init__(
+        self, web_sockets: WebSockets, metrics: Metrics, play_sample: Callable[[str], str]
+    ) -> None:
+        self._web_sockets = web_sockets
+        self._metrics = metrics
+        self._play_sample = play_sample
+        self._viewers: set[Viewer] = set()
+        self._epochs: dict[str, int] = {}  # by session, in the order they were opened
+        self._sample = ""  # the session of the sample sentence, while it is spoken
+        self._missing: tuple[str, ...] = ("control",)
+
+    def add_session(self, session: str, epoch: int) -> None:
+        """Show a session to whom it concerns; again when it goes on in another epoch."""
+        self._epochs[session] = epoch
+        self._notify_viewers()
+
+    def remove_session(self, session: str) -> None:
+        """Show a session no longer."""
+        self._epochs.pop(session, None)
+        self._notify_viewers()
+
+    def end_sample(self, error: str = "") -> None:
+        """Let those who asked for the sample sentence see the newest session again.
+
+        Parameters
+        ----------
+        error
+            An error message for them, if the sentence could not be spoken.
+        """
+        for viewer in self._viewers:
+            if self._sample and viewer.chosen == self._sample:
+                viewer.chosen = ""
+                if error:
+                    self._put(viewer, Kind.TEXT, error)
+        self._sample = ""
+        self._notify_viewers()
+
+    def set_missing(self, missing: tuple[str, ...]) -> None:
+        """Tell every viewer which services do not run, if these are others than before."""
+        if missing != self._missing:
+            self._missing = missing
+            for viewer in self._viewers:
+                self._put(viewer, Kind.TEXT, self._status())
+
+    def forward(self, session: str, kind: Kind, message: str | bytes) -> None:
+        """Send a message to the viewers of a session."""
+        for viewer in self._viewers:
+            if viewer.shown is not None and viewer.shown[0] == session:
+                self._put(viewer, kind, message)
+
+    async def serve(self, request: web.Request) -> web.StreamResponse:
+        """Serve one viewer until it leaves."""
+        chosen = request.query.get("session", "")
+        if chosen and not _SESSION.fullmatch(chosen):
+            raise web.HTTPBadRequest(text="session: up to 64 letters, digits, '-' and '_'\n")
+        if len(self._viewers) >= MAX_VIEWERS:
+            raise web.HTTPServiceUnavailable(text=f"{MAX_VIEWERS} viewers are looking already\n")
+        viewer = Viewer(chosen)
+        self._viewers.add(viewer)
+        try:
+            async with self._web_sockets.accept(request) as browser:
+                _limit_send_buffer(request)
+                self._put(viewer, Kind.TEXT, self._status())
+                self._notify_viewer(viewer)
+                await self._converse(viewer, browser)
+        finally:
+            self._viewers.discard(viewer)
+        return browser
+
+    async def _converse(self, viewer: Viewer, browser: web.WebSocketResponse) -> None:
+        writer = asyncio.create_task(_write(browser, viewer.outbox))
+        try:
+            async for message in browser:
+                if message.type is WSMsgType.TEXT:
+                    self._handle_command(viewer, message.data)
+        finally:
+            writer.cancel()
+
+    def _handle_command(self, viewer: Viewer, message: str) -> None:
+        try:
+            command = wire.parse_object(message)
+            session = command.get("follow")
+            if command.get("play") == "sample":
+                self._sample = viewer.chosen = self._play_sample(wire.parse_lips(command))
+            elif isinstance(session, str) and (not session or _SESSION.fullmatch(session)):
+                viewer.chosen = session
+            else:
+                raise UserError("expected 'follow' with a session's name, or 'play'")
+        except UserError as error:
+            self._put(viewer, Kind.TEXT, wire.error_text(str(error)))
+        self._notify_viewer(viewer)
+
+    def _notify_viewers(self) -> None:
+        for viewer in self._viewers:
+            self._notify_viewer(viewer)
+
+    def _notify_viewer(self, viewer: Viewer) -> None:
+        """Say which session the viewer sees now, if it is another than before."""
+        newest = (name for name in reversed(self._epochs) if name != self._sample)
+        name = viewer.chosen or next(newest, self._sample)
+        shown = (name, self._epochs[name]) if name in self._epochs else None
+        if shown != viewer.shown:
+            viewer.shown = shown
+            session, epoch = shown or (None, 0)
+            message = wire.text("session", session=session, chosen=viewer.chosen, epoch=epoch)
+            self._put(viewer, Kind.TEXT, message)
+
+    def _put(self, viewer: Viewer, kind: Kind, message: str | bytes) -> None:
+        num_dropped = viewer.outbox.put(kind, message)
+        if num_dropped:
+            self._metrics.count("dropped_slow_viewer", num_dropped)
+
+    def _status(self) -> str:
+        return wire.text("status", missing=self._missing)
+
+
+def _limit_send_buffer(request: web.Request) -> None:
+    raw = request.transport.get_extra_info("socket") if request.transport else None
+    if raw is not None:
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+
+
+async def _write(browser: web.WebSocketResponse, outbox: Outbox) -> None:
+    with contextlib.suppress(ConnectionError):
+        while True:
+            message = await outbox.get()
+            if isinstance(message, str):
+                await browser.send_str(message)
+            else:
+                await browser.send_bytes(message)

@@ -1,0 +1,105 @@
+"""The kinds of service: one entry here makes a service known to every command and test."""
+
+from __future__ import annotations
+
+import contextlib
+import pkgutil
+import socket
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from shared.config import COMMON, Bound, ServiceConfig, Settings, bound_keys, variable
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceKind:
+    """A service by name; its classes are imported when they are needed."""
+
+    name: str
+    config: str  # its keys, as module:class
+    service: str  # its process, as module:class
+    summary: str
+
+    @property
+    def config_type(self) -> type[ServiceConfig]:
+        """The class of its configuration."""
+        found: type[ServiceConfig] = pkgutil.resolve_name(self.config)
+        return found
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (  # in the order in which they start
+        ServiceKind(
+            "control",
+            "services.control.config:ControlConfig",
+            "services.control.service:ControlService",
+            "Run control: it opens sessions and places them on the other services.",
+        ),
+        ServiceKind(
+            "recognizer",
+            "services.recognizer.config:RecognizerConfig",
+            "services.recognizer.service:RecognizerService",
+            "Run a recognizer: audio in, phones with times out.",
+        ),
+        ServiceKind(
+            "synthesizer",
+            "services.synthesizer.config:SynthesizerConfig",
+            "services.synthesizer.service:SynthesizerService",
+            "Run a synthesizer: phones in, FAP frames out.",
+        ),
+        ServiceKind(
+            "driver",
+            "services.driver.config:DriverConfig",
+            "services.driver.service:DriverService",
+            "Run a driver: FAP frames in, a window and videos out.",
+        ),
+        ServiceKind(
+            "gateway",
+            "services.gateway.config:GatewayConfig",
+            "services.gateway.service:GatewayService",
+            "Run the gateway: the face and a microphone in a browser.",
+        ),
+    )
+}
+
+
+def read_settings(file: Path | None = None) -> Settings:
+    """Return what a file and the environment say about all services.
+
+    Raises
+    ------
+    UserError
+        As ``shared.config.Settings``.
+    """
+    return Settings({kind.name: kind.config_type for kind in KINDS.values()}, file=file)
+
+
+def free_addresses(
+    names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Return an environment in which services bind free ports, beside a system that runs already.
+
+    Parameters
+    ----------
+    names
+        Services that bind.
+    hosts
+        Addresses of this machine, by service; 127.0.0.1 where none is given.
+    """
+    environment = {}
+    with contextlib.ExitStack() as probes:  # all stay open, so that no port is found twice
+        for name in names:
+            host = (hosts or {}).get(name, "127.0.0.1")
+            for key, bound in bound_keys(KINDS[name].config_type).items():
+                if bound is Bound.HOST:
+                    continue
+                probe = probes.enter_context(socket.socket())
+                probe.bind((host, 0))
+                port = str(probe.getsockname()[1])
+                address = f"tcp://{host}:{port}" if bound is Bound.ENDPOINT else port
+                environment[variable(name, key)] = address
+    if "control" in names:
+        environment[variable(COMMON, "control")] = environment[variable("control", "commands")]
+    return environment

@@ -1,0 +1,1 @@
+"""Acoustic models: state scores from feature frames."""

@@ -1,0 +1,222 @@
+"""Gaussian mixture acoustic model: log scores of HMM states for one feature frame.
+
+Source: Li et al. 2011, section 3.1 (one mixture per state, diagonal covariances); the density is
+the HTK book's eq. 7.2 (Young et al. 2009).
+
+======== ========================================= =====================
+symbol   meaning                                   shape
+======== ========================================= =====================
+x        normalised, rotated feature frame         (39,)
+A        rotation that decorrelates (STC)          (39, 39)
+w        mixture weights                           (states, mixtures)
+means    component means                           (states, mixtures, 39)
+covars   component variances                       (states, mixtures, 39)
+======== ========================================= =====================
+
+log b(x) = logsumexp_m [ log w_m - 1/2 sum_k (log 2 pi covars_mk + (x_k - means_mk)^2 / covars_mk) ]
+
+computed as a product of [x^2, x, 1] with a precomputed matrix. All states share one rotation
+(Gales 1999, "Semi-tied covariance matrices").
+
+Vocal-tract-length normalisation raises the formants of low voices
+(:mod:`services.recognizer.front_end.vtln`). The front end measures the pitch of every frame; the
+stream gets only frames of speech, so only they count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import Topology, Work
+from services.recognizer.acoustic.model_file import (
+    Archive,
+    topology_arrays,
+    topology_from,
+    write_archive,
+)
+from services.recognizer.front_end.features import (
+    NUM_FEATURES,
+    NUM_STATIC,
+    Differences,
+    LiveMean,
+    cepstra,
+)
+from services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
+from shared.phones.inventory import PhoneInventory
+
+FORMAT = "gmm 3"
+_MAX_MIXTURES = 1024
+_MAX_HALF_WIDTH = 4  # of the differences, feature frames
+
+_MIN_LOG_WEIGHT = -1e30  # of an absent component: finite, so that no NaN arises
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GaussianMixtures:
+    """The densities of all states."""
+
+    weights: NDArray[np.float32]  # (states, mixtures), rows sum to 1
+    means: NDArray[np.float32]  # (states, mixtures, 39)
+    covars: NDArray[np.float32]  # (states, mixtures, 39)
+
+    def score_matrix(self) -> NDArray[np.float32]:
+        """Return the matrix from [x^2, x, 1] to log densities, (79, states * mixtures)."""
+        num_states, num_mixtures, num_features = self.means.shape
+        covars = self.covars.astype(np.float64)
+        means = self.means.astype(np.float64)
+        with np.errstate(divide="ignore"):
+            log_weights = np.maximum(np.log(self.weights.astype(np.float64)), _MIN_LOG_WEIGHT)
+        constant = log_weights - 0.5 * (np.log(2 * np.pi * covars) + means**2 / covars).sum(-1)
+        matrix = np.concatenate([-0.5 / covars, means / covars, constant[..., None]], axis=-1)
+        shape = (num_states * num_mixtures, 2 * num_features + 1)
+        return np.ascontiguousarray(matrix.reshape(shape).T, dtype=np.float32)
+
+
+def mixture_scores(
+    frames: NDArray[np.float32], matrix: NDArray[np.float32], num_mixtures: int
+) -> NDArray[np.float32]:
+    """Compute the log densities of the states.
+
+    Parameters
+    ----------
+    frames
+        Shape (n, 39).
+    matrix
+        From :meth:`GaussianMixtures.score_matrix`, shape (79, states * mixtures).
+    num_mixtures
+        Components of each state.
+
+    Returns
+    -------
+    NDArray
+        Shape (n, states).
+    """
+    ones = np.ones((len(frames), 1), dtype=np.float32)
+    components = np.concatenate([frames * frames, frames, ones], axis=1) @ matrix
+    components = components.reshape(len(frames), -1, num_mixtures)
+    peak = components.max(axis=2)
+    components -= peak[..., None]
+    np.exp(components, out=components)
+    log_density: NDArray[np.float32] = peak + np.log(components.sum(axis=2))
+    return log_density
+
+
+@dataclass(frozen=True, kw_only=True)
+class GmmModel:
+    """A Gaussian mixture HMM with its front end; implements ``AcousticModel``."""
+
+    topology: Topology
+    mixtures: GaussianMixtures
+    rotation: NDArray[np.float32]  # (39, 39)
+    prior_mean: NDArray[np.float32]  # (13,) cepstral mean of the training corpus
+    half_width: int  # of the differences
+    acoustic_scale: float = 1.0  # weight of the log scores: neighbouring frames are correlated
+
+    @property
+    def inventory(self) -> PhoneInventory:
+        """The language's phones."""
+        return self.topology.inventory
+
+    @cached_property
+    def matrix(self) -> NDArray[np.float32]:
+        """Matrix of the component densities, computed once for all streams."""
+        return self.mixtures.score_matrix()
+
+    def front_end(self) -> PitchedLogMel:
+        """Start a front end for one session."""
+        return PitchedLogMel()
+
+    def stream(self) -> GmmStream:
+        """Start a stream of scores for one speaker."""
+        return GmmStream(self)
+
+    def score(self, work: Sequence[Work]) -> list[NDArray[np.float32]]:
+        """Score the frames of several streams, each alone; None ends a stream's segment."""
+        return [
+            stream.finish() if frames is None else stream.accept(frames) for stream, frames in work
+        ]
+
+    def save(self, path: Path) -> None:
+        """Write the model as an npz file (arrays only, no pickle)."""
+        arrays = {
+            "format": np.array(FORMAT),
+            **topology_arrays(self.topology),
+            "weights": self.mixtures.weights,
+            "means": self.mixtures.means,
+            "covars": self.mixtures.covars,
+            "rotation": self.rotation,
+            "prior_mean": self.prior_mean,
+            "half_width": np.array(self.half_width),
+            "acoustic_scale": np.array(self.acoustic_scale, np.float32),
+        }
+        write_archive(path, arrays)
+
+
+class GmmStream:
+    """Scores of one speaker's speech, segment by segment."""
+
+    def __init__(self, model: GmmModel) -> None:
+        self._model = model
+        self._vtln = VocalTractNormalizer()
+        self._mean = LiveMean(model.prior_mean)
+        self._differences = Differences(model.half_width)
+        self.look_ahead_frames = self._differences.look_ahead_frames
+
+    def accept(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take log-mel frames with their pitch, shape (n, 43); return the scores ready."""
+        log_mel = self._vtln.accept(frames[:, :-2], frames[:, -2], frames[:, -1])
+        return self._score(self._differences.accept(cepstra(log_mel)))
+
+    def finish(self) -> NDArray[np.float32]:
+        """End the segment; return its remaining scores. The speaker is remembered."""
+        scores = self._score(self._differences.finish())
+        self._differences = Differences(self._model.half_width)
+        return scores
+
+    def reset(self) -> None:
+        """Forget the segment and the speaker."""
+        self._differences = Differences(self._model.half_width)
+        self._vtln.reset()
+        self._mean.reset()
+
+    def _score(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        normalised = self._mean.normalise(features)
+        scores = np.empty((len(features), self._model.topology.num_states), dtype=np.float32)
+        num_mixtures = self._model.mixtures.weights.shape[1]
+        for row in range(len(features)):  # row by row: a product's rounding depends on its height
+            frame = normalised[row : row + 1] @ self._model.rotation
+            scores[row] = mixture_scores(frame, self._model.matrix, num_mixtures)[0]
+        return scores * np.float32(self._model.acoustic_scale)
+
+
+def gmm_from(archive: Archive) -> GmmModel:
+    """Build the model after checking every size; ValueError says what does not fit."""
+    topology = topology_from(archive)
+    num_mixtures = archive.array("weights", None).shape[-1]
+    if not 1 <= num_mixtures <= _MAX_MIXTURES:
+        raise ValueError(f"{num_mixtures} mixture components")
+    half_width = int(archive.array("half_width", ()))
+    if not 1 <= half_width <= _MAX_HALF_WIDTH:
+        raise ValueError(f"half width of the differences {half_width}")
+    shape = (topology.num_states, num_mixtures)
+    mixtures = GaussianMixtures(
+        weights=archive.floats("weights", *shape),
+        means=archive.floats("means", *shape, NUM_FEATURES),
+        covars=archive.floats("covars", *shape, NUM_FEATURES),
+    )
+    if (mixtures.covars <= 0).any() or (mixtures.weights < 0).any():
+        raise ValueError("weights or variances are negative")
+    return GmmModel(
+        topology=topology,
+        mixtures=mixtures,
+        rotation=archive.floats("rotation", NUM_FEATURES, NUM_FEATURES),
+        prior_mean=archive.floats("prior_mean", NUM_STATIC),
+        half_width=half_width,
+        acoustic_scale=float(archive.floats("acoustic_scale")),
+    )

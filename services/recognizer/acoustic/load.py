@@ -1,0 +1,60 @@
+"""Load an acoustic model of any kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from services.recognizer.acoustic import gmm, neural
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.acoustic.model_file import Archive, read_archive
+from shared.errors import UserError
+
+MODELS = Path(__file__).parents[1] / "models"
+SHIPPED = ("gmm", "neural")
+DEFAULT_MODEL = "neural"
+MODEL_PATH = MODELS / f"{DEFAULT_MODEL}.npz"
+_READERS: dict[str, Callable[[Archive], AcousticModel]] = {
+    gmm.FORMAT: gmm.gmm_from,
+    neural.FORMAT: neural.neural_from,
+}
+
+
+def model_path(name: str) -> Path:
+    """Return the file of a shipped model, by its name; any other name is a path."""
+    return MODELS / f"{name}.npz" if name in SHIPPED else Path(name)
+
+
+def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -> AcousticModel:
+    """Read a model file.
+
+    Parameters
+    ----------
+    path
+        A file that ``GmmModel.save`` or ``NeuralModel.save`` wrote.
+    look_ahead_ms
+        How far a neural model looks ahead, one of those it was trained for; None is its default. A
+        Gaussian mixture model has a fixed look-ahead and ignores this.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, broken or of another format, its language is not installed, or the
+        model was not trained for the look-ahead.
+    """
+    archive = read_archive(path)
+    try:
+        form = str(archive.array("format", ()))
+        model = _READERS[form](archive)
+    except KeyError:
+        raise UserError(
+            f"acoustic model {path} has the format {form!r}; this program reads "
+            f"{' and '.join(_READERS)}: train again"
+        ) from None
+    except ValueError as error:
+        raise UserError(f"acoustic model {path}: {error}; train it again") from error
+    except UserError as error:
+        raise UserError(f"acoustic model {path}: {error}") from error
+    if look_ahead_ms is not None and isinstance(model, neural.NeuralModel):
+        return model.with_look_ahead(look_ahead_ms)
+    return model

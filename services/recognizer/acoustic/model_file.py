@@ -1,0 +1,186 @@
+"""Model files: npz archives of plain arrays, never pickle, every size checked."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory, load_inventory
+
+_MAX_STATES = 10_000
+_MAX_NODES = 10_000_000
+_MAX_WEIGHT = 10.0
+_LOG_STEP = np.float32(0.05)  # nats; a phone language model's logs are stored in 8 bits
+
+
+@dataclass(frozen=True, slots=True)
+class Archive:
+    """The arrays of a model file."""
+
+    arrays: dict[str, NDArray[Any]]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.arrays
+
+    def array(self, name: str, shape: tuple[int, ...] | None) -> NDArray[Any]:
+        """Return an array of a given shape (None: any); ValueError says what does not fit."""
+        if name not in self.arrays:
+            raise ValueError(f"{name} is missing")
+        found = self.arrays[name]
+        if shape is not None and found.shape != shape:
+            raise ValueError(f"{name} has shape {found.shape}, expected {shape}")
+        return found
+
+    def floats(self, name: str, *shape: int) -> NDArray[np.float32]:
+        """Return finite numbers of a given shape."""
+        values = self.array(name, shape).astype(np.float32)
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} holds values that are not finite")
+        return values
+
+
+def read_archive(path: Path) -> Archive:
+    """Read a model file.
+
+    Raises
+    ------
+    UserError
+        If the file is missing or no model file.
+    """
+    try:
+        content = io.BytesIO(path.read_bytes())
+    except OSError as error:
+        raise UserError(f"no acoustic model at {path}; train one or reinstall") from error
+    try:
+        with np.lib.npyio.NpzFile(content, allow_pickle=False) as archive:
+            return Archive({name: archive[name] for name in archive.files})
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"{path} is no acoustic model ({error}); train one or reinstall") from error
+
+
+def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a model file."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    path.write_bytes(buffer.getvalue())
+
+
+def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the HMMs and of the phone language model."""
+    return {
+        **phone_lm_arrays(topology.phone_lm),
+        "lm_scale": np.array(topology.lm_scale, np.float32),
+        "phone_penalty": np.array(topology.phone_penalty, np.float32),
+        "first_state": topology.first_state,
+        "log_stay": topology.log_stay,
+        "log_leave": topology.log_leave,
+        "duration_mean_s": topology.duration_mean_s,
+        "duration_spread_s": topology.duration_spread_s,
+    }
+
+
+def topology_from(archive: Archive) -> Topology:
+    """Build the HMMs after checking every size.
+
+    Raises
+    ------
+    ValueError
+        If an array does not fit.
+    UserError
+        If the model's language is not installed.
+    """
+    phone_lm = phone_lm_from(archive)
+    num_phones = len(phone_lm.inventory)
+    first_state = archive.array("first_state", (num_phones + 1,)).astype(np.int64)
+    if first_state[0] != 0 or (np.diff(first_state) < 1).any() or first_state[-1] > _MAX_STATES:
+        raise ValueError("its states are not numbered upwards")
+    num_states = int(first_state[-1])
+    lm_scale = float(archive.floats("lm_scale"))
+    phone_penalty = float(archive.floats("phone_penalty"))
+    if not 0 <= lm_scale <= _MAX_WEIGHT or abs(phone_penalty) > _MAX_WEIGHT:
+        raise ValueError(f"lm_scale is {lm_scale:g}, phone_penalty {phone_penalty:g}")
+    return Topology(
+        phone_lm=phone_lm,
+        first_state=first_state,
+        log_stay=archive.floats("log_stay", num_states),
+        log_leave=archive.floats("log_leave", num_states),
+        lm_scale=lm_scale,
+        phone_penalty=phone_penalty,
+        duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_phones),
+        duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_phones),
+    )
+
+
+def phone_lm_arrays(phone_lm: PhoneLanguageModel) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a phone language model, with the language they belong to."""
+    log_prob, log_backoff = (
+        np.rint(log / _LOG_STEP) for log in (phone_lm.log_prob, phone_lm.log_backoff)
+    )
+    return {
+        "language": np.array(phone_lm.inventory.language),
+        "phones": np.array(phone_lm.inventory.phones),
+        "lm_children": phone_lm.num_children,
+        "lm_phone": phone_lm.phone,
+        "lm_log_prob": np.clip(-log_prob, 0, 255).astype(np.uint8),  # without its sign
+        "lm_log_backoff": np.clip(log_backoff, -127, 127).astype(np.int8),
+    }
+
+
+def phone_lm_from(archive: Archive) -> PhoneLanguageModel:
+    """Build a phone language model after checking every number.
+
+    Raises
+    ------
+    ValueError
+        If an array does not fit.
+    UserError
+        If the model's language is not installed.
+    """
+    inventory = inventory_from(archive)
+    num_phones = len(inventory)
+    children = archive.array("lm_children", None).astype(np.int64)
+    if children.ndim != 1 or not 1 + num_phones <= len(children) <= _MAX_NODES:
+        raise ValueError(f"lm_children has shape {children.shape}")
+    at = np.arange(len(children))
+    first_child = 1 + np.cumsum(children) - children
+    if (
+        children.min() < 0
+        or children[0] != num_phones
+        or children.sum() != len(children) - 1
+        or (first_child <= at)[children > 0].any()
+    ):
+        raise ValueError("its phone language model is no tree")
+    phone = archive.array("lm_phone", children.shape).astype(np.int64)
+    is_first = np.zeros(len(phone) + 1, dtype=bool)
+    is_first[first_child] = True
+    if phone.min() < 0 or phone.max() >= num_phones or (np.diff(phone) < 1)[~is_first[1:-1]].any():
+        raise ValueError("the phones of its phone language model are not in order")
+    phone_lm = PhoneLanguageModel(
+        inventory=inventory,
+        num_children=children.astype(np.uint8),
+        phone=phone.astype(np.uint8),
+        log_prob=-_LOG_STEP * archive.floats("lm_log_prob", len(phone)),
+        log_backoff=_LOG_STEP * archive.floats("lm_log_backoff", len(phone)),
+    )
+    if len(phone_lm.levels) > MAX_ORDER + 2:
+        raise ValueError(f"its phone language model has n-grams of more than {MAX_ORDER} phones")
+    return phone_lm
+
+
+def inventory_from(archive: Archive) -> PhoneInventory:
+    """Load the inventory of the file's language; check that the file was made with its phones."""
+    inventory = load_inventory(str(archive.array("language", ())))
+    if tuple(archive.array("phones", None).tolist()) != inventory.phones:
+        raise ValueError(f"its phones are not those of the installed language {inventory.language}")
+    return inventory

@@ -1,0 +1,136 @@
+"""The neural model's network: an ONNX file that onnxruntime runs one position at a time.
+
+See :mod:`services.recognizer.acoustic.neural` for what it computes and
+:mod:`training.neural.export` for how the file is written.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from services.recognizer.front_end.whisper_mel import NUM_MELS
+
+NUM_INPUTS = NUM_MELS
+WINDOW = 128  # positions that one attends to, itself included
+MAX_POSITIONS = 1500  # rows of the table of positions
+SEEN_FRAMES = 5  # feature frames that enter at one position
+
+_OUTPUTS = ["log_posteriors", "keys", "values"]
+_MIN_WIDTH, _MAX_WIDTH = 4, 4096
+_MAX_LAYERS = 64
+_LONGEST_WAVE = 10_000.0  # of the sinusoids, over 2 pi
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkSizes:
+    """Sizes of a network, read from its inputs."""
+
+    width: int
+    num_layers: int
+    num_heads: int  # of attention
+    head_size: int  # numbers in a head's key or value
+
+
+class KeyValueCache:
+    """Keys and values of some sessions' earlier positions, as the network takes them.
+
+    Each is a ring of ``WINDOW`` slots. Keys are transposed, so that a product with a query runs
+    along the positions.
+    """
+
+    def __init__(self, sizes: NetworkSizes, num_sessions: int) -> None:
+        layers, heads, size = sizes.num_layers, sizes.num_heads, sizes.head_size
+        self.keys = np.zeros((layers, num_sessions, heads, size, WINDOW), np.float32)
+        self.values = np.zeros((layers, num_sessions, heads, WINDOW, size), np.float32)
+
+
+def position_table(width: int) -> Floats:
+    """Return Whisper's table of sinusoidal positions, shape (1500, width)."""
+    step = math.log(_LONGEST_WAVE) / (width // 2 - 1)
+    phase = np.arange(MAX_POSITIONS)[:, None] * np.exp(-step * np.arange(width // 2))
+    return np.concatenate([np.sin(phase), np.cos(phase)], axis=1).astype(np.float32)
+
+
+def past_masks() -> Floats:
+    """Return attention masks by the number of positions in a cache, shape (128, 1, 1, 128).
+
+    A mask is added to the products with the cached keys. The last slot is the position's own.
+    """
+    slot = np.arange(WINDOW)
+    is_empty = (slot >= np.arange(WINDOW)[:, None]) & (slot < WINDOW - 1)
+    return np.where(is_empty, np.float32(-np.inf), np.float32(0))[:, None, None]
+
+
+def input_names(num_layers: int) -> list[str]:
+    """Return the names of the network's inputs, in order."""
+    caches = [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
+    return ["frames", "position", "output_layer", "past_mask", *caches]
+
+
+class NetworkSession:
+    """A network that is ready to run, on one thread.
+
+    Parameters
+    ----------
+    file
+        An ONNX file's bytes.
+
+    Raises
+    ------
+    ValueError
+        If it is no network of this kind.
+    """
+
+    def __init__(self, file: NDArray[np.uint8]) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        try:
+            self._session = onnxruntime.InferenceSession(
+                file.tobytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime's errors have no base of their own
+            raise ValueError(f"its network cannot be read ({error})") from error
+        self.sizes = _sizes_of({node.name: node.shape for node in self._session.get_inputs()})
+
+    def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[Floats]:
+        """Return log posteriors, keys and values.
+
+        Raises
+        ------
+        ValueError
+            If the network does not run.
+        """
+        try:
+            outputs: list[Floats] = self._session.run(_OUTPUTS, inputs)
+        except Exception as error:
+            raise ValueError(f"its network does not run ({error})") from error
+        return outputs
+
+
+def _sizes_of(shapes: Mapping[str, Sequence[object]]) -> NetworkSizes:
+    """Read a network's sizes from its inputs, after checking their names and shapes."""
+    num_layers = sum(name.startswith("keys_") for name in shapes)
+    if not 1 <= num_layers <= _MAX_LAYERS or list(shapes) != input_names(num_layers):
+        raise ValueError(f"its network has the inputs {', '.join(shapes)}")
+    width, heads, size = shapes["position"][-1], shapes["keys_0"][1], shapes["keys_0"][-2]
+    if (
+        not (isinstance(width, int) and isinstance(heads, int) and isinstance(size, int))
+        or not (_MIN_WIDTH <= width <= _MAX_WIDTH and width % 2 == 0)
+        or not (heads >= 1 and size >= 1 and heads * size <= _MAX_WIDTH)
+    ):
+        raise ValueError(f"its network has the width {width}, {heads} heads of size {size}")
+    expected_shapes = [(SEEN_FRAMES * NUM_INPUTS,), (width,), (), (1, 1, WINDOW)]
+    expected_shapes += [(heads, size, WINDOW)] * num_layers + [(heads, WINDOW, size)] * num_layers
+    for (name, shape), expected in zip(shapes.items(), expected_shapes, strict=True):
+        if tuple(shape[1:]) != expected:
+            raise ValueError(f"its network has {name} of {shape}, expected {expected} of each")
+    return NetworkSizes(width, num_layers, heads, size)

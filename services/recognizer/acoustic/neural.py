@@ -1,0 +1,342 @@
+"""Neural acoustic model: a causal transformer, run by onnxruntime.
+
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
+layers of Whisper's encoder); Vaswani et al. 2017, "Attention is all you need" (sinusoidal
+positions); Sak et al. 2015, "Fast and accurate recurrent neural network acoustic models for speech
+recognition" (a look-ahead is a delay of the output); Bourlard and Morgan 1994, "Connectionist
+speech recognition" (scores are posteriors divided by priors). HMMs, search and output rule are
+those of Li et al. 2011.
+
+================ ====================================================== ========================
+symbol           meaning                                                shape
+================ ====================================================== ========================
+x                log-mel bands of the five frames at a position         (rows, 400)
+K, V             keys and values of the 127 positions before it, for    (sessions, heads, 128,
+                 each layer; the last slot is the position's own        size), K transposed
+y                log posteriors of the states at two frames             (rows, 2, states)
+d                look-ahead, feature frames, 1 or more                  1
+prior            prior of the states, to a power below one              (states,)
+acoustic_scale   weight of the log scores, chosen on development data   1
+================ ====================================================== ========================
+
+    log b(x) = acoustic_scale * (y - log prior)
+
+There is a position for every other frame. Position ``p`` of a segment has seen the frames up to
+``2 p + 2`` (zeros stand before the first) and scores the frames ``2 p + 2 - d`` and
+``2 p + 3 - d``. With ``d = 1`` no position scores frame 0, which gets the scores of frame 1. At the
+end of a segment, its last frame is repeated until all frames are scored.
+
+A position attends to itself and to the ``WINDOW - 1`` positions before it, 2.5 seconds. The table
+of positions ends after 30 seconds. Longer speech without a pause starts again at the first row,
+with an empty past.
+
+One network serves several look-aheads, each with its own output layer. Many sessions share one
+call. A matrix product with a single row may be summed in another order, so every product has at
+least two rows: a session's scores are the same to the last bit in any batch and any chunking. The
+caches of keys and values are rings, because attention does not depend on their order.
+
+Cost: about 90 ms of one core of 2020 per second of sound; 40 ms each with 16 sessions together. A
+session's keys and values take 2 MB.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TypeAlias, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import Topology, Work
+from services.recognizer.acoustic.model_file import (
+    Archive,
+    topology_arrays,
+    topology_from,
+    write_archive,
+)
+from services.recognizer.acoustic.network import (
+    MAX_POSITIONS,
+    NUM_INPUTS,
+    SEEN_FRAMES,
+    WINDOW,
+    Floats,
+    KeyValueCache,
+    NetworkSession,
+    past_masks,
+    position_table,
+)
+from services.recognizer.front_end.features import HOP_S
+from services.recognizer.front_end.whisper_mel import WhisperMel
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory
+
+FORMAT = "neural 5"
+
+_PAST = WINDOW - 1
+_PADDING = 2  # frames of zeros before a segment's first
+_MIN_ROWS = 2  # in a call
+_MAX_LOOK_AHEAD = 100  # feature frames
+_PAST_MASKS = past_masks()
+
+# Is told of a position: its two newest frames, (2, 80); keys and values of the last layer, (heads,
+# size) each.
+OnPosition: TypeAlias = Callable[[Floats, Floats, Floats], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeuralModel:
+    """A network with its front end; implements ``AcousticModel``."""
+
+    topology: Topology
+    network: NDArray[np.uint8]  # an ONNX file
+    look_aheads: NDArray[np.int64]  # feature frames, of each output layer
+    log_prior: Floats  # (states,)
+    acoustic_scale: float
+    output_layer: int = 0  # the one in use
+
+    @property
+    def inventory(self) -> PhoneInventory:
+        """The language's phones."""
+        return self.topology.inventory
+
+    @property
+    def look_ahead_frames(self) -> int:
+        """Look-ahead in use."""
+        return int(self.look_aheads[self.output_layer])
+
+    @cached_property
+    def session(self) -> NetworkSession:
+        """The network, ready to run."""
+        return NetworkSession(self.network)
+
+    @cached_property
+    def positions(self) -> Floats:
+        """Table of positions, shape (1500, width)."""
+        return position_table(self.session.sizes.width)
+
+    def front_end(self) -> WhisperMel:
+        """Start a front end for one session."""
+        return WhisperMel()
+
+    def stream(self) -> NeuralStream:
+        """Start a stream of scores for one speaker."""
+        return NeuralStream(self)
+
+    def score(self, work: Sequence[Work]) -> list[Floats]:
+        """Score frames of several streams in one batch; None ends a stream's segment.
+
+        The streams advance in step, one position at a time.
+        """
+        streams = [cast(NeuralStream, stream) for stream, _ in work]
+        for stream, (_, frames) in zip(streams, work, strict=True):
+            stream.take_frames(frames)
+        while ready := [stream for stream in streams if stream.num_pending]:
+            ready.sort(key=lambda stream: (id(stream.cache), stream.row))
+            log_posteriors, keys, values = self.run(ready, self.output_layer)
+            for row, stream in enumerate(ready):
+                stream.take_outputs(log_posteriors[row], keys[row], values[row])
+        scores = []
+        for stream, (_, frames) in zip(streams, work, strict=True):
+            rows = stream.new_log_posteriors(is_end=frames is None)
+            scores.append(np.float32(self.acoustic_scale) * (rows - self.log_prior))
+            if frames is None:
+                stream.reset()
+        return scores
+
+    def run(self, streams: Sequence[NeuralStream], output_layer: int) -> list[Floats]:
+        """Run the network at the next position of every stream, with one of its output layers.
+
+        Returns
+        -------
+        list
+            Log posteriors, (rows, 2, states); keys and values, (rows, layers, heads, size). The
+            first rows are those of the streams.
+        """
+        cache = _common_cache(streams)
+        rows = [*streams, streams[0]] if len(streams) < _MIN_ROWS else streams
+        inputs = {
+            "frames": np.stack([stream.next_frames() for stream in rows]),
+            "position": self.positions[[stream.position for stream in rows]],
+            "output_layer": np.array(output_layer),
+            "past_mask": _PAST_MASKS[[min(stream.position, _PAST) for stream in streams]],
+        }
+        for layer, (keys, values) in enumerate(zip(cache.keys, cache.values, strict=True)):
+            inputs[f"keys_{layer}"] = keys
+            inputs[f"values_{layer}"] = values
+        return self.session.run(inputs)
+
+    def with_look_ahead(self, look_ahead_ms: float) -> NeuralModel:
+        """Return the model with another look-ahead.
+
+        Raises
+        ------
+        UserError
+            If the network was not trained for it.
+        """
+        offered = [float(frames * HOP_S * 1000) for frames in self.look_aheads]
+        if look_ahead_ms not in offered:
+            known = ", ".join(f"{one:g}" for one in offered)
+            raise UserError(f"recognizer.look_ahead_ms is {look_ahead_ms:g}; give one of {known}")
+        model = replace(self, output_layer=offered.index(look_ahead_ms))
+        vars(model)["session"] = self.session  # opened once for all look-aheads
+        return model
+
+    def save(self, path: Path) -> None:
+        """Write the model as an npz file (arrays only, no pickle)."""
+        arrays = {
+            "format": np.array(FORMAT),
+            **topology_arrays(self.topology),
+            "network": self.network,
+            "look_aheads": self.look_aheads,
+            "log_prior": self.log_prior,
+            "acoustic_scale": np.array(self.acoustic_scale, np.float32),
+            "output_layer": np.array(self.output_layer),
+        }
+        write_archive(path, arrays)
+
+
+def _common_cache(streams: Sequence[NeuralStream]) -> KeyValueCache:
+    """Return a cache whose rows are the streams', in order.
+
+    Streams that are mostly scored together share a cache already, so nothing is copied.
+    """
+    cache = streams[0].cache
+    if cache.keys.shape[1] == len(streams) and all(
+        stream.cache is cache and stream.row == row for row, stream in enumerate(streams)
+    ):
+        return cache
+    cache = KeyValueCache(streams[0].sizes, len(streams))
+    for row, stream in enumerate(streams):
+        cache.keys[:, row] = stream.cache.keys[:, stream.row]
+        cache.values[:, row] = stream.cache.values[:, stream.row]
+    for row, stream in enumerate(streams):
+        stream.cache, stream.row = cache, row
+    return cache
+
+
+class NeuralStream:
+    """Scores of one speaker's speech, segment by segment.
+
+    Attributes
+    ----------
+    on_position
+        Is called for every position, in order; None: nobody asks.
+    """
+
+    def __init__(self, model: NeuralModel) -> None:
+        self.on_position: OnPosition | None = None
+        self._model = model
+        self.sizes = model.session.sizes
+        self.look_ahead_frames = model.look_ahead_frames
+        self.reset()
+
+    def accept(self, frames: Floats) -> Floats:
+        """Take frames, shape (n, 80); return the scores ready, (m, states)."""
+        return self._model.score([(self, frames)])[0]
+
+    def finish(self) -> Floats:
+        """End the segment; return its remaining scores."""
+        return self._model.score([(self, None)])[0]
+
+    def reset(self) -> None:
+        """Forget the segment. Nothing is known of the speaker."""
+        self._frames = np.zeros((_PADDING, NUM_INPUTS), np.float32)  # from the next position on
+        self._num_frames = 0  # accepted
+        self._num_scored = 0
+        self._num_positions = 0  # done
+        self._rows: list[Floats] = []  # log posteriors not yet returned, one array a frame
+        self.cache, self.row = KeyValueCache(self.sizes, 1), 0
+
+    @property
+    def num_pending(self) -> int:
+        """Number of positions whose frames are there."""
+        return max(0, (len(self._frames) - SEEN_FRAMES) // 2 + 1)
+
+    @property
+    def position(self) -> int:
+        """Row of the next position in the table."""
+        return self._num_positions % MAX_POSITIONS
+
+    def take_frames(self, frames: Floats | None) -> None:
+        """Take frames; None, at the end of the segment, repeats the last one as often as needed."""
+        if frames is None:
+            num_more = self._num_missing() if self._num_frames else 0
+            frames = np.repeat(self._frames[-1:], num_more, axis=0)
+        else:
+            self._num_frames += len(frames)
+        self._frames = np.concatenate([self._frames, frames])
+
+    def _num_missing(self) -> int:
+        """Frames that must still come so that all accepted frames are scored."""
+        last = max(0, math.ceil((self._num_frames + self.look_ahead_frames) / 2) - 2)  # position
+        num_seen = 2 * self._num_positions - _PADDING + len(self._frames)
+        return max(0, 2 * last + _PADDING + 1 - num_seen)
+
+    def next_frames(self) -> Floats:
+        """Return the frames at the next position, shape (400,)."""
+        return self._frames[:SEEN_FRAMES].reshape(-1)
+
+    def take_outputs(self, log_posteriors: Floats, keys: Floats, values: Floats) -> None:
+        """Take the network's outputs at a position: log posteriors (2, states), keys and values."""
+        first = 2 * self._num_positions + _PADDING - self.look_ahead_frames
+        if first == 1 and self._num_positions == 0:
+            self._rows.append(log_posteriors[0])  # frame 0, which no position scores
+        self._rows += [row for number, row in enumerate(log_posteriors) if first + number >= 0]
+        slot = self.position % _PAST
+        self.cache.keys[:, self.row, :, :, slot] = keys
+        self.cache.values[:, self.row, :, slot] = values
+        if self.on_position:
+            self.on_position(self._frames[SEEN_FRAMES - 2 : SEEN_FRAMES], keys[-1], values[-1])
+        self._num_positions += 1
+        self._frames = self._frames[2:]
+        if self.position == 0:  # the table has ended
+            self.cache, self.row = KeyValueCache(self.sizes, 1), 0
+
+    def new_log_posteriors(self, *, is_end: bool) -> Floats:
+        """Return the new log posteriors, (m, states); at the end those of all frames left."""
+        rows = self._rows[: self._num_frames - self._num_scored] if is_end else self._rows
+        self._num_scored += len(rows)
+        self._rows = []
+        return np.stack(rows) if rows else np.empty((0, len(self._model.log_prior)), np.float32)
+
+
+def neural_from(archive: Archive) -> NeuralModel:
+    """Build the model after checking every size; ValueError says what does not fit."""
+    topology = topology_from(archive)
+    look_aheads = archive.array("look_aheads", None).astype(np.int64)
+    if look_aheads.ndim != 1 or not len(look_aheads):
+        raise ValueError("it names no look-aheads")
+    if look_aheads.min() < 1 or look_aheads.max() > _MAX_LOOK_AHEAD:
+        raise ValueError(f"look-aheads {look_aheads.tolist()}")
+    output_layer = int(archive.array("output_layer", ()))
+    if not 0 <= output_layer < len(look_aheads):
+        raise ValueError(f"output layer {output_layer} of {len(look_aheads)}")
+    model = NeuralModel(
+        topology=topology,
+        network=archive.array("network", None).astype(np.uint8),
+        look_aheads=look_aheads,
+        log_prior=archive.floats("log_prior", topology.num_states),
+        acoustic_scale=float(archive.floats("acoustic_scale")),
+        output_layer=output_layer,
+    )
+    _check_network(model)
+    return model
+
+
+def _check_network(model: NeuralModel) -> None:
+    """Run the network once with every output layer, and check what comes out."""
+    sizes = model.session.sizes
+    stream = model.stream()
+    stream.take_frames(np.zeros((SEEN_FRAMES - _PADDING, NUM_INPUTS), np.float32))
+    own = (_MIN_ROWS, sizes.num_layers, sizes.num_heads, sizes.head_size)
+    expected = [(_MIN_ROWS, 2, model.topology.num_states), own, own]
+    for output_layer in range(len(model.look_aheads)):
+        outputs = model.run([stream], output_layer)
+        if [array.shape for array in outputs] != expected:
+            raise ValueError(f"its network scores {outputs[0].shape}, expected {expected[0]}")
+        if not all(np.isfinite(array).all() for array in outputs):
+            raise ValueError("its network scores with values that are not finite")

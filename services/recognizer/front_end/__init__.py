@@ -1,0 +1,1 @@
+"""From sound to feature frames: resampling, features, voice activity, VTLN."""

@@ -1,0 +1,275 @@
+"""Cepstral features: 39 for each feature frame of 10 ms.
+
+Source: Li et al. 2011, section 3.1: 16 kHz, window 25 ms, hop 10 ms, 12 mel-frequency cepstral
+coefficients and energy with first and second differences. Differences follow the HTK book's
+regression formula (Young et al. 2009, eq. 5.16).
+
+======== =============================================== ===========
+symbol   meaning                                         shape
+======== =============================================== ===========
+x        samples at 16 kHz, in [-1, 1]                   (n,)
+m        log energy and log-mel bands                    (frames, 41)
+c        log energy and 12 cepstra                       (frames, 13)
+d, dd    first and second difference of c                (frames, 13)
+mu       live mean of c                                  (13,)
+======== =============================================== ===========
+
+Deviations from the paper: log-mel bands have a floor, so that digital silence is finite without
+dither. A live cepstral mean is subtracted, because microphones differ (the paper's corpus came from
+one laboratory). The differences are computed first, so that the moving mean does not leak into
+them.
+
+Algorithmic delay: feature frame ``t`` needs samples up to ``t * 10 + 25`` ms and the
+``2 * half_width`` frames after it: 25 + 20 ms with ``half_width`` 1, 25 + 40 ms with the textbook's
+2.
+"""
+
+from __future__ import annotations
+
+import kaldi_native_fbank as knf
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+SAMPLE_RATE_HZ = 16_000
+WINDOW_S = 0.025
+HOP_S = 0.010
+WINDOW_SAMPLES = round(WINDOW_S * SAMPLE_RATE_HZ)
+HOP_SAMPLES = round(HOP_S * SAMPLE_RATE_HZ)
+NUM_BANDS = 40
+NUM_STATIC = 13  # log energy, then cepstra 1 to 12
+NUM_FEATURES = 3 * NUM_STATIC
+
+LOWEST_HZ, HIGHEST_HZ = 40.0, 7600.0  # edges of the filter bank
+MELS, MEL_KNEE_HZ = 1127.0, 700.0  # mel = 1127 ln(1 + f / 700)
+
+_FULL_SCALE = 32768.0  # the filter bank's energies are those of 16-bit samples
+LOG_FLOOR = 6.0  # a few decibels above the noise of the least significant bit
+_MEAN_MEMORY_FRAMES = 1500.0  # the live mean forgets older speech
+_PRIOR_FRAMES = 100.0  # weight of the prior mean
+_ENERGY_PRIOR_FRAMES = 30.0  # fewer: a level is known sooner than a timbre
+_PEAK_DECAY = 0.005  # per frame, natural log of power: 2 dB a second
+_SPEECH_BELOW_PEAK = 6.9  # natural log of power (30 dB): the mean ignores quieter frames
+
+
+def mel_of(hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert frequencies to the mel scale."""
+    return MELS * np.log1p(hz / MEL_KNEE_HZ)
+
+
+def hz_of(mel: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert mels to frequencies."""
+    return MEL_KNEE_HZ * np.expm1(mel / MELS)
+
+
+LOWEST_MEL, HIGHEST_MEL = mel_of(np.array([LOWEST_HZ, HIGHEST_HZ]))
+BAND_MEL = np.linspace(LOWEST_MEL, HIGHEST_MEL, NUM_BANDS + 2)[1:-1]  # centres of the bands
+BAND_HZ = hz_of(BAND_MEL)
+
+
+def _filter_bank() -> knf.OnlineFbank:
+    options = knf.FbankOptions()
+    options.frame_opts.samp_freq = SAMPLE_RATE_HZ
+    options.frame_opts.frame_length_ms = WINDOW_S * 1000
+    options.frame_opts.frame_shift_ms = HOP_S * 1000
+    options.frame_opts.dither = 0.0  # the same sound gives the same features
+    options.frame_opts.snip_edges = True
+    options.mel_opts.num_bins = NUM_BANDS
+    options.mel_opts.low_freq = LOWEST_HZ
+    options.mel_opts.high_freq = HIGHEST_HZ
+    options.use_energy = True
+    options.energy_floor = 1.0
+    return knf.OnlineFbank(options)
+
+
+def _cepstral_matrix() -> NDArray[np.float32]:
+    """Return the discrete cosine transform (HTK book, eq. 5.14); row 0 keeps the energy."""
+    band = np.arange(NUM_BANDS) + 0.5
+    order = np.arange(1, NUM_STATIC)
+    matrix = np.zeros((1 + NUM_BANDS, NUM_STATIC))
+    matrix[0, 0] = 1.0
+    matrix[1:, 1:] = np.sqrt(2 / NUM_BANDS) * np.cos(np.pi / NUM_BANDS * np.outer(band, order))
+    return matrix.astype(np.float32)
+
+
+_CEPSTRAL = _cepstral_matrix()
+
+
+def frames_in(num_samples: int) -> int:
+    """Return the number of whole feature frames in a number of samples."""
+    return max(0, (num_samples - WINDOW_SAMPLES) // HOP_SAMPLES + 1)
+
+
+class LogMel:
+    """Streaming log energy and log-mel bands; any chunking gives the same frames."""
+
+    def __init__(self) -> None:
+        self._bank = _filter_bank()
+        self._num_read = 0
+
+    def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take samples in.
+
+        Parameters
+        ----------
+        samples
+            Shape (n,), 16 kHz, in [-1, 1].
+
+        Returns
+        -------
+        NDArray
+            The new feature frames, shape (frames, 41): log energy, 40 log-mel bands.
+        """
+        self._bank.accept_waveform(SAMPLE_RATE_HZ, (samples * _FULL_SCALE).tolist())
+        num_ready = self._bank.num_frames_ready
+        rows = np.empty((num_ready - self._num_read, 1 + NUM_BANDS), dtype=np.float32)
+        for row in range(len(rows)):
+            rows[row] = self._bank.get_frame(self._num_read + row)
+        self._bank.pop(num_ready - self._num_read)
+        self._num_read = num_ready
+        return np.maximum(rows, np.float32(LOG_FLOOR))
+
+
+def cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Compute log energy and cepstra 1 to 12.
+
+    Parameters
+    ----------
+    log_mel
+        Shape (frames, 41).
+
+    Returns
+    -------
+    NDArray
+        Shape (frames, 13).
+    """
+    static = np.empty((len(log_mel), NUM_STATIC), dtype=np.float32)
+    for row in range(len(log_mel)):  # one by one: rounding depends on the number of rows
+        static[row] = log_mel[row] @ _CEPSTRAL
+    return static
+
+
+class Differences:
+    """Streaming first and second differences.
+
+    Parameters
+    ----------
+    half_width
+        Frames on each side in the regression: 2 is the textbook's, 1 halves the look-ahead.
+    """
+
+    def __init__(self, half_width: int) -> None:
+        self.look_ahead_frames = 2 * half_width
+        self._half_width = half_width
+        self._context: NDArray[np.float32] | None = None
+
+    def accept(self, static: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take static features, shape (n, 13); return the complete rows, (m, 39)."""
+        if len(static) == 0:
+            return np.empty((0, NUM_FEATURES), dtype=np.float32)
+        if self._context is None:  # the first frame is repeated before itself (HTK book, 5.9)
+            self._context = np.repeat(static[:1], self.look_ahead_frames, axis=0)
+        known = np.concatenate([self._context, static])
+        self._context = known[-2 * self.look_ahead_frames :]
+        return _with_differences(known, self._half_width)
+
+    def finish(self) -> NDArray[np.float32]:
+        """Return the remaining rows at the end, shape (look-ahead, 39)."""
+        if self._context is None:
+            return np.empty((0, NUM_FEATURES), dtype=np.float32)
+        return self.accept(np.repeat(self._context[-1:], self.look_ahead_frames, axis=0))
+
+
+def with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
+    """Append the differences of a whole recording: (frames, 13) to (frames, 39)."""
+    look_ahead = 2 * half_width
+    padded = np.concatenate(
+        [
+            np.repeat(static[:1], look_ahead, axis=0),
+            static,
+            np.repeat(static[-1:], look_ahead, axis=0),
+        ]
+    )
+    return _with_differences(padded, half_width)
+
+
+def cepstra_of_all(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Like :func:`cepstra`, in one matrix product: the last digit may differ. For training."""
+    return log_mel @ _CEPSTRAL
+
+
+@numba.njit(cache=True)
+def _with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
+    num_static = static.shape[1]
+    num_first = max(0, static.shape[0] - 2 * half_width)
+    num_rows = max(0, static.shape[0] - 4 * half_width)
+    norm = np.float32(0.0)
+    for step in range(1, half_width + 1):
+        norm += np.float32(2 * step * step)
+    first = np.zeros((num_first, num_static), dtype=np.float32)
+    for row in range(num_first):
+        for step in range(1, half_width + 1):
+            centre = row + half_width
+            for k in range(num_static):
+                difference = static[centre + step, k] - static[centre - step, k]
+                first[row, k] += np.float32(step) / norm * difference
+    out = np.zeros((num_rows, 3 * num_static), dtype=np.float32)
+    for row in range(num_rows):
+        for k in range(num_static):
+            out[row, k] = static[row + 2 * half_width, k]
+            out[row, num_static + k] = first[row + half_width, k]
+        for step in range(1, half_width + 1):
+            centre = row + half_width
+            for k in range(num_static):
+                difference = first[centre + step, k] - first[centre - step, k]
+                out[row, 2 * num_static + k] += np.float32(step) / norm * difference
+    return out
+
+
+class LiveMean:
+    """Subtracts a running mean of speech from features, starting from a prior.
+
+    Parameters
+    ----------
+    prior
+        Mean of the training corpus, shape (k,), log energy first.
+    """
+
+    def __init__(self, prior: NDArray[np.float32]) -> None:
+        self._prior = prior.astype(np.float64)
+        self._prior_frames = np.full(len(prior), _PRIOR_FRAMES)
+        self._prior_frames[0] = _ENERGY_PRIOR_FRAMES
+        self.reset()
+
+    def normalise(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return features, shape (n, k or more), without the running mean of the first k."""
+        out = features.copy()
+        _normalise(out, self._prior, self._prior_frames, self._state)
+        return out
+
+    def reset(self) -> None:
+        """Forget the speaker."""
+        # sums of the features, their number, the peak of the log energy
+        self._state = np.array([*[0.0] * len(self._prior), 0.0, -np.inf])
+
+
+@numba.njit(cache=True)
+def _normalise(
+    features: NDArray[np.float32],
+    prior: NDArray[np.float64],
+    prior_frames: NDArray[np.float64],
+    state: NDArray[np.float64],
+) -> None:
+    num_static = prior.shape[0]
+    keep = 1.0 - 1.0 / _MEAN_MEMORY_FRAMES
+    for row in range(features.shape[0]):
+        energy = features[row, 0]
+        state[num_static + 1] = max(energy, state[num_static + 1] - _PEAK_DECAY)
+        if energy > state[num_static + 1] - _SPEECH_BELOW_PEAK:
+            for k in range(num_static):
+                state[k] = keep * state[k] + features[row, k]
+            state[num_static] = keep * state[num_static] + 1.0
+        for k in range(num_static):
+            weight = prior_frames[k]
+            mean = (weight * prior[k] + state[k]) / (weight + state[num_static])
+            features[row, k] -= np.float32(mean)

@@ -1,0 +1,73 @@
+"""Audio bytes to samples and back, in 20 ms slices."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
+FULL_SCALE = 32768.0
+SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
+
+
+class BadAudio(ValueError):
+    """Bytes that are not audio of the session's encoding."""
+
+
+def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
+    """Convert bytes to samples, shape (n, channels), clipped to [-1, 1].
+
+    Raises
+    ------
+    BadAudio
+        If the bytes are not a whole number of sample frames, or a sample is not finite.
+    """
+    frame_bytes = SAMPLE_BYTES[encoding] * num_channels
+    if len(pcm) % frame_bytes:
+        raise BadAudio(
+            f"{len(pcm)} bytes are not a whole number of {encoding} frames of {num_channels} "
+            f"channels ({frame_bytes} bytes each); was another encoding or channel count opened?"
+        )
+    if encoding == "s16le":
+        scaled = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(FULL_SCALE)
+        return scaled.reshape(-1, num_channels)
+    samples = np.frombuffer(pcm, "<f4").astype(np.float32)
+    if not np.isfinite(samples).all():
+        raise BadAudio("the chunk holds NaN or infinite samples; it was dropped")
+    return np.clip(samples, -1.0, 1.0).reshape(-1, num_channels)
+
+
+def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
+    """Cut samples where the stream's sample index is a multiple of 20 ms.
+
+    So the results at each multiple do not depend on the client's chunks.
+
+    Parameters
+    ----------
+    samples
+        Shape (n,), 16 kHz.
+    num_before
+        Samples of the stream before these.
+    """
+    begin = 0
+    while begin < len(samples):
+        end = begin + SLICE - (num_before + begin) % SLICE
+        yield samples[begin:end]
+        begin = end
+
+
+def pcm16_of(samples: NDArray[np.float32]) -> bytes:
+    """Convert mono samples in [-1, 1] to little-endian int16 bytes."""
+    scaled = np.clip(np.rint(samples * FULL_SCALE), -FULL_SCALE, FULL_SCALE - 1)
+    return bytes(scaled.astype("<i2").tobytes())
+
+
+def level_db(samples: NDArray[np.float32]) -> float:
+    """Return the RMS level in decibels relative to full scale; -120 is silence."""
+    if len(samples) == 0:
+        return -120.0
+    power = float(np.mean(np.square(samples, dtype=np.float64)))
+    return max(-120.0, 10.0 * math.log10(power + 1e-12))

@@ -1,0 +1,275 @@
+"""Lips from sound: what the acoustic network knows of a sound, turned into the mouth that made it.
+
+Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
+recurrent unit); Hoerl and Kennard 1970, "Ridge regression". That the network's layers know lips
+better than its phones do was measured here (``models/lips.md``).
+
+======== ============================================================ ==================
+symbol   meaning                                                      shape
+======== ============================================================ ==================
+f        a position: its two log-mel frames, keys and values of the   (160 + 2 width,)
+         network's last layer
+x        principal components of f                                    (components,)
+u        relu(U x + b_u)                                              (units,)
+h        state of the gated recurrent unit, driven by u               (units,)
+X        x of the last positions, the newest last; zeros before the   (history, components)
+         segment's first
+y        for each delay the FAPs, and log odds of closure and of      (delays, 17)
+         lip to teeth
+======== ============================================================ ==================
+
+    y = A X + B [h, u] + c
+
+A is a ridge regression, which carries over to strangers; B [h, u] follows known voices closer. The
+two are fitted apart and averaged, so A and B hold half of each.
+
+There is a position every 20 ms while somebody speaks; outside speech there are no lips. A position
+that has seen the sound up to T gives, for every delay d, the mouth at T - d. The same sound gives
+the same lips in any chunking and beside any other sessions, because every position is one step.
+
+Cost: about 4 ms of one core per second of speech.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
+from services.recognizer.acoustic.network import NUM_INPUTS
+from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.front_end.whisper_mel import NUM_MELS
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import LipFrame
+
+Floats = NDArray[np.float32]
+
+LIPS_PATH = Path(__file__).parent / "models" / "lips.npz"
+FORMAT = "lips 1"
+# FAPs that a camera tracks. Each of a pair on the left and on the right has the same value.
+LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
+OTHER_SIDE = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
+CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outputs, after the FAPs
+NUM_OUTPUTS = len(LIP_FAPS) + 2
+FRAMES_PER_POSITION = 2
+
+_MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
+_MAX_SIZE = 4096  # of features, components, units
+_MAX_HISTORY = 64
+_COLUMNS = [MOUTH_FAPS.index(fap) for fap in LIP_FAPS]
+_PAIRS = [(MOUTH_FAPS.index(fap), MOUTH_FAPS.index(other)) for fap, other in OTHER_SIDE.items()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LipPredictor:
+    """A trained model of lips from sound, shared by any number of streams."""
+
+    delays: Floats  # (delays,) seconds, rising
+    feature_mean: Floats  # (features,)
+    projection: Floats  # (features, components)
+    entry_weights: Floats  # (components, units): U
+    entry_bias: Floats  # (units,): b_u
+    input_weights: Floats  # (units, 3 units): reset, update and new
+    input_bias: Floats  # (3 units,)
+    state_weights: Floats  # (units, 3 units)
+    state_bias: Floats  # (3 units,)
+    history_weights: Floats  # (history, components, delays, 17): A, oldest first
+    output_weights: Floats  # (2 units, delays, 17): B
+    output_bias: Floats  # (delays, 17): c
+
+    @cached_property
+    def delays_s(self) -> tuple[float, ...]:
+        """Delays that it offers, seconds, rising."""
+        return tuple(round(float(delay_s), 6) for delay_s in self.delays)
+
+    def stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
+        """Start a session's lips with these of the delays.
+
+        Raises
+        ------
+        UserError
+            If the model does not offer one of them.
+        """
+        unknown = [delay_s for delay_s in delays_s if delay_s not in self.delays_s]
+        if unknown:
+            known = ", ".join(f"{1e3 * one:g}" for one in self.delays_s)
+            raise UserError(
+                f"lips from sound: no delay of {1e3 * unknown[0]:g} ms; give one of {known}"
+            )
+        return LipPredictorStream(self, [self.delays_s.index(delay_s) for delay_s in delays_s])
+
+    def save(self, path: Path) -> None:
+        """Write the model as an npz file (arrays only, no pickle), weights in 16 bits."""
+        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        halves = {name: array.astype(np.float16) for name, array in arrays.items()}
+        exact = {name: arrays[name] for name in ("delays", "output_bias")}
+        write_archive(path, {"format": np.array(FORMAT), **halves, **exact})
+
+
+class LipPredictorStream:
+    """The lips of one session, from one segment of speech to the next.
+
+    Parameters
+    ----------
+    model
+        The model of all streams.
+    delays
+        Which of its delays are asked for.
+    """
+
+    def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
+        self._model = model
+        self._delays_s = [model.delays_s[delay] for delay in delays]
+        history, components, _, outputs = model.history_weights.shape
+        size = len(delays) * outputs
+        self._history_weights = _columns_of(model.history_weights, delays).reshape(
+            history * components, size
+        )
+        self._output_weights = _columns_of(model.output_weights, delays).reshape(-1, size)
+        self._output_bias = model.output_bias[list(delays)]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the segment: the next speech starts a new one."""
+        history, components = self._model.history_weights.shape[:2]
+        nothing = np.zeros(components, np.float32)
+        self._history = deque([nothing] * history, maxlen=history)
+        self._state = np.zeros(len(self._model.state_weights), np.float32)
+
+    def accept(
+        self, known_s: float, frames: Floats, keys: Floats, values: Floats
+    ) -> list[LipFrame]:
+        """Take what the network computes at a position; return the lip frames, one a delay.
+
+        Parameters
+        ----------
+        known_s
+            Media time of the last sample that the position has seen, seconds.
+        frames
+            Its two newest log-mel frames, shape (2, 80).
+        keys, values
+            Of the last layer, shape (heads, size).
+        """
+        outputs = self.step(np.concatenate([frames, keys, values], axis=None))
+        return [
+            LipFrame(
+                time_s=known_s - delay_s,
+                delay_s=delay_s,
+                faps=mouth_faps(row[: len(LIP_FAPS)]),
+                closure=_probability(row[CLOSURE]),
+                lip_to_teeth=_probability(row[LIP_TO_TEETH]),
+            )
+            for delay_s, row in zip(self._delays_s, outputs, strict=True)
+        ]
+
+    def step(self, features: Floats) -> Floats:
+        """Take a position's features, shape (features,); return the outputs, (delays, 17)."""
+        model = self._model
+        centred = features - model.feature_mean
+        component = (centred @ model.projection).astype(np.float32, copy=False)
+        self._history.append(component)
+        entered = np.maximum(component @ model.entry_weights + model.entry_bias, 0)
+        from_input = entered @ model.input_weights + model.input_bias
+        from_state = self._state @ model.state_weights + model.state_bias
+        size = len(self._state)
+        gates = expit(from_input[: 2 * size] + from_state[: 2 * size])
+        reset, update = gates[:size], gates[size:]
+        new = np.tanh(from_input[2 * size :] + reset * from_state[2 * size :])
+        self._state = (1 - update) * new + update * self._state
+        linear = np.concatenate(self._history) @ self._history_weights
+        recurrent = np.concatenate([self._state, entered]) @ self._output_weights
+        outputs: Floats = (linear + recurrent).reshape(self._output_bias.shape)
+        return outputs + self._output_bias
+
+
+def mouth_faps(lips: Floats) -> Floats:
+    """Return the FAPs of the mouth, (28,), from those that a camera tracks, (15,)."""
+    faps = np.zeros(len(MOUTH_FAPS), np.float32)
+    faps[_COLUMNS] = lips
+    for one, other in _PAIRS:
+        faps[other] = faps[one]
+    return faps
+
+
+def _columns_of(weights: Floats, delays: Sequence[int]) -> Floats:
+    """Return the weights of some delays, the last axis but one, in one piece of memory."""
+    return np.ascontiguousarray(weights[..., list(delays), :])
+
+
+def _probability(log_odds: np.float32) -> float:
+    return float(expit(log_odds))
+
+
+def load_lips(path: Path = LIPS_PATH) -> LipPredictor:
+    """Read a model file.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, broken or of another format.
+    """
+    archive = read_archive(path)
+    try:
+        form = str(archive.array("format", ()))
+        if form != FORMAT:
+            raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
+        return lips_from(archive)
+    except ValueError as error:
+        raise UserError(f"lips from sound, {path}: {error}; train it again") from error
+
+
+def lips_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | None:
+    """Read the model of lips that fits an acoustic model; None if it was trained on another one."""
+    if not isinstance(model, NeuralModel):
+        return None
+    lips, sizes = load_lips(path), model.session.sizes
+    width = sizes.num_heads * sizes.head_size
+    fits = len(lips.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + 2 * width
+    return lips if fits else None
+
+
+def lips_from(archive: Archive) -> LipPredictor:
+    """Build the model after checking every size; ValueError says what does not fit."""
+    delays = archive.floats("delays", *_sizes(archive, "delays", 1))
+    if len(delays) > _MAX_DELAYS or delays[0] < 0 or delays[-1] > _MAX_DELAY_S:
+        raise ValueError(f"its delays are {delays.tolist()}")
+    if (np.diff(delays) <= 0).any():
+        raise ValueError("its delays do not rise")
+    num_features, num_components = _sizes(archive, "projection", 2)
+    if num_features <= FRAMES_PER_POSITION * NUM_MELS:
+        raise ValueError(f"it takes {num_features} features of a position")
+    _, units = _sizes(archive, "entry_weights", 2)
+    history = _sizes(archive, "history_weights", 4)[0]
+    if history > _MAX_HISTORY:
+        raise ValueError(f"it looks back {history} positions")
+    outputs = (len(delays), NUM_OUTPUTS)
+    return LipPredictor(
+        delays=delays,
+        feature_mean=archive.floats("feature_mean", num_features),
+        projection=archive.floats("projection", num_features, num_components),
+        entry_weights=archive.floats("entry_weights", num_components, units),
+        entry_bias=archive.floats("entry_bias", units),
+        input_weights=archive.floats("input_weights", units, 3 * units),
+        input_bias=archive.floats("input_bias", 3 * units),
+        state_weights=archive.floats("state_weights", units, 3 * units),
+        state_bias=archive.floats("state_bias", 3 * units),
+        history_weights=archive.floats("history_weights", history, num_components, *outputs),
+        output_weights=archive.floats("output_weights", 2 * units, *outputs),
+        output_bias=archive.floats("output_bias", *outputs),
+    )
+
+
+def _sizes(archive: Archive, name: str, num_axes: int) -> tuple[int, ...]:
+    shape = archive.array(name, None).shape
+    if len(shape) != num_axes or not all(1 <= size <= _MAX_SIZE for size in shape):
+        raise ValueError(f"{name} has shape {shape}")
+    return shape

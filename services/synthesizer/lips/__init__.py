@@ -1,0 +1,1 @@
+"""Lip models: mouth FAPs from what the recognizer tells."""

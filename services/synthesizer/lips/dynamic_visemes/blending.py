@@ -1,0 +1,152 @@
+"""Blend visemes by their dominance.
+
+Source: Wang & Cai 2003, eq. 6 (all visemes and silences); Li et al. 2011, eq. 9-11 (the pair of
+visemes around a time, which is all that a live synthesizer has to know).
+
+Both are the same quotient over different sets of visemes, so one function blends and another
+chooses. A softmax over log weights replaces the quotient: the weights of the silences overflow as
+plain numbers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.synthesizer.lips.dynamic_visemes.dominance import (
+    log_closure,
+    log_dominance,
+    log_left_silence,
+    log_pause,
+    log_right_silence,
+)
+from services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
+from services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+
+
+def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights along the first axis that sum to one."""
+    weights: NDArray[np.float64] = np.exp(log_weights - np.max(log_weights, axis=0))
+    weights /= np.sum(weights, axis=0)
+    return weights
+
+
+def log_weights(
+    parameters: VisemeParameters, timeline: Timeline, time_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Log weights of all visemes and silences.
+
+    Parameters
+    ----------
+    parameters : VisemeParameters
+    timeline : Timeline
+    time_s : array (num_times,)
+        Seconds.
+
+    Returns
+    -------
+    array (num_visemes + num_silences, num_times, num_mouth_faps)
+    """
+    p, c = parameters, parameters.c
+    time = time_s[:, None]  # (F, 1)
+    viseme = timeline.viseme
+    offset = p.offset_s[viseme][:, None, :]  # (E, 1, P)
+    # signed distance to the apex: positive before it, negative after it, 0 inside
+    before = timeline.apex_start_s[:, None, None] + offset - time
+    after = timeline.apex_end_s[:, None, None] + offset - time
+    tau = np.maximum(before, 0.0) + np.minimum(after, 0.0)  # (E, F, P)
+    spoken = log_dominance(
+        tau,
+        p.alpha[viseme][:, None, :],
+        p.theta_minus[viseme][:, None, :],
+        p.theta_plus[viseme][:, None, :],
+        c,
+    )
+    start_s = timeline.silence_start_s[:, None, None]  # (S, 1, 1)
+    end_s = timeline.silence_end_s[:, None, None]
+    # before and after all speech one of the two is infinite, and the other alone remains
+    silent = log_pause(
+        log_right_silence(start_s + p.offset_right_s - time, p.alpha_right, p.theta_right, c),
+        log_left_silence(end_s + p.offset_left_s - time, p.alpha_left, p.theta_left, c),
+        end_s - start_s,
+    )
+    weights = np.concatenate([spoken, silent])
+    return _close_lips(parameters, viseme, tau, weights)
+
+
+def _close_lips(
+    parameters: VisemeParameters,
+    viseme: NDArray[np.intp],
+    tau: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Apply the closure rule (Wang & Cai 2003, eq. 7) to the visemes that close."""
+    closed = weights
+    for row in np.flatnonzero(parameters.closes[viseme].any(axis=1)):
+        faps = np.flatnonzero(parameters.closes[viseme[row]])
+        near = np.flatnonzero((np.abs(tau[row][:, faps]) < parameters.closure_reach_s).any(axis=1))
+        if not near.size:
+            continue
+        if closed is weights:
+            closed = weights.copy()
+        at = np.ix_(near, faps)
+        others = np.delete(weights, row, axis=0)[:, near[:, None], faps]
+        log_others = (
+            np.logaddexp.reduce(others, axis=0)
+            if len(others)
+            else np.full((near.size, faps.size), -np.inf)
+        )
+        closed[row][at] = log_closure(
+            weights[row][at],
+            np.maximum(log_others, weights[row][at] - 50.0),
+            tau[row][at],
+            parameters.closure_reach_s,
+            parameters.closure_ratio,
+        )
+    return closed
+
+
+def blend(
+    parameters: VisemeParameters, timeline: Timeline, time_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mouth FAPs at the given times from all visemes and silences of a timeline.
+
+    Wang & Cai 2003, eq. 6; over the pair around a time, Li 2011, eq. 11.
+
+    Parameters
+    ----------
+    parameters : VisemeParameters
+    timeline : Timeline
+    time_s : array (num_times,)
+        Seconds.
+
+    Returns
+    -------
+    array (num_times, num_mouth_faps)
+        FAP units.
+    """
+    num_silences = len(timeline.silence_start_s)
+    if not len(timeline.viseme) + num_silences:
+        return np.tile(parameters.neutral, (len(time_s), 1))
+    weights = softmax(log_weights(parameters, timeline, time_s))  # (E + S, F, P)
+    targets = np.concatenate(
+        [parameters.target[timeline.viseme], np.tile(parameters.neutral, (num_silences, 1))]
+    )
+    curves: NDArray[np.float64] = np.einsum("efp,ep->fp", weights, targets)
+    return curves  # Wang & Cai 2003, eq. 6
+
+
+def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray[np.bool_]:
+    """Choose the visemes that act at a time: the pair around it, and all within ``reach_s``.
+
+    With ``reach_s`` 0 this is the pair of Li 2011, eq. 11, from apex to apex; the longer the
+    reach, the nearer to the full model.
+
+    Returns
+    -------
+    array (num_visemes,) of bool
+    """
+    chosen = (timeline.apex_start_s < time_s + reach_s) & (timeline.apex_end_s > time_s - reach_s)
+    following = int(np.searchsorted(timeline.apex_start_s, time_s, side="right"))
+    chosen[max(following - 1, 0) : following + 1] = True
+    return chosen

@@ -1,0 +1,92 @@
+"""The dynamic visemes' initial parameters, set by hand: training starts from them.
+
+Static targets are published ones (``targets.tsv``). Dominances and decays are estimates: the
+feature that makes a consonant heard stays (lips shut for labials, teeth shut for sibilants); all
+else gives way to the vowel, and more so the further back the tongue articulates.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.synthesizer.lips.dynamic_visemes.parameters import (
+    NUM_MOUTH_FAPS,
+    VisemeParameters,
+    columns,
+)
+from services.synthesizer.lips.dynamic_visemes.visemes import (
+    CLOSURE_FAPS,
+    REST,
+    ROUNDED_VISEMES,
+    VISEME_INDEX,
+    VISEMES,
+    static_targets,
+)
+
+_JAW_FAPS = (3, 14)
+_ROUNDING_FAPS = (6, 7, 16, 17, 53, 54)  # mouth width and protrusion
+_TONGUE_FAPS = (44, 45, 46, 47)
+
+# Consonants' visemes: dominance over lip height, jaw and rounding, and their decay.
+CONSONANTS = {
+    "b": (3.0, 1.2, 0.4, 55.0),
+    "f": (2.0, 1.2, 0.6, 55.0),
+    "d": (0.6, 0.8, 0.3, 55.0),
+    "l": (0.5, 0.6, 0.3, 55.0),
+    "g": (0.35, 0.4, 0.25, 50.0),
+    "j": (0.8, 1.0, 0.5, 50.0),
+    "zh": (1.0, 1.3, 0.7, 50.0),
+    "z": (1.0, 1.3, 0.6, 50.0),
+}
+_VOWEL_THETA = 42.0
+_ROUNDED_ALPHA = 2.0
+_ROUNDED_THETA_MINUS = 28.0  # lips round early
+_SILENCE_THETA = 40.0
+_SILENCE_OFFSET_S = 0.12  # the mouth opens before the voice and closes after it
+_INITIAL_C = 1.3
+_MEAN_DISTANCE_S = 0.115  # between apexes: there the decays of all exponents are equal
+_CONSONANT_LEVEL_DB = -12.0  # relative to vowels
+
+
+def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
+    """Parameters set by hand, for an exponent ``c``."""
+    shape = (len(VISEMES), NUM_MOUTH_FAPS)
+    decay = _MEAN_DISTANCE_S ** (_INITIAL_C - c)
+    alpha, closes = np.ones(shape), np.zeros(shape)
+    level_db = np.zeros(len(VISEMES))
+    theta_minus, theta_plus = np.full(shape, _VOWEL_THETA), np.full(shape, _VOWEL_THETA)
+    for viseme, row in VISEME_INDEX.items():
+        group, _, variant = viseme.partition("_")
+        if group in CONSONANTS:
+            lips, jaw, rounding, theta = CONSONANTS[group]
+            level_db[row] = _CONSONANT_LEVEL_DB
+            alpha[row] = lips
+            alpha[row, columns(_JAW_FAPS)] = jaw
+            alpha[row, columns(_ROUNDING_FAPS)] = 2.0 * rounding if variant else rounding
+            alpha[row, columns(_TONGUE_FAPS)] = 1.5
+            theta_minus[row] = theta_plus[row] = theta
+        elif viseme in ROUNDED_VISEMES:
+            alpha[row, columns(_ROUNDING_FAPS)] = _ROUNDED_ALPHA
+            theta_minus[row, columns(_ROUNDING_FAPS)] = _ROUNDED_THETA_MINUS
+        closes[row, columns(CLOSURE_FAPS.get(viseme, ()))] = 1.0
+    targets = static_targets()
+    per_fap = np.ones(NUM_MOUTH_FAPS)
+    return VisemeParameters(
+        alpha=alpha,
+        theta_minus=theta_minus * decay,
+        theta_plus=theta_plus * decay,
+        offset_s=np.zeros(shape),
+        target=targets,
+        closes=closes,
+        level_db=level_db,
+        alpha_left=per_fap,
+        alpha_right=per_fap,
+        theta_left=_SILENCE_THETA * decay * per_fap,
+        theta_right=_SILENCE_THETA * decay * per_fap,
+        offset_left_s=-_SILENCE_OFFSET_S * per_fap,
+        offset_right_s=_SILENCE_OFFSET_S * per_fap,
+        neutral=targets[VISEME_INDEX[REST]],
+        c=c,
+        closure_ratio=1000.0,
+        closure_reach_s=0.07,
+    )

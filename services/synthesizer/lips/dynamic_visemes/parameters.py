@@ -1,0 +1,203 @@
+"""Parameters of the dynamic visemes, and the file that holds them.
+
+Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta_plus, t_o and T,
+for closures C and T; per FAP the silence models; one exponent c.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.synthesizer.lips.dynamic_visemes.visemes import (
+    VISEMES,
+)
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+
+FORMAT = "kouxing viseme parameters 2"
+NUM_MOUTH_FAPS = len(MOUTH_FAPS)
+
+_PER_VISEME = ("alpha", "theta_minus", "theta_plus", "offset_s", "target", "closes")
+_PER_SILENCE = (
+    "alpha_left", "alpha_right", "theta_left", "theta_right", "offset_left_s", "offset_right_s",
+    "neutral",
+)  # fmt: skip
+_LIMITS = {  # lowest and highest value that makes sense
+    "alpha": (1e-3, 1e3),
+    "theta": (1e-2, 1e4),
+    "offset": (-0.5, 0.5),
+    "target": (-2000.0, 2000.0),
+    "neutral": (-2000.0, 2000.0),
+    "closes": (0.0, 1.0),
+    "level": (-60.0, 30.0),
+    "c": (0.5, 3.0),
+    "closure_ratio": (20.0, 1e6),
+    "closure_reach_s": (0.02, 0.2),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VisemeParameters:
+    """Everything the dominance model needs.
+
+    Arrays per viseme have shape (num_visemes, num_mouth_faps), rows as ``visemes.VISEMES``, columns
+    as ``visemes.MOUTH_FAPS``; arrays of the silences have shape (num_mouth_faps,).
+    """
+
+    alpha: NDArray[np.float64]  # dominance at the apex
+    theta_minus: NDArray[np.float64]  # decay before the apex, s**-c
+    theta_plus: NDArray[np.float64]  # decay after the apex, s**-c
+    offset_s: NDArray[np.float64]  # t_o: the FAP's apex minus the acoustic one, seconds
+    target: NDArray[np.float64]  # T, FAP units
+    closes: NDArray[np.float64]  # 1 where the closure rule holds, else 0
+    level_db: NDArray[np.float64]  # (num_visemes,) usual level beside the speaker's mean
+    alpha_left: NDArray[np.float64]
+    alpha_right: NDArray[np.float64]
+    theta_left: NDArray[np.float64]  # s**-c
+    theta_right: NDArray[np.float64]  # s**-c
+    offset_left_s: NDArray[np.float64]  # t_l: from the start of speech, seconds
+    offset_right_s: NDArray[np.float64]  # t_r: from the end of speech, seconds
+    neutral: NDArray[np.float64]  # T_0, FAP units
+    c: float
+    closure_ratio: float  # C of Wang & Cai 2003, eq. 7
+    closure_reach_s: float  # T of Wang & Cai 2003, eq. 7, seconds
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = np.asarray(getattr(self, field.name), dtype=float)
+            shape: tuple[int, ...] = ()
+            if field.name in _PER_VISEME:
+                shape = (len(VISEMES), NUM_MOUTH_FAPS)
+            elif field.name in _PER_SILENCE:
+                shape = (NUM_MOUTH_FAPS,)
+            elif field.name == "level_db":
+                shape = (len(VISEMES),)
+            if value.shape != shape:
+                raise UserError(
+                    f"viseme parameters: {field.name} has shape {value.shape}, expected {shape}; "
+                    "train them again or restore the file"
+                )
+            key = field.name if field.name in _LIMITS else field.name.split("_")[0]
+            low, high = _LIMITS[key]
+            if not np.all((value >= low) & (value <= high)):
+                raise UserError(
+                    f"viseme parameters: {field.name} is not within {low:g} to {high:g}; "
+                    "train them again or restore the file"
+                )
+
+
+def save_parameters(
+    parameters: VisemeParameters,
+    path: Path,
+    source: str,
+    *,
+    learnt_from: Sequence[str] = (),
+    chosen_with: Sequence[str] = (),
+) -> None:
+    """Write parameters as JSON, one line for each viseme and array.
+
+    Parameters
+    ----------
+    parameters : VisemeParameters
+    path : Path
+    source : str
+        Whose they are.
+    learnt_from, chosen_with : sequence of str
+        Names of clips that an honest score leaves out.
+    """
+
+    def line(name: str, values: NDArray[np.float64]) -> str:
+        # seven digits: far below what a face shows, and the same on every machine
+        return f"{json.dumps(name)}: [{', '.join(f'{value:.7g}' for value in values)}]"
+
+    visemes = ",\n".join(
+        f"  {json.dumps(viseme)}: {{\n"
+        + ",\n".join(f"   {line(name, getattr(parameters, name)[i])}" for name in _PER_VISEME)
+        + f',\n   "level_db": {parameters.level_db[i]:.4g}'
+        + "\n  }"
+        for i, viseme in enumerate(VISEMES)
+    )
+    silence = ",\n".join(f"  {line(name, getattr(parameters, name))}" for name in _PER_SILENCE)
+    head = "".join(
+        f" {json.dumps(name)}: {json.dumps(value)},\n"
+        for name, value in (
+            ("format", FORMAT),
+            ("source", source),
+            ("learnt_from", list(learnt_from)),
+            ("chosen_with", list(chosen_with)),
+            ("c", parameters.c),
+            ("closure_ratio", parameters.closure_ratio),
+            ("closure_reach_s", parameters.closure_reach_s),
+            ("faps", list(MOUTH_FAPS)),
+        )
+    )
+    path.write_text(
+        f'{{\n{head} "silence": {{\n{silence}\n }},\n "visemes": {{\n{visemes}\n }}\n}}\n',
+        encoding="utf-8",
+    )
+
+
+def load_parameters(path: Path | None = None) -> VisemeParameters:
+    """Read parameters from ``path``, or those that come with the program.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read or what it holds makes no sense.
+    """
+    try:
+        data = _read(path)
+        if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
+            raise ValueError(f"not a file of '{FORMAT}'")
+        _clips_of(data)
+        arrays = {
+            name: np.array([data["visemes"][viseme][name] for viseme in VISEMES], dtype=float)
+            for name in _PER_VISEME
+        }
+        arrays |= {name: np.array(data["silence"][name], dtype=float) for name in _PER_SILENCE}
+        return VisemeParameters(
+            **arrays,
+            level_db=np.array([data["visemes"][viseme]["level_db"] for viseme in VISEMES]),
+            c=float(data["c"]),
+            closure_ratio=float(data["closure_ratio"]),
+            closure_reach_s=float(data["closure_reach_s"]),
+        )
+    except UserError as error:
+        raise UserError(f"{path or 'parameters.json'}: {error}") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"cannot read viseme parameters from {path or 'parameters.json'}: {error}; "
+            "give a file written by 'kouxing train visemes'"
+        ) from error
+
+
+def clips_seen(path: Path | None = None) -> frozenset[str]:
+    """Return the names of the clips that parameters were learnt from or chosen with."""
+    return _clips_of(_read(path))
+
+
+def _clips_of(data: dict[str, Any]) -> frozenset[str]:
+    return frozenset((*data["learnt_from"], *data["chosen_with"]))
+
+
+def _read(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        path = (
+            Path(str(resources.files("services.synthesizer.lips.dynamic_visemes")))
+            / "parameters.json"
+        )
+    data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return data
+
+
+def columns(faps: Sequence[int]) -> NDArray[np.intp]:
+    """Columns of the parameter arrays that hold the given FAPs."""
+    return np.array([MOUTH_FAPS.index(fap) for fap in faps], dtype=np.intp)

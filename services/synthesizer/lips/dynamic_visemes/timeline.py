@@ -1,0 +1,225 @@
+"""From recognised phones to visemes on the time axis, with the silences between them.
+
+Source: Li et al. 2011, 2.3.1 (compound finals become several visemes), Wang & Cai 2003, section 3
+(where silence models stand).
+
+The *apex* of a viseme is the time at which it acts most (the papers' centre). Deviations: a viseme
+longer than twice ``EDGE_S`` has an interval as its apex, so that a long vowel is held instead of
+fading from its middle on; the distance in eq. 5 is measured from the nearer end of the interval.
+Shorter visemes have the paper's single time. Live, an expected viseme follows the last phone known:
+a vowel comes after every initial, and an initial after most vowels, so the mouth sets out in time
+for a phone that will be recognised late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
+from shared.phones.events import Phone
+from shared.phones.inventory import PhoneInventory
+
+EXPECTED = -1
+MAX_HOLD_S = 1.5  # a phone lasts up to this long beyond its estimate if nothing follows
+_HOLD_SOFTNESS_S = 0.03
+_HOLD_FACTOR = 3.0  # below, a long vowel half closes before it is held
+_EXPECTED_AFTER_S = 0.3  # how long the expected viseme lasts before the mouth relaxes
+# What usually follows looks like: a middling vowel; after a vowel, a mouth less open, which keeps
+# its rounding.
+_EXPECTED_AFTER_INITIAL, _EXPECTED_AFTER_VOWEL, _EXPECTED_AFTER_ROUNDED = "ei", "i", "u"
+_ROUNDED_AT_THE_END = frozenset({"o", "ou", "u", "v"})
+EDGE_S = 0.08  # a viseme's apex is at most this far from its beginning and its end
+_MIN_PHONE_S = 0.01
+_TOUCHING_S = 0.03  # a shorter hole between two phones is a rounding of their times, no pause
+_MAX_ERROR_S = 0.3  # an estimated end may be this much too early
+_EXPECTED_EDGE_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class OpenPhone:
+    """The last phone, where nothing is known of what follows.
+
+    The last two visemes of its timeline are the phone's last and the expected one, and the last
+    silence follows them.
+    """
+
+    end_s: float  # estimated, seconds
+    is_held: bool  # it ends in a viseme that vowels end in: what has lasted long goes on
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timeline:
+    """Visemes in order of time, and the silences before, between and after words."""
+
+    viseme: NDArray[np.intp]  # (num_visemes,) rows of VisemeParameters
+    apex_start_s: NDArray[np.float64]  # (num_visemes,) seconds
+    apex_end_s: NDArray[np.float64]  # (num_visemes,) seconds, not before apex_start_s
+    phone_index: NDArray[np.int64]  # (num_visemes,) Phone.index, EXPECTED for the expected viseme
+    silence_start_s: NDArray[np.float64]  # (num_silences,) end of speech; -inf before all speech
+    silence_end_s: NDArray[np.float64]  # (num_silences,) start of speech; inf after all speech
+    syllable_s: NDArray[np.float64]  # (num_syllables,) when each syllable's vowel begins
+    open_phone: OpenPhone | None = None
+
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
+        """Timeline with the chosen visemes, by mask or by rows, and all silences and syllables."""
+        return replace(
+            self,
+            viseme=self.viseme[chosen],
+            apex_start_s=self.apex_start_s[chosen],
+            apex_end_s=self.apex_end_s[chosen],
+            phone_index=self.phone_index[chosen],
+            open_phone=None,
+        )
+
+    def same_visemes(self, other: Timeline) -> bool:
+        """Tell whether another timeline has the same visemes of the same phones, at any times."""
+        return np.array_equal(self.viseme, other.viseme) and np.array_equal(
+            self.phone_index, other.phone_index
+        )
+
+    def nearest(self, time_s: float) -> int | None:
+        """Row, in ``VisemeParameters``, of the viseme nearest to a time; None if there is none."""
+        if not len(self.viseme):
+            return None
+        distance_s = np.maximum(self.apex_start_s - time_s, time_s - self.apex_end_s)
+        return int(self.viseme[np.argmin(distance_s)])
+
+    def extend_open_phone(self, until_s: float) -> Timeline:
+        """Let an open phone last: nothing that follows it has begun at ``until_s``.
+
+        Its end moves from the estimate to ``until_s``, smoothly, and that of a held one beyond,
+        since what has lasted long is not about to end; by up to ``MAX_HOLD_S``.
+        """
+        if self.open_phone is None:
+            return self
+        overdue_s = _HOLD_SOFTNESS_S * np.logaddexp(
+            0.0, (until_s - self.open_phone.end_s) / _HOLD_SOFTNESS_S
+        )
+        factor = _HOLD_FACTOR if self.open_phone.is_held else 1.0
+        later_s = min(factor * float(overdue_s), MAX_HOLD_S)
+        start_s, end_s = self.apex_start_s.copy(), self.apex_end_s.copy()
+        silence_start_s = self.silence_start_s.copy()
+        start_s[-1] += later_s
+        end_s[-2:] += later_s
+        silence_start_s[-1] += later_s
+        return replace(
+            self,
+            apex_start_s=start_s,
+            apex_end_s=end_s,
+            silence_start_s=silence_start_s,
+            open_phone=None,
+        )
+
+
+def build_timeline(
+    phones: Sequence[Phone],
+    inventory: PhoneInventory,
+    speech_ends_s: Sequence[float] = (),
+    live: bool = False,
+) -> Timeline:
+    """Place visemes and silences.
+
+    Parameters
+    ----------
+    phones : sequence of Phone
+        One for each index, in any order; silence ends the speech before it.
+    inventory : PhoneInventory
+        Their language.
+    speech_ends_s : sequence of float
+        Further times at which speech is known to have ended, seconds.
+    live : bool
+        More phones may follow: the last one is open unless speech is known to have ended, and the
+        durations of phones that are not final are estimates.
+    """
+    in_order = sorted(phones, key=lambda phone: (phone.onset_s, phone.index))
+    silent = inventory.silence
+    quiet_s = sorted(
+        [*speech_ends_s, *(phone.onset_s for phone in in_order if phone.symbol == silent)]
+    )
+    spoken = [phone for phone in in_order if phone.symbol != silent]
+
+    visemes: list[_PlacedViseme] = []
+    silences: list[tuple[float, float]] = []
+    open_phone: OpenPhone | None = None
+    if spoken:
+        silences.append((-np.inf, spoken[0].onset_s))
+    for number, phone in enumerate(spoken):
+        following = spoken[number + 1] if number + 1 < len(spoken) else None
+        next_onset_s = following.onset_s if following is not None else np.inf
+        if not phone.final and next_onset_s - phone.onset_s < _MIN_PHONE_S:
+            continue  # the recognizer changed its mind
+        bound_s = next((end for end in quiet_s if phone.onset_s < end < next_onset_s), next_onset_s)
+        end_s = min(phone.onset_s + max(phone.duration_s, _MIN_PHONE_S), bound_s)
+        estimated = live and not phone.final
+        if bound_s - end_s < (_MAX_ERROR_S if estimated else _TOUCHING_S):
+            end_s = bound_s
+        if live and bound_s == np.inf:
+            open_phone = OpenPhone(end_s, _is_held(phone.symbol, inventory))
+        touching = end_s == next_onset_s
+        if not touching:
+            silent_s = end_s if open_phone is None else end_s + _EXPECTED_AFTER_S
+            silences.append((silent_s, next_onset_s))
+        end_s = max(end_s, phone.onset_s + _MIN_PHONE_S)
+        next_symbol = following.symbol if following is not None and touching else None
+        visemes += _placed_visemes(phone, next_symbol, end_s, inventory)
+    visemes.sort(key=lambda row: row[1:])
+    if open_phone is not None:
+        visemes.append(
+            (
+                VISEME_INDEX[_expected_after(spoken[-1].symbol, inventory)],
+                open_phone.end_s + _EXPECTED_EDGE_S,
+                open_phone.end_s + _EXPECTED_AFTER_S,
+                EXPECTED,
+            )
+        )
+    return Timeline(
+        viseme=np.array([row[0] for row in visemes], dtype=np.intp),
+        apex_start_s=np.array([row[1] for row in visemes], dtype=float),
+        apex_end_s=np.array([row[2] for row in visemes], dtype=float),
+        phone_index=np.array([row[3] for row in visemes], dtype=np.int64),
+        silence_start_s=np.array([row[0] for row in silences], dtype=float),
+        silence_end_s=np.array([row[1] for row in silences], dtype=float),
+        syllable_s=np.array(
+            [phone.onset_s for phone in spoken if phone.symbol not in inventory.initials]
+        ),
+        open_phone=open_phone,
+    )
+
+
+# Row in VisemeParameters, start and end of the apex in seconds, index of the phone.
+_PlacedViseme: TypeAlias = tuple[int, float, float, int]
+
+
+def _placed_visemes(
+    phone: Phone, next_symbol: str | None, end_s: float, inventory: PhoneInventory
+) -> list[_PlacedViseme]:
+    """Visemes of a phone that lasts until ``end_s``."""
+    placed, start_s = [], phone.onset_s
+    for viseme, share in visemes_of(phone.symbol, next_symbol, inventory):
+        length_s = share * (end_s - phone.onset_s)
+        edge_s = min(0.5 * length_s, EDGE_S)
+        placed.append(
+            (VISEME_INDEX[viseme], start_s + edge_s, start_s + length_s - edge_s, phone.index)
+        )
+        start_s += length_s
+    return placed
+
+
+def _expected_after(symbol: str, inventory: PhoneInventory) -> str:
+    """Viseme that the mouth sets out for after the last phone known."""
+    if symbol in inventory.initials:
+        return _EXPECTED_AFTER_INITIAL
+    if inventory.visemes[symbol][-1][0] in _ROUNDED_AT_THE_END:
+        return _EXPECTED_AFTER_ROUNDED
+    return _EXPECTED_AFTER_VOWEL
+
+
+def _is_held(symbol: str, inventory: PhoneInventory) -> bool:
+    """Tell whether a phone ends in a viseme that vowels end in."""
+    last_viseme = inventory.visemes[symbol][-1][0]
+    return any(inventory.visemes[vowel][-1][0] == last_viseme for vowel in inventory.vowels)

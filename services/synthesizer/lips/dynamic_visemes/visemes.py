@@ -1,0 +1,88 @@
+"""The visemes of this lip model, and how a language's phones become visemes.
+
+Which visemes a phone goes through, its language's inventory tells. The visemes are those of Li et
+al. 2011, table 1, named after a phone each. A second, rounded variant of a consonant that stands
+before a rounded vowel follows Crystal.TTVS (Tsinghua University, Apache-2.0), as do the static
+targets in ``targets.tsv``.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.inventory import PhoneInventory, VisemeShares
+
+REST = "rest"
+VISEMES = (
+    REST,
+    *"b f d d_rounded l l_rounded g g_rounded j j_rounded zh zh_rounded z z_rounded".split(),
+    *"a ai ao o ou e ei er i u v".split(),
+)
+VISEME_INDEX = {viseme: index for index, viseme in enumerate(VISEMES)}
+
+# What must meet for a closed mouth: every upper and lower lip height, inner and outer.
+LIP_HEIGHT_FAPS = (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)
+# Lip to teeth: the lower lip alone.
+LOWER_LIP_FAPS = (5, 10, 11, 52, 57, 58)
+CLOSURE_FAPS = {"b": LIP_HEIGHT_FAPS, "f": LOWER_LIP_FAPS}
+
+ROUNDED_VISEMES = frozenset({"u", "v"})
+
+
+def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) -> VisemeShares:
+    """Visemes of a phone in order, each with its share of the phone's duration.
+
+    Parameters
+    ----------
+    phone : str
+        One of the inventory's.
+    next_phone : str or None
+        The phone that follows without a pause, if it is known: before one that begins rounded,
+        some phones have another viseme.
+    inventory : PhoneInventory
+        The language.
+    """
+    rounded = inventory.before_rounded.get(phone)
+    if (
+        rounded is not None
+        and next_phone is not None
+        and inventory.visemes[next_phone][0][0] in ROUNDED_VISEMES
+    ):
+        return ((rounded, 1.0),)
+    return inventory.visemes[phone]
+
+
+def check_visemes(inventory: PhoneInventory) -> None:
+    """Check that a language names visemes of this model only.
+
+    Raises
+    ------
+    UserError
+        Naming those that the model lacks.
+    """
+    named = {viseme for shares in inventory.visemes.values() for viseme, _ in shares}
+    lacking = sorted({*named, *inventory.before_rounded.values()} - VISEME_INDEX.keys())
+    if lacking:
+        raise UserError(
+            f"language {inventory.language}: phones.tsv names the visemes {', '.join(lacking)}; "
+            f"known: {', '.join(VISEMES)}"
+        )
+
+
+def static_targets() -> NDArray[np.float64]:
+    """Read the static targets T, shape (num_visemes, num_mouth_faps), in FAP units."""
+    text = (
+        resources.files("services.synthesizer.lips.dynamic_visemes")
+        .joinpath("targets.tsv")
+        .read_text("utf-8")
+    )
+    lines = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
+    if lines[0][1:] != [str(fap) for fap in MOUTH_FAPS]:
+        raise UserError("targets.tsv: the columns are not the mouth FAPs; restore the file")
+    rows = {row[0]: [float(value) for value in row[1:]] for row in lines[1:]}
+    return np.array([rows[viseme] for viseme in VISEMES])

@@ -1,0 +1,1 @@
+"""Lips as the sound itself tells them, with the closures and the tongue of recognised phones."""

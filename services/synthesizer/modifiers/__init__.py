@@ -1,0 +1,1 @@
+"""What changes a face after its lip model: amplitude, idle motion."""

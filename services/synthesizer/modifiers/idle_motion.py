@@ -1,0 +1,136 @@
+"""Blinks, gaze and small head motion, so that the face is not a mask with a mouth.
+
+Figures: about 17 to 20 blinks a minute in conversation, intervals skewed (log-normal), the lid
+falls in about 80 ms and rises twice as slowly (Bentivoglio et al. 1997; VanderWerf et al. 2003).
+Saccades last 21 ms and 2.2 ms a degree (Bahill et al. 1975); most fixations of a speaker rest on
+the listener. Head turns of about a degree, slower than 1.5 Hz. When the head turns, the eyes turn
+back (vestibulo-ocular reflex).
+
+Everything follows from the seed and the time: the same times, in whatever portions, give the same
+face.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.synthesizer.modifiers.modifier import Moment
+from shared.face.faps import FAP_NUMBER
+
+_DEGREE = math.pi / 180.0 / 1e-5  # in the FAPs' angle unit, 1e-5 rad
+
+_BLINK_MEDIAN_S = 3.0
+_BLINK_LOG_SD = 0.5
+_BLINK_MIN_S = 0.6
+_LID_FALL_S, _LID_SHUT_S, _LID_RISE_S = 0.08, 0.03, 0.16
+_UPPER_LID, _LOWER_LID = 900.0, 150.0  # together a little over the open eye's 1024
+
+_FIXATION_MEAN_S = 1.4
+_FIXATION_MIN_S = 0.3
+_ON_LISTENER = 0.7  # share of the fixations
+_GAZE_SD_DEG = (0.5, 0.4)  # on the listener, sideways and up or down
+_GLANCE_SD_DEG = (5.0, 2.5)
+_GLANCE_LIMIT_DEG = 12.0
+_LID_PER_GAZE = 0.012  # FAP units of the upper lid for each unit of gaze downwards
+
+_HEAD_SD_DEG = (0.9, 1.1, 0.6)  # pitch, yaw, roll while speaking
+_HEAD_HZ = (0.07, 1.4)
+_NUM_WAVES = 9
+_LISTENING_HEAD = 0.35  # head motion of a listener, as a share of a speaker's
+_SPEAKING_S = 0.8  # time constant between the two
+
+_LIDS_UPPER = [FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_t_r_eyelid"] - 1]
+_LIDS_LOWER = [FAP_NUMBER["close_b_l_eyelid"] - 1, FAP_NUMBER["close_b_r_eyelid"] - 1]
+_EYES_YAW = [FAP_NUMBER["yaw_l_eyeball"] - 1, FAP_NUMBER["yaw_r_eyeball"] - 1]
+_EYES_PITCH = [FAP_NUMBER["pitch_l_eyeball"] - 1, FAP_NUMBER["pitch_r_eyeball"] - 1]
+_HEAD = [FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw", "roll")]
+
+
+class IdleMotion:
+    """Eyes and head over time; times must not decrease.
+
+    Parameters
+    ----------
+    seed : int
+        The same seed gives the same motion.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        waves, self._blink_rng, self._gaze_rng = (
+            np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
+        )
+        # pink-like noise as a sum of sines: a pure function of time
+        self._wave_hz = np.geomspace(*_HEAD_HZ, _NUM_WAVES) * waves.uniform(
+            0.85, 1.15, (3, _NUM_WAVES)
+        )
+        self._wave_phase = waves.uniform(0.0, 2.0 * np.pi, (3, _NUM_WAVES))
+        size = self._wave_hz**-0.5
+        size *= np.sqrt(2.0 / np.sum(size**2, axis=1, keepdims=True))
+        self._wave_size = size * np.array(_HEAD_SD_DEG)[:, None] * _DEGREE
+        self._liveliness = _LISTENING_HEAD
+        self._time_s = 0.0
+        self._blink_s = self._draw_blink(0.0)
+        self._gaze_from = self._gaze_to = np.zeros(2)
+        self._saccade_s, self._saccade_length_s = 0.0, 0.03
+        self._next_saccade_s = self._draw_fixation(0.0)
+
+    def apply(self, faps: NDArray[np.float32], moment: Moment) -> None:
+        """Add the motion to a frame, FAPs (68,), in place.
+
+        A speaker's head moves more than a listener's. Media time may stand still; what counts is
+        the time since the first frame.
+        """
+        time_s = moment.elapsed_s
+        elapsed_s = max(time_s - self._time_s, 0.0)
+        self._time_s = time_s
+        goal = 1.0 if moment.is_speaking else _LISTENING_HEAD
+        self._liveliness += (goal - self._liveliness) * -math.expm1(-elapsed_s / _SPEAKING_S)
+        angles = 2.0 * np.pi * self._wave_hz * time_s + self._wave_phase
+        head = self._liveliness * np.sum(self._wave_size * np.sin(angles), axis=1)
+        yaw, pitch = self._gaze(time_s)
+        lid = self._lid(time_s)
+        faps[_HEAD] += head.astype(np.float32)
+        # the eyes stay on what they look at while the head turns
+        faps[_EYES_PITCH] += pitch - head[0]
+        faps[_EYES_YAW] += yaw - head[1]
+        faps[_LIDS_UPPER] += lid * _UPPER_LID + (1.0 - lid) * _LID_PER_GAZE * (pitch - head[0])
+        faps[_LIDS_LOWER] += lid * _LOWER_LID
+
+    def _draw_blink(self, after_s: float) -> float:
+        interval_s = _BLINK_MEDIAN_S * math.exp(_BLINK_LOG_SD * self._blink_rng.standard_normal())
+        return after_s + max(interval_s, _BLINK_MIN_S)
+
+    def _draw_fixation(self, after_s: float) -> float:
+        return after_s + _FIXATION_MIN_S + float(self._gaze_rng.exponential(_FIXATION_MEAN_S))
+
+    def _lid(self, time_s: float) -> float:
+        """How far the lids are shut, 0 to 1."""
+        while time_s > self._blink_s + _LID_FALL_S + _LID_SHUT_S + _LID_RISE_S:
+            self._blink_s = self._draw_blink(self._blink_s)
+        since_s = time_s - self._blink_s
+        if since_s < _LID_FALL_S + _LID_SHUT_S:
+            return _smooth_step(since_s / _LID_FALL_S)
+        return 1.0 - _smooth_step((since_s - _LID_FALL_S - _LID_SHUT_S) / _LID_RISE_S)
+
+    def _gaze(self, time_s: float) -> NDArray[np.float64]:
+        """Yaw (to the left) and pitch (downwards) of the gaze in space."""
+        while time_s >= self._next_saccade_s:
+            sd = _GAZE_SD_DEG if self._gaze_rng.random() < _ON_LISTENER else _GLANCE_SD_DEG
+            target_deg = np.clip(
+                self._gaze_rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG
+            )
+            self._gaze_from, self._gaze_to = self._gaze_to, target_deg * _DEGREE
+            size_deg = float(np.linalg.norm(self._gaze_to - self._gaze_from)) / _DEGREE
+            self._saccade_s = self._next_saccade_s
+            self._saccade_length_s = 0.021 + 0.0022 * size_deg
+            self._next_saccade_s = self._draw_fixation(self._saccade_s)
+        done = _smooth_step((time_s - self._saccade_s) / self._saccade_length_s)
+        return self._gaze_from + done * (self._gaze_to - self._gaze_from)
+
+
+def _smooth_step(part: float) -> float:
+    part = min(max(part, 0.0), 1.0)
+    return part * part * (3.0 - 2.0 * part)

@@ -1,0 +1,85 @@
+"""The full model, offline: phones with their times in, all FAP frames out.
+
+Source: Wang & Cai 2003, eq. 6: every frame blends all visemes and silences. Li et al. 2011, 3.2,
+schemes 1 (phones of a forced alignment) and 2 (recognised phones with their times).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.synthesizer.lips.dynamic_visemes.blending import blend
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes, VisemeArticulation
+from services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
+from services.synthesizer.modifiers.amplitude import Amplitude
+from services.synthesizer.modifiers.modifier import Moment
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from shared.phones.events import Phone
+
+_BLOCK_S = 2.0
+# Further away a viseme weighs less than a face can show, whatever its parameters.
+_REACH_S = 1.5
+
+
+def synthesize(
+    lips: DynamicVisemes,
+    phones: Sequence[Phone],
+    num_frames: int,
+    frame_rate_hz: float = 50.0,
+    levels: Sequence[tuple[float, float]] = (),
+) -> NDArray[np.float32]:
+    """FAP frames of an utterance.
+
+    Parameters
+    ----------
+    lips : DynamicVisemes
+    phones : sequence of Phone
+        With their true times; holes between them and silences are pauses.
+    num_frames : int
+        Frame ``k`` is at ``k / frame_rate_hz`` seconds.
+    frame_rate_hz : float
+    levels : sequence of (time in seconds, level in dB of full scale)
+        Of the sound, if it is known.
+
+    Returns
+    -------
+    array (num_frames, 68)
+        FAP units.
+    """
+    parameters = lips.parameters
+    timeline = build_timeline(phones, lips.inventory)
+    time_s = np.arange(num_frames) / frame_rate_hz
+    faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
+    block = max(int(_BLOCK_S * frame_rate_hz), 1)
+    for first in range(0, num_frames, block):
+        times = time_s[first : first + block]
+        near = _within(timeline, times[0] - _REACH_S, times[-1] + _REACH_S)
+        faps[first : first + block, np.array(MOUTH_FAPS) - 1] = blend(parameters, near, times)
+    amplitude = Amplitude()
+    articulation = VisemeArticulation(timeline, parameters.level_db)
+    for number, (frame_s, faps_now) in enumerate(zip(time_s, faps, strict=True)):
+        moment = Moment(
+            time_s=float(frame_s),
+            known_s=np.inf,
+            elapsed_s=float(frame_s),
+            step_s=1.0 / frame_rate_hz,
+            is_speaking=True,
+            levels=levels if number == 0 else (),
+            articulation=articulation,
+        )
+        amplitude.apply(faps_now, moment)
+    return faps
+
+
+def _within(timeline: Timeline, start_s: float, end_s: float) -> Timeline:
+    near = timeline.select((timeline.apex_end_s >= start_s) & (timeline.apex_start_s <= end_s))
+    silent = (timeline.silence_end_s >= start_s) & (timeline.silence_start_s <= end_s)
+    return replace(
+        near,
+        silence_start_s=timeline.silence_start_s[silent],
+        silence_end_s=timeline.silence_end_s[silent],
+    )

@@ -1,0 +1,39 @@
+"""Addresses: what an endpoint looks like, and who can reach it."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+
+from shared.errors import UserError
+
+WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - named to be recognised, not bound
+_ENDPOINT = re.compile(r"^tcp://(?P<host>\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.*-]+):(?P<port>\d{1,5}|\*)$")
+
+
+def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
+    """Return host and port of ``tcp://host:port``.
+
+    Raises
+    ------
+    UserError
+        Naming the configuration key, if the endpoint is not of that form.
+    """
+    match = _ENDPOINT.match(endpoint)
+    if match is None or (match["port"] != "*" and int(match["port"]) > 65535):
+        raise UserError(f"{key}: {endpoint!r} is no endpoint; write tcp://HOST:PORT")
+    return match["host"], match["port"]
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name or address can only be reached from this machine."""
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def reachable(endpoint: str, advertise: str, key: str) -> str:
+    """Return the endpoint that others connect to for one that was bound."""
+    host, port = split_endpoint(endpoint, key)
+    return f"tcp://{advertise or host}:{port}"

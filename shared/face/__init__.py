@@ -1,0 +1,1 @@
+"""MPEG-4 FAPs, their files, and blendshapes as sums of FAPs."""

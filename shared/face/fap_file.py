@@ -1,0 +1,238 @@
+"""Read and write MPEG-4 ``.fap`` text files, version 2.1, as Xface and Greta do.
+
+The first line is ``2.1 NAME FPS NFRAMES``; NAME may hold blanks. Each frame has two lines: a mask
+of 68 digits, and the frame's number with one value for each 1 in the mask. A ``#`` begins a comment
+line. What differs in the wild and is accepted: Greta's mask has a 69th digit and its FAP 1 one
+number, where Xface has four (and six for FAP 2); digits of the mask may stand without blanks;
+values may be ``inf`` or ``nan`` (taken as 0); a file may set only the inner or only the outer lips
+(the others follow them).
+
+FAP 1 is ``viseme_select1 viseme_select2 viseme_blend viseme_def`` and FAP 2 ``expression_select1
+expression_intensity1 expression_select2 expression_intensity2 init_face expression_def`` (ISO/IEC
+14496-2, annex C); a single number selects one at full strength.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+from shared.face.faps import NUM_FAPS
+
+_VERSION = "2.1"
+MAX_BYTES = 256 * 1024 * 1024  # hours
+_GRETA_MASK_DIGITS = NUM_FAPS + 1
+# highest values of the numbers that a set FAP 1 and FAP 2 bring; the flags at their ends say
+# nothing to a head whose shapes are given, and programs write anything there
+_ANY = 2**31
+_VISEME_LIMITS = (14, 14, 63, _ANY)
+_EXPRESSION_LIMITS = (6, 63, 6, 63, _ANY, _ANY)
+# what a selection alone stands for: all of it
+_VISEME_ALONE = (0, 63, 0)
+_EXPRESSION_ALONE = (63, 0, 0, 0, 0)
+# inner lip FAP: the outer one
+_LIP_PAIRS = {
+    4: 51, 5: 52, 6: 53, 7: 54, 8: 55, 9: 56, 10: 57, 11: 58, 12: 59, 13: 60,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class FapAnimation:
+    """Frames at a constant rate."""
+
+    name: str
+    frame_rate_hz: float
+    faps: NDArray[np.float32]  # (num_frames, 68), FAP units; FAP 1 and 2: the first selection
+    visemes: NDArray[np.int64] | None = None  # (num_frames, 4), the numbers of FAP 1; None: unset
+    expressions: NDArray[np.int64] | None = None  # (num_frames, 6), those of FAP 2
+
+
+class _BadFileError(Exception):
+    """A line and what is wrong in it."""
+
+    def __init__(self, line_number: int, reason: str) -> None:
+        super().__init__(f"line {line_number}: {reason}")
+
+
+def read_fap(path: Path) -> FapAnimation:
+    """Read a ``.fap`` file.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read or is no such file; the text names the line and the reason.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UserError(f"{path} is larger than {MAX_BYTES // 2**20} MiB; cut it into parts")
+        text = path.read_text(encoding="utf-8-sig", errors="replace")
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}; give a .fap file") from error
+    try:
+        return _parse(text)
+    except _BadFileError as error:
+        raise UserError(f"{path}, {error}; give a .fap file of version {_VERSION}") from error
+
+
+def write_fap(
+    path: Path, animation: FapAnimation, style: Literal["xface", "greta"] = "xface"
+) -> None:
+    """Write a ``.fap`` file.
+
+    Greta's have a longer mask, whole numbers and one number for FAP 1; FAP 2 is left out there.
+
+    Raises
+    ------
+    UserError
+        The file cannot be written.
+    """
+    visemes, expressions = animation.visemes, animation.expressions
+    low = animation.faps[:, 2:]
+    if style == "greta":
+        expressions = None
+        visemes = None if visemes is None else visemes[:, :1]
+        rows = [[f"{value:.0f}" for value in row] for row in low]
+    else:
+        # nine digits give every float32 back
+        rows = [[f"{value:.9g}" for value in row] for row in low]
+    for high in (expressions, visemes):
+        if high is not None:
+            rows = [[*map(str, numbers), *row] for numbers, row in zip(high, rows, strict=True)]
+    digits = [str(int(high is not None)) for high in (visemes, expressions)]
+    mask = " ".join([*digits, *["1"] * 66, *["0"] * (style == "greta")])
+    name = " ".join(animation.name.split()) or "kouxing"
+    lines = [f"{_VERSION} {name} {animation.frame_rate_hz:.10g} {len(low)}"]
+    for number, row in enumerate(rows):
+        lines += [mask, f"{number} {' '.join(row)}"]
+    try:
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}; choose another place") from error
+
+
+def _parse(text: str) -> FapAnimation:
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ] or [(1, "")]
+    name, frame_rate_hz, num_frames = _parse_header(lines[0][0], lines[0][1].split())
+    complete = (len(lines) - 1) // 2
+    if complete < num_frames:
+        raise _BadFileError(lines[-1][0], f"the file ends after {complete} of {num_frames} frames")
+    if len(lines) > 1 + 2 * num_frames:
+        raise _BadFileError(
+            lines[1 + 2 * num_frames][0], f"more than the {num_frames} frames of the first line"
+        )
+    faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
+    visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
+    expressions = np.zeros((num_frames, len(_EXPRESSION_LIMITS)), dtype=np.int64)
+    used = np.zeros(NUM_FAPS, dtype=bool)
+    first_number: int | None = None
+    for frame in range(num_frames):
+        mask = _parse_mask(*lines[1 + 2 * frame])
+        line_number, line = lines[2 + 2 * frame]
+        words = line.split()
+        visemes[frame], expressions[frame], values = _parse_values(line_number, words, mask)
+        faps[frame, 2:][mask[2:]] = values
+        number = _parse_int(line_number, words[0], "a frame number")
+        first_number = number if first_number is None else first_number
+        if number != first_number + frame:
+            raise _BadFileError(
+                line_number, f"frame {number} where {first_number + frame} must follow"
+            )
+        used |= mask
+    faps[:, 0], faps[:, 1] = visemes[:, 0], expressions[:, 0]
+    for inner, outer in _LIP_PAIRS.items():
+        if used[inner - 1] and not used[outer - 1]:
+            faps[:, outer - 1] = faps[:, inner - 1]
+        elif used[outer - 1] and not used[inner - 1]:
+            faps[:, inner - 1] = faps[:, outer - 1]
+    return FapAnimation(
+        name,
+        frame_rate_hz,
+        faps,
+        visemes if used[0] else None,
+        expressions if used[1] else None,
+    )
+
+
+def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
+    if not words or words[0] != _VERSION:
+        found = f"version '{words[0]}'" if words else "nothing"
+        raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES', found {found}")
+    if len(words) < 4:
+        raise _BadFileError(line_number, f"expected '{_VERSION} NAME FPS NFRAMES'")
+    try:
+        frame_rate_hz = float(words[-2])
+    except ValueError:
+        frame_rate_hz = math.nan
+    if not 1.0 <= frame_rate_hz <= 1000.0:
+        raise _BadFileError(line_number, f"frame rate '{words[-2]}' is not within 1 to 1000")
+    num_frames = _parse_int(line_number, words[-1], "a count of frames")
+    if num_frames < 0:
+        raise _BadFileError(line_number, f"{num_frames} frames")
+    return " ".join(words[1:-2]), frame_rate_hz, num_frames
+
+
+def _parse_int(line_number: int, word: str, what: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise _BadFileError(line_number, f"'{word}' is not {what}") from None
+
+
+def _parse_mask(line_number: int, line: str) -> NDArray[np.bool_]:
+    digits = "".join(line.split())
+    if len(digits) not in (NUM_FAPS, _GRETA_MASK_DIGITS) or set(digits) - {"0", "1"}:
+        raise _BadFileError(
+            line_number,
+            f"expected a mask of {NUM_FAPS} (Greta: {_GRETA_MASK_DIGITS}) digits 0 or 1",
+        )
+    if digits[NUM_FAPS:] == "1":
+        raise _BadFileError(line_number, "the mask sets a 69th FAP, which the standard has not")
+    return np.array([digit == "1" for digit in digits[:NUM_FAPS]])
+
+
+def _parse_values(
+    line_number: int, words: list[str], mask: NDArray[np.bool_]
+) -> tuple[list[int], list[int], NDArray[np.float32]]:
+    """Numbers of FAP 1 (4) and of FAP 2 (6), and the values of the other set FAPs."""
+    try:
+        values = [float(word) for word in words[1:]]
+    except ValueError:
+        raise _BadFileError(line_number, "a value is not a number") from None
+    # how many numbers FAP 1 and 2 have shows in the length of the line
+    for num_viseme in (len(_VISEME_LIMITS), 1) if mask[0] else (0,):
+        for num_expression in (len(_EXPRESSION_LIMITS), 1) if mask[1] else (0,):
+            high = num_viseme + num_expression
+            if len(values) == high + int(mask[2:].sum()):
+                low = np.array(values[high:], dtype=np.float64)
+                sane = np.where(np.abs(low) <= np.finfo(np.float32).max, low, 0.0)
+                return (
+                    _parse_high(line_number, 1, values[:num_viseme], _VISEME_LIMITS),
+                    _parse_high(line_number, 2, values[num_viseme:high], _EXPRESSION_LIMITS),
+                    sane.astype(np.float32),
+                )
+    raise _BadFileError(line_number, f"{len(values)} values, the mask asks for {int(mask.sum())}")
+
+
+def _parse_high(
+    line_number: int, fap: int, given: list[float], limits: tuple[int, ...]
+) -> list[int]:
+    if not given:
+        return [0] * len(limits)
+    if len(given) == 1:
+        given = [*given, *(_VISEME_ALONE if fap == 1 else _EXPRESSION_ALONE)]
+    for value, limit in zip(given, limits, strict=True):
+        if not (0 <= value <= limit and value == int(value)):
+            raise _BadFileError(
+                line_number, f"FAP {fap} has {value:g}; a whole number from 0 to {limit} is due"
+            )
+    return [int(value) for value in given]

@@ -1,0 +1,49 @@
+"""The 68 facial animation parameters (FAPs) of MPEG-4 (ISO/IEC 14496-2, annex C).
+
+An array of FAPs has shape ``(68,)``; index ``i`` holds FAP ``i + 1`` in FAP units: a displacement
+is ``value * FAPU / 1024``, an angle ``value * 1e-5`` rad.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from importlib import resources
+
+NUM_FAPS = 68
+MASK_BYTES = 9  # one bit a FAP, least significant bit of the first byte is FAP 1
+FAP_UNITS_PER_FAPU = 1024.0
+RADIANS_PER_ANGLE_UNIT = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Fap:
+    """One row of the standard's table."""
+
+    number: int  # 1 to 68
+    name: str
+    fapu: str  # MNS MW IRISD ES ENS AU, empty for FAP 1 and 2
+    direction: str  # where positive values lead; "left" is the subject's left
+    bidirectional: bool
+    feature_points: tuple[str, ...]  # the points it moves, as "2.1"
+
+
+def _read_table() -> tuple[Fap, ...]:
+    text = resources.files("shared.face").joinpath("faps.tsv").read_text(encoding="utf-8")
+    return tuple(
+        Fap(
+            number=int(row["fap"]),
+            name=row["name"],
+            fapu=row["fapu"],
+            direction=row["direction"],
+            bidirectional=row["bidirectional"] != "0",
+            feature_points=tuple(point for point in row["feature_points"].split(",") if point),
+        )
+        for row in csv.DictReader(text.splitlines(), delimiter="\t")
+    )
+
+
+FAPS = _read_table()
+# What a mouth is made of: jaw, lips, tongue.
+MOUTH_FAPS = (*range(3, 15), 16, 17, *range(44, 48), *range(51, 61))
+FAP_NUMBER = {fap.name: fap.number for fap in FAPS}

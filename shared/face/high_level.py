@@ -1,0 +1,99 @@
+"""FAP 1 (viseme) and FAP 2 (expression) as sums of low-level FAPs.
+
+ISO/IEC 14496-2, annex C: FAP 1 blends two of 14 visemes, FAP 2 two of six expressions. The
+standard describes their looks in words; the values here (``high_level.tsv``) are those of Crystal
+TTVS (Tsinghua HCSI, Apache-2.0) for the expressions and for the Mandarin visemes nearest to the
+standard's English ones. Deviations: "th", "tS dZ S" and "r" are mixed from several of these; the
+tongue's tip rises in "th", "t d" and "n l", and the lower lip draws in for "f v"; brows, lids and
+cheeks move less far than there, where brows would cross and the middle of a worried brow sink; and
+disgust pulls up both sides of the lip.
+"""
+
+from __future__ import annotations
+
+import csv
+from importlib import resources
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.errors import UserError
+from shared.face.faps import NUM_FAPS
+
+Float32 = NDArray[np.float32]
+
+FULL = 63  # highest viseme_blend and expression_intensity
+
+
+def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
+    """Read a table beside this module: its rows, and their columns ``fapN`` as FAPs (rows, 68)."""
+    text = resources.files("shared.face").joinpath(name).read_text("utf-8")
+    rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
+    values = np.zeros((len(rows), NUM_FAPS), np.float32)
+    for row, target in zip(rows, values, strict=True):
+        for column, value in row.items():
+            if column.startswith("fap"):
+                target[int(column.removeprefix("fap")) - 1] = float(value)
+    return rows, values
+
+
+def _read(kind: str) -> tuple[tuple[str, ...], Float32]:
+    rows, values = fap_table("high_level.tsv")
+    of_kind = [number for number, row in enumerate(rows) if row["kind"] == kind]
+    return tuple(rows[number]["name"] for number in of_kind), values[of_kind]
+
+
+VISEME_NAMES, VISEMES = _read("viseme")  # (15, 68), row 0 is "none"
+EXPRESSION_NAMES, EXPRESSIONS = _read("expression")  # (7, 68), row 0 is neutral
+
+
+def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
+    """Blend two visemes into low-level FAPs (68,).
+
+    Parameters
+    ----------
+    select1, select2
+        Visemes 1 to 14; 0 for none.
+    blend
+        0 (all of the second) to 63 (all of the first).
+
+    Raises
+    ------
+    UserError
+        If a number is out of range.
+    """
+    _check("viseme_select", (select1, select2), len(VISEMES) - 1)
+    _check("viseme_blend", (blend,), FULL)
+    share = np.float32(blend / FULL)
+    blended: Float32 = VISEMES[select1] * share + VISEMES[select2] * (1 - share)
+    return blended
+
+
+def expression_faps(
+    select1: int, intensity1: float, select2: int = 0, intensity2: float = 0.0
+) -> Float32:
+    """Add two expressions, each by its intensity, into low-level FAPs (68,).
+
+    Parameters
+    ----------
+    select1, select2
+        1 joy, 2 sadness, 3 anger, 4 fear, 5 disgust, 6 surprise; 0 for none.
+    intensity1, intensity2
+        0 to 63.
+
+    Raises
+    ------
+    UserError
+        If a number is out of range.
+    """
+    _check("expression_select", (select1, select2), len(EXPRESSIONS) - 1)
+    _check("expression_intensity", (intensity1, intensity2), FULL)
+    first, second = np.float32(intensity1 / FULL), np.float32(intensity2 / FULL)
+    added: Float32 = EXPRESSIONS[select1] * first + EXPRESSIONS[select2] * second
+    return added
+
+
+def _check(name: str, values: tuple[float, ...], highest: int) -> None:
+    for value in values:
+        if not 0 <= value <= highest:
+            raise UserError(f"{name} is {value}; give 0 to {highest}")

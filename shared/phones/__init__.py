@@ -1,0 +1,1 @@
+"""Languages as values: phone inventories, their lexicons and visemes, and timed phones."""

@@ -1,0 +1,64 @@
+"""What a recognizer tells about a sound as it comes: phones, lips, voice activity, level.
+
+Times are media time: seconds from the session's first sample, whole samples at 16 kHz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phone:
+    """One recognised phone.
+
+    A live recognizer emits the same ``index`` at least twice: first with an estimated duration
+    (``final`` false), then with the measured onset and duration (``final`` true).
+    """
+
+    index: int  # counts the phones of a session from 0
+    symbol: str  # one of the inventory's phones
+    onset_s: float  # seconds from the session's first sample
+    duration_s: float  # seconds
+    confidence: float  # 0 to 1
+    final: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LipFrame:
+    """The mouth as the sound itself tells it."""
+
+    time_s: float  # seconds from the session's first sample
+    delay_s: float  # the sound was known up to time_s + delay_s
+    faps: NDArray[np.float32]  # (28,) FAP units, in the order of MOUTH_FAPS; 0 where not tracked
+    closure: float  # probability that the lips touch, 0 to 1
+    lip_to_teeth: float  # probability that the lower lip touches the teeth, 0 to 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeechChange:
+    """Voice activity began or ended."""
+
+    active: bool
+    time_s: float  # seconds from the session's first sample
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """The sound is known up to ``time_s``: nothing that ended before it will still be emitted."""
+
+    time_s: float
+    level_db: float  # RMS of the newest 20 ms, full scale = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndOfSound:
+    """No more sound will come."""
+
+    time_s: float
+
+
+SoundEvent = Phone | LipFrame | SpeechChange | Progress | EndOfSound

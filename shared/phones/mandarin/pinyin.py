@@ -1,0 +1,177 @@
+"""Mandarin's lexicon: Chinese text to pinyin (the Latin spelling of Mandarin), pinyin to phones.
+
+Source of the phones: Li et al. 2011, section 3.1 (21 initials, 38 finals). Spelling rules: the
+Scheme for the Chinese Phonetic Alphabet (1958) and ISO 7098:2015.
+
+Decisions beyond these sources:
+
+- A syllable is legal if its final belongs to a row that its initial may take (``j q x`` only
+  before i and ü, and so on). This accepts the rare readings (``biang``, ``fiao``, ``den``) on which
+  word lists differ, and still refuses typing errors (``muo``, ``ja``).
+- Er-hua (an r-coloured ending) written apart (``hua1 er5``) is the phone ``er``; written together
+  (``huar1``) it is the syllable's own final followed by ``er``.
+- The bare ``ê`` (also ``eh``) is ``ei``, the nearest phone by mouth shape; ``yo`` is ``iou``;
+  ``wong`` is ``ueng``; ``yai`` (an old reading of 崖) is ``ia`` + ``i``.
+- The interjections ``m n ng hm hng`` have no final. They are the nasal initials with the same mouth
+  shape (``n`` for ``ng``), after ``h`` where it is written.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from functools import lru_cache
+
+from pypinyin import Style, lazy_pinyin
+
+from shared.errors import UserError
+
+# Longest first, so that zh is not read as z + h.
+_INITIALS_BY_LENGTH = tuple("zh ch sh b p m f d t n l g k h j q x r z c s".split())
+
+# Rows of finals: spelling after an initial -> phone, and the initials that may take the row.
+_OPEN_ROW = {phone: phone for phone in "a o e ai ei ao ou an en ang eng ong".split()}
+_OPEN_INITIALS = set("b p m f d t n l g k h zh ch sh r z c s".split())
+_I_ROW = {phone: phone for phone in "i ia ie iao ian in iang ing iong".split()} | {"iu": "iou"}
+_I_INITIALS = set("b p m f d t n l j q x".split())
+_U_ROW = {phone: phone for phone in "ua uo uai uan uang".split()} | {"ui": "uei", "un": "uen"}
+_U_INITIALS = _OPEN_INITIALS - set("b p m f".split())
+_V_ROW = {"v": "v", "ve": "ve", "van": "van", "vn": "vn", "ue": "ve"}
+_V_INITIALS = set("n l j q x".split())
+_J_ROW = {"u": "v", "uan": "van", "un": "vn"}  # after j q x a written u is ü
+_J_INITIALS = set("j q x".split())
+
+_WITHOUT_INITIAL = {
+    **{phone: (phone,) for phone in "a o e er ai ei ao ou an en ang eng".split()},
+    **{"yi": ("i",), "ya": ("ia",), "ye": ("ie",), "yao": ("iao",), "you": ("iou",)},
+    **{"yan": ("ian",), "yin": ("in",), "yang": ("iang",), "ying": ("ing",), "yong": ("iong",)},
+    **{"wu": ("u",), "wa": ("ua",), "wo": ("uo",), "wai": ("uai",), "wei": ("uei",)},
+    **{"wan": ("uan",), "wen": ("uen",), "wang": ("uang",), "weng": ("ueng",)},
+    **{"yu": ("v",), "yue": ("ve",), "yuan": ("van",), "yun": ("vn",)},
+    **{"yv": ("v",), "yve": ("ve",), "yvan": ("van",), "yvn": ("vn",)},
+    **{"ê": ("ei",), "eh": ("ei",), "yo": ("iou",), "wong": ("ueng",), "yai": ("ia", "i")},
+    **{"m": ("m",), "n": ("n",), "ng": ("n",), "hm": ("h", "m"), "hng": ("h", "n")},
+}
+
+_PINYIN_LETTERS = "üāáǎàēéěèīíǐìōóǒòūúǔùǖǘǚǜ"
+_TONE_MARKS = "\u0300\u0301\u0304\u030c"
+
+
+def phones_of_syllable(syllable: str) -> tuple[str, ...]:
+    """Split a pinyin syllable into phones.
+
+    Parameters
+    ----------
+    syllable
+        One syllable, with or without a tone digit (1-5, 0) or a tone mark; ü may be written
+        ``ü``, ``v`` or ``u:``. Case is ignored.
+
+    Returns
+    -------
+    tuple of str
+        An initial and a final, a final alone, or an interjection's phones; er-hua adds ``er``.
+
+    Raises
+    ------
+    UserError
+        If Mandarin has no such syllable.
+
+    Examples
+    --------
+    >>> phones_of_syllable("zhuang1")
+    ('zh', 'uang')
+    >>> phones_of_syllable("yuán")
+    ('van',)
+    """
+    plain = _plain(syllable)
+    phones = _whole(plain)
+    if phones is None and plain.endswith("r"):  # er-hua: hua + r
+        stem = _whole(plain[:-1])
+        phones = (*stem, "er") if stem else None
+    if phones is None:
+        raise UserError(
+            f"unknown pinyin syllable {syllable!r}; write one syllable such as zhuang1, lü4 or er5"
+        )
+    return phones
+
+
+def pronounce(text: str) -> list[tuple[str, ...]]:
+    """Return the phones of each syllable of a text, in Chinese characters or in pinyin.
+
+    Spaces between Chinese characters, as in segmented texts, mean nothing.
+
+    Raises
+    ------
+    UserError
+        If the text cannot be read.
+    """
+    is_pinyin = text.isascii() or any(letter in text for letter in _PINYIN_LETTERS)
+    syllables = text.split() if is_pinyin else pinyin_of_text("".join(text.split()))
+    return [phones_of_syllable(syllable) for syllable in syllables]
+
+
+def pinyin_of_text(text: str) -> tuple[str, ...]:
+    """Convert Chinese text to numbered pinyin syllables; punctuation is left out.
+
+    Raises
+    ------
+    UserError
+        If the text contains letters or digits, whose reading is unknown.
+
+    Examples
+    --------
+    >>> pinyin_of_text("你好！")
+    ('ni3', 'hao3')
+    """
+    foreign = re.search(r"[^\W\u3007\u3400-\u9fff\U00020000-\U0003ffff]+", text)
+    if foreign:
+        raise UserError(
+            f"cannot read {foreign.group()!r} as Mandarin; write it out in Chinese characters"
+        )
+    syllables = lazy_pinyin(
+        text,
+        style=Style.TONE3,
+        errors="ignore",
+        neutral_tone_with_five=True,
+        v_to_u=False,
+    )
+    return tuple(syllables)
+
+
+def _plain(syllable: str) -> str:
+    """Return a syllable in lower case, with v for ü, without its tone."""
+    decomposed = unicodedata.normalize("NFD", syllable.strip().lower())
+    toneless = "".join(mark for mark in decomposed if mark not in _TONE_MARKS)
+    composed = unicodedata.normalize("NFC", toneless)
+    return re.sub(r"[0-5]$", "", composed).replace("u:", "v").replace("ü", "v")
+
+
+@lru_cache(maxsize=1024)
+def _whole(plain: str) -> tuple[str, ...] | None:
+    """Return the phones of a syllable without er-hua, or None if there is no such syllable."""
+    if plain in _WITHOUT_INITIAL:
+        return _WITHOUT_INITIAL[plain]
+    initial = next((phone for phone in _INITIALS_BY_LENGTH if plain.startswith(phone)), None)
+    if initial is None:
+        return None
+    final = _final_of(initial, plain.removeprefix(initial))
+    return (initial, final) if final else None
+
+
+def _final_of(initial: str, spelling: str) -> str | None:
+    if spelling == "i" and initial in ("z", "c", "s"):
+        return "ii"
+    if spelling == "i" and initial in ("zh", "ch", "sh", "r"):
+        return "iii"
+    if spelling == "u" and initial in _OPEN_INITIALS:
+        return "u"
+    rows = (
+        (_J_INITIALS, _J_ROW),  # before the u row, which j q x do not take
+        (_V_INITIALS, _V_ROW),
+        (_OPEN_INITIALS, _OPEN_ROW),
+        (_I_INITIALS, _I_ROW),
+        (_U_INITIALS, _U_ROW),
+    )
+    return next(
+        (row[spelling] for takers, row in rows if initial in takers and spelling in row), None
+    )

@@ -1,0 +1,180 @@
+"""Messages between control and the services, and the events that control publishes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Annotated
+
+from msgspec import Meta
+
+from shared.wire.message import (
+    ChosenLips,
+    Count,
+    Delay,
+    Encoding,
+    EndpointMap,
+    FrameRate,
+    LanguageName,
+    LipsOrNone,
+    Message,
+    MetricMap,
+    Name,
+    Nanoseconds,
+    NumChannels,
+    SampleRate,
+    SessionName,
+    Text,
+)
+
+Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
+ServiceStatus = Annotated[str, Meta(pattern="^(ready|draining)$")]
+SessionStatus = Annotated[str, Meta(pattern="^(starting|open)$")]
+
+
+class EventName(StrEnum):
+    """The names of events."""
+
+    ERROR = "error"
+    RECORDED = "recorded"
+    SERVICE_LOST = "service-lost"
+    SERVICE_READY = "service-ready"
+    SESSION_CLOSED = "session-closed"
+    SESSION_FLUSHED = "session-flushed"
+    SESSION_MOVED = "session-moved"
+    SESSION_OPENED = "session-opened"
+    SPEECH_START = "speech-start"
+    SPEECH_STOP = "speech-stop"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusRequest(Message):
+    """Asks for the state of the whole system."""
+
+    request: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceState:
+    """One service as its own loop last described it."""
+
+    service: Name  # recognizer, driver, ...
+    instance: Name
+    role: Role
+    state: ServiceStatus
+    age_s: float  # since its last heartbeat
+    clock_offset_ms: float  # its clock minus control's
+    endpoints: EndpointMap
+    metrics: MetricMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionState:
+    """One session as control knows it."""
+
+    session: SessionName
+    state: SessionStatus
+    age_s: float
+    speaking: bool
+    endpoints: EndpointMap  # of the session's workers: audio, phones, faps, ...
+    workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusReport(Message):
+    """The answer to a status request."""
+
+    request: Name
+    services: Annotated[list[ServiceState], Meta(max_length=1000)]
+    sessions: Annotated[list[SessionState], Meta(max_length=10000)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionInput:
+    """How far a service is with the input of one session."""
+
+    idle_s: Annotated[float, Meta(ge=0)] = 0.0  # since its last input
+    sequence: Count = 0  # of the newest audio message; 0 where a service takes no audio
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Heartbeat(Message):
+    """A service's processing loop is alive; the first heartbeat registers it with control."""
+
+    service: Name
+    instance: Name  # new at every start of the process
+    role: Role  # a worker is placed in sessions, an observer takes part in all of them
+    state: ServiceStatus
+    sent_ns: Nanoseconds  # the sender's clock
+    endpoints: EndpointMap = field(default_factory=dict)  # what it provides, by name
+    needs: Annotated[list[Name], Meta(max_length=16)] = field(
+        default_factory=list
+    )  # names of endpoints it connects to
+    language: LanguageName = ""  # of the phones that it recognises
+    frame_rate_hz: FrameRate = 0.0  # of the FAP frames that it makes
+    delay_ms: Delay = 0.0  # how much later than its sound it makes a FAP frame
+    metrics: MetricMap = field(default_factory=dict)
+    sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
+        default_factory=dict
+    )  # those it takes part in
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeartbeatSeen(Message):
+    """Control's answer to a heartbeat: the other three of the four timestamps follow from it."""
+
+    sent_ns: Nanoseconds  # echoed
+    received_ns: Nanoseconds  # control's clock
+    replied_ns: Nanoseconds  # control's clock
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartSession(Message):
+    """Control tells a service to serve a session (again, with a greater epoch, after a crash)."""
+
+    request: Name
+    token: Name
+    encoding: Encoding
+    sample_rate_hz: SampleRate
+    num_channels: NumChannels
+    record: bool
+    paced: bool
+    language: LanguageName  # of the phones
+    endpoints: EndpointMap  # of the session's workers: audio, phones, phone_input, faps, ...
+    delay_ms: Delay = 0.0  # how much later than its sound a FAP frame is made
+    lips: LipsOrNone = ""  # the lip model that the client has chosen
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopSession(Message):
+    """Control tells a service to forget a session."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlushNow(Message):
+    """Control passes a flush on to the services."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UseLips(Message):
+    """Control passes the choice of a lip model on to the services."""
+
+    lips: ChosenLips
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recorded(Message):
+    """The driver finished a session's video."""
+
+    path: Text  # on the driver's host
+    num_images: Count
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event(Message):
+    """Something changed; numbered without gaps."""
+
+    number: Count
+    name: Name  # an EventName, or one of a later build
+    detail: Text = ""

@@ -1,0 +1,72 @@
+"""Speech messages from the pure events of a recognizer, and back."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from shared.clock import to_samples, to_seconds
+from shared.phones import events
+from shared.wire.message import Message
+from shared.wire.speech import EndOfPhones, Lips, Phone, Progress, Speech
+
+SpeechMessage: TypeAlias = Phone | Lips | Speech | Progress | EndOfPhones
+SPEECH_MESSAGES: tuple[type[Message], ...] = (Phone, Lips, Speech, Progress, EndOfPhones)
+
+
+def message_of(event: events.SoundEvent) -> SpeechMessage:
+    """Return the message of an event; the sender fills in session, epoch and sequence."""
+    match event:
+        case events.Phone():
+            return Phone(
+                media_time=to_samples(event.onset_s),
+                index=event.index,
+                symbol=event.symbol,
+                duration=to_samples(event.duration_s),
+                confidence=event.confidence,
+                final=event.final,
+            )
+        case events.LipFrame():
+            return Lips(
+                media_time=to_samples(event.time_s),
+                values=event.faps.astype("<f4").tobytes(),
+                delay=to_samples(event.delay_s),
+                closure=event.closure,
+                lip_to_teeth=event.lip_to_teeth,
+            )
+        case events.SpeechChange():
+            return Speech(media_time=to_samples(event.time_s), active=event.active)
+        case events.Progress():
+            return Progress(media_time=to_samples(event.time_s), level_db=event.level_db)
+        case events.EndOfSound():
+            return EndOfPhones(media_time=to_samples(event.time_s))
+
+
+def event_of(message: SpeechMessage) -> events.SoundEvent:
+    """Return the event that a message carries."""
+    time_s = to_seconds(message.media_time)
+    match message:
+        case Phone():
+            return events.Phone(
+                index=message.index,
+                symbol=message.symbol,
+                onset_s=time_s,
+                duration_s=to_seconds(message.duration),
+                confidence=message.confidence,
+                final=message.final,
+            )
+        case Lips():
+            return events.LipFrame(
+                time_s=time_s,
+                delay_s=to_seconds(message.delay),
+                faps=np.frombuffer(message.values, "<f4"),
+                closure=message.closure,
+                lip_to_teeth=message.lip_to_teeth,
+            )
+        case Speech():
+            return events.SpeechChange(active=message.active, time_s=time_s)
+        case Progress():
+            return events.Progress(time_s=time_s, level_db=message.level_db)
+        case EndOfPhones():
+            return events.EndOfSound(time_s=time_s)

@@ -1,0 +1,73 @@
+"""Every kind of message by its name, and the endpoints at which messages are published."""
+
+from __future__ import annotations
+
+from shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from shared.wire.control import (
+    Event,
+    FlushNow,
+    Heartbeat,
+    HeartbeatSeen,
+    Recorded,
+    StartSession,
+    StatusReport,
+    StatusRequest,
+    StopSession,
+    UseLips,
+)
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.session import (
+    ChooseLips,
+    CloseSession,
+    Done,
+    Error,
+    FlushSession,
+    Joined,
+    OpenSession,
+    SessionMoved,
+    SessionOpened,
+)
+from shared.wire.speech import Acknowledge, EndOfPhones, Lips, Phone, Progress, Speech
+
+MESSAGES: dict[str, type[Message]] = {
+    cls.kind: cls
+    for cls in (
+        OpenSession,
+        SessionOpened,
+        SessionMoved,
+        CloseSession,
+        FlushSession,
+        ChooseLips,
+        StatusRequest,
+        StatusReport,
+        Done,
+        Error,
+        Heartbeat,
+        HeartbeatSeen,
+        StartSession,
+        StopSession,
+        FlushNow,
+        UseLips,
+        Recorded,
+        Event,
+        AudioChunk,
+        EndOfAudio,
+        Sound,
+        Speech,
+        Phone,
+        Lips,
+        Progress,
+        EndOfPhones,
+        Acknowledge,
+        FapFrame,
+        EndOfFaps,
+        Joined,
+    )
+}
+
+# The session's endpoint that publishes each kind.
+PUBLISHER_OF: dict[type[Message], str] = {
+    **dict.fromkeys((Phone, Lips, Speech, Sound), "phones"),
+    **dict.fromkeys((FapFrame, EndOfFaps), "faps"),
+}

@@ -1,0 +1,130 @@
+"""Messages of a client and control about a session, and the confirmation of subscriptions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated
+
+from msgspec import Meta
+
+from shared.wire.message import (
+    ChosenLips,
+    Count,
+    Encoding,
+    Endpoint,
+    FrameRate,
+    LanguageName,
+    Message,
+    Name,
+    NumChannels,
+    SampleRate,
+    Text,
+)
+
+
+class ErrorCode(StrEnum):
+    """The codes of ``error`` messages."""
+
+    BAD_MESSAGE = "bad-message"
+    BAD_AUDIO = "bad-audio"
+    BAD_TOKEN = "bad-token"  # noqa: S105 - no password
+    FINISHED = "finished"
+    NO_SERVICE = "no-service"
+    NO_VIDEO = "no-video"
+    REPLAYED = "replayed"
+    SESSION_EXISTS = "session-exists"
+    TIMEOUT = "timeout"
+    TOO_MANY_SESSIONS = "too-many-sessions"
+    UNKNOWN_SESSION = "unknown-session"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenSession(Message):
+    """A client asks for a session; an empty session name lets control choose one."""
+
+    request: Name  # echoed in the answer; a repeated request gets the same answer
+    encoding: Encoding = "s16le"
+    sample_rate_hz: SampleRate = 16000
+    num_channels: NumChannels = 1
+    record: bool = False  # the driver writes a video named after the session
+    paced: bool = True  # audio comes in real time; false: as fast as the services take it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionOpened(Message):
+    """The session exists; these are the sockets to use."""
+
+    request: Name
+    token: Name  # proves ownership when the client sends audio, flushes or closes
+    audio: Endpoint  # ROUTER for the client's audio
+    phones: Endpoint  # XPUB: phone, speech, sound
+    faps: Endpoint  # XPUB: fap-frame, end-of-faps
+    events: Endpoint  # XPUB: event, session-moved
+    language: LanguageName = ""  # of the phones
+    frame_rate_hz: FrameRate = 0.0  # of the FAP frames
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionMoved(Message):
+    """Another process serves a part of the session from here on; ``epoch`` is the new one.
+
+    Sent to the client, and published for whoever follows the session.
+    """
+
+    audio: Endpoint
+    phones: Endpoint
+    faps: Endpoint
+    next_sequence: Count  # first audio message to send to `audio`; 0: audio goes on as before
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloseSession(Message):
+    """The client is done; the services forget the session."""
+
+    request: Name
+    token: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlushSession(Message):
+    """Interrupts: audio not yet shown is dropped and the face returns to rest."""
+
+    request: Name
+    token: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChooseLips(Message):
+    """Lets another lip model move the mouth, while the session goes on."""
+
+    request: Name
+    token: Name
+    lips: ChosenLips
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Done(Message):
+    """A request was carried out."""
+
+    request: Name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Error(Message):
+    """A request or message was refused, or something failed.
+
+    Kind and fields are the same in every version of the protocol, and a message of another version
+    is answered in that version, so that every client can read why it was refused.
+    """
+
+    code: Name  # an ErrorCode, or one of a later build
+    text: Text
+    request: Annotated[str, Meta(max_length=128)] = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Joined(Message):
+    """Answers a subscription to ``joined/<session>/``: that peer's earlier ones are in effect."""
+
+    publisher: Name  # differs between publishers; wait for as many as you connected to

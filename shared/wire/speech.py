@@ -1,0 +1,62 @@
+"""What the recognizer emits: voice activity, phones, lips, progress."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
+
+from shared.wire.message import (
+    Count,
+    LipValues,
+    Message,
+    PhoneSymbol,
+    Probability,
+    Samples,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Speech(Message):
+    """Voice activity began (active) or ended at media_time."""
+
+    active: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phone(Message):
+    """A recognised phone; media_time is its onset. The same index again revises it."""
+
+    index: Count
+    symbol: PhoneSymbol  # one of the session's language
+    duration: Samples
+    confidence: Probability
+    final: bool  # false: the duration is an estimate
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lips(Message):
+    """The mouth at media_time, from a lip model that works on the sound itself."""
+
+    values: LipValues  # float32, little-endian, FAP units, in the order of MOUTH_FAPS
+    delay: Samples  # how much sound after media_time the model has used
+    closure: Probability  # that the lips touch
+    lip_to_teeth: Probability  # that the lower lip touches the teeth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress(Message):
+    """The sound is processed up to media_time."""
+
+    level_db: Annotated[float, Meta(ge=-200, le=20)]  # RMS of the newest 20 ms, full scale = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EndOfPhones(Message):
+    """The session's sound ended at media_time; nothing more is emitted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Acknowledge(Message):
+    """The receiver has every message of the session up to ``sequence``."""

@@ -1,0 +1,169 @@
+"""The services, offline rendering and evaluation make the same frames, bit for bit."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
+from services.live_chain import LiveChain
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.config import RecognizerConfig
+from services.recognizer.lip_source import delay_for
+from services.recognizer.service import RecognizerService
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.lips.load import load_lip_model
+from shared.client import Client, Refused
+from shared.clock import to_samples
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import LipFrame, Phone
+from shared.wire.events import message_of
+from tests.e2e.following import samples_of_file, stream, stream_into
+from tests.lips import LIPS, clip_of
+from tests.made_up_lips import JAW, LoudLips
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+MOUTH = np.array(MOUTH_FAPS) - 1
+
+
+def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
+    positions = np.arange(len(samples) * rate_hz // 16000) * (16000 / rate_hz)
+    resampled: NDArray[np.float32] = np.interp(positions, np.arange(len(samples)), samples).astype(
+        np.float32
+    )
+    return resampled
+
+
+@pytest.mark.parametrize(
+    ("name", "rate_hz", "chunk"),
+    [
+        ("hello-female", 16000, 320),
+        ("vowels-male", 16000, 97),
+        ("bilabials-female", 44100, 1021),
+        ("hello-male", 48000, 128),
+    ],
+)
+def test_services_send_the_frames_of_the_chain(
+    system: System, name: str, rate_hz: int, chunk: int
+) -> None:
+    samples = at_rate(samples_of_file(DEMO / f"{name}.wav"), rate_hz)
+    samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
+    sent = stream(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
+    chain = LiveChain(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
+    frames = chain.accept_waveform(samples) + chain.input_finished()
+
+    assert [frame.media_time for frame in sent.frames] == [
+        to_samples(time_s) for time_s, _ in frames
+    ]
+    np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
+    assert sent.faps[:, MOUTH].any()
+    recognised = [event for event in chain.events if isinstance(event, Phone)]
+    assert [
+        (phone.index, phone.symbol, phone.media_time, phone.duration, phone.confidence, phone.final)
+        for phone in sent.phones
+    ] == [
+        (
+            phone.index,
+            phone.symbol,
+            to_samples(phone.onset_s),
+            to_samples(phone.duration_s),
+            phone.confidence,
+            phone.final,
+        )
+        for phone in recognised
+    ]
+
+
+@contextlib.contextmanager
+def recognizer_with_lips(control: str) -> Iterator[None]:
+    """Run a recognizer in this process, since no shipped file holds the made-up lips."""
+    local = "tcp://127.0.0.1:*"
+    config = RecognizerConfig(control=control, audio=local, phones=local)
+    service = RecognizerService(config, LoudLips())
+    stop = threading.Event()
+
+    def serve() -> None:
+        service.announce_ready()
+        while not stop.is_set():
+            service.step(0.01)
+        service.drain()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+@pytest.mark.parametrize("delay_ms", [40.0, 160.0])
+def test_services_send_the_frames_of_the_chain_with_learnt_lips(
+    tmp_path: Path, delay_ms: float
+) -> None:
+    samples = samples_of_file(DEMO / "bilabials-female.wav")
+    settings = {"KOUXING_SYNTHESIZER_LIPS": "learnt", "KOUXING_SYNTHESIZER_DELAY_MS": str(delay_ms)}
+    with (
+        System(("control", "synthesizer"), tmp_path, settings=settings) as running,
+        recognizer_with_lips(running.control),
+    ):
+        running.wait_until(
+            lambda report: "recognizer" in {each.service for each in report.services}
+        )
+        sent = stream(running.control, samples, chunk=1021)
+    chain = LiveChain(
+        load_model(),
+        load_lip_model(name="learnt"),
+        synthesizer=SynthesizerConfig(delay_ms=delay_ms),
+        lips_from_sound=LoudLips(),
+    )
+    frames = chain.accept_waveform(samples) + chain.input_finished()
+
+    np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
+    lips = [message_of(event) for event in chain.events if isinstance(event, LipFrame)]
+    assert [replace(each, session="", epoch=0, sequence=0) for each in sent.lips] == lips
+    (delay,) = {each.delay for each in sent.lips}
+    assert delay == round(delay_for(LoudLips().delays_s, delay_ms / 1e3) * 16000)
+    assert sent.faps[:, MOUTH[JAW]].max() > 50.0
+
+
+def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
+    samples = samples_of_file(DEMO / "bilabials-female.wav")
+    chain = LiveChain(load_model(), load_lip_model(name="learnt"), lips_from_sound=LoudLips())
+    frames = chain.accept_waveform(samples) + chain.input_finished()
+    with (
+        System(("control", "synthesizer"), tmp_path) as running,
+        recognizer_with_lips(running.control),
+    ):
+        running.wait_until(
+            lambda report: "recognizer" in {each.service for each in report.services}
+        )
+        with Client(running.control) as client:
+            session = client.open_session(encoding="f32le", sample_rate_hz=16000, paced=False)
+            with pytest.raises(Refused):
+                session.choose_lips("ferguson")
+            session.choose_lips("learnt")
+            sent = stream_into(session, samples, chunk=320)
+            session.close()
+    # the choice may overtake the sound's beginning or not; both are at rest there
+    np.testing.assert_allclose(sent.faps, np.array([faps for _, faps in frames]), atol=0.5)
+    assert sent.faps[:, MOUTH[JAW]].max() > 50.0
+
+
+def test_evaluation_scores_the_mouth_of_the_chain() -> None:
+    samples = samples_of_file(DEMO / "vowels-male.wav")
+    chain = LiveChain(load_model(), LIPS)
+    frames = chain.accept_waveform(samples) + chain.input_finished()
+    clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
+    scored = live_scheme("lips", LIPS, DEFAULT_DELAY_S).frames(hear(load_model(), clip, None))
+    assert scored is not None
+    np.testing.assert_array_equal(scored[:, MOUTH], np.array([faps[MOUTH] for _, faps in frames]))
+    assert scored[:, MOUTH].any()

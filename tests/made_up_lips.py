@@ -1,0 +1,61 @@
+"""A model of lips that needs no training: the louder the sound, the wider the jaw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import LipFrame
+
+JAW = MOUTH_FAPS.index(3)
+
+
+@dataclass(frozen=True)
+class LoudLips:
+    """Offers any delays; the keys and values of the network count a little, too."""
+
+    delays_s: Sequence[float] = (0.0, 0.025, 0.085, 0.145)
+
+    def stream(self, delays_s: Sequence[float]) -> LoudLipStream:
+        assert set(delays_s) <= set(self.delays_s)
+        return LoudLipStream(delays_s)
+
+
+class LoudLipStream:
+    """Remembers how many positions of the segment came before."""
+
+    def __init__(self, delays_s: Sequence[float]) -> None:
+        self._delays_s = delays_s
+        self.reset()
+
+    def reset(self) -> None:
+        self._num_positions = 0
+
+    def accept(
+        self,
+        known_s: float,
+        frames: NDArray[np.float32],
+        keys: NDArray[np.float32],
+        values: NDArray[np.float32],
+    ) -> list[LipFrame]:
+        self._num_positions += 1
+        assert frames.shape == (2, 80)
+        assert keys.shape == values.shape
+        loudness = 1.0 / (1.0 + np.exp(-4.0 * frames.mean()))
+        faps = np.zeros(len(MOUTH_FAPS), np.float32)
+        faps[JAW] = 400.0 * loudness + 0.1 * keys.mean() + 0.1 * values.mean()
+        faps[JAW + 1] = self._num_positions
+        return [
+            LipFrame(
+                time_s=known_s - delay_s,
+                delay_s=delay_s,
+                faps=faps,
+                closure=float(1.0 - loudness),
+                lip_to_teeth=0.0,
+            )
+            for delay_s in self._delays_s
+        ]

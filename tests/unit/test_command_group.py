@@ -1,0 +1,67 @@
+"""Commands that other packages add as entry points."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from services.cli import main as command_line
+from services.kinds import KINDS
+
+pytestmark = pytest.mark.unit
+
+wave_app = typer.Typer(add_completion=False)
+
+
+@wave_app.command()
+def wave(name: str) -> None:
+    """Wave to somebody."""
+    typer.echo(f"waving to {name}")
+
+
+@pytest.fixture
+def added(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Add the command above as another package would; return the groups that are asked for."""
+    groups: list[str] = []
+
+    def entry_points(*, group: str) -> list[EntryPoint]:
+        groups.append(group)
+        return [EntryPoint("wave", f"{__name__}:wave_app", group)]
+
+    monkeypatch.setattr(command_line, "entry_points", entry_points)
+    return groups
+
+
+def test_an_added_command_runs_and_is_listed(added: list[str]) -> None:
+    result = CliRunner().invoke(command_line.app, ["wave", "Mei"])
+    assert result.output == "waving to Mei\n"
+    listed = CliRunner().invoke(command_line.app, ["--help"], env={"COLUMNS": "120"}).output
+    assert "Wave to somebody." in listed
+    assert all(name in listed for name in KINDS)
+    assert set(added) == {"kouxing.commands"}
+
+
+def test_a_misspelt_added_command_is_suggested(added: list[str]) -> None:
+    result = CliRunner().invoke(command_line.app, ["wafe"])
+    assert result.exit_code == 2
+    assert "wave" in result.output
+
+
+def test_a_command_of_this_package_starts_without_the_added_ones(added: list[str]) -> None:
+    assert CliRunner().invoke(command_line.app, ["phones", "--help"]).exit_code == 0
+    assert added == []
+
+
+def test_the_command_line_imports_neither_training_nor_evaluation_nor_services() -> None:
+    code = (
+        "import sys, services.cli.main\n"
+        "heavy = ('training', 'evaluation', 'numpy', 'zmq', 'services.recognizer.service')\n"
+        "print([name for name in heavy if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

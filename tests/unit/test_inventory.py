@@ -1,0 +1,105 @@
+"""Phone inventories: what the tables of a language must hold."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.errors import UserError
+from shared.phones.inventory import MAX_PHONES, PhoneInventory, load_inventory
+from tests.languages import MANDARIN, install_language
+
+pytestmark = pytest.mark.unit
+
+
+def small(**changes: object) -> PhoneInventory:
+    values = {
+        "language": "small",
+        "phones": ("m", "a", "sil"),
+        "kinds": ("initial", "vowel", "silence"),
+        "visemes": {"m": (("b", 1.0),), "a": (("a", 0.5), ("e", 0.5)), "sil": (("rest", 1.0),)},
+        "before_rounded": {},
+        "pronounce": lambda text: [tuple(text)],
+    }
+    return PhoneInventory(**(values | changes))  # type: ignore[arg-type]
+
+
+def test_mandarin_has_the_paper_s_phones() -> None:
+    """Li et al. 2011, section 3.1: 21 initials, 38 finals and silence."""
+    assert (len(MANDARIN.initials), len(MANDARIN.vowels), MANDARIN.silence) == (21, 38, "sil")
+    assert len(MANDARIN) == 60
+    assert [MANDARIN.phones[MANDARIN.index[phone]] for phone in MANDARIN.phones] == list(
+        MANDARIN.phones
+    )
+    assert MANDARIN.pronounce("你好") == [("n", "i"), ("h", "ao")]
+    assert MANDARIN.pronounce("ni3 hǎo") == [("n", "i"), ("h", "ao")]
+
+
+def test_a_small_inventory() -> None:
+    inventory = small()
+    assert (len(inventory), inventory.index["sil"], inventory.silence) == (3, 2, "sil")
+    assert (inventory.initials, inventory.vowels) == (frozenset("m"), frozenset("a"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"phones": ("m", "m", "sil")}, "phones are distinct"),
+        ({"phones": ("m", "A", "sil")}, "1 to 4 letters a-z"),
+        ({"phones": ("m", "silence", "sil")}, "1 to 4 letters a-z"),
+        ({"kinds": ("initial", "vowel", "vowel")}, "exactly one phone is silence"),
+        ({"kinds": ("initial", "final", "silence")}, "one of initial, vowel, silence"),
+        ({"visemes": {"m": (("b", 1.0),), "a": (("a", 0.9),)}}, "viseme shares of a must add up"),
+    ],
+)
+def test_phones_that_make_no_inventory(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(UserError, match=f"language small: .*{message}"):
+        small(**changes)
+
+
+def test_phones_are_counted_in_8_bits() -> None:
+    names = [chr(97 + n // 26) + chr(97 + n % 26) for n in range(MAX_PHONES)]
+    visemes = dict.fromkeys([*names, "sil"], (("rest", 1.0),))
+    largest = {"kinds": ("vowel",) * (MAX_PHONES - 1) + ("silence",), "visemes": visemes}
+    assert len(small(phones=(*names[1:], "sil"), **largest)) == MAX_PHONES
+    with pytest.raises(UserError, match="at most 255 phones"):
+        small(phones=(*names, "sil"), **(largest | {"kinds": ("vowel", *largest["kinds"])}))
+
+
+def test_an_unknown_language_names_the_known_ones() -> None:
+    with pytest.raises(UserError, match="language 'klingon' is not installed; known: mandarin"):
+        load_inventory("klingon")
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        (None, r"phones\.tsv"),
+        ("phone\tkind\tvisemes\nsil\tsilence\trest:1\n", "before_rounded"),
+        ("phone\tkind\tvisemes\tbefore_rounded\nsil\tsilence\trest\t\n", "not enough values"),
+        ("phone\tkind\tvisemes\tbefore_rounded\nsil\tsilence\trest:one\t\n", "one"),
+        ("phone\tkind\tvisemes\tbefore_rounded\nsil\tsilence\trest:1\t\n", "pronounce"),
+    ],
+)
+def test_a_broken_package_is_named(
+    table: str | None, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "broken_language", raising=False)  # of the case before
+    package = tmp_path / "broken_language"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    if table is not None:
+        (package / "phones.tsv").write_text(table)
+    install_language(tmp_path, "broken", "broken_language")
+    with pytest.raises(UserError, match=f"language broken: package broken_language .*{message}"):
+        load_inventory("broken")
+
+
+def test_a_package_that_is_not_there_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    install_language(tmp_path, "lost", "no_such_package")
+    with pytest.raises(UserError, match="package no_such_package cannot be read"):
+        load_inventory("lost")

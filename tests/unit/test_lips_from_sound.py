@@ -1,0 +1,192 @@
+"""Lips from sound: the model's steps, its file, and what a session gets."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.model_file import write_archive
+from services.recognizer.lips import (
+    CLOSURE,
+    FORMAT,
+    LIP_FAPS,
+    NUM_OUTPUTS,
+    LipPredictor,
+    load_lips,
+    mouth_faps,
+)
+from services.recognizer.stream import SpeechStream
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import LipFrame
+from tests.e2e.following import samples_of_file
+from tests.system import DEMO
+
+pytestmark = pytest.mark.unit
+
+WIDTH = 512  # of the shipped network
+NUM_FEATURES, NUM_COMPONENTS, UNITS, HISTORY = 160 + 2 * WIDTH, 6, 5, 3
+DELAYS_S = (0.0, 0.05, 0.16)
+SAMPLES = samples_of_file(DEMO / "vowels-male.wav")[:32_000]
+
+
+def made_up_model() -> LipPredictor:
+    rng = np.random.default_rng(0)
+    outputs = (len(DELAYS_S), NUM_OUTPUTS)
+
+    def draw(*shape: int, spread: float = 0.3) -> NDArray[np.float32]:
+        return rng.normal(0, spread, shape).astype(np.float32)
+
+    return LipPredictor(
+        delays=np.array(DELAYS_S, np.float32),
+        feature_mean=draw(NUM_FEATURES),
+        projection=draw(NUM_FEATURES, NUM_COMPONENTS, spread=0.01),
+        entry_weights=draw(NUM_COMPONENTS, UNITS),
+        entry_bias=draw(UNITS),
+        input_weights=draw(UNITS, 3 * UNITS),
+        input_bias=draw(3 * UNITS),
+        state_weights=draw(UNITS, 3 * UNITS),
+        state_bias=draw(3 * UNITS),
+        history_weights=draw(HISTORY, NUM_COMPONENTS, *outputs),
+        output_weights=draw(2 * UNITS, *outputs),
+        output_bias=draw(*outputs),
+    )
+
+
+MODEL = made_up_model()
+
+
+def arrays_of(model: LipPredictor) -> dict[str, np.ndarray]:
+    arrays = {field.name: getattr(model, field.name) for field in fields(model)}
+    return {"format": np.array(FORMAT), **arrays}
+
+
+def lips_of(chunk: int, delay_s: float = 0.2) -> list[LipFrame]:
+    stream = SpeechStream(load_model(), lips=MODEL, face_delay_s=delay_s)
+    outputs = [
+        output
+        for start in range(0, len(SAMPLES), chunk)
+        for output in stream.accept_waveform(SAMPLES[start : start + chunk])
+    ]
+    return [output for output in outputs + stream.input_finished() if isinstance(output, LipFrame)]
+
+
+def test_a_step_is_what_the_formulas_say() -> None:
+    rng = np.random.default_rng(1)
+    rows = rng.normal(size=(4, NUM_FEATURES)).astype(np.float32)
+    stream = MODEL.stream(MODEL.delays_s)
+    made = [stream.step(row) for row in rows]
+
+    components = [(row - MODEL.feature_mean) @ MODEL.projection for row in rows]
+    state = np.zeros(UNITS)
+    for component in components:
+        entered = np.maximum(component @ MODEL.entry_weights + MODEL.entry_bias, 0)
+        given = np.split(entered @ MODEL.input_weights + MODEL.input_bias, 3)
+        kept = np.split(state @ MODEL.state_weights + MODEL.state_bias, 3)
+        reset, update = (1 / (1 + np.exp(-given[k] - kept[k])) for k in (0, 1))
+        state = (1 - update) * np.tanh(given[2] + reset * kept[2]) + update * state
+    expected = (
+        np.einsum("hc,hcdo->do", np.stack(components[-HISTORY:]), MODEL.history_weights)
+        + np.einsum("u,udo->do", np.concatenate([state, entered]), MODEL.output_weights)
+        + MODEL.output_bias
+    )
+    np.testing.assert_allclose(made[-1], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_reset_forgets_everything() -> None:
+    row = np.ones(NUM_FEATURES, np.float32)
+    stream = MODEL.stream(MODEL.delays_s)
+    first, second = stream.step(row), stream.step(row)
+    stream.reset()
+    assert not np.allclose(first, second)
+    np.testing.assert_array_equal(stream.step(row), first)
+
+
+def test_each_delay_has_its_own_outputs_and_times() -> None:
+    frames, keys, values = np.ones((2, 80)), np.ones((8, 64)), np.ones((8, 64))
+    position = [array.astype(np.float32) for array in (frames, keys, values)]
+    both = MODEL.stream([0.05, 0.16]).accept(1.0, position[0], position[1], position[2])
+    alone = MODEL.stream([0.16]).accept(1.0, position[0], position[1], position[2])
+    assert [(lip.time_s, lip.delay_s) for lip in both] == [(0.95, 0.05), (0.84, 0.16)]
+    np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
+    assert 0 < both[0].closure < 1
+    outputs = MODEL.stream([0.16]).step(np.concatenate(position, axis=None))
+    assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
+
+
+def test_left_and_right_move_alike_and_the_tongue_is_left_alone() -> None:
+    faps = mouth_faps(np.arange(1, len(LIP_FAPS) + 1, dtype=np.float32))
+    value = dict(zip(MOUTH_FAPS, faps, strict=True))
+    assert value[6] == value[7] == LIP_FAPS.index(6) + 1
+    assert value[59] == value[60] == len(LIP_FAPS)
+    assert value[44] == value[45] == value[46] == value[47] == 0
+
+
+def test_any_chunking_gives_the_same_lips() -> None:
+    whole, small = lips_of(len(SAMPLES)), lips_of(777)
+    assert len(whole) > 20
+    assert [lip.time_s for lip in small] == [lip.time_s for lip in whole]
+    for one, other in zip(small, whole, strict=True):
+        np.testing.assert_array_equal(one.faps, other.faps)
+        assert (one.closure, one.lip_to_teeth) == (other.closure, other.lip_to_teeth)
+
+
+def test_a_model_comes_back_from_its_file(tmp_path: Path) -> None:
+    MODEL.save(tmp_path / "lips.npz")
+    again = load_lips(tmp_path / "lips.npz")
+    assert again.delays_s == DELAYS_S
+    row = np.random.default_rng(2).normal(size=NUM_FEATURES).astype(np.float32)
+    made, before = (one.stream(DELAYS_S).step(row) for one in (again, MODEL))
+    np.testing.assert_allclose(made, before, atol=0.01)  # weights have 16 bits
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "message"),
+    [
+        ("format", np.array("neural 5"), "format 'neural 5'"),
+        ("delays", np.array([0.05, 0.0], np.float32), "do not rise"),
+        ("delays", np.array([0.0, 3.0], np.float32), "delays are"),
+        ("projection", np.ones((NUM_FEATURES, 7), np.float32), "entry_weights has shape"),
+        ("state_weights", np.ones((UNITS, 2), np.float32), "state_weights has shape"),
+        ("output_bias", np.full((3, NUM_OUTPUTS), np.nan, np.float32), "not finite"),
+        ("history_weights", np.ones((65, 6, 3, 17), np.float32), "looks back 65 positions"),
+        ("projection", np.ones((100, 6), np.float32), "100 features"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(
+    tmp_path: Path, name: str, array: np.ndarray, message: str
+) -> None:
+    write_archive(tmp_path / "bad.npz", {**arrays_of(MODEL), name: array})
+    with pytest.raises(UserError, match=message):
+        load_lips(tmp_path / "bad.npz")
+
+
+def test_a_missing_array_or_delay_is_named(tmp_path: Path) -> None:
+    arrays = arrays_of(MODEL)
+    del arrays["entry_bias"]
+    write_archive(tmp_path / "bad.npz", arrays)
+    with pytest.raises(UserError, match="entry_bias is missing"):
+        load_lips(tmp_path / "bad.npz")
+    with pytest.raises(UserError, match="no delay of 70 ms; give one of 0, 50, 160"):
+        MODEL.stream([0.07])
+
+
+def test_the_shipped_lips_open_round_and_close() -> None:
+    stream = SpeechStream(load_model(), lips=load_lips(), face_delay_s=0.2)
+    outputs = stream.accept_waveform(SAMPLES) + stream.input_finished()
+    lips = [output for output in outputs if isinstance(output, LipFrame)]
+
+    def mean(fap: int, start_s: float, end_s: float) -> float:
+        column = MOUTH_FAPS.index(fap)
+        return float(np.mean([lip.faps[column] for lip in lips if start_s < lip.time_s < end_s]))
+
+    assert mean(5, 0.45, 0.6) < -100  # er: the lower lip is down
+    assert mean(6, 0.91, 1.0) < mean(6, 0.45, 0.6) - 30  # u: the corners are inwards
+    shut = [lip for lip in lips if lip.time_s > 1.45]
+    assert shut
+    assert min(lip.closure for lip in shut) > 0.5

@@ -1,0 +1,193 @@
+"""Training lips from sound, on made-up speakers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, part_of
+from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS, load_lips
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import Phone
+from tests.e2e.following import samples_of_file
+from tests.lips import clip_of
+from tests.system import DEMO
+from training.lips.card import lips_of
+from training.lips.positions import Speech
+from training.lips.recipe import DELAYS_S, fit, train_lips
+from training.lips.ridge import Products, fit_ridge, history_of
+from training.lips.scores import Stretch, correlations, count_closures
+from training.lips.targets import Touch, targets_at, touches
+
+pytestmark = [pytest.mark.unit, pytest.mark.slow]
+
+NUM_FEATURES = 160 + 8
+FRAME_S = 0.04
+POSITIONS_S = 0.02 * np.arange(150, dtype=np.float64)
+TOUCH = Touch(closed_below=20.0, half_open=100.0)
+
+
+def clip_with(height: np.ndarray) -> LipClip:
+    """Make a clip whose lower lip opens so far at each frame."""
+    time_s = FRAME_S * np.arange(len(height), dtype=np.float64)
+    faps = np.full((len(height), len(MOUTH_FAPS)), np.nan)
+    faps[:, MOUTH_FAPS.index(4)] = 0.0
+    faps[:, MOUTH_FAPS.index(5)] = -height
+    faps[:, MOUTH_FAPS.index(3)] = height
+    faps[:, MOUTH_FAPS.index(6)], faps[:, MOUTH_FAPS.index(7)] = 10.0, 30.0
+    return clip_of(time_s, faps)
+
+
+def test_targets_are_the_lips_a_delay_ago() -> None:
+    clip = clip_with(np.linspace(0.0, 500.0, 51))  # 250 a second, for 2 s
+    known_s = np.array([0.1, 1.0])
+    targets = targets_at(clip, None, TOUCH, known_s, [0.0, 0.2])
+    lower, corner = LIP_FAPS.index(5), LIP_FAPS.index(6)
+    np.testing.assert_allclose(targets[1, :, lower], [-250.0, -200.0], atol=1e-3)
+    np.testing.assert_allclose(targets[1, :, corner], 20.0)  # the mean of left and right
+    assert np.isnan(targets[0, 1]).all()  # before the clip
+    assert np.isnan(targets[1, :, LIP_FAPS.index(16)]).all()  # not tracked
+    assert targets[1, 0, CLOSURE] == 0
+    early = targets_at(clip, None, TOUCH, np.array([0.05]), [0.0])
+    assert early[0, 0, CLOSURE] == 1
+
+
+def test_the_phone_f_touches_the_teeth() -> None:
+    clip = clip_with(np.zeros(51))
+    phone = Phone(index=0, symbol="f", onset_s=0.5, duration_s=0.1, confidence=1.0, final=True)
+    targets = targets_at(clip, [phone], TOUCH, np.array([0.45, 0.55, 0.65]), [0.0])
+    assert targets[:, 0, -1].tolist() == [0, 1, 0]
+
+
+def test_lips_touch_in_the_lowest_tenth_of_a_speakers_range() -> None:
+    limits = touches([clip_with(np.linspace(50.0, 250.0, 1001))])["nobody"]
+    assert limits.closed_below == pytest.approx(70.0, abs=3.0)
+    assert limits.half_open == pytest.approx(150.0, abs=3.0)
+
+
+def test_ridge_finds_a_linear_map_of_the_past() -> None:
+    rng = np.random.default_rng(0)
+    components = rng.normal(size=(20_000, 3)).astype(np.float32)
+    history = history_of(components)
+    targets = np.stack([components[:, 0], np.roll(components[:, 1], 2)], axis=1)[:, None]
+    targets[:2, 0, 1] = 0.0
+    targets[::3, 0, 0] = np.nan
+    weights = fit_ridge([history], [targets.astype(np.float32)])
+    made = np.einsum("nx,xdo->ndo", history[::3], weights)
+    assert np.corrcoef(made[:, 0, 0], components[::3, 0])[0, 1] > 0.99
+    assert np.corrcoef(made[5:, 0, 1], targets[::3][5:, 0, 1])[0, 1] > 0.99
+
+
+def test_products_without_a_speaker_are_those_of_the_others() -> None:
+    rng = np.random.default_rng(0)
+    one, other = (
+        Products.of(rng.normal(size=(50, 4)).astype(np.float32), np.ones((50, 2), np.float32))
+        for _ in range(2)
+    )
+    np.testing.assert_allclose((one + other - one).solve(), other.solve(), atol=1e-9)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_fitting_learns_lips_that_the_features_tell_in_each_speakers_units() -> None:
+    rng = np.random.default_rng(0)
+    speech, targets = [], []
+    for speaker, scale in (("one", 200.0), ("two", 100.0)):
+        clip = replace(clip_with(np.zeros(2)), speaker=speaker)
+        for _ in range(12):
+            features = rng.normal(size=(150, NUM_FEATURES)).astype(np.float16)
+            features[:, 3] *= 5  # so it is a principal component
+            smooth = np.convolve(features[:, 3], np.ones(5) / 11, "full")[:150]
+            target = np.full((150, len(DELAYS_S), NUM_OUTPUTS), np.nan, np.float32)
+            target[..., LIP_FAPS.index(5)] = -scale * (2 + smooth[:, None])
+            target[..., CLOSURE] = smooth[:, None] < -1
+            speech.append(Speech(clip=clip, features=features, known_s=POSITIONS_S, speed=1.0))
+            targets.append(target)
+    train = [number for number in range(24) if number % 12]
+    model, losses = fit(
+        [speech[k] for k in train], [targets[k] for k in train], speech, seed=3, num_epochs=6
+    )
+    assert losses[-1] < losses[0]
+    for held in (0, 12):
+        made = lips_of(model, [speech[held]])[0].outputs[:, 2]
+        lower = LIP_FAPS.index(5)
+        assert np.corrcoef(made[:, lower], targets[held][:, 2, lower])[0, 1] > 0.8
+        assert not made[:, LIP_FAPS.index(16)].any()  # nobody tracked it
+
+
+def stretch_of(clip: LipClip, delay_s: float, log_odds: np.ndarray) -> Stretch:
+    """Make lips that follow a clip exactly, with a closure's log odds at each frame."""
+    outputs = np.zeros((len(clip.time_s), 1, NUM_OUTPUTS), np.float32)
+    outputs[:, 0, LIP_FAPS.index(5)] = clip.faps[:, MOUTH_FAPS.index(5)]
+    outputs[:, 0, CLOSURE] = log_odds
+    return Stretch(clip.time_s + delay_s, outputs)
+
+
+def test_lips_that_follow_exactly_correlate_by_one() -> None:
+    clip = clip_with(100 + 80 * np.sin(np.arange(200) / 3))
+    made = {clip.name: [stretch_of(clip, 0.05, np.zeros(200))]}
+    assert correlations([clip], made, 0, 0.05)[0] == pytest.approx(1.0)
+    late = correlations([clip], made, 0, -0.07)[0]
+    assert late < 0.9
+
+
+def test_closures_that_are_met_missed_and_made_up() -> None:
+    height = np.full(100, 200.0)
+    height[[20, 60]] = 0.0
+    clip = clip_with(height)
+    log_odds = np.full(100, -5.0)
+    log_odds[[20, 40]] = 5.0  # one met, one made up; that at 60 is missed
+    made = {clip.name: [stretch_of(clip, 0.0, log_odds)]}
+    counts = count_closures([clip], made, {"nobody": TOUCH}, 0, 0.0)
+    assert (counts.real, counts.met, counts.told, counts.right) == (2, 1, 2, 1)
+    assert counts.f1 == pytest.approx(0.5)
+
+
+def write_clip(folder: Path, name: str, speaker: str, licence: str) -> None:
+    samples = samples_of_file(DEMO / "vowels-male.wav")[: 2 * SAMPLE_RATE_HZ]
+    soundfile.write(folder / f"{name}.flac", samples, SAMPLE_RATE_HZ)
+    about = {"speaker": speaker, "licence": licence, "language": "en"}
+    (folder / f"{name}.json").write_text(json.dumps(about))
+    rows = [
+        f"{k * FRAME_S},{100 + 50 * np.sin(k)},0,{-200 - 100 * np.sin(k)},{5 * np.cos(k)},0"
+        for k in range(50)
+    ]
+    head = "t,F3_open_jaw,F4_upper,F5_lower,F6_left,F7_right"
+    (folder / f"{name}.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
+def name_for(part: str) -> str:
+    """Return a name that the rule gives this part."""
+    return next(name for k in range(100) if part_of(name := f"clip_{k}", may_train=True) == part)
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_the_command_makes_a_model_and_a_card_from_clips_that_may_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder, output = tmp_path / "clips", tmp_path / "lips.npz"
+    folder.mkdir()
+    write_clip(folder, name_for("train"), "anna", "CC0")
+    write_clip(folder, name_for("choice"), "berta", "MIT")
+    write_clip(folder, name_for("held"), "clara", "CC0")
+    write_clip(folder, "closed", "dora", "academic use only")
+    train_lips(folder, output, seed=1)
+    assert load_lips(output).delays_s == DELAYS_S
+    card = output.with_suffix(".md").read_text()
+    assert "| CC0 | 1 | 1 | en | 2 |" in card
+    assert "| MIT | 1 | 1 | en | 2 |" in card
+    assert "academic" not in card
+    assert "| en, clara (not in training) | 1 |" in card
+    assert "| en, anna | 1 |" in card
+
+
+def test_clips_that_may_not_be_used_are_refused(tmp_path: Path) -> None:
+    write_clip(tmp_path, "closed", "dora", "academic use only")
+    with pytest.raises(UserError, match=r"no clip .* may be used"):
+        train_lips(tmp_path, tmp_path / "lips.npz")

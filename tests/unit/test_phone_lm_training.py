@@ -1,0 +1,464 @@
+"""Phone language models counted from texts, corpora and a language model of words."""
+
+import struct
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from services.recognizer.acoustic.load import MODEL_PATH, load_model
+from services.recognizer.acoustic.model_file import write_archive
+from services.recognizer.search.phone_lm import PhoneLanguageModel
+from shared.errors import UserError
+from shared.phones.inventory import load_inventory
+from tests.languages import MANDARIN, NUM_PHONES, SIL, START, Table, install_language, step
+from training.commands import app
+from training.phone_lm import open_gram
+from training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
+from training.phone_lm.open_gram import draw_phones
+from training.phone_lm.recipe import load_phone_lm, phone_lm_of, phones_of_text, train_phone_lm
+from training.training_set import Example
+
+pytestmark = pytest.mark.unit
+
+INDEX = MANDARIN.index
+# the corpus's sentence of split train
+SENTENCE = [
+    INDEX[phone]
+    for syllable in MANDARIN.pronounce("mei3 yi2 ge4 zi4 dou1 you2")
+    for phone in syllable
+]
+
+
+def grams_of(phone_lm: PhoneLanguageModel) -> dict[tuple[int, ...], float]:
+    return Table.of(phone_lm).log_prob
+
+
+def wandering(num_sentences: int = 400, seed: int = 0) -> Stream:
+    """Sentences in which two phones tell much about the next."""
+    rng = np.random.default_rng(seed)
+    likely = rng.dirichlet(np.full(8, 0.2), (8, 8))
+    sentences = []
+    for length in rng.integers(1, 12, num_sentences):
+        sentence = [0, 0]
+        for _ in range(length):
+            sentence.append(int(rng.choice(8, p=likely[sentence[-2], sentence[-1]])))
+        sentences.append([7 * phone for phone in sentence[2:]])
+    return stream_of(sentences, MANDARIN)
+
+
+# --- estimation
+
+
+@pytest.mark.parametrize("max_ngrams", [60, 300, 1_000_000])
+def test_probabilities_after_every_context_sum_to_one(max_ngrams: int) -> None:
+    graph = estimate_phone_lm([wandering()], MANDARIN, order=4, max_ngrams=max_ngrams).graph
+    for context in range(0, len(graph.last_phone), max(1, len(graph.last_phone) // 60)):
+        probs = [np.exp(step(graph, context, phone)[0]) for phone in range(NUM_PHONES)]
+        assert sum(probs) == pytest.approx(1, abs=1e-3)
+        assert min(probs) > 0
+
+
+def test_probabilities_are_those_of_witten_and_bell() -> None:
+    """After 1 2 comes 3 eight times and 4 twice, after 5 2 only 4: eq. as in the docstring."""
+    sentences = [[1, 2, 3]] * 8 + [[1, 2, 4]] * 2 + [[5, 2, 4]] * 10
+    graph = estimate_phone_lm([stream_of(sentences, MANDARIN)], MANDARIN, order=3).graph
+    num_phones = 3 * 20 + 20 - 1  # the pause before the first sentence is not counted
+    alone = {3: 8.5, 4: 12.5}
+    after_2 = {u: ((8, 12)[u == 4] + 2 * alone[u] / (num_phones + 30)) / 22 for u in (3, 4)}
+    _, after_1 = step(graph, START, 1)
+    _, after_1_2 = step(graph, after_1, 2)
+    for phone, count in ((3, 8), (4, 2)):
+        prob = np.exp(step(graph, after_1_2, phone)[0])
+        assert prob == pytest.approx((count + 2 * after_2[phone]) / 12, rel=1e-4)
+    assert graph.last_phone[after_1_2] == 2
+    assert step(graph, after_1_2, 3) > step(graph, after_1_2, 4)
+    _, after_5_2 = step(graph, step(graph, START, 5)[1], 2)
+    assert step(graph, after_5_2, 4) > step(graph, after_5_2, 3)
+
+
+def test_an_unseen_phone_is_as_likely_as_after_fewer_phones() -> None:
+    sentences = [[1, 2, 3]] * 8 + [[5, 2, 4]] * 10
+    phone_lm = estimate_phone_lm([stream_of(sentences, MANDARIN)], MANDARIN, order=3)
+    table = Table.of(phone_lm)
+    assert (1, 2, 4) not in table.log_prob
+    back_off = table.log_backoff[1, 2]
+    assert back_off < 0
+    assert table.after((1, 2), 4) == pytest.approx(back_off + table.log_prob[2, 4])
+    never = table.after((1, 2), 50)
+    assert never == pytest.approx(back_off + table.log_backoff[2,] + table.log_prob[50,])
+    assert never < table.after((1, 2), 4) < table.after((1, 2), 3)
+
+
+def test_n_grams_do_not_cross_pauses() -> None:
+    grams = grams_of(
+        estimate_phone_lm([stream_of([[1, 2], [3, 4], [5]] * 3, MANDARIN)], MANDARIN, order=6)
+    )
+    assert max(map(len, grams)) == 4
+    assert all(SIL not in gram[1:-1] for gram in grams)
+    assert {(SIL, 1, 2, SIL), (SIL, 3, 4, SIL), (SIL, 5, SIL)} <= grams.keys()
+    assert not {(2, 3), (2, SIL, 3), (4, 5), (SIL, SIL)} & grams.keys()
+
+
+@pytest.mark.parametrize("max_ngrams", [20, 100, 400])
+def test_about_as_many_as_asked_for_are_kept(max_ngrams: int) -> None:
+    stream = wandering()
+    whole, kept = (
+        estimate_phone_lm([stream], MANDARIN, order=5, max_ngrams=n) for n in (10**6, max_ngrams)
+    )
+    assert len(whole.phone) > 1000
+    assert [(phone,) in grams_of(kept) for phone in range(NUM_PHONES)] == [True] * NUM_PHONES
+    num_longer = kept.levels[-1] - kept.levels[2]
+    assert max_ngrams <= num_longer <= 1.3 * max_ngrams
+    assert grams_of(kept).keys() <= grams_of(whole).keys()
+    all_grams = grams_of(whole)
+    assert grams_of(kept) == pytest.approx({gram: all_grams[gram] for gram in grams_of(kept)})
+
+
+def test_what_tells_most_is_kept_first() -> None:
+    """1 2 is as frequent as its phones make it; 3 is always followed by 4."""
+    rng = np.random.default_rng(0)
+    some = [rng.permutation([1, 2, 5, 6, 7, 8]).tolist() for _ in range(50)]
+    phone_lm = estimate_phone_lm(
+        [stream_of([*some, *[[3, 4]] * 30], MANDARIN)], MANDARIN, order=2, max_ngrams=12
+    )
+    assert (3, 4) in grams_of(phone_lm)
+    assert (1, 2) not in grams_of(phone_lm)
+
+
+def test_the_same_texts_give_the_same_arrays() -> None:
+    streams = [wandering(seed=1), wandering(seed=2)]
+    first, second = (
+        estimate_phone_lm(streams, MANDARIN, order=4, max_ngrams=200) for _ in range(2)
+    )
+    for name in ("num_children", "phone", "log_prob", "log_backoff"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_little_text_is_enough() -> None:
+    phone_lm = estimate_phone_lm([stream_of([[5]], MANDARIN)], MANDARIN, order=10)
+    assert phone_lm.levels == [0, 1, 61, 62]  # nothing else follows a pause than 5
+    assert grams_of(phone_lm)[SIL, 5] > grams_of(phone_lm)[5,] > grams_of(phone_lm)[6,]
+
+
+def test_corpora_give_the_phone_lm_of_their_texts() -> None:
+    phones = [tuple(INDEX[p] for p in names.split()) for names in ("t i m a", "l an t i")]
+    examples = [
+        Example(log_mel=np.zeros((40, 41), np.float16), phones=one, syllables=(2, 2), weight=1.0)
+        for one in phones * 5
+    ]
+    phone_lm = phone_lm_of(examples, MANDARIN)
+    table = Table.of(phone_lm)
+    t, i, a = (INDEX[phone] for phone in "tia")
+    assert table.log_prob[t, i] > table.after((t,), a)
+    assert table.log_prob[i, SIL] > table.after((t,), SIL)
+    assert table.after((SIL, INDEX["l"], INDEX["an"]), t) == max(
+        table.after((SIL, INDEX["l"], INDEX["an"]), phone) for phone in range(NUM_PHONES)
+    )
+
+
+# --- words drawn from a language model
+
+WORDS = ("", "，", "你好", "中国", "人", "abc")
+SINGLE = {0: 0.05, 1: 0.05, 2: 0.15, 3: 0.3, 4: 0.4, 5: 0.05}
+PAIRS = {(2, 3): 0.9, (3, 4): 0.5}
+TRIPLES = {(2, 3, 4): 0.95}
+
+
+def write_ngrams(path: Path) -> Path:
+    """Write as `tslminfo -v` does."""
+
+    def row(words: tuple[int, ...], prob: float, rest: str = "0.25 ") -> str:
+        numbers = "".join(f"{word:8d} " for word in words)
+        return f"{numbers}{-np.log(prob):.6f} {rest}(0,{len(words)})\n"
+
+    levels = [
+        "\\0-gram\\1\n" + row((), 1.0),
+        f"\\1-gram\\{len(SINGLE)}\n" + "".join(row((w,), prob) for w, prob in SINGLE.items()),
+        f"\\2-gram\\{len(PAIRS)}\n" + "".join(row(words, prob) for words, prob in PAIRS.items()),
+        f"\\3-gram\\{len(TRIPLES)}\n" + "".join(row(w, prob, "") for w, prob in TRIPLES.items()),
+    ]
+    path.write_text("".join(levels), encoding="ascii")
+    return path
+
+
+def write_dictionary(path: Path) -> Path:
+    head = struct.pack("<4I", 7, 7, 24, 7) + bytes(8)
+    path.write_bytes(head + "\0".join(WORDS).encode("utf-32-le"))
+    return path
+
+
+@pytest.fixture
+def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    monkeypatch.setattr(open_gram, "_NUM_CHAINS", 20)
+    return write_ngrams(tmp_path / "lm.txt"), write_dictionary(tmp_path / "pydict_sc.bin")
+
+
+def words_of(stream: Stream) -> list[str]:
+    """Read the words back: each begins with a phone of its own."""
+    readable = [word for word in WORDS if MANDARIN.readable.fullmatch(word)]
+    words = {phones_of_text(word, MANDARIN): word for word in readable}
+    words[SIL,] = ""
+    found: list[str] = []
+    left = tuple(stream.tolist())
+    while left:
+        (phones,) = (phones for phones in words if left[: len(phones)] == phones)
+        found.append(words[phones])
+        left = left[len(phones) :]
+    return found
+
+
+def test_words_come_with_their_probabilities(model: tuple[Path, Path]) -> None:
+    stream = draw_phones(*model, MANDARIN, num_words=8000)
+    assert stream.dtype == np.uint8
+    assert not ((stream[1:] == SIL) & (stream[:-1] == SIL)).any()
+    assert stream[0] == SIL
+    words = words_of(stream)
+    assert 6500 < len(words) < 8100
+    pairs = Counter(pairwise(words))
+    triples = Counter(zip(words, words[1:], words[2:], strict=False))
+    hello = sum(count for pair, count in pairs.items() if pair[0] == "你好")
+    assert hello > 500
+    assert pairs["你好", "中国"] / hello == pytest.approx(0.9, abs=0.04)
+    of_china = {
+        before: (
+            triples[before, "中国", "人"],
+            sum(n for three, n in triples.items() if three[:2] == (before, "中国")),
+        )
+        for before in ("你好", "人")
+    }
+    assert of_china["你好"][0] / of_china["你好"][1] == pytest.approx(0.95, abs=0.04)
+    assert of_china["人"][0] / of_china["人"][1] == pytest.approx(0.5, abs=0.06)
+    people = [after for before, after in pairwise(words) if before == "人"]
+    assert people.count("人") / len(people) == pytest.approx(0.4, abs=0.04)
+    # a comma, Latin letters and word 0 are pauses
+    assert people.count("") / len(people) == pytest.approx(0.15, abs=0.03)
+
+
+def test_the_seed_decides_what_is_drawn(model: tuple[Path, Path]) -> None:
+    first, again, other = (draw_phones(*model, MANDARIN, num_words=400, seed=s) for s in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert first.tobytes() != other.tobytes()
+
+
+def test_one_word_can_be_drawn(model: tuple[Path, Path]) -> None:
+    assert len(words_of(draw_phones(*model, MANDARIN, num_words=1))) <= 2
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is not what `tslminfo -v` prints"),
+        ("", "has 0 levels of n-grams, expected 4"),
+        ("\\0-gram\\1\n0 0 (0,0)\n\\1-gram\\1\n3 0.1 0 (0,0)\n", "has 2 levels"),
+        ("\\0-gram\\1\n0 0 (0,0)\n" + "\\1-gram\\0\n" * 3, "levels of n-grams"),
+        ("1 2 3\n", "is not what `tslminfo -v` prints"),
+        ("\\0-gram\\1\n0 0\n\\1-gram\\1\n3\n", "is not what `tslminfo -v` prints"),
+        ("\\0-gram\\1\n0 0\n\\1-gram\\1\nthree 0.1\n", "is not what `tslminfo -v` prints"),
+        ("\\0-gram\\1\n0 0\n\\1-gram\\1\n3 none\n", "is not what `tslminfo -v` prints"),
+        ("三", "is not what `tslminfo -v` prints"),
+    ],
+)
+def test_damaged_n_grams_are_named(
+    content: str | None, message: str, model: tuple[Path, Path]
+) -> None:
+    ngrams, dictionary = model
+    ngrams.unlink()
+    if content is not None:
+        ngrams.write_text(content, encoding="utf-8")
+    with pytest.raises(UserError, match=message) as raised:
+        draw_phones(ngrams, dictionary, MANDARIN, num_words=10)
+    assert str(ngrams) in str(raised.value)
+
+
+def test_pairs_of_words_that_are_none_are_named(model: tuple[Path, Path]) -> None:
+    content = model[0].read_text(encoding="ascii")
+    model[0].write_text(content.replace("\\3-gram", "3 99 0.1 0 (0,0)\n\\3-gram"), encoding="ascii")
+    with pytest.raises(UserError, match="has words that"):
+        draw_phones(*model, MANDARIN, num_words=10)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is no dictionary of SunPinyin"),
+        (b"", "is no dictionary of SunPinyin"),
+        (bytes(10), "is no dictionary of SunPinyin"),
+        (bytes(8) + struct.pack("<I", 12) + b"\0\0\0", "is no dictionary of SunPinyin"),
+        (bytes(8) + struct.pack("<I", 12) + b"\xff" * 8, "is no dictionary of SunPinyin"),
+        # fewer words than the n-grams know
+        (bytes(8) + struct.pack("<I", 12) + "\0你\0好".encode("utf-32-le"), "has words that"),
+        (bytes(8) + struct.pack("<I", 4000), "has words that"),
+    ],
+)
+def test_damaged_dictionaries_are_named(
+    content: bytes | None, message: str, model: tuple[Path, Path]
+) -> None:
+    ngrams, dictionary = model
+    dictionary.unlink()
+    if content is not None:
+        dictionary.write_bytes(content)
+    with pytest.raises(UserError, match=message) as raised:
+        draw_phones(ngrams, dictionary, MANDARIN, num_words=10)
+    assert str(dictionary) in str(raised.value)
+
+
+# --- from files to a file
+
+
+@pytest.fixture
+def corpus(tmp_path: Path) -> Path:
+    """One sentence that counts, and a word, synthetic speech and a sentence for dev."""
+    folder = tmp_path / "corpus"
+    folder.mkdir()
+    (folder / "a.wav").touch()
+    sentence = "mei3 yi2 ge4 zi4 dou1 you2"
+    rows = [
+        f"a\ta.wav\tA\tCC0-1.0\ttrain\t9\t{sentence}",
+        f"b\ta.wav\tB\tCC0-1.0\ttrain\t9\t{sentence}",
+        "c\ta.wav\tA\tCC0-1.0\ttrain\t9\tni3 hao3",
+        f"d\ta.wav\tA\tsynthetic\ttrain\t9\t{sentence} zao3",
+        f"e\ta.wav\tA\tCC0-1.0\tdev\t9\t{sentence} zao3",
+        f"f\tnone.wav\tA\tCC0-1.0\ttrain\t9\t{sentence} zao3",
+    ]
+    header = "utt_id\tpath\tspeaker\tlicence\tsplit\tseconds\tpinyin"
+    (folder / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return folder
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_from_text_and_corpus_to_a_file(corpus: Path, tmp_path: Path) -> None:
+    text = written(tmp_path / "a.txt", "你好，中国人。\nHello 你好！\n鿋，好\n" * 5)
+    output = tmp_path / "lm.npz"
+    lines: list[str] = []
+    train_phone_lm([corpus], [text], output, MANDARIN, report=lines.append)
+    # 你好 has four phones, 中国人 six, 好 two; a pause is before each; the rest cannot be read
+    assert lines[0] == (
+        f"{5 * (5 + 7 + 5 + 3)} phones of text, {1 + len(SENTENCE)} of sentences of the corpora"
+    )
+    assert "none.wav; row skipped" in lines[1]
+    assert lines[2] == "1 rows skipped"
+    assert "n-grams of 1 to 6 phones kept: 60, " in lines[3]
+    table = Table.of(load_phone_lm(output, MANDARIN))
+    n, i, h = (INDEX[phone] for phone in "nih")
+    assert (SIL, n, i, h) in table.log_prob
+    assert (SIL, *SENTENCE[:5]) in table.log_prob
+    assert (INDEX["z"], INDEX["ao"]) not in table.log_prob
+    assert max(range(NUM_PHONES), key=lambda phone: table.after((SIL,), phone)) == n
+    other = tmp_path / "again.npz"
+    train_phone_lm([corpus], [text], other, MANDARIN, report=lines.append)
+    assert other.read_bytes() == output.read_bytes()
+
+
+def test_spoken_sentences_count_for_a_hundredth_of_much_text(corpus: Path, tmp_path: Path) -> None:
+    text = written(tmp_path / "a.txt", "你好。\n" * 1000)
+    output = tmp_path / "l.npz"
+    train_phone_lm([corpus], [text], output, MANDARIN, order=2, report=lambda _: None)
+    num_spoken = 1 + len(SENTENCE)
+    times = round(0.012 * 5000 / num_spoken)
+    expected = (times + 0.5) / (5000 + times * num_spoken - 1 + NUM_PHONES / 2)
+    found = Table.of(load_phone_lm(output, MANDARIN)).log_prob[INDEX["m"],]
+    assert found == pytest.approx(np.log(expected), abs=0.03)
+
+
+def test_drawn_words_count_as_text(model: tuple[Path, Path], tmp_path: Path) -> None:
+    lines: list[str] = []
+    drawn = draw_phones(*model, MANDARIN, num_words=400)
+    train_phone_lm([], [], tmp_path / "l.npz", MANDARIN, drawn=drawn, order=4, report=lines.append)
+    assert lines[0].startswith(f"{len(drawn)} phones of text, 0 of sentences")
+    table = Table.of(load_phone_lm(tmp_path / "l.npz", MANDARIN))
+    assert [MANDARIN.phones[phone] for phone in phones_of_text("你好中", MANDARIN)[:4]] == [
+        "n",
+        "i",
+        "h",
+        "ao",
+    ]
+    assert phones_of_text("你好", MANDARIN)[:4] in table.log_prob
+
+
+def test_texts_that_cannot_be_read_and_nothing_to_count(tmp_path: Path) -> None:
+    output = tmp_path / "lm.npz"
+    foreign = tmp_path / "foreign.txt"
+    foreign.write_bytes("你好".encode("gb18030"))
+    with pytest.raises(UserError, match=r"cannot read .*foreign\.txt as UTF-8"):
+        train_phone_lm([], [foreign], output, MANDARIN)
+    with pytest.raises(UserError, match=r"cannot read .*nowhere\.txt"):
+        train_phone_lm([], [tmp_path / "nowhere.txt"], output, MANDARIN)
+    latin = written(tmp_path / "latin.txt", "no Chinese\n")
+    with pytest.raises(UserError, match="no text to count"):
+        train_phone_lm([], [latin], output, MANDARIN)
+    with pytest.raises(UserError, match="no text to count"):
+        train_phone_lm([], [], output, MANDARIN)
+    assert not output.exists()
+
+
+def test_files_without_a_phone_lm_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "lm.npz"
+    with pytest.raises(UserError, match=r"lm\.npz"):
+        load_phone_lm(path, MANDARIN)
+    path.write_bytes(b"no archive")
+    with pytest.raises(UserError, match=r"lm\.npz"):
+        load_phone_lm(path, MANDARIN)
+    write_archive(path, {"language": np.array("mandarin"), "phones": np.array(MANDARIN.phones)})
+    with pytest.raises(UserError, match=r"no phone language model in .*lm\.npz: lm_children is"):
+        load_phone_lm(path, MANDARIN)
+
+
+def test_the_phone_lm_of_a_model_can_be_taken() -> None:
+    shipped = load_model().topology.phone_lm
+    np.testing.assert_array_equal(load_phone_lm(MODEL_PATH, MANDARIN).log_prob, shipped.log_prob)
+
+
+def test_another_language_needs_no_other_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install_language(tmp_path, "toy", "tests.toy_language")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    text = written(tmp_path / "a.txt", "Mami o, mama. moxxx 5 uy\n" * 20)
+    output = tmp_path / "l.npz"
+    arguments = ["phone-lm", "-o", output, "--text", text, "--language", "toy", "--order", 3]
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    toy = load_inventory("toy")
+    table = Table.of(load_phone_lm(output, toy))
+    sil, m, a, u, y = (toy.index[phone] for phone in ("sil", "m", "a", "u", "y"))
+    assert {(sil, m, a), (sil, u, y), (u, y, sil)} <= table.log_prob.keys()
+    assert (m, toy.index["o"]) not in table.log_prob  # a word that cannot be read
+    with pytest.raises(UserError, match="is for toy, not for mandarin"):
+        load_phone_lm(output, MANDARIN)
+    load_inventory.cache_clear()
+
+
+def test_n_grams_must_fit_into_64_bits() -> None:
+    with pytest.raises(UserError, match="order 11 is too high for 60 phones"):
+        estimate_phone_lm([wandering()], MANDARIN, order=11)
+
+
+@pytest.mark.parametrize("option", ["--ngrams", "--dictionary"])
+def test_n_grams_and_dictionary_belong_together(option: str, tmp_path: Path) -> None:
+    arguments = ["phone-lm", "-o", str(tmp_path / "l.npz"), option, str(tmp_path / "file")]
+    result = CliRunner().invoke(app, arguments)
+    assert isinstance(result.exception, UserError)
+    assert "belong together" in str(result.exception)
+
+
+def test_the_command_writes_a_phone_lm(model: tuple[Path, Path], tmp_path: Path) -> None:
+    text = written(tmp_path / "a.txt", "你好，中国人。\n")
+    output = tmp_path / "l.npz"
+    arguments = ["phone-lm", "-o", output, "--text", text, "--ngrams", model[0], "--dictionary",
+                 model[1], "--words", 200, "--order", 3]  # fmt: skip
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
+    assert len(load_phone_lm(output, MANDARIN).levels) == 5
+    refused = ["--order", 11], ["--order", 1], ["--words", 0], ["--max-ngrams", 10]
+    for option in refused:
+        result = CliRunner().invoke(app, [str(argument) for argument in (*arguments, *option)])
+        assert result.exit_code == 2
+        assert "Traceback" not in result.output

@@ -1,0 +1,1 @@
+"""Train the Gaussian mixture models."""

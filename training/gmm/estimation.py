@@ -1,0 +1,181 @@
+"""Estimate the Gaussian mixture HMMs of the recognizer from transcribed speech.
+
+Source: Li et al. 2011, section 3.1 (the model; the paper trained with HTK); the procedure is the
+HTK book's (Young et al. 2009, chapters 8 and 10): flat start, embedded re-estimation along the best
+path, Gaussian splitting with realignment, optional pauses between syllables.
+
+Path and mixtures are re-estimated in turn. While the number of components stays the same, the log
+likelihood of the data along the best path never falls:
+
+    L = sum_t log b_{s(t)}(x_t) + sum_t log a_{s(t-1) s(t)},     s = argmax L
+
+======== ================================================ =====================
+symbol   meaning                                          shape
+======== ================================================ =====================
+x        normalised features of the frames of a copy      (frames, 39)
+s        state of every frame                             (frames,)
+gamma    probability of a component in a frame            (frames, mixtures)
+======== ================================================ =====================
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import Topology
+from services.recognizer.acoustic.gmm import GaussianMixtures
+from services.recognizer.front_end.features import NUM_FEATURES
+from services.recognizer.search.forced_path import segments_of_path
+from services.recognizer.search.phone_lm import PhoneLanguageModel
+from training.durations import PhoneDurations
+from training.gmm.frames import FrameSet, Hmm
+
+_VARIANCE_FLOOR = 0.05  # relative to the variance of all speech
+_MIN_FRAMES = 8.0  # a component with fewer frames is dropped
+_BLOCK_FRAMES = 4096
+_MIN_STAY, _MAX_STAY = 0.05, 0.99
+
+
+def first_estimate(frames: FrameSet, first_state: NDArray[np.int64]) -> Hmm:
+    """Estimate one Gaussian per state from the flat start."""
+    num_states = int(first_state[-1])
+    half = np.full(num_states, np.log(0.5), np.float32)
+    overall = frames.features.var(axis=0)
+    mean_of_all = frames.features.mean(axis=0)
+    blank = GaussianMixtures(
+        weights=np.ones((num_states, 1), np.float32),
+        means=np.tile(mean_of_all, (num_states, 1, 1)).astype(np.float32),
+        covars=np.tile(overall, (num_states, 1, 1)).astype(np.float32),
+    )
+    hmm = Hmm(first_state=first_state, log_stay=half, log_leave=half.copy(), mixtures=blank)
+    return estimate(frames, hmm)
+
+
+def variance_floor(frames: FrameSet) -> NDArray[np.float32]:
+    """Lowest variance of a component, shape (39,)."""
+    floor: NDArray[np.float32] = _VARIANCE_FLOOR * frames.features.var(axis=0)
+    return floor
+
+
+def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
+    """Re-estimate along the current path by expectation-maximisation (HTK book, eq. 8.6-8.13)."""
+    floor = variance_floor(frames)
+    mixtures = hmm.mixtures
+    weights, means, covars = mixtures.weights.copy(), mixtures.means.copy(), mixtures.covars.copy()
+    # With the path fixed, states are independent: each one runs all its iterations in turn.
+    for state, numbers in enumerate(frames.by_state(hmm.num_states)):
+        if len(numbers) < _MIN_FRAMES:
+            continue
+        x = frames.features[numbers]
+        design = np.concatenate([x * x, x, np.ones((len(x), 1), np.float32)], axis=1)
+        one = slice(state, state + 1)
+        for _ in range(num_iterations):
+            now = GaussianMixtures(weights=weights[one], means=means[one], covars=covars[one])
+            sums = _component_sums(design, now.score_matrix(), frames.weights[numbers])
+            counts = sums[:, -1]
+            kept = counts > 0
+            safe = np.maximum(counts, 1e-9)[:, None]
+            mean = sums[:, NUM_FEATURES:-1] / safe
+            covar = np.maximum(sums[:, :NUM_FEATURES] / safe - mean**2, floor)
+            means[state, kept] = mean[kept]
+            covars[state, kept] = covar[kept]
+            weights[state] = counts / counts.sum()
+    log_stay, log_leave = _transitions(frames, hmm)
+    return replace(
+        hmm,
+        log_stay=log_stay,
+        log_leave=log_leave,
+        mixtures=GaussianMixtures(weights=weights, means=means, covars=covars),
+    )
+
+
+def _component_sums(
+    design: NDArray[np.float32], matrix: NDArray[np.float32], weights: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Sum [x^2, x, 1] over a state's frames, weighted by gamma, shape (mixtures, 79)."""
+    sums = np.zeros((matrix.shape[1], design.shape[1]))
+    for start in range(0, len(design), _BLOCK_FRAMES):  # blocks keep single precision exact enough
+        block = design[start : start + _BLOCK_FRAMES]
+        gamma = block @ matrix
+        gamma -= gamma.max(axis=1, keepdims=True)
+        np.exp(gamma, out=gamma)
+        gamma *= (weights[start : start + _BLOCK_FRAMES] / gamma.sum(axis=1))[:, None]
+        sums += gamma.T @ block
+    return sums
+
+
+def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Estimate log_stay and log_leave from the paths."""
+    occupied = np.full(hmm.num_states, 2.0)
+    left = np.full(hmm.num_states, 1.0)
+    for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
+        if len(path) == 0:
+            continue
+        weight = float(frames.weights[frames.bounds[number]])
+        np.add.at(occupied, graph.states[path], weight)
+        ends = np.append(np.flatnonzero(np.diff(path)), len(path) - 1)
+        np.add.at(left, graph.states[path[ends]], weight)
+    stay = np.clip(1 - left / occupied, _MIN_STAY, _MAX_STAY)
+    return np.log(stay).astype(np.float32), np.log(1 - stay).astype(np.float32)
+
+
+def split(hmm: Hmm, frames: FrameSet, num_mixtures: int) -> Hmm:
+    """Split the heaviest components until every state has ``num_mixtures`` (HTK book, 10.6).
+
+    States with little data keep fewer; their missing components have weight 0.
+    """
+    mixtures = hmm.mixtures
+    num_states, had, _ = mixtures.means.shape
+    weights = np.zeros((num_states, num_mixtures), np.float32)
+    means = np.zeros((num_states, num_mixtures, NUM_FEATURES), np.float32)
+    covars = np.ones((num_states, num_mixtures, NUM_FEATURES), np.float32)
+    weights[:, :had], means[:, :had], covars[:, :had] = (
+        mixtures.weights,
+        mixtures.means,
+        mixtures.covars,
+    )
+    counts = np.array([frames.weights[n].sum() for n in frames.by_state(num_states)])
+    for state in range(num_states):
+        _drop_light(weights[state], counts[state])
+        while True:
+            unused = np.flatnonzero(weights[state] == 0)
+            heaviest = int(weights[state].argmax())
+            if len(unused) == 0 or weights[state, heaviest] * counts[state] < 4 * _MIN_FRAMES:
+                break
+            free = int(unused[0])
+            step = 0.2 * np.sqrt(covars[state, heaviest])
+            weights[state, heaviest] /= 2
+            weights[state, free] = weights[state, heaviest]
+            covars[state, free] = covars[state, heaviest]
+            means[state, free] = means[state, heaviest] + step
+            means[state, heaviest] -= step
+    return replace(hmm, mixtures=GaussianMixtures(weights=weights, means=means, covars=covars))
+
+
+def _drop_light(weights: NDArray[np.float32], count: float) -> None:
+    """Set the weights of components with too few frames to 0, in place."""
+    light = weights * count < _MIN_FRAMES
+    light[weights.argmax()] = False
+    weights[light] = 0
+    weights /= weights.sum()
+
+
+def topology_of(hmm: Hmm, phone_lm: PhoneLanguageModel, frames: FrameSet) -> Topology:
+    """Make the model's topology, with phone durations measured on the alignment."""
+    durations = PhoneDurations(phone_lm.inventory)
+    for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
+        if len(path):
+            weight = float(frames.weights[frames.bounds[number]])
+            durations.add(segments_of_path(path, graph), weight)
+    mean_s, spread_s = durations.mean_and_spread_s()
+    return Topology(
+        phone_lm=phone_lm,
+        first_state=hmm.first_state,
+        log_stay=hmm.log_stay,
+        log_leave=hmm.log_leave,
+        duration_mean_s=mean_s,
+        duration_spread_s=spread_s,
+    )

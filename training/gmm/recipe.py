@@ -1,0 +1,174 @@
+"""From corpora to a model file with its card: the Gaussian mixture recognizer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.speech_corpus import RowErrors, is_synthetic
+from services.recognizer.acoustic.gmm import GmmModel
+from services.recognizer.front_end.features import NUM_FEATURES, cepstra_of_all
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory
+from training import SYNTHETIC_WEIGHT
+from training.gmm.augmentation import Augmentation
+from training.gmm.decorrelation import decorrelate
+from training.gmm.estimation import estimate, first_estimate, split, topology_of
+from training.gmm.frames import Copy, FrameSet, Hmm
+from training.model_card import write_card
+from training.phone_lm.recipe import load_phone_lm, phone_lm_of
+from training.progress import Report
+from training.search_weights import SearchWeights, choose_search_weights
+from training.training_set import Example, load_examples
+
+_STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
+_HALF_WIDTH = 2  # frames, of the differences: the textbook's
+_FLAT_START_STEP = 4  # the flat start takes every fourth copy
+_FLAT_START_ITERATIONS = 4
+_DECORRELATED_AT = 8  # mixtures per state when the features are decorrelated
+_MIN_SENTENCE_SYLLABLES = 4  # a real recording with fewer syllables is a word
+_SENTENCE_COPIES = 3
+_WORD_WEIGHT = 0.3
+_MIN_COPY_WEIGHT = 0.5  # recordings of lower weight are sampled instead
+_UNTUNED = SearchWeights(acoustic_scale=0.2, phone_penalty=-1.0)
+_MEAN_RECORDINGS = 500  # for the mean of the cepstra
+
+
+def train_gmm(
+    corpora: Sequence[Path],
+    output: Path,
+    inventory: PhoneInventory,
+    *,
+    seed: int = 0,
+    phone_lm: Path | None = None,
+    num_mixtures: int = 32,
+    synthetic_weight: float = SYNTHETIC_WEIGHT,
+    shipping: bool = True,
+    report: Report = print,
+) -> None:
+    """Train the Gaussian mixture recognizer and write the model and its card.
+
+    Parameters
+    ----------
+    corpora
+        Folders that :func:`corpora.speech_corpus.read_corpus` reads; splits ``train`` and ``dev``.
+    output
+        The ``.npz`` file to write; the card is written beside it as ``.md``.
+    inventory
+        The corpora's language.
+    seed
+        Seed of the augmentation.
+    phone_lm
+        A file of :func:`training.phone_lm.recipe.train_phone_lm`; without it the phone language
+        model is estimated from the corpora's texts.
+    num_mixtures
+        Gaussians per state, a power of two.
+    synthetic_weight
+        Weight of synthetic relative to real speech.
+    shipping
+        Leave out rows whose licence forbids giving the model away.
+    report
+        Receives lines of progress.
+
+    Raises
+    ------
+    UserError
+        If there is nothing to train on, or the number of mixtures is no power of two.
+    """
+    if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
+        raise UserError(f"{num_mixtures} mixtures are no power of two; give 1, 2, 4, 8, 16...")
+    errors = RowErrors()
+    examples = load_examples(
+        corpora, errors, inventory, shipping=shipping, synthetic_weight=synthetic_weight
+    )
+    lm = load_phone_lm(phone_lm, inventory) if phone_lm else phone_lm_of(examples, inventory)
+    rng = np.random.default_rng(seed)
+    copies = [copy for example in examples for copy in _copies(example, rng)]
+    report(f"{len(examples)} recordings, {len(copies)} copies with augmentation")
+    first_state = np.arange(len(inventory) + 1) * _STATES_PER_PHONE
+    prior_mean = _mean_cepstra(examples)
+
+    flat_start = FrameSet.build(
+        copies[::_FLAT_START_STEP], inventory, first_state, prior_mean, _HALF_WIDTH
+    )
+    hmm = first_estimate(flat_start, first_state)
+    for _ in range(_FLAT_START_ITERATIONS):
+        report(f"flat start: log likelihood {flat_start.realign(hmm):.3f} per frame")
+        hmm = estimate(flat_start, hmm)
+    frames = FrameSet.build(copies, inventory, first_state, prior_mean, _HALF_WIDTH)
+    hmm, rotation = _train_mixtures(frames, hmm, num_mixtures, report)
+    model = GmmModel(
+        topology=topology_of(hmm, lm, frames),
+        mixtures=hmm.mixtures,
+        rotation=rotation,
+        prior_mean=prior_mean,
+        half_width=_HALF_WIDTH,
+    )
+
+    chosen = choose_search_weights(model, corpora, shipping=shipping, report=report)
+    (chosen or _UNTUNED).applied_to(model).save(output)
+    write_card(
+        output,
+        title=f"Gaussian mixture recognizer, {num_mixtures} mixtures in each of "
+        f"{len(inventory)} x {_STATES_PER_PHONE} states",
+        details=f"seed {seed}, synthetic weight {synthetic_weight:.2f}",
+        examples=examples,
+        errors=errors,
+        chosen=chosen,
+    )
+    errors.print_to(report)
+
+
+def _train_mixtures(
+    frames: FrameSet, hmm: Hmm, num_mixtures: int, report: Report
+) -> tuple[Hmm, NDArray[np.float32]]:
+    """Double the mixtures step by step; return the model and the rotation of the features."""
+    rotation = np.eye(NUM_FEATURES, dtype=np.float32)
+    report(f"1 mixture: log likelihood {frames.realign(hmm):.3f} per frame")
+    hmm = estimate(frames, hmm, 3)
+    size = 1
+    while size < num_mixtures:
+        size *= 2
+        hmm = estimate(frames, split(hmm, frames, size), 5)
+        if size == min(_DECORRELATED_AT, num_mixtures):
+            hmm, rotation = decorrelate(frames, hmm)
+            hmm = estimate(frames, hmm, 3)
+            report(f"{size} mixtures: log likelihood {frames.realign(hmm):.3f} per frame")
+            hmm = estimate(frames, hmm, 3)
+    return hmm, rotation
+
+
+def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
+    """Make the copies of a recording: three of a real sentence, one of anything else.
+
+    The first copy is augmented in half of the cases, all others always. Isolated words
+    and syllables have a lower weight. Low-weight recordings are sampled less often.
+    """
+    num_copies, weight = 1, example.weight
+    if not is_synthetic(example.licence):
+        if len(example.syllables) >= _MIN_SENTENCE_SYLLABLES:
+            num_copies = _SENTENCE_COPIES
+        else:
+            weight *= _WORD_WEIGHT
+    if weight < _MIN_COPY_WEIGHT:
+        num_copies = int(rng.random() < weight / _MIN_COPY_WEIGHT)
+        weight = _MIN_COPY_WEIGHT
+    copies = []
+    for number in range(num_copies):
+        is_augmented = number > 0 or rng.random() < 0.5
+        copies.append(Copy(example, weight, Augmentation.draw(rng) if is_augmented else None))
+    return copies
+
+
+def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
+    """Mean cepstra of the recordings, shape (13,)."""
+    step = max(1, len(examples) // _MEAN_RECORDINGS)
+    means = [
+        cepstra_of_all(example.log_mel.astype(np.float32)).mean(axis=0)
+        for example in examples[::step]
+    ]
+    mean: NDArray[np.float32] = np.mean(means, axis=0, dtype=np.float32)
+    return mean

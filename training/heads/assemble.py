@@ -1,0 +1,323 @@
+"""Put a head together.
+
+Every head is a shape of one mesh. Zones, texture, teeth, tongue and hair are laid out by hand on
+the reference head, in dm, and carried over to the same vertices of the other heads.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import interpolate
+
+from services.driver.head import surface
+from training.heads import paint, paint_parts, parts
+from training.heads.asset import Piece, write
+from training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
+from training.heads.feature_points import FEATURE_POINTS
+from training.heads.makehuman import PIVOT, MakeHuman
+from training.heads.measures import (
+    eye_sockets,
+    head_weight,
+    lip_outline,
+    measure_fapu,
+    mouth_cavity,
+    neckline_height,
+)
+from training.heads.occlusion import shade
+from training.heads.people import REFERENCE, Person, Shape
+from training.heads.texture import encode
+from training.heads.zones import (
+    FaceFields,
+    Fields,
+    Skin,
+    close_lips,
+    subdivided,
+)
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LOWEST = 3.4  # dm, where the bust ends
+# the front edge of the left upper eyelid, from the nose outwards
+LEFT_LID = (6886, 6844, 6841, 6838, 6785, 6784, 6790, 6793, 6796, 6799)
+LEFT_LOWER_LID = (
+    6886, 6850, 6853, 6856, 6837, 11695, 6834, 6831, 6828, 6825, 6820, 6817, 6814, 6808
+)  # fmt: skip
+
+
+class Builder:
+    """Makes heads out of MakeHuman's data."""
+
+    def __init__(self, source: MakeHuman) -> None:
+        self._source = source
+        self._mesh = mesh = source.base_mesh()
+        self._plain = self._shaped(*REFERENCE)
+        middle = self._plain[mesh.quads].mean(axis=1)
+        body = mesh.group("body")
+        is_socket = np.isin(mesh.quads, eye_sockets(mesh)).all(axis=1) & (middle[:, 2] < 1.1)
+        above = middle[:, 1] - neckline_height(middle[:, 2])
+        self._face = mesh.quads[body & (above > -0.3) & (middle[:, 1] > 4.0) & ~is_socket]
+        self._torso = mesh.quads[body & (middle[:, 1] > LOWEST) & (abs(middle[:, 0]) < 2.6)]
+        self._tongue = subdivided(self._plain, mesh.quads[mesh.group("helper-tongue")])
+        self._layout = subdivided(self._plain, self._face).vertices
+        self._cavity = mouth_cavity(mesh, subdivided(self._plain, self._face))
+        self.reference = self._skin(self._plain)
+        self._map = self._face_map()
+
+    def _shaped(self, targets: Shape, face_units: Shape) -> Float:
+        """Shape the mesh (19158, 3) and move its pivot to where all have it."""
+        vertices = self._mesh.vertices.copy()
+        for name, amount in targets:
+            vertices += amount * self._source.target(name)
+        for name, amount in face_units:
+            vertices += amount * self._source.face_unit(name)
+        joint = np.unique(self._mesh.quads[self._mesh.group("joint-head")])
+        shaped: Float = vertices - vertices[joint].mean(axis=0) + PIVOT
+        return shaped
+
+    def _skin(self, vertices: Float) -> Skin:
+        """Make the skin, with room for hair and mouth, and the lips closed."""
+        skin = subdivided(vertices, self._face)
+        x, y, z = self._layout.T
+        top = np.clip((y - 6.48) / 0.15, 0, 1)
+        normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
+        # the mouth's lining keeps away from its corners
+        corner = np.clip((np.abs(x) - 0.13) / 0.05, 0, 1) * (z > 1.0) * self._cavity
+        skin.vertices[:] -= 0.05 * top[:, None] * normals + 0.012 * corner[:, None] * [0, 0, 1]
+        close_lips(skin)
+        return skin
+
+    def build(self, person: Person, output: Path) -> None:
+        """Make a head and write it to ``output``."""
+        vertices = self._shaped(person.targets, person.face_units)
+        skin = self._skin(vertices)
+        fapu = measure_fapu(skin, vertices, self._mesh)
+        face = self._face_fields(fapu)
+        pieces = [
+            self._skin_piece(skin, person, face),
+            self._garment(vertices),
+            *eye_pieces(vertices, self._mesh, fapu),
+            *self._mouth_pieces(skin, fapu),
+            *self._hair(skin, person),
+            self._lashes(skin, face, person.lashes),
+        ]
+        shade(pieces, self.reference.vertices, self._cavity, person.hair)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write(output, pieces, self._textures(person), skin, self._tongue, fapu)
+
+    def measured(
+        self,
+    ) -> tuple[dict[int, tuple[Float, Float]], dict[str, Float], dict[str, Float]]:
+        """Compare the reference head's fields with MakeHuman's face units, in dm.
+
+        Returns
+        -------
+        By FAP, its field at 1 FAPU over the outer face (V, 3) and on the lower front teeth (3,);
+        by face unit, its displacements there (V, 3) and (3,).
+        """
+        skin, mesh = self.reference, self._mesh
+        outer = ~self._cavity & (skin.vertices[:, 2] > PIVOT[2] + 0.2)
+        fapu = measure_fapu(skin, self._plain, mesh)
+        own = teeth_pieces(fapu)[1]
+        tooth = parts.middle_of_teeth(own.part)[0]
+        still = np.zeros_like(own.part.vertices)
+        faps = {
+            fap: (field[outer], own.fields.get(fap, still)[tooth])
+            for fap, field in self._face_fields(fapu).items()
+        }
+        teeth = np.unique(mesh.quads[mesh.group("helper-lower-teeth")])
+        front = teeth[np.argsort(-self._plain[teeth, 2])[:8]]
+        units = {name: self._source.face_unit(name) for name in self._source.face_units()}
+        return (
+            faps,
+            {name: skin.carry(unit)[outer] for name, unit in units.items()},
+            {name: unit[front].mean(axis=0) for name, unit in units.items()},
+        )
+
+    def _face_fields(self, fapu: dict[str, float]) -> Fields:
+        """Fields of the skin."""
+        blink, squint = (
+            (self._carried(unit + "Left"), self._carried(unit + "Right"))
+            for unit in ("eyeBlink", "eyeSquint")
+        )
+        return FaceFields(self.reference, self._cavity, blink, squint, fapu).fields
+
+    def _carried(self, unit: str) -> Float:
+        """Displacements (V, 3) of the skin by a face unit."""
+        return self.reference.carry(self._source.face_unit(unit))
+
+    def _skin_piece(self, skin: Skin, person: Person, fields: Fields) -> Piece:
+        layout = self.reference.vertices
+        covered = person.hair.hidden(layout) & ~self._cavity
+        covered |= layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
+
+        def seen(quads: Index) -> Index:
+            triangles = surface.triangles_of(quads)
+            shown: Index = triangles[~covered[triangles].all(axis=1)]
+            return shown
+
+        part = parts.Part(
+            skin.vertices, seen(skin.quads), paint.skin_uv(layout), np.ones_like(layout)
+        )
+        return Piece(
+            "skin",
+            part,
+            "skin",
+            0.55,
+            skin.matrix @ head_weight(self._source)[skin.base],
+            fields,
+            coarse_vertices=len(skin.base),
+            coarse_triangles=seen(skin.coarse_quads),
+        )
+
+    def _garment(self, vertices: Float) -> Piece:
+        """Make a round-necked top: the torso, a little larger, cut off round the neck."""
+        torso = subdivided(vertices, self._torso)
+        layout = subdivided(self._plain, self._torso).vertices
+        triangles = surface.triangles_of(torso.quads)
+        normals = surface.vertex_normals(torso.vertices, triangles)
+        height = layout[:, 1] - neckline_height(layout[:, 2])
+        cut, triangles, rim = surface.clip(height, triangles, np.hstack([torso.vertices, normals]))
+        points, normals = cut[:, :3], cut[:, 3:]
+        # the edge is folded in towards the neck
+        ring, local = np.unique(rim, return_inverse=True)
+        local = local.reshape(rim.shape)
+        folds = [
+            points[ring] + out * normals[ring] + [0, up, 0]
+            for out, up in ((0.034, 0.012), (0.020, 0.014), (0.002, -0.03))
+        ]
+        strips = []
+        before = rim
+        for step in range(len(folds)):
+            after = local + len(points) + step * len(ring)
+            strips += [
+                np.stack([before[:, 1], before[:, 0], after[:, 0]], axis=1),
+                np.stack([before[:, 1], after[:, 0], after[:, 1]], axis=1),
+            ]
+            before = after
+        everything = np.concatenate([points + 0.034 * normals, *folds])
+        used, compact = np.unique(np.concatenate([triangles, *strips]), return_inverse=True)
+        everything = everything[used]
+        part = parts.Part(
+            everything,
+            compact.reshape(-1, 3),
+            np.full((len(everything), 2), 0.5),
+            np.ones_like(everything),
+        )
+        return Piece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
+
+    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float]) -> list[Piece]:
+        """Teeth and tongue, which keep their place behind the lips."""
+        lips = ("2.2", "2.3")
+        middle, wanted = (
+            whose.vertices[whose.points(*lips)].mean(axis=0) for whose in (self.reference, skin)
+        )
+        corners = self.reference.points("8.3", "8.4")
+        size = np.ptp(skin.vertices[corners, 0]) / np.ptp(self.reference.vertices[corners, 0])
+        pieces = [*teeth_pieces(fapu), tongue_piece(self._tongue, fapu)]
+        for piece in pieces:
+            piece.part.vertices = (piece.part.vertices - middle) * size + wanted
+        return pieces
+
+    def _hair(self, skin: Skin, person: Person) -> list[Piece]:
+        """Make the hair and let it follow the skin under it."""
+        layout = self.reference.vertices
+        outer = np.flatnonzero((layout[:, 1] > 4.7) & ~self._cavity)[::5]
+        warp = interpolate.RBFInterpolator(
+            layout[outer], skin.vertices[outer] - layout[outer], neighbors=60, smoothing=1e-3,
+            kernel="linear",
+        )  # fmt: skip
+        pieces = []
+        for name, part in person.hair.parts(layout).items():
+            part.vertices = part.vertices + warp(part.vertices)
+            pieces.append(Piece(name, part, "hair", 0.7, np.ones(len(part.vertices))))
+        return pieces
+
+    def _lashes(self, skin: Skin, fields: Fields, length: float) -> Piece:
+        """Grow two ribbons of lashes out of the edges of the upper eyelids."""
+        columns, rows = 25, 4
+        layout = self.reference.vertices[: len(skin.base)]
+        pieces = []
+        moved: list[Fields] = []
+        for side in (1.0, -1.0):
+            lid = skin.number[np.array(LEFT_LID)]
+            if side < 0:
+                mirror = layout[lid] * [-1, 1, 1]
+                lid = np.array([np.argmin(((layout - p) ** 2).sum(1)) for p in mirror])
+            edge = skin.vertices[lid]
+            walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))])
+            at = np.linspace(0.06, 1.0, columns) * walked[-1]
+            root = interpolate.make_interp_spline(walked, edge, 3)(at)
+            sideways = (np.linspace(-0.55, 1.0, columns) * side)[:, None] * [1.0, 0, 0]
+            out = np.array([0.0, 0.0, 1.0]) + 0.75 * sideways
+            grow = np.sin(np.pi * np.linspace(0.12, 0.80, columns))[:, None] * 0.060 * length
+            ribbon = [
+                root
+                + grow * (t * out * 0.85 + np.array([0.0, 1.0, 0.0]) * (0.75 * t**2 - 0.10 * t))
+                for t in np.linspace(0, 1, rows)
+            ]
+            points = np.concatenate(ribbon)
+            uv = np.stack(
+                [
+                    np.tile(np.linspace(0, 1, columns), rows),
+                    np.repeat(np.linspace(1, 0, rows), columns),
+                ],
+                axis=1,
+            )
+            triangles = parts.grid_triangles(rows, columns)
+            pieces.append(parts.Part(points, triangles, uv, np.ones_like(points)))
+            moved.append(
+                {
+                    fap: np.tile(
+                        interpolate.make_interp_spline(walked, shift[lid], 3)(at), (rows, 1)
+                    )
+                    for fap, shift in fields.items()
+                    if np.abs(shift[lid]).max() > 1e-6
+                }
+            )
+        left, right = pieces
+        count = len(left.vertices)
+        part = parts.Part(
+            np.concatenate([left.vertices, right.vertices]),
+            np.concatenate([left.triangles, right.triangles + count]),
+            np.concatenate([left.uv, right.uv]),
+            np.ones((2 * count, 3)),
+        )
+        both: Fields = {}
+        for half, own in enumerate(moved):
+            for fap, shift in own.items():
+                whole = both.setdefault(fap, np.zeros((2 * count, 3)))
+                whole[half * count : (half + 1) * count] = shift
+        return Piece("lashes", part, "lashes", 0.9, np.ones(2 * count), both)
+
+    def _face_map(self) -> paint.FaceMap:
+        """Lay the texture of the skin out on the reference head."""
+        skin = self.reference
+        uv = paint.skin_uv(skin.vertices)
+        normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
+        outward = skin.vertices - [0, 0, paint.AXIS_Z]
+        outward[:, 1] = 0
+        outer = ((normals * outward).sum(axis=1) > 0) & (skin.vertices[:, 0] > -1e-6)
+        outer &= ~self._cavity
+        return paint.face_map(skin.vertices[outer], uv[outer])
+
+    def _textures(self, person: Person) -> dict[str, bytes]:
+        look, plain = person.look, self._plain
+        brow = plain[[FEATURE_POINTS[name] for name in ("4.1", "4.3", "4.5")]][:, :2]
+        upper, lower = (plain[np.array(edge)] for edge in (LEFT_LID, LEFT_LOWER_LID))
+        low = np.interp(upper[:, 0], lower[:, 0], lower[:, 1])
+        lid = np.stack([upper[:, 0], upper[:, 1], low], axis=1)
+        lips = lip_outline(self.reference)
+        return {
+            "skin": encode(paint.skin(self._map, brow, lid, lips, look, person.hair)),
+            "eye": encode(paint_parts.eye()),
+            "teeth_upper": encode(paint_parts.teeth(parts.UPPER_TEETH)),
+            "teeth_lower": encode(paint_parts.teeth(parts.LOWER_TEETH)),
+            "tongue": encode(paint_parts.tongue()),
+            "cloth": encode(paint_parts.cloth(look.cloth)),
+            "hair": encode(paint_parts.hair(look.hair, person.hair)),
+            "lashes": encode(paint_parts.lashes()),
+        }

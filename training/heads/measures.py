@@ -1,0 +1,98 @@
+"""Places and sizes on a head, found on the mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.heads.feature_points import FEATURE_POINTS
+from training.heads.makehuman import BaseMesh, MakeHuman
+from training.heads.zones import Skin
+
+Float = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# the left half of the lips' outline, from 8.1 over 8.3 to 8.2
+LIP_OUTLINE = (
+    455, 7214, 7210, 7215, 7169, 11956, 7170, 7171, 7168, 7167, 10405, 7162, 7163, 10370, 7164,
+    7165, 7166, 7235, 7241, 492,
+)  # fmt: skip
+_TORSO = ("spine", "clavicle", "shoulder", "upperarm", "breast", "root", "pelvis")
+
+
+def eye_centres(vertices: Float, mesh: BaseMesh) -> Float:
+    """Centres of the left and the right eyeball (2, 3)."""
+    centres = []
+    for group in ("helper-l-eye", "helper-r-eye"):
+        around = vertices[np.unique(mesh.quads[mesh.group(group)])]
+        centres.append((around.max(axis=0) + around.min(axis=0)) / 2)
+    return np.array(centres)
+
+
+def eye_radius(vertices: Float, mesh: BaseMesh) -> float:
+    """Radius of an eyeball that stays behind the eyelids, dm."""
+    around = vertices[np.unique(mesh.quads[mesh.group("helper-l-eye")])]
+    return 0.988 * float(np.ptp(around[:, 0])) / 2
+
+
+def measure_fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float]:
+    """Measure the face in the units of the standard, in dm."""
+
+    def at(name: str) -> Float:
+        place: Float = skin.vertices[skin.point(name)]
+        return place
+
+    left, right = eye_centres(vertices, mesh)
+    return {
+        "MNS": at("9.15")[1] - at("2.2")[1],
+        "MW": at("8.3")[0] - at("8.4")[0],
+        "ENS": left[1] - at("9.15")[1],
+        "ES": left[0] - right[0],
+        "IRISD": at("3.1")[1] - at("3.3")[1],
+    }
+
+
+def mouth_cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
+    """Find the vertices that line the mouth: they have a texture island of their own."""
+    islands = mesh.uv[mesh.uv_quads].max(axis=1)
+    lining = mesh.group("body") & (islands[:, 1] < 0.137) & (islands[:, 0] > 0.7)
+    is_lining = np.zeros(len(mesh.vertices))
+    is_lining[mesh.quads[lining]] = 1.0
+    cavity: NDArray[np.bool_] = skin.matrix @ is_lining[skin.base] > 0.5
+    return cavity
+
+
+def eye_sockets(mesh: BaseMesh) -> Index:
+    """Vertices of the two bags behind the eyelids, which have texture islands of their own."""
+    islands = mesh.uv_quads[mesh.group("body")]
+    inside = (mesh.uv[islands].max(axis=(1, 2)) < 0.64) & (mesh.uv[islands][..., 0].max(1) < 0.152)
+    return np.unique(mesh.quads[mesh.group("body")][inside])
+
+
+def neckline_height(z: Float) -> Float:
+    """Height of the garment's edge round the neck."""
+    return 4.50 - 0.30 * z
+
+
+def head_weight(source: MakeHuman) -> Float:
+    """Share of the head's turn for every vertex of the base mesh: it fades down the neck."""
+    weight = np.ones(19158)
+    for bone, share in (("neck03", 0.25), ("neck02", 0.55), ("neck01", 0.85)):
+        weight -= share * source.bone_weights(bone)
+    for bone in source.bones():
+        if bone.startswith(_TORSO):
+            weight -= source.bone_weights(bone)
+    np.clip(weight, 0, 1, out=weight)
+    return weight
+
+
+def lip_outline(skin: Skin) -> Float:
+    """Outlines of the lips (N, 3) from the middle outwards: x, upper and lower height, dm."""
+    corner = LIP_OUTLINE.index(FEATURE_POINTS["8.3"])
+    upper, lower = (
+        skin.vertices[skin.number[np.array(half)]]
+        for half in (LIP_OUTLINE[: corner + 1], LIP_OUTLINE[: corner - 1 : -1])
+    )
+    x = upper[:, 0]
+    order = np.argsort(lower[:, 0])
+    return np.stack([x, upper[:, 1], np.interp(x, lower[order, 0], lower[order, 1])], axis=1)

@@ -1,0 +1,273 @@
+"""Bake the skin into a texture.
+
+The two halves of the face share one texture: its columns count the angle round a vertical axis
+inside the head (0 in front, pi behind), its rows the height. Colours are sRGB, 0 to 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import interpolate, ndimage, spatial
+
+from training.heads.hair import Hair
+from training.heads.texture import Color, mix, noise
+
+Float = NDArray[np.float64]
+
+AXIS_Z = 0.35  # dm, of the vertical axis the angle is counted about
+TOP_Y, BOTTOM_Y = 6.85, 4.15  # dm
+SKIN_SIZE = (1280, 832)  # rows, columns
+_ANGLES = np.radians([0.0, 70.0, 110.0, 180.0])
+_COLUMNS = np.array([0.0, 0.80, 0.92, 1.0])
+
+
+def skin_uv(vertices: Float) -> Float:
+    """Texture coordinates (V, 2) of points (V, 3)."""
+    angle = np.abs(np.arctan2(np.abs(vertices[:, 0]), vertices[:, 2] - AXIS_Z))
+    u = np.interp(angle, _ANGLES, _COLUMNS)
+    v = (TOP_Y - vertices[:, 1]) / (TOP_Y - BOTTOM_Y)
+    uv: Float = np.clip(np.stack([u, v], axis=1), 0.0, 1.0)
+    return uv
+
+
+@dataclass(frozen=True, slots=True)
+class FaceMap:
+    """Where the texels of the skin lie on the neutral face."""
+
+    x: Float  # (H, W) dm, distance from the middle plane
+    y: Float
+    z: Float
+    angle: Float
+
+
+def face_map(vertices: Float, uv: Float) -> FaceMap:
+    """Carry positions from the outer skin's vertices to the texels."""
+    rows, columns = SKIN_SIZE
+    v, u = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
+    )
+    values = np.abs(vertices)
+    nearest = interpolate.NearestNDInterpolator(uv, values)
+    linear = interpolate.LinearNDInterpolator(uv, values)(u, v)
+    values = np.where(np.isfinite(linear), linear, nearest(u, v))
+    # points that a fold hides under others leave specks
+    values = ndimage.median_filter(values, (9, 9, 1))
+    values = ndimage.gaussian_filter(values, (2, 2, 0))
+    return FaceMap(
+        x=values[..., 0],
+        y=TOP_Y - v * (TOP_Y - BOTTOM_Y),
+        z=values[..., 2],
+        angle=np.interp(u, _COLUMNS, _ANGLES),
+    )
+
+
+def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
+    """Soft spot (H, W) of height 1 at a place of the face."""
+    spot: Float = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
+    return spot
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Colours (sRGB) and how strongly they are laid on."""
+
+    skin: Color = (0.890, 0.725, 0.625)
+    lip: Color = (0.720, 0.405, 0.385)
+    lip_strength: float = 0.80
+    hair: Color = (0.135, 0.105, 0.095)
+    brow: Color = (0.23, 0.165, 0.14)
+    brow_width: float = 1.0
+    brow_strength: float = 1.0
+    blush: float = 1.0
+    stubble: float = 0.0
+    age: float = 0.0  # wrinkles and spots
+    cloth: Color = (0.20, 0.29, 0.38)
+
+
+def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: Hair) -> Float:
+    """Paint the skin.
+
+    Parameters
+    ----------
+    face
+        Where the texels lie.
+    brow
+        Middle line of a brow from the nose outwards (3, 2), x and y in dm.
+    lid
+        Edges of the eyelids from the nose outwards (N, 3): x, height of the upper and of the lower
+        one in dm.
+    lips
+        From the middle outwards (N, 3): x, height of the upper and of the lower outline in dm.
+    look, hair
+        Whose skin it is.
+
+    Returns
+    -------
+    sRGB (H, W, 3).
+    """
+    shape = face.x.shape
+    image = np.broadcast_to(np.array(look.skin), (*shape, 3)).copy()
+
+    def tone(red: float, green: float, blue: float) -> Color:
+        """Tint the skin."""
+        return red * look.skin[0], green * look.skin[1], blue * look.skin[2]
+
+    blotch = noise(shape, 26, 1)
+    # the neck is thin: there the texture is squeezed, and grain would turn into streaks
+    grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1)
+    image *= 1 + 0.010 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
+    fine = 0.010 * noise(shape, 1.1, 2) + 0.006 * noise(shape, 3.5, 3)
+    image *= 1 + (grain * fine)[..., None]
+    rosy = tone(1.01, 0.77, 0.80)
+    image = mix(image, rosy, 0.30 * look.blush * _spot(face, 0.42, 5.42, 0.20, 0.17))
+    image = mix(image, rosy, 0.16 * _spot(face, 0.0, 5.46, 0.10, 0.10))
+    image = mix(image, rosy, 0.10 * _spot(face, 0.0, 4.92, 0.16, 0.10))
+    image = mix(image, rosy, 0.20 * _spot(face, 0.76, 5.60, 0.06, 0.25) * (face.angle > 1.3))
+    image = mix(image, tone(0.90, 0.83, 0.85), 0.22 * _spot(face, 0.28, 5.70, 0.13, 0.035))
+    image = mix(image, tone(0.88, 0.79, 0.82), 0.18 * _spot(face, 0.27, 5.885, 0.14, 0.05))
+    image = mix(image, tone(1.07, 1.10, 1.12), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
+    if look.stubble:
+        image = _paint_stubble(image, face, look.stubble, tone(0.74, 0.79, 0.86), lips)
+    if look.age:
+        image = _paint_age(image, face, look.age)
+    image = _paint_lips(image, face, lips, look)
+    image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2])
+    image = _paint_brow(image, face, brow, look)
+    return np.clip(_paint_roots(image, face, look, hair), 0, 1)
+
+
+def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
+    """Grey the shaven parts of the face: upper lip, chin, jaw and sideburns."""
+    top = np.interp(
+        face.angle, [0.0, 0.30, 0.55, 0.95, 1.25, 1.45], [5.10, 5.12, 5.16, 5.28, 5.55, 5.70]
+    )
+    jaw = 1 / (1 + np.exp((face.y - top) / 0.03)) * np.clip((face.y - 4.60) / 0.25, 0, 1)
+    jaw *= np.clip((1.60 - face.angle) / 0.45, 0, 1)
+    lip = np.clip(1.1 * _spot(face, 0.10, 5.235, 0.12, 0.04), 0, 1) * (face.y < 5.32)
+    upper = np.interp(face.x, lips[:, 0], lips[:, 1])
+    lip *= np.clip((face.y - upper - 0.008) / 0.015, 0, 1)
+    soul = 1 - 0.6 * _spot(face, 0.0, 5.01, 0.20, 0.05)
+    dots = np.clip(0.75 + 0.30 * noise(face.x.shape, 0.9, 21), 0.2, 1.2)
+    return mix(image, color, amount * np.maximum(jaw * soul, lip) * dots)
+
+
+# lines of an old face as x and y in dm, and their depth: forehead, between the brows, outer corner
+# of the eye, under the eye, beside the mouth, chin
+_WRINKLES = (
+    (((0.0, 6.335), (0.15, 6.345), (0.33, 6.32)), 0.45),
+    (((0.0, 6.255), (0.20, 6.27), (0.40, 6.23)), 0.65),
+    (((0.0, 6.175), (0.20, 6.195), (0.42, 6.15)), 0.55),
+    (((0.055, 5.93), (0.050, 6.00), (0.062, 6.07)), 0.6),
+    (((0.45, 5.81), (0.51, 5.835), (0.57, 5.875)), 0.40),
+    (((0.45, 5.78), (0.52, 5.78), (0.58, 5.785)), 0.45),
+    (((0.45, 5.745), (0.50, 5.715), (0.55, 5.67)), 0.40),
+    (((0.165, 5.73), (0.25, 5.675), (0.34, 5.675), (0.41, 5.72)), 0.65),
+    (((0.19, 5.665), (0.27, 5.61), (0.36, 5.605)), 0.35),
+    (((0.195, 5.43), (0.245, 5.34), (0.285, 5.24), (0.305, 5.13)), 0.8),
+    (((0.265, 5.10), (0.285, 5.02), (0.27, 4.94)), 0.55),
+    (((0.0, 4.985), (0.08, 4.98), (0.15, 4.95)), 0.35),
+    (((0.0, 4.50), (0.20, 4.51), (0.40, 4.56)), 0.45),
+)
+
+
+def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
+    """Draw wrinkles, each a dark groove with a light rim below, and brown spots."""
+    texels = np.stack([face.x, face.y], axis=-1)
+    waver = 0.004 * noise(face.x.shape, 9, 22)
+    for points, depth in _WRINKLES:
+        line = np.array(points)
+        steps = np.linspace(0, 1, 80)
+        curve = interpolate.make_interp_spline(np.linspace(0, 1, len(line)), line, 2)(steps)
+        near = (np.abs(texels - curve.mean(axis=0)) < np.ptp(curve, axis=0) / 2 + 0.06).all(axis=-1)
+        near &= face.angle < 1.6
+        away, at = spatial.cKDTree(curve).query(texels[near])
+        above = (texels[near] - curve[at])[:, 1]
+        fade = np.sin(np.pi * np.clip(0.02 + 0.96 * steps[at], 0, 1))
+        if line[0, 0] == 0.0:  # goes on over the middle
+            fade = np.cos(np.pi / 2 * steps[at])
+        across = away + waver[near]
+        groove = np.exp(-((across / 0.009) ** 2)) + 0.45 * np.exp(-((across / 0.028) ** 2))
+        rim = np.exp(-(((away - 0.022) / 0.012) ** 2)) * (above < 0)
+        shade = amount * depth * fade
+        shaded = image[near] * (1 - shade[:, None] * groove[:, None] * [0.17, 0.24, 0.27])
+        image[near] = shaded * (1 + 0.05 * (shade * rim)[:, None])
+    spots = np.clip(noise(face.x.shape, 5, 23) - 2.3, 0, 1) * (face.angle > 0.35)
+    image = mix(image, (0.60, 0.42, 0.33), 0.55 * amount * spots)
+    return image * (1 + 0.012 * amount * noise(face.x.shape, 12, 24)[..., None])
+
+
+def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
+    """Tint what lies between the two lip outlines."""
+    upper, lower = (np.interp(face.x, lips[:, 0], lips[:, column]) for column in (1, 2))
+    upper = upper - 0.012 * np.exp(-((face.x / 0.024) ** 2))  # Cupid's bow
+    edge = 0.0065
+    inset = np.clip((lips[-1, 0] - face.x) / 0.07, 0, 1)  # none at the corner
+    inside = 1 / (1 + np.exp((face.y - upper + 0.004 * inset) / edge))
+    inside *= 1 / (1 + np.exp((lower + 0.012 * inset - face.y) / edge))
+    inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.004) / 0.006))
+    lines = noise(face.x.shape, (14, 1.8), 4)
+    color = np.array(look.lip) * (1 + 0.022 * lines[..., None])
+    image = image + (color - image) * (look.lip_strength * inside)[..., None]
+    below = _spot(face, 0.0, 5.005, 0.15, 0.024) * (1 - inside)
+    shaded: Float = image * (1 - 0.30 * below[..., None] * [0.21, 0.34, 0.33])
+    return shaded
+
+
+def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> Float:
+    """Darken the edges of the lids, where the lashes grow, and the upper lid's fold."""
+    edge = np.interp(face.x, lid[:, 0], lid[:, 1])
+    inside = 1 / (1 + np.exp(-(face.x - lid[0, 0] - 0.01) / 0.008))
+    inside *= 1 / (1 + np.exp((face.x - lid[-1, 0] - 0.02) / 0.012))
+    height = face.y - edge
+    line = np.exp(-((height / 0.011) ** 2)) * inside
+    fold = np.exp(-(((height - 0.052) / 0.010) ** 2)) * inside
+    below = np.interp(face.x, lid[:, 0], lower)
+    rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
+    image = mix(image, (0.52, 0.31, 0.28), 0.45 * rim)
+    image = mix(image, (0.16, 0.10, 0.09), 0.80 * line)
+    return mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
+
+
+def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
+    """Strokes along a spindle that follows the brow's middle line."""
+    curve = np.polynomial.Polynomial.fit(brow[:, 0], brow[:, 1], 2)
+    along = (face.x - brow[0, 0]) / (brow[-1, 0] - brow[0, 0])
+    # a calm brow: the feature points alone would have it fall outwards, which looks worried
+    across = face.y - curve(face.x) - 0.024 * (along - 0.45)
+    half = np.interp(along, [-0.05, 0.08, 0.45, 0.8, 1.05], [0.018, 0.034, 0.034, 0.022, 0.004])
+    half *= look.brow_width
+    body = np.clip(1.35 - np.abs(across) / half, 0, 1)
+    ends = np.clip((along + 0.08) / 0.16, 0, 1) * np.clip((1.06 - along) / 0.2, 0, 1)
+    # hairs lean outwards: noise that is long along sheared lines
+    shape = face.x.shape
+    fine = np.random.default_rng(5).standard_normal(shape)
+    lean = np.clip(along, 0, 1)
+    hairs = np.zeros(shape)
+    for slope, weight in ((1.6, 1 - lean), (0.35, lean)):
+        strand = _directed(fine, slope, 9)
+        hairs += weight * strand
+    hairs = np.clip(0.66 + 0.24 * hairs / hairs.std(), 0, 1)
+    amount = body * ends * hairs * (0.72 + 0.20 * np.clip(along, 0, 1))
+    return mix(image, look.brow, look.brow_strength * amount)
+
+
+def _directed(white: Float, slope: float, length: int) -> Float:
+    """Average noise along short lines, ``slope`` rows up for a column."""
+    total = np.zeros_like(white)
+    for step in np.linspace(-length, length, 2 * length + 1):
+        scale = 1.0 / np.hypot(1.0, slope)
+        total += ndimage.shift(white, (-slope * scale * step, scale * step), order=1, mode="wrap")
+    smooth: Float = ndimage.gaussian_filter(total, 0.7)
+    smooth /= smooth.std()
+    return smooth
+
+
+def _paint_roots(image: Float, face: FaceMap, look: Look, hair: Hair) -> Float:
+    """Let the hair begin on the skin."""
+    shape = face.x.shape
+    ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
+    inside = hair.roots(face.x, face.y, face.z) + ragged
+    return mix(image, look.hair, np.clip(inside + 0.3, 0, 1) ** 1.6)

@@ -1,0 +1,135 @@
+"""Paint eyes, teeth, tongue, cloth, hair and lashes. Colours are sRGB, 0 to 1."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.heads.hair import NUM_SHELLS, Bob, Hair
+from training.heads.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
+from training.heads.texture import Color, mix, noise
+
+Float = NDArray[np.float64]
+
+
+def eye(size: int = 256) -> Float:
+    """Paint an eyeball; the distance from the middle counts the angle from the pupil."""
+    place = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(place, place)
+    angle = np.hypot(x, y) * EYE_RINGS[-1]
+    turn = np.arctan2(y, x)
+    rng = np.random.default_rng(8)
+    spokes = np.zeros((size, size))
+    for frequency in (23, 41, 67, 97):
+        spokes += np.sin(frequency * turn + rng.uniform(0, 6.28) + 2 * rng.standard_normal())
+    white = np.array([0.90, 0.885, 0.87]) - 0.10 * np.clip(angle / 1.2, 0, 1)[..., None] * np.array(
+        [0.2, 1.0, 1.0]
+    )
+    image = white
+    within = np.clip((angle - PUPIL_ANGLE) / (IRIS_ANGLE - PUPIL_ANGLE), 0, 1)
+    iris = np.array([0.17, 0.105, 0.07]) * (1 + 0.08 * spokes[..., None])
+    iris = iris + np.array([0.10, 0.06, 0.035]) * (1 - np.abs(2 * within - 0.9))[..., None]
+    iris = iris + np.array([0.10, 0.06, 0.03]) * np.clip(y / 0.3, -0.4, 1)[..., None]
+    iris *= np.clip(1.25 - within**4, 0.3, 1)[..., None]
+    soft = 0.016
+    image = _mix_images(image, iris, 1 / (1 + np.exp((angle - IRIS_ANGLE) / soft)))
+    pupil = np.array([0.02, 0.016, 0.016])
+    image = _mix_images(image, pupil, 1 / (1 + np.exp((angle - PUPIL_ANGLE) / 0.010)))
+    return np.clip(image, 0, 1)
+
+
+def _mix_images(low: Float, high: Float, amount: Float) -> Float:
+    return low + (high - low) * amount[..., None]
+
+
+def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Float:
+    """Paint a row of teeth: gum at the top of the texture, cutting edge at 0.7, back below."""
+    rows, columns = size
+    v, u = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
+    )
+    bounds = np.concatenate([[0.0], np.cumsum(widths)])
+    place = np.abs(u - 0.5) * 2 * bounds[-1]
+    tooth = np.clip(np.searchsorted(bounds, place) - 1, 0, len(widths) - 1)
+    within = (place - bounds[tooth]) / np.array(widths)[tooth]
+    gap = np.minimum(within, 1 - within) * np.array(widths)[tooth]  # mm to the next tooth
+    ivory = np.array([0.965, 0.94, 0.885])
+    image = np.broadcast_to(ivory, (rows, columns, 3)).copy()
+    image *= 1 - 0.10 * (np.clip(0.45 - v, 0, 1) / 0.45)[..., None] * np.array([0.3, 0.6, 1.0])
+    image *= 1 + 0.03 * np.clip((v - 0.5) / 0.2, 0, 1)[..., None]
+    image *= (1 - 0.42 * np.exp(-((gap / 0.28) ** 2)) * (v < 0.74))[..., None]
+    arch = 0.30 - 0.16 * np.sin(np.pi * within)
+    gum = 1 / (1 + np.exp((v - arch) / 0.012))
+    image = mix(image, (0.72, 0.36, 0.36), gum)
+    return np.clip(image, 0, 1)
+
+
+def tongue(size: int = 64) -> Float:
+    """Paint the tongue."""
+    bumps = noise((size, size), 1.0, 9)[..., None]
+    return np.clip(np.array([0.72, 0.36, 0.36]) * (1 + 0.05 * bumps), 0, 1)
+
+
+def cloth(color: Color, size: int = 16) -> Float:
+    """Paint a plain knitted fabric."""
+    return np.broadcast_to(np.array(color), (size, size, 3)).copy()
+
+
+def hair(color: Color, style: Hair) -> Float:
+    """Paint strands that run down the texture and thin out (RGBA)."""
+    return _long_hair(color) if isinstance(style, Bob) else _short_hair(color)
+
+
+def _long_hair(color: Color, size: tuple[int, int] = (512, 512)) -> Float:
+    """Strands for a sheet of hair; the tips and the front edge are thin."""
+    rows, columns = size
+    v, u = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
+    )
+    strands = 0.7 * noise(size, (70, 1.2), 11) + 0.5 * noise(size, (90, 4), 12)
+    shine = np.exp(-(((v - 0.20 + 0.012 * strands) / 0.07) ** 2))
+    value = 1 + 0.22 * strands + 0.55 * shine
+    image = np.array(color) * value[..., None] + np.array([0.045, 0.03, 0.02]) * shine[..., None]
+    tips = (0.99 - v) / 0.045 + 0.35 * noise(size, (40, 1.2), 13) + 0.35 * noise(size, (40, 5), 14)
+    front = np.clip(u / 0.055, 0, 1)
+    alpha = np.clip(tips, 0, 1) * front * front * (3 - 2 * front)
+    painted: Float = np.clip(np.concatenate([image, alpha[..., None]], axis=2), 0, 1)
+    return painted
+
+
+def _short_hair(color: Color, size: tuple[int, int] = (160, 384)) -> Float:
+    """Strands for the shells of short hair, side by side; the outer the shell, the fewer."""
+    v = ((np.arange(size[0]) + 0.5) / size[0])[:, None]
+    tuft = 0.9 * noise(size, (22, 0.9), 16) + 0.4 * noise(size, (28, 3.0), 17)
+    tone = 0.9 * noise(size, (34, 0.8), 18) + 0.3 * noise(size, (20, 5), 19)
+    bands = []
+    for shell in range(NUM_SHELLS):
+        value = 1 + 0.16 * tone + (0.10 + 0.05 * shell) * tuft
+        image = np.array(color) * value[..., None]
+        ends = (1.0 - v) / 0.10 + 0.35 * tuft - 0.2 - 0.25 * shell  # the hairline
+        alpha = np.clip(ends, 0, 1) * np.clip((1.0 - v) / 0.03, 0, 1)
+        if shell:
+            alpha = alpha * np.clip(1.5 - 0.5 * shell + 1.1 * tuft, 0, 1)
+        bands.append(np.concatenate([image, alpha[..., None]], axis=2))
+    painted: Float = np.clip(np.concatenate(bands, axis=1), 0, 1)
+    # few levels pack well
+    painted[..., :3] = np.round(painted[..., :3] * 90) / 90
+    painted[..., 3] = np.round(painted[..., 3] * 20) / 20
+    return painted
+
+
+def lashes(size: tuple[int, int] = (64, 256)) -> Float:
+    """Paint lashes that grow from the bottom row of the texture and thin out (RGBA)."""
+    rows, columns = size
+    rng = np.random.default_rng(15)
+    alpha = np.zeros(size)
+    height = np.arange(rows)[::-1] / rows
+    for root in np.linspace(6, columns - 6, 46) + rng.uniform(-2, 2, 46):
+        length = rng.uniform(0.55, 0.95)
+        bend = rng.uniform(-9, 9) + (root / columns - 0.5) * 26
+        middle = root + bend * height**2
+        width = 1.7 * np.clip(1 - height / length, 0, 1) ** 0.6
+        near = np.clip(width[:, None] - np.abs(np.arange(columns) - middle[:, None]) + 0.4, 0, 1)
+        alpha = np.maximum(alpha, near * (height < length)[:, None])
+    color = np.broadcast_to(np.array([0.07, 0.05, 0.05]), (*size, 3))
+    return np.concatenate([color, 0.85 * alpha[..., None]], axis=2)

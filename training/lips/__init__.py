@@ -1,0 +1,1 @@
+"""Train lips from sound."""

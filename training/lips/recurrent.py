@@ -1,0 +1,143 @@
+"""The recurrent part of lips from sound, and each source's own units.
+
+Every speaker's lips are measured in units of their own: a tracked face's neutral is never quite
+its rest, and an animator's rig has other extents. So the network predicts a canonical face, and
+each speaker's scale and offset are learnt beside it, held near 1 and 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS
+
+Floats = NDArray[np.float32]
+
+UNITS = 96
+_DROPOUT = 0.3
+_INPUT_NOISE = 0.1  # standard deviation; that of a component is 1
+_PIECE = 200  # positions
+_MIN_PIECE = 10
+_BATCH = 32  # pieces
+_RATE, _WEIGHT_DECAY = 2e-3, 1e-2
+_PROBABILITY_WEIGHT = 0.3  # of closure and of lip to teeth in the loss
+_UNITS_WEIGHT = 0.01  # of a speaker's squared scale (log) and offset
+_MAX_GRADIENT = 1.0
+_NUM_FAPS = len(LIP_FAPS)
+
+
+class LipNetwork(nn.Module):
+    """A gated recurrent unit behind a layer of rectified units."""
+
+    def __init__(self, num_components: int, num_delays: int, num_speakers: int) -> None:
+        super().__init__()
+        self.shape = (num_delays, NUM_OUTPUTS)
+        self.entry = nn.Linear(num_components, UNITS)
+        self.recurrent = nn.GRU(UNITS, UNITS, batch_first=True)
+        self.output = nn.Linear(2 * UNITS, num_delays * NUM_OUTPUTS)
+        self.dropout = nn.Dropout(_DROPOUT)
+        self.log_scale = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
+        self.offset = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
+
+    def forward(self, components: Tensor) -> Tensor:
+        """Return outputs in canonical units, (batch, positions, delays, 17)."""
+        entered = torch.relu(self.entry(self.dropout(components)))
+        states, _ = self.recurrent(self.dropout(entered))
+        outputs: Tensor = self.output(self.dropout(torch.cat([states, entered], dim=-1)))
+        return outputs.view(*components.shape[:2], *self.shape)
+
+    def loss(self, components: Tensor, targets: Tensor, speakers: Tensor) -> Tensor:
+        """Mean loss of a batch; targets that are NaN do not count."""
+        noise = _INPUT_NOISE * torch.randn_like(components)
+        outputs = self(components + noise)
+        scale = torch.exp(self.log_scale[speakers])[:, None, None]
+        offset = self.offset[speakers][:, None, None]
+        wanted = torch.nan_to_num(targets)
+        known = ~torch.isnan(targets)
+        error = (outputs[..., :_NUM_FAPS] * scale + offset - wanted[..., :_NUM_FAPS]) ** 2
+        total = _mean(error, known[..., :_NUM_FAPS])
+        for column in range(_NUM_FAPS, NUM_OUTPUTS):
+            entropy = binary_cross_entropy_with_logits(
+                outputs[..., column], wanted[..., column], reduction="none"
+            )
+            total = total + _PROBABILITY_WEIGHT * _mean(entropy, known[..., column])
+        squares = (self.log_scale**2).mean() + (self.offset**2).mean()
+        return total + _UNITS_WEIGHT * len(self.offset) * squares
+
+
+@dataclass(frozen=True, slots=True)
+class Example:
+    """A stretch of speech with its targets."""
+
+    components: Floats  # (positions, components)
+    targets: Floats  # (positions, delays, 17), FAPs standardised
+    speaker: int
+
+
+def train_network(
+    examples: Sequence[Example], num_speakers: int, *, num_epochs: int, seed: int
+) -> tuple[LipNetwork, list[float]]:
+    """Train; return the network and the mean loss of each epoch."""
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(seed)
+    pieces = _cut(examples)
+    first = pieces[0]
+    network = LipNetwork(first.components.shape[1], first.targets.shape[1], num_speakers)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_WEIGHT_DECAY)
+    num_batches = -(-len(pieces) // _BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimizer, _RATE, total_steps=num_batches * num_epochs
+    )
+    losses = []
+    network.train()
+    for _ in range(num_epochs):
+        total = 0.0
+        # Pieces of about the same length share a batch.
+        lengths = [len(piece.components) // 40 + rng.random() for piece in pieces]
+        batches = np.array_split(np.argsort(lengths), num_batches)
+        for number in rng.permutation(num_batches):
+            optimizer.zero_grad()
+            loss = network.loss(*_batch([pieces[k] for k in batches[number]]))
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT)
+            optimizer.step()
+            schedule.step()
+            total += float(loss.detach())
+        losses.append(total / num_batches)
+    return network.eval(), losses
+
+
+def _cut(examples: Sequence[Example]) -> list[Example]:
+    """Cut stretches into pieces; those of a moment are left out."""
+    return [
+        Example(each.components[start:end], each.targets[start:end], each.speaker)
+        for each in examples
+        for start in range(0, len(each.components), _PIECE)
+        if (end := min(start + _PIECE, len(each.components))) - start >= _MIN_PIECE
+    ]
+
+
+def _batch(pieces: Sequence[Example]) -> tuple[Tensor, Tensor, Tensor]:
+    """Stack pieces, padded at their ends: components, targets, speakers."""
+    longest = max(len(piece.components) for piece in pieces)
+
+    def padded(rows: Floats, value: float) -> Floats:
+        more = [(0, longest - len(rows)), *[(0, 0)] * (rows.ndim - 1)]
+        return np.pad(rows, more, constant_values=value)
+
+    components = np.stack([padded(piece.components, 0.0) for piece in pieces])
+    targets = np.stack([padded(piece.targets, np.nan) for piece in pieces])
+    speakers = torch.tensor([piece.speaker for piece in pieces])
+    return torch.from_numpy(components), torch.from_numpy(targets), speakers
+
+
+def _mean(values: Tensor, known: Tensor) -> Tensor:
+    return torch.where(known, values, torch.zeros(())).sum() / (known.sum() + 1)

@@ -1,0 +1,127 @@
+"""What the lips of a clip do at the network's positions, for every delay.
+
+======== ============================================================== ==========
+symbol   meaning                                                        unit
+======== ============================================================== ==========
+T        media time up to which the sound is known at a position        s
+d        delay: a position's target is the mouth at T - d               s
+======== ============================================================== ==========
+
+Left and right of a face are averaged: which side a speaker favours is not in the sound. Lips touch
+where the tracked opening is within the lowest tenth of its speaker's range. The lower lip touches
+the teeth within the phone f of the clip's text, or where that is unknown of the recognised phones;
+other languages have no such label.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.lip_clips import LipClip
+from services.recognizer.lips import LIP_FAPS, OTHER_SIDE
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import Phone
+
+Array = NDArray[np.float64]
+
+_CLOSED_SHARE, _OPEN_SHARE = 0.1, 0.5  # of the range of a speaker's opening
+_RANGE_PERCENTILES = (1.0, 99.0)
+_MAX_GAP_S = 0.1  # between two tracked frames that are interpolated
+_LIP_TO_TEETH = "f"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Touch:
+    """Openings of a speaker, FAP units."""
+
+    closed_below: float  # the lips touch
+    half_open: float
+
+
+def lip_tracks(clip: LipClip) -> Array:
+    """Return the tracked FAPs, left and right averaged, (num_frames, len(LIP_FAPS))."""
+    sides = [
+        [MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] for fap in LIP_FAPS
+    ]
+    return np.stack([clip.faps[:, pair].mean(axis=1) for pair in sides], axis=1)
+
+
+def opening(clip: LipClip) -> Array:
+    """Return the height of the inner lips' opening relative to the neutral face, (num_frames,)."""
+    upper, lower = (MOUTH_FAPS.index(fap) for fap in (4, 5))
+    height: Array = -clip.faps[:, upper] - clip.faps[:, lower]
+    return height
+
+
+def touches(clips: Sequence[LipClip]) -> dict[str, Touch]:
+    """Return from where on the lips of each speaker touch, by speaker."""
+    by_speaker: dict[str, list[Array]] = defaultdict(list)
+    for clip in clips:
+        by_speaker[clip.speaker].append(opening(clip))
+    limits = {}
+    for speaker, heights in by_speaker.items():
+        known = np.concatenate(heights)
+        known = known[~np.isnan(known)]
+        low, high = np.percentile(known, _RANGE_PERCENTILES) if len(known) else (np.nan, np.nan)
+        limits[speaker] = Touch(
+            closed_below=float(low + _CLOSED_SHARE * (high - low)),
+            half_open=float(low + _OPEN_SHARE * (high - low)),
+        )
+    return limits
+
+
+def targets_at(
+    clip: LipClip,
+    phones: Sequence[Phone] | None,
+    touch: Touch,
+    known_s: Array,
+    delays_s: Sequence[float],
+) -> NDArray[np.float32]:
+    """Return the targets of some positions.
+
+    Parameters
+    ----------
+    clip
+        The clip.
+    phones
+        Its phones; None where the recognizer does not know its language.
+    touch
+        From where on its speaker's lips touch.
+    known_s
+        Time in the clip up to which the sound is known at each position, (n,).
+    delays_s
+        Delays, seconds.
+
+    Returns
+    -------
+    NDArray
+        FAPs in FAP units, closure, lip to teeth (0 or 1), (n, delays, 17); NaN where unknown.
+    """
+    time_s = known_s[:, None] - np.asarray(delays_s)
+    faps = [_at(clip.time_s, track, time_s) for track in lip_tracks(clip).T]
+    height = _at(clip.time_s, opening(clip), time_s)
+    closure = np.where(np.isnan(height), np.nan, height < touch.closed_below)
+    lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
+    for phone in phones or ():
+        if phone.symbol == _LIP_TO_TEETH:
+            end_s = phone.onset_s + phone.duration_s
+            lip_to_teeth[(time_s >= phone.onset_s) & (time_s < end_s)] = 1.0
+    return np.stack([*faps, closure, lip_to_teeth], axis=-1).astype(np.float32)
+
+
+def _at(frame_s: Array, values: Array, time_s: Array) -> Array:
+    """Interpolate a track; NaN outside it and within its gaps."""
+    known = ~np.isnan(values)
+    if known.sum() < 2:
+        return np.full(time_s.shape, np.nan)
+    frame_s, values = frame_s[known], values[known]
+    after = np.clip(np.searchsorted(frame_s, time_s), 1, len(frame_s) - 1)
+    is_gap = frame_s[after] - frame_s[after - 1] > _MAX_GAP_S
+    outside = (time_s < frame_s[0]) | (time_s > frame_s[-1])
+    made: Array = np.interp(time_s, frame_s, values)
+    return np.where(is_gap | outside, np.nan, made)

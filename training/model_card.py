@@ -1,0 +1,68 @@
+"""The model card: what a model was trained on, written beside it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from corpora.speech_corpus import RowErrors
+from training.search_weights import SearchWeights
+from training.training_set import FRAMES_PER_MINUTE, Example
+
+
+def write_card(
+    output: Path,
+    *,
+    title: str,
+    details: str,
+    examples: Sequence[Example],
+    errors: RowErrors,
+    chosen: SearchWeights | None,
+    measure: str = "phone error rate",
+) -> None:
+    """Write the card of a model.
+
+    Parameters
+    ----------
+    output
+        The model's file; the card has the same name and the suffix ``.md``.
+    title
+        First line of the card.
+    details
+        How the model was trained, within a sentence.
+    examples
+        The recordings it was trained on; listed by licence.
+    errors
+        Rows that were skipped; counted.
+    chosen
+        The weights of the search, if they were chosen on development data.
+    measure
+        The meaning of ``chosen.error_rate``.
+    """
+    by_licence: dict[str, list[Example]] = defaultdict(list)
+    for example in examples:
+        by_licence[example.licence or "none given"].append(example)
+    rows = [
+        f"| {licence} | {len(group)} | {len({example.speaker for example in group})} | "
+        f"{sum(len(example.log_mel) for example in group) / FRAMES_PER_MINUTE:.1f} |"
+        for licence, group in sorted(by_licence.items())
+    ]
+    lines = [
+        f"# {title}",
+        "",
+        f"Made by `kouxing train`, {details}.",
+        "",
+        "| licence of the recordings | recordings | speakers | minutes without outer silence |",
+        "|---|---|---|---|",
+        *rows,
+        "",
+        f"{len(errors.messages)} rows were skipped.",
+    ]
+    if chosen:
+        lines += [
+            "",
+            f"Chosen on dev: acoustic scale {chosen.acoustic_scale}, phone penalty "
+            f"{chosen.phone_penalty}; {measure} there {100 * chosen.error_rate:.1f} %.",
+        ]
+    output.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,156 @@
+"""Forced alignment of the training set, and the statistics of the HMMs that it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.search.decoder import Segment
+from services.recognizer.search.forced_path import segments_of_path, utterance_graph, viterbi_path
+from services.recognizer.search.phone_lm import PhoneLanguageModel
+from shared.errors import UserError
+from training.durations import PhoneDurations
+from training.neural.export import network_of
+from training.neural.scoring import network_scores
+from training.progress import Report, with_progress
+from training.search_weights import all_scores
+from training.training_set import Example
+
+STATES_PER_PHONE = 3
+_LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; layers with more are trained less
+_MIN_STAY, _MAX_STAY = 0.05, 0.98
+_LM_SCALE = 2.0  # chosen on development data
+_PRIOR_SCALE = 0.5  # of the states' log priors; chosen on development data
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedExample:
+    """A recording with the state of each frame."""
+
+    number: int  # of the example in the training set
+    example: Example
+    states: NDArray[np.int64]  # (frames,) STATES_PER_PHONE for each phone
+    phones: list[Segment]
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """The part of a model that is counted on an alignment."""
+
+    topology: Topology
+    log_prior: NDArray[np.float32]  # (states,)
+
+
+def aligning_output(look_aheads: Sequence[int]) -> int:
+    """Output layer that aligns best: its look-ahead shows a little of what follows an onset."""
+    return int(np.abs(np.array(look_aheads) - _LOOK_AHEAD_FRAMES).argmin())
+
+
+def aligner_scores(
+    aligner: AcousticModel, examples: Sequence[Example]
+) -> Iterator[NDArray[np.float32]]:
+    """Yield the scores of another model, of each recording, shape (frames, states).
+
+    A network of this package computes whole recordings at once, which is faster.
+    """
+    if not isinstance(aligner, NeuralModel):
+        return all_scores(aligner, examples)
+    look_aheads = aligner.look_aheads.tolist()
+    output = aligning_output(look_aheads)
+    with suppress(KeyError):
+        network = network_of(aligner.network, look_aheads)
+        return network_scores(network, output, aligner.log_prior, examples)
+    return all_scores(replace(aligner, output_layer=output, acoustic_scale=1.0), examples)
+
+
+def align_all(
+    scores: Iterable[NDArray[np.float32]],
+    topology: Topology,
+    examples: Sequence[Example],
+    report: Report,
+) -> list[AlignedExample]:
+    """Align each recording with its text; recordings that do not fit are dropped.
+
+    Parameters
+    ----------
+    scores
+        Of each recording, shape (frames, states).
+    topology
+        The HMMs of the scores, with any number of states per phone.
+    examples
+        The recordings.
+    report
+        Receives lines of progress.
+
+    Raises
+    ------
+    UserError
+        If no recording fits its text.
+    """
+    aligned = []
+    inventory = topology.inventory
+    silence = inventory.index[inventory.silence]
+    num_states = np.diff(topology.first_state)
+    phone = np.repeat(np.arange(len(inventory)), num_states)
+    place = np.arange(len(phone)) - topology.first_state[phone]
+    # the middle of a phone's n-th state, among STATES_PER_PHONE
+    new_place = (2 * place + 1) * STATES_PER_PHONE // (2 * num_states[phone])
+    followed = with_progress(examples, "aligned", report)
+    for number, (rows, example) in enumerate(zip(scores, followed, strict=True)):
+        graph = utterance_graph(
+            example.phones, example.syllables, topology.first_state, silence=silence
+        )
+        path, _ = viterbi_path(rows[:, graph.states], graph, topology.log_stay, topology.log_leave)
+        if len(path):
+            on_path = graph.states[path]
+            states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
+            aligned.append(AlignedExample(number, example, states, segments_of_path(path, graph)))
+    if not aligned:
+        raise UserError("no recording fits its text; is the aligner trained?")
+    return aligned
+
+
+def statistics_of(
+    aligned: Sequence[AlignedExample], weights: Sequence[float], phone_lm: PhoneLanguageModel
+) -> Statistics:
+    """Count priors, transitions and durations.
+
+    Parameters
+    ----------
+    aligned
+        The alignment.
+    weights
+        How often the training samples each recording, relative to the others.
+    phone_lm
+        The phone language model.
+    """
+    num_states = STATES_PER_PHONE * len(phone_lm.inventory)
+    counts = np.ones(num_states)
+    occupied, left = np.full(num_states, 2.0), np.ones(num_states)
+    durations = PhoneDurations(phone_lm.inventory)
+    for one, weight in zip(aligned, weights, strict=True):
+        in_states = np.bincount(one.states, minlength=num_states)
+        counts += weight * len(aligned) * in_states
+        occupied += in_states
+        ends = np.append(np.flatnonzero(np.diff(one.states)), len(one.states) - 1)
+        np.add.at(left, one.states[ends], 1.0)
+        durations.add(one.phones, one.example.weight)
+    stay = np.clip(1 - left / occupied, _MIN_STAY, _MAX_STAY)
+    mean_s, spread_s = durations.mean_and_spread_s()
+    topology = Topology(
+        phone_lm=phone_lm,
+        first_state=np.arange(len(phone_lm.inventory) + 1) * STATES_PER_PHONE,
+        log_stay=np.log(stay).astype(np.float32),
+        log_leave=np.log(1 - stay).astype(np.float32),
+        lm_scale=_LM_SCALE,
+        duration_mean_s=mean_s,
+        duration_spread_s=spread_s,
+    )
+    log_prior = _PRIOR_SCALE * np.log(counts / counts.sum())
+    return Statistics(topology, log_prior.astype(np.float32))

@@ -1,0 +1,199 @@
+"""Augmentation of samples, for the neural network: other speeds, rooms, noises and lines.
+
+(The Gaussian mixtures' augmentation, :mod:`training.gmm.augmentation`, works on log-mel bands.)
+
+Sources: Ko et al. 2015, "Audio augmentation for speech recognition" (speed, by resampling: pitch
+and formants move along); Ko et al. 2017, "A study on data augmentation of reverberant speech for
+robust speech recognition" (rooms and noise); Polack 1988 (a room's response is a decaying noise);
+Park et al. 2019, "SpecAugment" (masks of frames and bands).
+
+======== ============================================================= ============
+symbol   meaning                                                       unit, shape
+======== ============================================================= ============
+x        samples at 16 kHz                                             (n,)
+s        speed; above 1 is faster                                      1
+T60      a room's sound falls by 60 dB in it                           s
+h        a room's response: h[0] = 1, then noise * exp(-6.9 t / T60)   (m,)
+f^b      power density of the noise, multiplied by random peaks        1
+t        number of a feature frame, samples 160 t to 160 t + 400       1
+======== ============================================================= ============
+
+Everything is drawn from the given generator: the same state gives the same result. Each augmented
+frame has a source frame in the recording, whose targets it takes. The middle of frame t, sample
+160 t + 200, was sample s (160 t + 200) of the recording, which is the middle of the source frame
+
+    t_source = s t + (s - 1) 200 / 160
+
+A tempo changes the number of frames and leaves the pitch alone: frames are interpolated.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
+
+from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
+
+Samples = NDArray[np.float32]
+Sound = NDArray[np.floating[Any]]  # samples while they are worked on
+
+_HALF_RATE_HZ = SAMPLE_RATE_HZ / 2
+_HALF_WINDOW = WINDOW_S / HOP_S / 2  # from a frame's first sample to its middle, frames
+_TINY = 1e-9
+
+# Probabilities of the changes.
+_SPEED_PROB, _ROOM_PROB, _NOISE_PROB, _COLOUR_PROB = 0.75, 0.35, 0.6, 0.5
+_TELEPHONE_PROB, _CODEC_PROB = 0.14, 0.2
+_FLUTTER_PROB, _KNOCKS_PROB = 0.35, 0.15  # of a noise
+
+_SPEED_STEPS, _MIN_STEPS, _MAX_STEPS = 20, 17, 24  # new lengths are 17/20 to 24/20
+_MIN_T60_S, _MAX_T60_S, _MAX_ROOM_S = 0.1, 0.7, 0.5
+_MIN_SNR_DB, _MAX_SNR_DB = 3.0, 30.0
+_MIN_NOISE_HZ = 50.0  # the noise's spectrum is flat below
+_FLUTTER_SAMPLES = 2400  # between two knots of the noise's level
+_KNOCK_SAMPLES = 160
+_KNOCK_RATE = 0.03  # fraction of the pieces of this length with a knock
+_MIN_PEAK_DB = -36.0  # relative to full scale
+_MIN_LOG_TEMPO, _MAX_LOG_TEMPO = -0.20, 0.25
+_MAX_MASKS, _MAX_MASKED_FRAMES, _MAX_MASKED_BANDS = 2, 12, 14
+
+
+def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples, float]:
+    """Augment a recording at random.
+
+    Parameters
+    ----------
+    samples
+        Shape (n,), 16 kHz.
+    rng
+        Draws all changes.
+
+    Returns
+    -------
+    tuple
+        The new samples, shape (n / speed,), and the speed.
+    """
+    sound: Sound = samples
+    speed = 1.0
+    if rng.random() < _SPEED_PROB:
+        steps = int(rng.integers(_MIN_STEPS, _MAX_STEPS + 1))
+        sound, speed = resample_poly(sound, steps, _SPEED_STEPS), _SPEED_STEPS / steps
+    if rng.random() < _ROOM_PROB:
+        sound = fftconvolve(sound, _room(rng))[: len(sound)]
+    if rng.random() < _NOISE_PROB:
+        sound = sound + _noise(sound, rng)
+    sound = _transmitted(sound, rng)
+    if rng.random() < _COLOUR_PROB:
+        sound = _coloured(sound, rng)
+    return sound.astype(np.float32), speed
+
+
+def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
+    """Scale the peak to a random level, -36 to 0 dB of full scale."""
+    peak = np.abs(samples).max() + _TINY
+    gain = 10 ** (rng.uniform(_MIN_PEAK_DB, 0.0) / 20) / peak
+    return samples * np.float32(gain)
+
+
+def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.int64]:
+    """Source frame of each frame after a change of speed, of ``num_source``, (num_frames,)."""
+    at = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
+    nearest: NDArray[np.int64] = np.clip(np.rint(at), 0, num_source - 1).astype(np.int64)
+    return nearest
+
+
+def change_tempo(
+    frames: NDArray[np.float32], rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Change the tempo at random; return the new frames, (m, k), and their source frames, (m,)."""
+    num_frames = round(len(frames) / np.exp(rng.uniform(_MIN_LOG_TEMPO, _MAX_LOG_TEMPO)))
+    at = np.linspace(0, len(frames) - 1, max(1, num_frames))
+    low = np.minimum(at.astype(np.int64), len(frames) - 2)
+    fraction = (at - low)[:, None].astype(np.float32)
+    changed = (1 - fraction) * frames[low] + fraction * frames[low + 1]
+    return changed, np.rint(at).astype(np.int64)
+
+
+def mask(frames: NDArray[np.float32], rng: np.random.Generator) -> None:
+    """Replace some frames, and some bands of all frames, by the mean, in place."""
+    mean = frames.mean()
+    for _ in range(rng.integers(_MAX_MASKS + 1)):
+        at, width = rng.integers(len(frames)), rng.integers(1, _MAX_MASKED_FRAMES + 1)
+        frames[at : at + width] = mean
+    for _ in range(rng.integers(_MAX_MASKS + 1)):
+        at, width = rng.integers(frames.shape[1]), rng.integers(1, _MAX_MASKED_BANDS + 1)
+        frames[:, at : at + width] = mean
+
+
+def _room(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw a room's response; the first echo comes after 1 to 8 ms."""
+    t60_s = rng.uniform(_MIN_T60_S, _MAX_T60_S)
+    num_samples = int(SAMPLE_RATE_HZ * min(t60_s, _MAX_ROOM_S))
+    time_s = np.arange(num_samples) / SAMPLE_RATE_HZ
+    response: NDArray[np.float64] = rng.standard_normal(num_samples)
+    response *= np.exp(-6.9 * time_s / t60_s)
+    response[: int(SAMPLE_RATE_HZ * rng.uniform(0.001, 0.008))] = 0.0
+    response *= rng.uniform(0.1, 0.8) / np.sqrt((response**2).sum() + _TINY)
+    response[0] = 1.0
+    return response
+
+
+def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw a noise for a recording, 3 to 30 dB below it."""
+    num_samples = len(samples)
+    frequency = np.maximum(np.fft.rfftfreq(num_samples, 1 / SAMPLE_RATE_HZ), _MIN_NOISE_HZ)
+    slope = rng.uniform(-2.2, 0.2)
+    density = (frequency / 1000) ** (slope / 2) * _random_curve(frequency, 12, (0.1, 0.7), rng)
+    noise = np.fft.irfft(np.fft.rfft(rng.standard_normal(num_samples)) * density, num_samples)
+    if rng.random() < _FLUTTER_PROB:
+        num_knots = 2 + num_samples // _FLUTTER_SAMPLES
+        knots = rng.normal(0.0, rng.uniform(0.2, 0.8), num_knots)
+        at = np.arange(num_samples) / _FLUTTER_SAMPLES
+        noise *= np.exp(np.interp(at, np.arange(num_knots), knots))
+    if rng.random() < _KNOCKS_PROB:
+        num_pieces = num_samples // _KNOCK_SAMPLES + 1
+        knocks = (rng.random(num_pieces) < _KNOCK_RATE) * rng.uniform(1.0, 6.0, num_pieces)
+        noise *= 1 + np.repeat(knocks, _KNOCK_SAMPLES)[:num_samples]
+    below_db = rng.uniform(_MIN_SNR_DB, _MAX_SNR_DB)
+    scaled: NDArray[np.float64] = noise * (
+        np.sqrt(np.mean(np.square(samples)) / (np.mean(noise**2) + _TINY)) * 10 ** (-below_db / 20)
+    )
+    return scaled
+
+
+def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
+    """Filter some of the recordings as a telephone or a codec does."""
+    line = rng.random()
+    if line < _TELEPHONE_PROB:
+        band = [rng.uniform(200, 400), rng.uniform(3000, 3900)]
+        filters = butter(int(rng.integers(2, 5)), band, "band", fs=SAMPLE_RATE_HZ, output="sos")
+    elif line < _TELEPHONE_PROB + _CODEC_PROB:
+        order, highest_hz = int(rng.integers(2, 7)), rng.uniform(3800, 7800)
+        filters = butter(order, highest_hz, "low", fs=SAMPLE_RATE_HZ, output="sos")
+    else:
+        return samples
+    filtered: Sound = sosfilt(filters, samples)
+    return filtered
+
+
+def _coloured(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Filter a recording as another microphone does."""
+    frequency = np.fft.rfftfreq(len(samples), 1 / SAMPLE_RATE_HZ)
+    colour = _random_curve(frequency, 7, (0.1, 0.5), rng)
+    return np.fft.irfft(np.fft.rfft(samples) * colour, len(samples))
+
+
+def _random_curve(
+    frequency: NDArray[np.floating[Any]],
+    num_knots: int,
+    spread: tuple[float, float],
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Draw amplitudes over frequency; their logarithm varies by a spread, which is drawn too."""
+    knots = rng.normal(0.0, rng.uniform(*spread), num_knots)
+    at = np.linspace(0.0, _HALF_RATE_HZ, num_knots)
+    curve: NDArray[np.float64] = np.exp(np.interp(frequency, at, knots))
+    return curve

@@ -1,0 +1,139 @@
+"""Batches of augmented recordings with the targets of their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from corpora.feature_cache import as_floats
+from services.recognizer.front_end.whisper_mel import WhisperMel
+from training.neural.augmentation import (
+    augment_samples,
+    change_tempo,
+    mask,
+    scale_level,
+    source_frames,
+)
+
+_POOL_BATCHES = 8  # recordings of similar length are grouped within a pool of this many batches
+_MAX_FRAMES = 800  # of a recording in a batch; longer ones are cropped
+_AUGMENT_PROB = 0.9
+_TEMPO_PROB = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Targets:
+    """Target distribution of each frame: its likeliest states with their probabilities."""
+
+    states: NDArray[np.uint16]  # (frames, k)
+    probs: NDArray[np.float16]  # (frames, k) sum to 1, or to 0 where no target is known
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    @classmethod
+    def hard(cls, states: NDArray[np.integer[Any]]) -> Targets:
+        """Make targets of one state a frame, shape (frames,)."""
+        return cls(states[:, None].astype(np.uint16), np.ones((len(states), 1), np.float16))
+
+    def of(self, frames: NDArray[np.int64] | slice) -> Targets:
+        """Select the targets of some frames."""
+        return Targets(self.states[frames], self.probs[frames])
+
+    def averaged_with(self, other: Targets) -> Targets:
+        """Average with other targets of the same frames."""
+        return Targets(
+            np.hstack([self.states, other.states]),
+            np.hstack([self.probs, other.probs]) * np.float16(0.5),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """A recording with its targets."""
+
+    samples: NDArray[np.int16]  # (n,) 16 kHz
+    targets: Targets  # of its frames
+    weight: float  # relative to the others', how often it is sampled
+
+
+Sample = tuple[NDArray[np.floating[Any]], Targets]  # inputs of the network, (rows, inputs)
+Batch = tuple[Tensor, Tensor, Tensor]  # inputs; states and probabilities, (batch, frames, k)
+
+
+def sampling_probs(recordings: Sequence[Recording]) -> NDArray[np.float64]:
+    """Probabilities of sampling each recording, (recordings,)."""
+    weights = np.array([recording.weight for recording in recordings])
+    weights /= weights.sum()
+    return weights
+
+
+def augment(recording: Recording, rng: np.random.Generator) -> tuple[NDArray[np.float32], Targets]:
+    """Augment a recording; return its frames, (frames, 80), and their targets."""
+    samples, speed = as_floats(recording.samples), 1.0
+    if rng.random() < _AUGMENT_PROB:
+        samples, speed = augment_samples(samples, rng)
+    frames = WhisperMel().accept_waveform(scale_level(samples, rng))
+    targets = recording.targets.of(source_frames(len(frames), speed, len(recording.targets)))
+    if rng.random() < _TEMPO_PROB:
+        frames, source = change_tempo(frames, rng)
+        targets = targets.of(source)
+    if len(frames) > _MAX_FRAMES:
+        start = int(rng.integers(len(frames) - _MAX_FRAMES + 1))
+        crop = slice(start, start + _MAX_FRAMES)
+        frames, targets = frames[crop], targets.of(crop)
+    mask(frames, rng)
+    return frames, targets
+
+
+def batches_of(
+    draw: Callable[[], Sample], num_rows: int, rng: np.random.Generator
+) -> Iterator[Batch]:
+    """Yield batches of about ``num_rows`` rows without end; a batch's samples are similarly long.
+
+    Parameters
+    ----------
+    draw
+        Draws a sample.
+    num_rows
+        Rows of all samples in a batch, padding included.
+    rng
+        Draws the order of the batches.
+    """
+    while True:
+        pool: list[Sample] = []
+        size = 0
+        while size < _POOL_BATCHES * num_rows:
+            pool.append(draw())
+            size += len(pool[-1][0])
+        pool.sort(key=lambda pair: len(pair[0]))
+        groups: list[list[Sample]] = [[]]
+        for pair in pool:
+            if groups[-1] and (len(groups[-1]) + 1) * len(pair[0]) > num_rows:
+                groups.append([])
+            groups[-1].append(pair)
+        for at in rng.permutation(len(groups)):
+            yield _padded(groups[at])
+
+
+def _padded(group: Sequence[Sample]) -> Batch:
+    """Make a batch; short samples repeat their last row, without targets."""
+    num_rows = max(len(rows) for rows, _ in group) | 1  # odd: n positions take 2 n + 1 frames
+    inputs = np.empty((len(group), num_rows, group[0][0].shape[1]), dtype=np.float32)
+    num_frames = max(len(targets) for _, targets in group)
+    num_states = max(targets.states.shape[1] for _, targets in group)
+    states = np.zeros((len(group), num_frames, num_states), dtype=np.int64)
+    probs = np.zeros(states.shape, dtype=np.float32)
+    for number, (rows, targets) in enumerate(group):
+        inputs[number, : len(rows)] = rows
+        inputs[number, len(rows) :] = rows[-1]
+        place = number, slice(len(targets)), slice(targets.states.shape[1])
+        states[place] = targets.states
+        probs[place] = targets.probs
+    return torch.from_numpy(inputs), torch.from_numpy(states), torch.from_numpy(probs)

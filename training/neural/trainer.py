@@ -1,0 +1,215 @@
+"""Train the network on augmented recordings whose frames have target states.
+
+Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition"
+(cross-entropy on the states of a forced alignment); Hinton, Vinyals and Dean 2015, "Distilling the
+knowledge in a neural network" (soft targets); Loshchilov and Hutter 2019, "Decoupled weight decay
+regularization" (AdamW); Shamir and Zhang 2013, "Stochastic gradient descent for non-smooth
+optimization: convergence results and optimal averaging schemes" (the running mean of the weights,
+in which late ones weigh more).
+
+Pretrained layers have a low learning rate, new layers a higher one, and the convolutions are
+frozen. The learning rate rises and then stays: the running mean, which is the result, is better the
+more the averaged weights differ.
+
+    rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N))
+
+    m(0) = v(0),  m(n) = m(n - 1) + 3 / (n + 4) * (v(n) - m(n - 1))
+
+    H = - sum_t sum_j q[t, j] log y[t, s[t, j]] / sum_t sum_j q[t, j]
+
+    loss = H(main output) + H(another output) / 2, the others in turn
+
+======== ============================================================= ================
+symbol   meaning                                                       shape
+======== ============================================================= ================
+n, N     number of a step, and of all steps                            1
+v, m     weights after a step, and their running mean                  as the weights
+s, q     target states of a frame and their probabilities, which sum   (frames, k)
+         to one, or to zero where no target is known
+y        posteriors of the states, of an output layer                  (frames, states)
+H        mean cross-entropy of an output layer, nats a frame           1
+======== ============================================================= ================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+from training.neural.batches import Recording, Sample, augment, batches_of, sampling_probs
+from training.neural.network import Network, mixed_precision, output_frames
+
+BATCH_S = 30
+_BATCH_FRAMES = 100 * BATCH_S
+_MAX_START = 900  # position of a crop's first frame, as if it came from the middle of long speech
+_RATE = 2e-4  # of the pretrained layers
+_NEW_RATE = 1.2e-3  # of the last norm and the output layers
+_NEW = ("norm.", "outputs.")
+_FROZEN = ("first.", "second.")
+_WEIGHT_DECAY = 0.01
+_WARM_UP_STEPS = 60
+_MAX_WARM_UP = 0.2  # fraction of the steps
+_MAX_GRADIENT_NORM = 1.0
+_MEAN_EXPONENT = 2  # of the running mean of the weights
+_OTHER_OUTPUT_WEIGHT = 0.5  # of the loss of the other output layer
+
+
+class Trainer:
+    """Trains a network step by step.
+
+    Parameters
+    ----------
+    network
+        The network; trained in place.
+    recordings
+        With the targets of their frames.
+    main_output
+        Output layer that is trained in every step; another one is trained in turn.
+    seed
+        Of order and augmentation. The network's dropout draws from PyTorch's own generator.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        recordings: Sequence[Recording],
+        *,
+        main_output: int,
+        seed: int,
+    ) -> None:
+        self.network = network
+        self.main_output = main_output
+        self._averaged = AveragedModel(network, avg_fn=late_mean(_MEAN_EXPONENT))
+        self._averaged.eval()
+        self._rng = np.random.default_rng(seed)
+        self.replace_recordings(recordings)
+        pretrained: list[nn.Parameter] = []
+        new: list[nn.Parameter] = []
+        for name, parameter in network.named_parameters():
+            if name.startswith(_FROZEN):
+                parameter.requires_grad_(False)
+            else:
+                (new if name.startswith(_NEW) else pretrained).append(parameter)
+        self._rates = (_RATE, _NEW_RATE)
+        self._optimizer = torch.optim.AdamW(
+            [{"params": pretrained}, {"params": new}], weight_decay=_WEIGHT_DECAY
+        )
+
+    @property
+    def mean(self) -> Network:
+        """The network with the running mean of the weights."""
+        return cast(Network, self._averaged.module)
+
+    def replace_recordings(self, recordings: Sequence[Recording]) -> None:
+        """Continue with other recordings, or other targets of the same."""
+        probs = sampling_probs(recordings)
+
+        def draw() -> Sample:
+            return augment(recordings[self._rng.choice(len(probs), p=probs)], self._rng)
+
+        self._batches = batches_of(draw, _BATCH_FRAMES, self._rng)
+
+    def train(self, num_steps: int, watch: Callable[[int, float], None]) -> None:
+        """Take steps.
+
+        After each step, ``watch`` is called with the number of steps taken and the loss of the main
+        output layer in nats a frame.
+        """
+        warm_up_steps = min(_WARM_UP_STEPS, _MAX_WARM_UP * num_steps)
+        for step in range(num_steps):
+            rate_factor = min(1.0, (step + 1) / warm_up_steps)
+            watch(step + 1, self._step(step, rate_factor))
+
+    def _step(self, number: int, rate_factor: float) -> float:
+        """Train on one batch; return the mean cross-entropy of the main output layer."""
+        self.network.train()
+        frames, states, probs = next(self._batches)
+        start = 0 if self._rng.random() < 0.5 else int(self._rng.integers(_MAX_START))
+        with mixed_precision():
+            hidden = self.network(frames, start)
+            loss = self._loss(hidden, states, probs, self.main_output)
+            main_loss = float(loss.detach())
+            others = [k for k in range(len(self.network.outputs)) if k != self.main_output]
+            if others:
+                other = others[number % len(others)]
+                loss = loss + _OTHER_OUTPUT_WEIGHT * self._loss(hidden, states, probs, other)
+        for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = rate_factor * rate
+        take_step(loss, self._optimizer, self.network, self._averaged, _MAX_GRADIENT_NORM)
+        return main_loss
+
+    def _loss(self, hidden: Tensor, states: Tensor, probs: Tensor, output: int) -> Tensor:
+        """Mean cross-entropy of an output layer, nats a frame."""
+        look_ahead = self.network.shape.look_aheads[output]
+        shifted = shift_targets(states, probs, hidden.shape[1], look_ahead)
+        return cross_entropy(self.network.log_posteriors(hidden, output), *shifted)
+
+
+def take_step(
+    loss: Tensor,
+    optimizer: torch.optim.Optimizer,
+    network: nn.Module,
+    averaged: AveragedModel,
+    max_norm: float,
+) -> None:
+    """Step along the gradient, clipped to ``max_norm``, and update the running mean."""
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    nn.utils.clip_grad_norm_(network.parameters(), max_norm)
+    optimizer.step()
+    averaged.update_parameters(network)
+
+
+def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tensor:
+    """Mean cross-entropy over the frames with targets, in nats.
+
+    Parameters
+    ----------
+    log_posteriors
+        Output of the network, shape (..., states).
+    states, probs
+        Targets, shape (..., k).
+    """
+    return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
+
+
+def shift_targets(
+    states: Tensor, probs: Tensor, num_positions: int, look_ahead_frames: int
+) -> tuple[Tensor, Tensor]:
+    """Find the targets of each position's two output frames.
+
+    Parameters
+    ----------
+    states, probs
+        Targets of the frames, shape (batch, frames, k).
+    num_positions
+        Of the network.
+    look_ahead_frames
+        Of the output layer.
+
+    Returns
+    -------
+    tuple
+        States and probabilities, shape (batch, positions, 2, k); the probabilities of frames
+        outside the recording are 0.
+    """
+    num_frames = states.shape[1]
+    frames = output_frames(num_positions, look_ahead_frames)
+    inside = (frames >= 0) & (frames < num_frames)
+    at = frames.clamp(0, num_frames - 1)
+    return states[:, at], probs[:, at] * inside[..., None]
+
+
+def late_mean(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
+    """Make a running mean in which the n-th weights weigh about n ** exponent."""
+
+    def updated(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
+        factor = (exponent + 1) / (int(num_before) + exponent + 2)
+        return mean + factor * (weights - mean)
+
+    return updated

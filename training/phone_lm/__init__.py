@@ -1,0 +1,1 @@
+"""Train phone language models."""

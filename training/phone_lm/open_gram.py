@@ -1,0 +1,167 @@
+"""Draw sentences from a language model of words, as phones for a phone language model.
+
+The language model of words is Open-gram, a trigram of 72,000 Chinese words (CC BY-SA 3.0), as the
+SunPinyin input method comes with it (Debian package ``sunpinyin-data``). ``tslminfo -v lm_sc.t3g``
+(Debian package ``sunpinyin-utils``) prints it as text; its words are those of ``pydict_sc.bin``.
+
+A word is drawn by its probability after the two words before it. The probability that its counted
+words leave goes to the words counted after one word, and what those leave to all words. Words that
+the inventory's language does not write (punctuation, foreign words) are pauses.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory
+from training.phone_lm.estimation import Stream
+from training.phone_lm.recipe import phones_of_text
+
+_BASE = 100_000  # of the n-grams' codes, larger than the number of words
+_NUM_CHAINS = 100_000  # drawn side by side
+_CONTEXT_WORDS = 2
+_NUM_LEVELS = 4  # n-grams of 0 to 3 words
+_WORDS_OFFSET = slice(8, 12)  # bytes of a dictionary that hold the offset of its words
+_MAX_TRIES = 8  # to draw a word that is not counted after its context
+
+
+@dataclass(frozen=True, slots=True)
+class _Level:
+    """N-grams of one length, ascending; a code's digits to the base ``_BASE`` are the words."""
+
+    code: NDArray[np.int64]  # (n-grams,)
+    cumulative: NDArray[np.float64]  # (n-grams + 1,) sum of the probabilities before each n-gram
+
+    def draw(
+        self, context: NDArray[np.int64], rng: np.random.Generator
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Draw a word after each context; return the words and which draws hit a counted one."""
+        first, end = (np.searchsorted(self.code, (context + n) * _BASE) for n in (0, 1))
+        start = self.cumulative[first]
+        height = rng.random(len(context))
+        at = np.searchsorted(self.cumulative, start + height, side="right") - 1
+        counted = (height < self.cumulative[end] - start) & (first < end)
+        return self.code[np.minimum(at, len(self.code) - 1)] % _BASE, counted
+
+    def has(self, code: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which n-grams are counted."""
+        at = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
+        found: NDArray[np.bool_] = self.code[at] == code
+        return found
+
+
+def draw_phones(
+    ngrams: Path, dictionary: Path, inventory: PhoneInventory, *, num_words: int, seed: int = 0
+) -> Stream:
+    """Draw words; return their phones, with pauses between sentences.
+
+    Parameters
+    ----------
+    ngrams
+        The output of ``tslminfo -v``.
+    dictionary
+        The file ``pydict_sc.bin``.
+    inventory
+        The words' language.
+    num_words
+        Words to draw, about.
+    seed
+        The same seed draws the same words.
+
+    Raises
+    ------
+    UserError
+        If a file is missing or not of this kind.
+    """
+    words = _words(dictionary)
+    levels = _levels(ngrams)
+    if max(int((level.code % _BASE).max()) for level in levels) >= len(words):
+        raise UserError(f"{ngrams} has words that {dictionary} has not; give files of one version")
+    rng = np.random.default_rng(seed)
+    num_chains = min(_NUM_CHAINS, num_words)
+    num_drawn = max(1, num_words // num_chains)
+    drawn = np.zeros((num_chains, _CONTEXT_WORDS + num_drawn), np.int64)
+    for place in track(range(_CONTEXT_WORDS, drawn.shape[1]), description="words"):
+        context = drawn[:, place - _CONTEXT_WORDS : place]
+        drawn[:, place] = _next_words(levels, context, rng)
+    return _stream(drawn.ravel(), words, inventory)  # word 0, before each chain, is a pause
+
+
+def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory) -> Stream:
+    """Replace words by their phones; pauses that meet become one."""
+    silence = inventory.index[inventory.silence]
+    phones = [_phones_of(word, inventory) or (silence,) for word in words]
+    lengths = np.array([len(one) for one in phones])
+    starts = np.cumsum(lengths) - lengths
+    ends = np.cumsum(lengths[drawn])
+    shift = np.repeat(ends - lengths[drawn] - starts[drawn], lengths[drawn])
+    all_phones = np.concatenate([np.array(one, np.uint8) for one in phones])
+    stream = all_phones[np.arange(ends[-1]) - shift]
+    again = (stream[1:] == silence) & (stream[:-1] == silence)
+    single: Stream = stream[np.concatenate([[True], ~again])]
+    return single
+
+
+def _phones_of(word: str, inventory: PhoneInventory) -> tuple[int, ...]:
+    return phones_of_text(word, inventory) if inventory.readable.fullmatch(word) else ()
+
+
+def _next_words(
+    levels: Sequence[_Level], context: NDArray[np.int64], rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Draw a word after each row of words, shape (rows, words before)."""
+    num_before = context.shape[1]
+    code = context @ _BASE ** np.arange(num_before - 1, -1, -1)
+    level = levels[num_before]
+    word, counted = level.draw(code, rng)
+    left = np.flatnonzero(~counted)
+    for _ in range(_MAX_TRIES):
+        if not (num_before and len(left)):
+            break
+        word[left] = _next_words(levels, context[left, 1:], rng)
+        left = left[level.has(code[left] * _BASE + word[left])]
+    return word
+
+
+def _levels(path: Path) -> list[_Level]:
+    """Read words, pairs and triples with their negative log-probabilities."""
+    rows: list[list[tuple[int, float]]] = []
+    try:
+        with path.open(encoding="ascii") as lines:
+            for line in track(lines, description="n-grams"):
+                if line.startswith("\\"):
+                    rows.append([])
+                    continue
+                columns = line.split()
+                code = 0
+                for word in columns[: len(rows) - 1]:
+                    code = code * _BASE + int(word)
+                rows[-1].append((code, float(columns[len(rows) - 1])))
+    except (OSError, ValueError, IndexError) as error:
+        raise UserError(f"{path} is not what `tslminfo -v` prints: {error}") from error
+    if len(rows) != _NUM_LEVELS or not all(rows):
+        raise UserError(f"{path} has {len(rows)} levels of n-grams, expected {_NUM_LEVELS}")
+    levels = []
+    for level in rows[1:]:
+        codes, costs = zip(*level, strict=True)
+        cumulative = np.concatenate([[0.0], np.cumsum(np.exp(-np.array(costs)))])
+        levels.append(_Level(np.array(codes, np.int64), cumulative))
+    return levels
+
+
+def _words(path: Path) -> list[str]:
+    """Read the words; a word's number is its place."""
+    try:
+        content = path.read_bytes()
+        (start,) = struct.unpack("<I", content[_WORDS_OFFSET])
+        return content[start:].decode("utf-32-le").split("\0")
+    except (OSError, struct.error, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is no dictionary of SunPinyin: {error}") from error

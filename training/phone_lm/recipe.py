@@ -1,0 +1,137 @@
+"""From texts and corpora to a file with a phone language model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+from rich.progress import track
+
+from corpora.speech_corpus import RowErrors, Utterance, is_synthetic, read_corpus
+from services.recognizer.acoustic.model_file import (
+    phone_lm_arrays,
+    phone_lm_from,
+    read_archive,
+    write_archive,
+)
+from services.recognizer.search.phone_lm import PhoneLanguageModel
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory
+from training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
+from training.progress import Report
+from training.training_set import MAX_WORD_PHONES, Example
+
+_CORPUS_WEIGHT = 0.012  # phones of the corpora's sentences per phone of other texts
+
+
+def train_phone_lm(
+    corpora: Sequence[Path],
+    texts: Sequence[Path],
+    output: Path,
+    inventory: PhoneInventory,
+    *,
+    drawn: Stream | None = None,
+    order: int = 6,
+    max_ngrams: int = 1_000_000,
+    report: Report = print,
+) -> None:
+    """Estimate a phone language model and write it to a file.
+
+    Parameters
+    ----------
+    corpora
+        Folders of speech. The real sentences of the split ``train`` count about one phone in a
+        hundred of the texts.
+    texts
+        Files of text, UTF-8.
+    output
+        The ``.npz`` file to write.
+    inventory
+        The language of all of them.
+    drawn
+        Phones that :func:`training.phone_lm.open_gram.draw_phones` has drawn.
+    order, max_ngrams
+        See :func:`training.phone_lm.estimation.estimate_phone_lm`.
+    report
+        Receives lines of progress.
+
+    Raises
+    ------
+    UserError
+        If a file cannot be read, or there is nothing to count.
+    """
+    errors = RowErrors()
+    streams = [stream_of(_sentences(text, inventory), inventory) for text in texts]
+    if drawn is not None:
+        streams.append(drawn)
+    rows = [row for c in corpora for row in read_corpus(c, errors, inventory, split="train")]
+    corpus = stream_of(sorted({row.phones for row in rows if _is_sentence(row)}), inventory)
+    num_text = sum(map(len, streams))
+    if len(corpus):
+        streams += [corpus] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus)))
+    if not num_text + len(corpus):
+        raise UserError("no text to count; give --text, --ngrams or a corpus with sentences")
+    report(f"{num_text} phones of text, {len(corpus)} of sentences of the corpora")
+    phone_lm = estimate_phone_lm(streams, inventory, order=order, max_ngrams=max_ngrams)
+    write_archive(output, phone_lm_arrays(phone_lm))
+    levels = phone_lm.levels
+    sizes = ", ".join(f"{end - first}" for first, end in pairwise(levels[1:]))
+    errors.print_to(report)
+    report(f"n-grams of 1 to {len(levels) - 2} phones kept: {sizes}")
+
+
+def _is_sentence(row: Utterance) -> bool:
+    return len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.licence)
+
+
+def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> PhoneLanguageModel:
+    """Estimate a phone language model from the recordings' own texts."""
+    stream = stream_of([example.phones for example in examples], inventory)
+    return estimate_phone_lm([stream], inventory)
+
+
+def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
+    """Read a file of :func:`train_phone_lm`, or the phone language model of a recognizer's model.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, holds no phone language model or is of another language.
+    """
+    try:
+        phone_lm = phone_lm_from(read_archive(path))
+    except ValueError as error:
+        raise UserError(
+            f"no phone language model in {path}: {error}; write one with: kouxing train phone-lm"
+        ) from error
+    if phone_lm.inventory.language != inventory.language:
+        raise UserError(
+            f"{path} is for {phone_lm.inventory.language}, not for {inventory.language}; give a "
+            "phone language model of the same language"
+        )
+    return phone_lm
+
+
+def _sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
+    """Read the sentences of a file; those that cannot be pronounced are left out."""
+    try:
+        lines = text.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"cannot read {text} as UTF-8: {error}") from error
+    sentences = []
+    for line in track(lines, description=text.name):
+        for sentence in inventory.readable.findall(line):
+            phones = phones_of_text(sentence, inventory)
+            if phones:
+                sentences.append(phones)
+    return sentences
+
+
+def phones_of_text(text: str, inventory: PhoneInventory) -> tuple[int, ...]:
+    """Return the indices of a text's phones; none if a part of it cannot be pronounced."""
+    try:
+        syllables = inventory.pronounce(text)
+    except UserError:
+        return ()
+    return tuple(inventory.index[phone] for syllable in syllables for phone in syllable)

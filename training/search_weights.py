@@ -1,0 +1,155 @@
+"""The search's weights, chosen on development data: acoustic scale and phone penalty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.feature_cache import as_floats
+from corpora.scoring import ErrorCounts, count_errors
+from corpora.speech_corpus import RowErrors
+from services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from services.recognizer.acoustic.gmm import GmmModel
+from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.front_end.vtln import without_pitch
+from services.recognizer.search.decoder import Decoder
+from shared.errors import UserError
+from shared.phones.inventory import PhoneInventory
+from training.progress import Report
+from training.training_set import Example, load_examples
+
+M = TypeVar("M", GmmModel, NeuralModel)
+# Error rate of recordings, from their scaled scores of shape (frames, states) each.
+ErrorRate = Callable[[Topology, Sequence[NDArray[np.float32]], Sequence[Example]], float]
+
+_SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
+_PHONE_PENALTIES = (2.0, 1.5, 1.0, 0.5, 0.0, -0.5, -1.0, -2.0)
+_BATCH_SIZE = 16  # recordings that are scored together
+
+
+@dataclass(frozen=True, slots=True)
+class SearchWeights:
+    """Weights of the search."""
+
+    acoustic_scale: float  # of the log scores
+    phone_penalty: float  # added to the log score of a path for each phone
+    error_rate: float = 1.0  # on the development data that they were chosen on
+
+    def applied_to(self, model: M) -> M:
+        """Return the model with these weights."""
+        topology = replace(model.topology, phone_penalty=self.phone_penalty)
+        return replace(model, topology=topology, acoustic_scale=self.acoustic_scale)
+
+
+def offline_error_rate(
+    topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
+) -> float:
+    """Phone error rate of offline decoding (full traceback), from scores of (frames, states)."""
+    decoder = Decoder(topology)
+    inventory = topology.inventory
+    total = ErrorCounts()
+    for rows, example in zip(scores, examples, strict=True):
+        decoder.reset()
+        for row in rows:
+            decoder.accept(row)
+        decoded = [inventory.phones[segment.phone] for segment in decoder.finish()]
+        recognized = [phone for phone in decoded if phone != inventory.silence]
+        total += count_errors([inventory.phones[phone] for phone in example.phones], recognized)
+    return total.rate
+
+
+def choose_search_weights(
+    model: AcousticModel,
+    corpora: Sequence[Path],
+    *,
+    scales: Sequence[float] = _SCALES,
+    shipping: bool = True,
+    with_samples: bool = False,
+    rate: ErrorRate = offline_error_rate,
+    report: Report = print,
+) -> SearchWeights | None:
+    """Choose the weights with the lowest error rate on the split ``dev``.
+
+    Parameters
+    ----------
+    model
+        A model whose own acoustic scale is 1.
+    corpora
+        Folders that :func:`corpora.speech_corpus.read_corpus` reads.
+    scales
+        Acoustic scales to try.
+    shipping
+        Leave out rows whose licence forbids giving the model away.
+    with_samples
+        Compute the features with the model's own front end instead of from the log-mel cache.
+    rate
+        What is minimised.
+    report
+        Receives lines of progress.
+
+    Returns
+    -------
+    SearchWeights or None
+        None if the corpora have no recordings for ``dev``.
+    """
+    dev = load_dev(corpora, model.inventory, shipping=shipping, with_samples=with_samples)
+    if not dev:
+        report("no dev recordings: acoustic scale and phone penalty are not chosen")
+        return None
+    scores = list(all_scores(model, dev))
+    best: SearchWeights | None = None
+    for scale in scales:
+        scaled = [np.float32(scale) * rows for rows in scores]
+        for phone_penalty in _PHONE_PENALTIES:
+            found = rate(replace(model.topology, phone_penalty=phone_penalty), scaled, dev)
+            if best is None or found < best.error_rate:
+                best = SearchWeights(scale, phone_penalty, found)
+                report(
+                    f"{100 * found:.1f} % errors on dev with acoustic scale {scale} and phone "
+                    f"penalty {phone_penalty}"
+                )
+    return best
+
+
+def load_dev(
+    corpora: Sequence[Path], inventory: PhoneInventory, *, shipping: bool, with_samples: bool
+) -> list[Example]:
+    """Load the recordings of the split ``dev``; none if the corpora have none."""
+    try:
+        return load_examples(
+            corpora,
+            RowErrors(),
+            inventory,
+            split="dev",
+            shipping=shipping,
+            with_samples=with_samples,
+        )
+    except UserError:
+        return []
+
+
+def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
+    """Yield the scores of each recording without augmentation, shape (frames, states).
+
+    The model's own front end computes the features from the samples; where an example has none,
+    its log-mel features are used.
+    """
+    for start in range(0, len(examples), _BATCH_SIZE):
+        batch = examples[start : start + _BATCH_SIZE]
+        streams = [model.stream() for _ in batch]
+        features = [_features(model, example) for example in batch]
+        first = model.score(list(zip(streams, features, strict=True)))
+        last = model.score([(stream, None) for stream in streams])
+        for pair in zip(first, last, strict=True):
+            yield np.concatenate(pair)
+
+
+def _features(model: AcousticModel, example: Example) -> NDArray[np.float32]:
+    if example.samples is None:
+        return without_pitch(example.log_mel.astype(np.float32))
+    return model.front_end().accept_waveform(as_floats(example.samples))

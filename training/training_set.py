@@ -1,0 +1,217 @@
+"""The training set: recordings with features, phones and weights, and the rule which may be used.
+
+Corpora are unbalanced: one speaker reads words for three hours, thirty others read one sentence
+each, and a synthesiser makes any amount. The weight of a recording in the estimates is
+
+    w = clip(sqrt(30 min / minutes of its speaker), 0.3, 3) * (synthetic_weight if synthetic)
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.feature_cache import log_mel_of, samples_of
+from corpora.speech_corpus import (
+    RowErrors,
+    Utterance,
+    audio_files,
+    is_synthetic,
+    may_ship,
+    read_corpus,
+)
+from services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
+from shared.phones.inventory import PhoneInventory
+from training import SYNTHETIC_WEIGHT
+
+MAX_WORD_PHONES = 8  # a recording with no more phones is a word, not connected speech
+FRAMES_PER_MINUTE = 6000
+_NEUTRAL_MINUTES = 30.0  # a speaker with this much speech has weight 1
+_MIN_WEIGHT, _MAX_WEIGHT = 0.3, 3.0
+_MIN_FRAMES_PER_PHONE = 3
+_MARGIN_FRAMES = 25  # silence left at both ends
+_MIN_PIECE_FRAMES = 20  # shorter recordings without text are skipped
+_MAX_PIECE_FRAMES = 2000  # longer recordings without text are cut
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Example:
+    """One recording to train on."""
+
+    log_mel: NDArray[np.float16]  # (frames, 41)
+    phones: tuple[int, ...]  # indices into the inventory's phones
+    syllables: tuple[int, ...]  # number of phones in each syllable
+    weight: float  # weight of its frames in the estimates
+    licence: str = ""
+    speaker: str = ""
+    samples: NDArray[np.int16] | None = None  # (n,) 16 kHz, the samples of the frames
+
+    @property
+    def is_word(self) -> bool:
+        """Whether this is a word or a syllable alone instead of connected speech."""
+        return len(self.phones) <= MAX_WORD_PHONES
+
+
+def load_examples(
+    corpora: Sequence[Path],
+    errors: RowErrors,
+    inventory: PhoneInventory,
+    *,
+    split: str = "train",
+    shipping: bool = True,
+    synthetic_weight: float = SYNTHETIC_WEIGHT,
+    with_samples: bool = False,
+) -> list[Example]:
+    """Read corpora with their log-mel features, computed or cached, and weight the recordings.
+
+    Parameters
+    ----------
+    corpora
+        Folders that :func:`corpora.speech_corpus.read_corpus` reads.
+    errors
+        Receives a message for every row that cannot be used.
+    inventory
+        The corpora's language.
+    split
+        Split to read.
+    shipping
+        Leave out rows whose licence forbids giving the model away.
+    synthetic_weight
+        Weight of synthetic relative to real speech.
+    with_samples
+        Load the samples too.
+
+    Raises
+    ------
+    UserError
+        If no recording can be used.
+    """
+    utterances: list[Utterance] = []
+    log_mels: list[NDArray[np.float16] | None] = []
+    sounds: list[NDArray[np.int16] | None] = []
+    for corpus in corpora:
+        rows = read_corpus(corpus, errors, inventory, split=split)
+        if shipping:
+            rows = _shippable(rows, errors)
+        utterances += rows
+        log_mels += log_mel_of(rows, errors)
+        sounds += samples_of(rows) if with_samples else [None] * len(rows)
+    weights = _weights(utterances, synthetic_weight)
+    examples = []
+    for utterance, weight, log_mel, sound in zip(
+        utterances, weights, log_mels, sounds, strict=True
+    ):
+        if log_mel is None:
+            continue
+        span = speech_span(log_mel)
+        trimmed = np.asarray(log_mel[span])
+        if len(trimmed) < _MIN_FRAMES_PER_PHONE * len(utterance.phones):
+            errors.add(utterance.utterance_id, "its text is longer than its sound")
+            continue
+        examples.append(
+            Example(
+                log_mel=trimmed,
+                phones=utterance.phones,
+                syllables=utterance.syllables,
+                weight=weight,
+                licence=utterance.licence,
+                speaker=utterance.speaker,
+                samples=None if sound is None else sound[_samples_of(span, len(trimmed))],
+            )
+        )
+    if not examples:
+        raise errors.nothing_left(f"of split {split!r} in {', '.join(map(str, corpora))}")
+    return examples
+
+
+def _shippable(rows: Sequence[Utterance], errors: RowErrors) -> list[Utterance]:
+    """Drop the rows whose licence forbids giving the model away."""
+    for row in rows:
+        if not may_ship(row.licence):
+            errors.add(row.utterance_id, f"its licence ({row.licence or 'none'}) is not free")
+    return [row for row in rows if may_ship(row.licence)]
+
+
+def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[float]:
+    """Weight the recordings by the formula above."""
+    minutes: dict[str, float] = defaultdict(float)
+    for utterance in utterances:
+        minutes[utterance.speaker] += utterance.seconds / 60
+    weights = []
+    for utterance in utterances:
+        weight = np.sqrt(_NEUTRAL_MINUTES / minutes[utterance.speaker])
+        weight = float(np.clip(weight, _MIN_WEIGHT, _MAX_WEIGHT))
+        weights.append(weight * (synthetic_weight if is_synthetic(utterance.licence) else 1.0))
+    return weights
+
+
+def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArray[np.int16]]:
+    """Read recordings without text, in any language.
+
+    Parameters
+    ----------
+    folders
+        Folders with audio files, at any depth.
+    errors
+        Receives a message for every file that cannot be used.
+
+    Returns
+    -------
+    list
+        Samples at 16 kHz without the long silence at both ends, in pieces of up to 20 s.
+
+    Raises
+    ------
+    UserError
+        If a folder holds no audio files, or none of them can be used.
+    """
+    pieces = []
+    for folder in folders:
+        files = [_file_without_text(path) for path in audio_files(folder)]
+        sounds = samples_of(files)
+        for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
+            if log_mel is None:
+                continue
+            span = speech_span(log_mel)
+            num_frames = len(log_mel[span])
+            if num_frames < _MIN_PIECE_FRAMES:
+                errors.add(file.utterance_id, "it is too short")
+            for start in range(0, num_frames - _MIN_PIECE_FRAMES + 1, _MAX_PIECE_FRAMES):
+                piece = slice(span.start + start, span.stop)
+                pieces.append(sound[_samples_of(piece, min(_MAX_PIECE_FRAMES, num_frames - start))])
+    if not pieces:
+        raise errors.nothing_left(f"in {', '.join(map(str, folders))}")
+    return pieces
+
+
+def _file_without_text(path: Path) -> Utterance:
+    return Utterance(
+        utterance_id=str(path),
+        path=path,
+        speaker="",
+        source="",
+        licence="",
+        split="",
+        seconds=0.0,
+        phones=(),
+        syllables=(),
+    )
+
+
+def speech_span(log_mel: NDArray[np.float16]) -> slice:
+    """Find the frames between the silence at both ends; a quarter of a second of it stays."""
+    log_energy = np.asarray(log_mel[:, 0], dtype=np.float32)
+    low, high = np.percentile(log_energy, [5, 95])
+    loud = np.flatnonzero(log_energy >= low + 0.3 * (high - low))
+    return slice(max(0, int(loud[0]) - _MARGIN_FRAMES), int(loud[-1]) + 1 + _MARGIN_FRAMES)
+
+
+def _samples_of(span: slice, num_frames: int) -> slice:
+    """Find the samples that the first ``num_frames`` frames of a span are computed from."""
+    first = HOP_SAMPLES * span.start
+    return slice(first, first + HOP_SAMPLES * (num_frames - 1) + WINDOW_SAMPLES)

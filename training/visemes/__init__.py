@@ -1,0 +1,1 @@
+"""Fit the dynamic visemes to tracked lips."""

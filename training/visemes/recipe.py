@@ -1,0 +1,121 @@
+"""From clips of real lips to a file with viseme parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from corpora.lip_clips import LEVEL_STEP_S, LipClip, label_clip, level_track, read_clips
+from services.recognizer.acoustic.load import load_model
+from services.synthesizer.lips.dynamic_visemes.blending import blend
+from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from services.synthesizer.lips.dynamic_visemes.parameters import (
+    VisemeParameters,
+    columns,
+    save_parameters,
+)
+from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
+from shared.errors import UserError
+from shared.phones.events import Phone
+from shared.phones.inventory import PhoneInventory
+from training.visemes.fit import estimate
+from training.visemes.frames import Array, frames_of
+
+_LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
+_SPOKEN_DB = 25.0  # sound this far below the loudest is no speech
+_CLOSURE_REACHES_S = (0.05, 0.06, 0.07, 0.08, 0.1)  # shorter ones are hardly visible
+_CLOSURE_WINDOW_S, _CLOSURE_NEIGHBOURS_S = 0.12, 1.0
+_SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apache-2.0"
+
+
+def usual_levels(
+    clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
+) -> Array:
+    """Level of each viseme relative to its speaker's mean speech level, dB, (num_visemes,)."""
+    start = initial_parameters().level_db
+    total, count = _LEVEL_RIDGE * start, np.full(len(VISEMES), _LEVEL_RIDGE)
+    for clip, phones in zip(clips, labels, strict=True):
+        time_s, level = np.array(level_track(clip.samples)).T
+        timeline = build_timeline(phones, inventory)
+        spoken_db = level[level > np.percentile(level, 95.0) - _SPOKEN_DB]
+        for viseme, start_s, end_s in zip(
+            timeline.viseme, timeline.apex_start_s, timeline.apex_end_s, strict=True
+        ):
+            inside = (time_s > start_s - LEVEL_STEP_S) & (time_s < end_s + LEVEL_STEP_S)
+            if inside.any():
+                quieter_db = float(np.mean(level[inside] - spoken_db.mean()))
+                if quieter_db > -_SPOKEN_DB:  # a lower one is a pause
+                    total[viseme] += quieter_db
+                    count[viseme] += 1.0
+    levels: Array = total / count
+    return levels
+
+
+def closure_reach(
+    parameters: VisemeParameters,
+    clips: Sequence[LipClip],
+    labels: Sequence[list[Phone]],
+    inventory: PhoneInventory,
+) -> float:
+    """Find the T of the closure rule that fits the lips around b p m best, seconds.
+
+    C cannot be estimated: every value above 20 shuts the lips, and a larger one changes nothing.
+    """
+    lips = columns((4, 5))
+
+    def loss(reach_s: float) -> float:
+        error = 0.0
+        for clip, phones in zip(clips, labels, strict=True):
+            timeline = build_timeline(phones, inventory)
+            rows = np.flatnonzero(timeline.viseme == VISEME_INDEX["b"])
+            for row in rows:
+                apex_s = timeline.apex_start_s[row]
+                frames = np.flatnonzero(np.abs(clip.time_s - apex_s) < _CLOSURE_WINDOW_S)
+                near = np.abs(timeline.apex_start_s - apex_s) < _CLOSURE_NEIGHBOURS_S
+                curve = blend(
+                    replace(parameters, closure_reach_s=reach_s),
+                    timeline.select(near),
+                    clip.time_s[frames],
+                )
+                error += float(np.nansum((curve[:, lips] - clip.faps[frames][:, lips]) ** 2))
+        return error
+
+    return min(_CLOSURE_REACHES_S, key=loss)
+
+
+def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> None:
+    """Train viseme parameters on the clips of ``folder`` that are for training.
+
+    Raises
+    ------
+    UserError
+        If no clip may be used, or the file cannot be written.
+    """
+    clips = read_clips(folder, any_licence=any_licence)
+    used = [clip for clip in clips if clip.part == "train"]
+    if not used:
+        raise UserError(
+            f"no clip in {folder} may be used; give clips with a free licence, or --any-licence"
+        )
+    model = load_model()
+    inventory = model.inventory
+    labels = [label_clip(model, clip) for clip in used]
+    parameters = estimate(frames_of(used, labels, inventory))
+    parameters = replace(parameters, level_db=usual_levels(used, labels, inventory))
+    reach_s = closure_reach(parameters, used, labels, inventory)
+    parameters = replace(parameters, closure_reach_s=reach_s)
+    licences = "; ".join(sorted({clip.licence for clip in used}))
+    try:
+        save_parameters(
+            parameters,
+            output,
+            f"{_SOURCE}; the rest learnt from clips under: {licences}",
+            learnt_from=[clip.name for clip in used],
+            chosen_with=[clip.name for clip in clips if clip.part == "choice"],
+        )
+    except OSError as error:
+        raise UserError(f"{output}: cannot be written: {error.strerror}") from None
