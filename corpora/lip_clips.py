@@ -15,6 +15,7 @@ from __future__ import annotations
 import csv
 import json
 import zlib
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,50 +135,68 @@ def read_clips(
     """
     held = folder / "held.txt"
     left_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
-    clips = []
-    for path in sorted(folder.glob("*.json")):
-        try:
-            about = json.loads(path.read_text(encoding="utf-8"))
-            spoken = str(about.get("language", "zh"))[:2]
-            if language not in (None, spoken):
-                continue
-            licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
-            with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
-                rows = list(csv.DictReader(file))
-            if not rows or None in rows[0]:
-                raise ValueError("its table has no rows, or rows longer than its head")
-            values = {
-                name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]
-            }
-            if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
-                raise ValueError("its times do not rise")
-            is_rig = "mouth_stretch_c" in values
-            faps = _rig_faps(values) if is_rig else _tracked_faps(values)
-            if np.isnan(faps).all():
-                raise ValueError("it measures no FAP of the mouth")
-            part = part_of(path.stem, may_train=any_licence or may_ship(licence))
-            clips.append(
-                LipClip(
-                    name=path.stem,
-                    speaker=speaker,
-                    licence=licence,
-                    language=spoken,
-                    part="held" if {path.stem, speaker} & left_out else part,
-                    is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
-                    transcript=about.get("transcript") or "",
-                    time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
-                    faps=faps,
-                    samples=read_audio(path.with_suffix(".flac")),
-                )
-            )
-        except KeyError as error:
-            raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
-        except (OSError, ValueError, AttributeError, csv.Error) as error:
-            raise UserError(f"cannot read the clip {path.stem}: {error}") from error
+    clips = [
+        clip
+        for path in sorted(folder.glob("*.json"))
+        if (clip := _read_clip(path, language, any_licence=any_licence, left_out=left_out))
+    ]
     if not clips:
         what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
         raise UserError(f"no {what} in {folder}; give a folder of .flac, .csv and .json")
     return clips
+
+
+def read_clip(path: Path) -> LipClip:
+    """Read one clip by the path of its ``.json``.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read.
+    """
+    clip = _read_clip(path.with_suffix(".json"), None, any_licence=True)
+    assert clip is not None  # noqa: S101 - in any language
+    return clip
+
+
+def _read_clip(
+    path: Path, language: str | None, *, any_licence: bool, left_out: Collection[str] = ()
+) -> LipClip | None:
+    """Read a clip; None if it is in another language."""
+    try:
+        about = json.loads(path.read_text(encoding="utf-8"))
+        spoken = str(about.get("language", "zh"))[:2]
+        if language not in (None, spoken):
+            return None
+        licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
+        with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        if not rows or None in rows[0]:
+            raise ValueError("its table has no rows, or rows longer than its head")
+        values = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
+        if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
+            raise ValueError("its times do not rise")
+        is_rig = "mouth_stretch_c" in values
+        faps = _rig_faps(values) if is_rig else _tracked_faps(values)
+        if np.isnan(faps).all():
+            raise ValueError("it measures no FAP of the mouth")
+        part = part_of(path.stem, may_train=any_licence or may_ship(licence))
+        return LipClip(
+            name=path.stem,
+            speaker=speaker,
+            licence=licence,
+            language=spoken,
+            part="held" if {path.stem, speaker} & {*left_out} else part,
+            is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
+            transcript=about.get("transcript") or "",
+            time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
+            faps=faps,
+            samples=read_audio(path.with_suffix(".flac")),
+        )
+    except KeyError as error:
+        raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
+    except (OSError, ValueError, AttributeError, csv.Error) as error:
+        raise UserError(f"cannot read the clip {path.stem}: {error}") from error
 
 
 def _tracked_faps(tracks: dict[str, Array]) -> Array:
@@ -216,8 +235,8 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
 
 
 def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
-    """Phones of a clip by its text; None where that is unknown, unreadable or not Mandarin."""
-    if not clip.transcript or clip.language != "zh":
+    """Phones of a clip by its text; None if it has none, or none in the model's language."""
+    if not clip.transcript or clip.language != model.inventory.code:
         return None
     try:
         return align_text(model, clip.samples, SAMPLE_RATE_HZ, clip.transcript)

@@ -29,7 +29,10 @@ from shared.phones.inventory import PhoneInventory
 _FREE_LICENCE = re.compile(
     r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
 )
-_CLOSED_LICENCE = re.compile(r"\bnc\b|\bnd\b|non-?commercial|no-?deriv", re.I)
+# Exceptions to a licence, and footage that is not its repository's to give, close it, too.
+_CLOSED_LICENCE = re.compile(
+    r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
+)
 _MIN_PHONE_S = 0.03
 _AUDIO_SUFFIXES = {".wav", ".flac", ".ogg", ".opus"}
 _KALDI_SPLITS = ("train", "dev", "test")

@@ -103,6 +103,43 @@ def lips(
 
 
 @app.command()
+def closures(
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    json_file: JsonFile = None,
+) -> None:
+    """Compare how the learnt lips may weigh evidence of closures, on clips for choices."""
+    from evaluation.lips.closure_fit import main, print_scores
+
+    check_output(json_file)
+    scores = main(clips)
+    print_scores(scores, Console())
+    write_json(json_file, [asdict(score) for score in scores])
+
+
+@app.command()
+def voices(
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    lips: Annotated[Path | None, typer.Option(help="Model of lips (.npz).")] = None,
+    speaker: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Speakers whom the model has not learnt from; repeatable. Else those whom the "
+            "model that ships has not."
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Show what some seconds of a speaker's own lips bring, on clips held out."""
+    from evaluation.lips.voices import print_scores, score_voices
+    from services.recognizer.lips import LIPS_PATH
+
+    check_output(json_file)
+    scores = score_voices(clips, lips or LIPS_PATH, speaker or ())
+    print_scores(scores, Console())
+    write_json(json_file, [asdict(score) for score in scores])
+
+
+@app.command()
 def visemes(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
@@ -137,7 +174,7 @@ def bench(
 
 @plot_app.callback()
 def plot() -> None:
-    """Draw pictures of the models."""
+    """Draw pictures and videos of the models."""
 
 
 @plot_app.command(name="visemes")
@@ -151,3 +188,16 @@ def plot_visemes(
 
     for path in draw(folder, audio, parameters):
         print_message(f"wrote {path}")
+
+
+@plot_app.command(name="clip")
+def plot_clip(
+    name: Annotated[str, typer.Argument(help="Name of the clip.")],
+    output: Annotated[Path, typer.Argument(help="Video to write (.mp4, .mov, .webm, .webp).")],
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+) -> None:
+    """Make a video of every lip model beside the tracked lips of a clip."""
+    from evaluation.lips.clip_video import film_clip
+
+    film_clip(clips, name, output)
+    print_message(f"wrote {output}")

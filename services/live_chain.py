@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.config import RecognizerConfig
 from services.recognizer.lip_source import LipsFromSound
+from services.recognizer.lips import lips_for
 from services.recognizer.stream import SpeechStream, StreamOutput, Waveform
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.face import Face, Frame
@@ -48,7 +49,7 @@ class LiveChain:
     recognizer, synthesizer
         The two services' settings; ``lips`` stands for ``synthesizer.lips``.
     lips_from_sound
-        The recognizer's model of lips; None: it emits no lip frames.
+        The recognizer's model of lips; None: the one that the recognizer itself would load.
 
     Attributes
     ----------
@@ -80,7 +81,7 @@ class LiveChain:
             recognizer,
             sample_rate_hz,
             num_channels,
-            lips_from_sound,
+            lips_from_sound or lips_for(model),
             synthesizer.delay_ms / 1e3,
         )
         self._face = Face(

@@ -17,6 +17,11 @@ def to_samples(time_s: float) -> int:
     return max(0, round(time_s * MEDIA_RATE_HZ))
 
 
+def duration_to_samples(duration_s: float) -> int:
+    """Return a duration in samples for seconds; it may be negative."""
+    return round(duration_s * MEDIA_RATE_HZ)
+
+
 def to_seconds(samples: int) -> float:
     """Return seconds for media time in samples."""
     return samples / MEDIA_RATE_HZ

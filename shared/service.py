@@ -67,6 +67,7 @@ class Service:
         self.language = ""  # of the phones that it recognises
         self.frame_rate_hz = 0.0  # of the FAP frames that it makes
         self.delay_ms = 0.0  # how much later than its sound it makes a FAP frame
+        self.lips = ""  # the lip model that it uses until a client chooses one
         self.warnings = RateLimit()
         self._poller = self.bus.poller()
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
@@ -266,6 +267,7 @@ class Service:
                 language=self.language,
                 frame_rate_hz=self.frame_rate_hz,
                 delay_ms=self.delay_ms,
+                lips=self.lips,
                 state="draining" if self._stop_requested else "ready",
                 sent_ns=now_ns(),
                 endpoints=self.endpoints,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corpora.lip_clips import LipClip
-from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.config import DELAYS_MS
 from services.synthesizer.face import Face, Frame
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes, VisemeArticulation
 from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
@@ -14,12 +14,13 @@ from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from services.synthesizer.lips.lip_model import Articulation
 from services.synthesizer.modifiers.modifier import Moment
 from shared.face.faps import MOUTH_FAPS
+from shared.face.lip_models import LipModelName
 from shared.phones.events import Phone, Progress
 from shared.phones.inventory import load_inventory
 
 INVENTORY = load_inventory()
 LIPS = DynamicVisemes(load_parameters(), INVENTORY)
-DELAY_S = SynthesizerConfig().delay_ms / 1e3
+DELAY_S = DELAYS_MS[LipModelName.DYNAMIC_VISEMES] / 1e3
 SILENT_DB = -120.0
 JAW, LOWER_LIP, WIDTH = (MOUTH_FAPS.index(fap) for fap in (3, 5, 6))
 

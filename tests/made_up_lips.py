@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import LipFrame
 
@@ -18,11 +19,14 @@ JAW = MOUTH_FAPS.index(3)
 class LoudLips:
     """Offers any delays; the keys and values of the network count a little, too."""
 
-    delays_s: Sequence[float] = (0.0, 0.025, 0.085, 0.145)
+    delays_s: Sequence[float] = (-0.005, 0.025, 0.085, 0.145)
 
     def stream(self, delays_s: Sequence[float]) -> LoudLipStream:
         assert set(delays_s) <= set(self.delays_s)
         return LoudLipStream(delays_s)
+
+    def for_voice(self, profile: bytes) -> LoudLips:
+        raise UserError(f"it is no voice: {profile!r}")
 
 
 class LoudLipStream:

@@ -15,20 +15,32 @@ from evaluation.lips.measures import (
     PAIRING_WINDOW_S,
     Hits,
     Likeness,
+    Speed,
     Turns,
     closures,
     likeness,
     lip_to_teeth,
     lip_to_teeth_poses,
+    made_shut,
     offsets,
     openings,
     real_closures,
     real_shut,
+    shut_after,
     shut_at,
+    speed_in,
     turns,
     without_drift,
 )
-from evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme, acoustic_closures, is_speech
+from evaluation.lips.schemes import (
+    FRAME_RATE_HZ,
+    HeardClip,
+    Scheme,
+    is_speech,
+    pauses,
+    phones_shaped,
+    quietest_moments,
+)
 from shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 Array = NDArray[np.float64]
@@ -91,6 +103,26 @@ class EventSums:
 
 
 @dataclass(frozen=True, slots=True)
+class PauseSums:
+    """The opening while nobody speaks."""
+
+    count: int = 0
+    speed: Speed = field(default_factory=Speed)
+    real_speed: Speed = field(default_factory=Speed)
+    shut_after_s: tuple[float, ...] = ()  # of the pauses in which the lips shut
+    real_shut_after_s: tuple[float, ...] = ()
+
+    def __add__(self, other: PauseSums) -> PauseSums:
+        return PauseSums(
+            self.count + other.count,
+            self.speed + other.speed,
+            self.real_speed + other.real_speed,
+            self.shut_after_s + other.shut_after_s,
+            self.real_shut_after_s + other.real_shut_after_s,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class ClipScore:
     """What one scheme reaches on one clip."""
 
@@ -99,6 +131,7 @@ class ClipScore:
     delay_s: float | None
     curves: dict[str, CurveSums]  # of the measures that the clip has
     events: EventSums
+    pauses: PauseSums
 
 
 def real_faps(clip: LipClip) -> Array:
@@ -116,7 +149,7 @@ def is_measured(clip: LipClip, measure: str) -> bool:
 def score_clip(heard: HeardClip, scheme: Scheme) -> ClipScore | None:
     """Score what a scheme makes of a clip; None if it makes nothing of it.
 
-    A clip whose sound is not in sync with the picture has no lags and no events.
+    A clip whose sound is not in sync with the picture has no lags, events and pauses.
     """
     made = scheme.frames(heard)
     if made is None:
@@ -129,7 +162,8 @@ def score_clip(heard: HeardClip, scheme: Scheme) -> ClipScore | None:
         if is_measured(clip, name)
     }
     events = _score_events(heard, real, made) if clip.is_in_sync else EventSums()
-    return ClipScore(clip, scheme.name, scheme.delay_s, curves, events)
+    silence = _score_pauses(heard, real, made) if clip.is_in_sync else PauseSums()
+    return ClipScore(clip, scheme.name, scheme.delay_s, curves, events, silence)
 
 
 def _score_curve(
@@ -156,11 +190,8 @@ def _score_curve(
 def _score_events(heard: HeardClip, real: Array, made: Array) -> EventSums:
     """Compare closures and openings of real FAPs with those of made ones, (num_frames, 68)."""
     clip = heard.clip
-    phones = (heard.aligned or heard.recognised) if clip.language == "zh" else []
-    bpm_s = acoustic_closures(clip, phones)
-    f_s = np.array(
-        [phone.onset_s + phone.duration_s / 2.0 for phone in phones if phone.symbol == "f"]
-    )
+    bpm_s = quietest_moments(clip, phones_shaped(heard, "b"))
+    f_s = np.array([phone.onset_s + phone.duration_s / 2.0 for phone in phones_shaped(heard, "f")])
     poses_s = lip_to_teeth_poses(clip.time_s, real[:, 3], real[:, 4])
     real_f_s = f_s + offsets(f_s, poses_s, _PHONE_WINDOW_S)
     real_f_s = real_f_s[~np.isnan(real_f_s)]
@@ -180,5 +211,23 @@ def _score_events(heard: HeardClip, real: Array, made: Array) -> EventSums:
         bpm=len(bpm_s),
         bpm_met=int(shut_at(bpm_s, time_s, opening).sum()),
         num_openings=len(real_openings_s),
-        opening_delays_s=tuple(delays_s[~np.isnan(delays_s)]),
+        opening_delays_s=_known(delays_s),
     )
+
+
+def _score_pauses(heard: HeardClip, real: Array, made: Array) -> PauseSums:
+    """Compare the openings of real FAPs in pauses with those of made ones, (num_frames, 68)."""
+    real_s, made_s = heard.clip.time_s, np.arange(len(made)) / FRAME_RATE_HZ
+    real_opening, opening = MEASURES["opening"](real), MEASURES["opening"](made)
+    pauses_s = pauses(heard)
+    return PauseSums(
+        count=len(pauses_s),
+        speed=speed_in(pauses_s, real_s, np.interp(real_s, made_s, opening)),
+        real_speed=speed_in(pauses_s, real_s, real_opening),
+        shut_after_s=_known(shut_after(pauses_s, made_shut(made_s, opening))),
+        real_shut_after_s=_known(shut_after(pauses_s, real_shut(real_s, real_opening))),
+    )
+
+
+def _known(values: Array) -> tuple[float, ...]:
+    return tuple(values[~np.isnan(values)])

@@ -26,6 +26,7 @@ _OPEN_SHARE, _OPEN_WINDOW_S = 0.5, 0.2  # which opens so far near a closure: els
 _NEAR_REST, _RAISED = 10.0, 10.0  # FAP units of the lower and the upper lip
 _RISE_FROM, _RISE_THROUGH = 0.1, 0.3  # shares of a mouth's range
 _STILL = 25.0  # FAP units per second
+_SETTLED_S, _SETTING_OUT_S = 0.3, 0.2  # of a pause: lips still close, and already open
 _NO_POWER = 1e-12  # of what filters leave of a curve that stands still
 _ROUNDING_S = 1e-6
 
@@ -115,6 +116,22 @@ class Turns:
         return self.count / self.seconds if self.seconds else None
 
 
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """How fast a curve moves."""
+
+    num_steps: int = 0
+    squares: float = 0.0
+
+    def __add__(self, other: Speed) -> Speed:
+        return Speed(self.num_steps + other.num_steps, self.squares + other.squares)
+
+    @property
+    def rms(self) -> float | None:
+        """Root of the mean squared velocity, units of the curve a second; None without steps."""
+        return float(np.sqrt(self.squares / self.num_steps)) if self.num_steps else None
+
+
 def likeness(made: Array, real: Array) -> Likeness:
     """Compare two curves of a clip, shape (num_frames,) each."""
     if not len(made):
@@ -144,6 +161,49 @@ def turns(time_s: Array, values: Array) -> Turns:
     velocity = np.diff(values) / np.diff(time_s)
     direction = np.sign(velocity[np.abs(velocity) > _STILL])
     return Turns(int(np.sum(direction[1:] != direction[:-1])), float(time_s[-1] - time_s[0]))
+
+
+def speed_in(pauses_s: Array, time_s: Array, values: Array) -> Speed:
+    """Measure how fast a curve moves within pauses.
+
+    The first 0.3 s and the last 0.2 s of each are left out: there a mouth closes and opens.
+
+    Parameters
+    ----------
+    pauses_s
+        Starts and ends, shape (num_pauses, 2).
+    time_s, values
+        Shape (num_frames,); nan where not measured.
+    """
+    start_s, end_s = pauses_s[:, :1] + _SETTLED_S, pauses_s[:, 1:] - _SETTING_OUT_S
+    still: NDArray[np.bool_] = np.any((time_s >= start_s) & (time_s <= end_s), axis=0)
+    velocity = np.diff(values) / np.diff(time_s)
+    velocity = velocity[still[1:] & still[:-1] & ~np.isnan(velocity)]
+    return Speed(len(velocity), float(velocity @ velocity))
+
+
+def shut_after(pauses_s: Array, shut_s: Array) -> Array:
+    """Time from the start of each pause to the first moment in which lips are shut, seconds.
+
+    Parameters
+    ----------
+    pauses_s
+        Starts and ends, shape (num_pauses, 2).
+    shut_s
+        Of ``real_shut`` or ``made_shut``.
+
+    Returns
+    -------
+    Array
+        Shape (num_pauses,); nan where they do not shut before the end.
+    """
+    after = np.append(shut_s, np.inf)[np.searchsorted(shut_s, pauses_s[:, 0])]
+    return np.where(after <= pauses_s[:, 1], after - pauses_s[:, 0], np.nan)
+
+
+def made_shut(time_s: Array, opening: Array) -> Array:
+    """Return the times of all frames in which made lips are shut, seconds."""
+    return time_s[opening < _SHUT]
 
 
 def real_closures(time_s: Array, opening: Array) -> Array:

@@ -82,6 +82,16 @@ def _of_hits(hits: Callable[[LipScore], HitScore]) -> dict[str, Cell]:
     }
 
 
+def _of_pauses(made: str, real: str) -> Cell:
+    """Return a cell with figures of the made and of the real lips."""
+
+    def cell(score: LipScore) -> str:
+        figures = (_figure(getattr(score.pauses, name), ".0f") for name in (made, real))
+        return "{} ({})".format(*figures)
+
+    return cell
+
+
 def _figure(value: float | None, form: str = ".2f") -> str:
     return "-" if value is None else format(value, form)
 
@@ -114,6 +124,13 @@ TABLES: dict[str, dict[str, Cell]] = {
         "p50": lambda score: _figure(score.opening_delay_p50_ms, "+.0f"),
         "p95": lambda score: _figure(score.opening_delay_p95_ms, "+.0f"),
         "met": lambda score: f"{score.openings_met}/{score.openings}",
+    },
+    "Pauses, made (real): FAP units/s of opening; ms from last sound to shut lips": {
+        "speed": _of_pauses("speed", "real_speed"),
+        "p50": _of_pauses("shut_after_p50_ms", "real_shut_after_p50_ms"),
+        "p95": _of_pauses("shut_after_p95_ms", "real_shut_after_p95_ms"),
+        "shut": _of_pauses("shut", "real_shut"),
+        "of": lambda score: str(score.pauses.count),
     },
 }
 SPEAKER_COLUMNS: dict[str, Cell] = {

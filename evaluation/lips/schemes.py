@@ -34,17 +34,19 @@ from services.synthesizer.lips.lip_model import LipModel
 from services.synthesizer.offline import synthesize
 from shared.face.faps import NUM_FAPS
 from shared.phones.events import Phone, SoundEvent, SpeechChange
+from shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
 DEFAULT_DELAY_S = SynthesizerConfig().delay_ms / 1e3
-DELAYS_S = sorted({0.0, 0.05, 0.1, 0.16, 0.3, DEFAULT_DELAY_S})
-NEXT_PHONE_DELAY_S = 0.05
+DELAYS_S = sorted({0.0, 0.1, 0.16, 0.3, DEFAULT_DELAY_S})
+NEXT_PHONE_DELAY_S = DEFAULT_DELAY_S
 FRAME_RATE_HZ = 50.0
 _HOP_S = 1.0 / FRAME_RATE_HZ
 _LOUDNESS_RANGE_DB = 40.0
 _LOUDNESS_WINDOW = np.hanning(7)  # frames
 _SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
+_PAUSE_S = 0.5
 _QUIETEST_HOP_S = 0.01
 _MEAN_OPENING = 250.0  # FAP units; only closures see it, means are removed
 
@@ -57,6 +59,7 @@ class HeardClip:
     num_frames: int  # of synthesis
     levels: list[tuple[float, float]]  # seconds, dB of full scale
     events: Mapping[float, Sequence[SoundEvent]]  # of the live recognizer, by the face's delay in s
+    inventory: PhoneInventory  # of the phones
     recognised: list[Phone]  # by offline decoding
     aligned: list[Phone] | None  # by the transcript
 
@@ -70,7 +73,12 @@ class Scheme:
     frames: Callable[[HeardClip], Array | None]
 
 
-def hear(model: AcousticModel, clip: LipClip, lips: LipsFromSound | None) -> HeardClip:
+def hear(
+    model: AcousticModel,
+    clip: LipClip,
+    lips: LipsFromSound | None,
+    delays_s: Sequence[float] = DELAYS_S,
+) -> HeardClip:
     """Recognise a clip live and offline, and align it with its text where that is known.
 
     Live, lip frames of the sound come in time for a face of each delay.
@@ -79,7 +87,8 @@ def hear(model: AcousticModel, clip: LipClip, lips: LipsFromSound | None) -> Hea
         clip=clip,
         num_frames=int(len(clip.samples) / SAMPLE_RATE_HZ * FRAME_RATE_HZ) + 1,
         levels=level_track(clip.samples),
-        events={delay_s: sound_events(model, clip.samples, lips, delay_s) for delay_s in DELAYS_S},
+        events={delay_s: sound_events(model, clip.samples, lips, delay_s) for delay_s in delays_s},
+        inventory=model.inventory,
         recognised=recognize(model, clip.samples, SAMPLE_RATE_HZ),
         aligned=aligned_phones(model, clip),
     )
@@ -196,20 +205,57 @@ def is_speech(heard: HeardClip, time_s: Array) -> NDArray[np.bool_]:
     30 dB below the loudest. Voice activity alone spans pauses of half a second, the level alone
     takes noise for speech.
     """
-    events = heard.events[DEFAULT_DELAY_S]
-    changes = [event for event in events if isinstance(event, SpeechChange)]
-    after = np.searchsorted([change.time_s for change in changes], time_s, side="right")
-    active = np.array([False, *(change.active for change in changes)])[after]
-    if not heard.levels:
-        return np.zeros(len(time_s), dtype=bool)
-    end_s, level_db = np.array(heard.levels).T
-    loud_s = end_s[level_db > np.percentile(level_db, 95) - _SPEECH_RANGE_DB] - LEVEL_STEP_S / 2.0
-    speech: NDArray[np.bool_] = active & is_near(time_s, loud_s, _SPEECH_MARGIN_S)
+    speech: NDArray[np.bool_] = _is_active(heard, time_s) & is_near(
+        time_s, _loud_s(heard), _SPEECH_MARGIN_S
+    )
     return speech
 
 
-def acoustic_closures(clip: LipClip, phones: Sequence[Phone]) -> Array:
-    """When the phones b p m of a clip are quietest, seconds."""
+def pauses(heard: HeardClip) -> Array:
+    """Where half a second and more is silent after speech, seconds, shape (num_pauses, 2).
+
+    A pause goes from the last sound that is less than 30 dB below the loudest, while the
+    recognizer's voice activity is on, to the next such sound or the end of the clip.
+    """
+    loud_s = _loud_s(heard)
+    spoken_s = loud_s[_is_active(heard, loud_s)]
+    edges_s = np.append(spoken_s, len(heard.clip.samples) / SAMPLE_RATE_HZ)
+    is_pause = np.diff(edges_s) >= _PAUSE_S
+    return np.stack([edges_s[:-1][is_pause], edges_s[1:][is_pause]], axis=1)
+
+
+def _is_active(heard: HeardClip, time_s: Array) -> NDArray[np.bool_]:
+    """Tell of some times whether the recognizer's voice activity is on."""
+    events = heard.events[DEFAULT_DELAY_S]
+    changes = [event for event in events if isinstance(event, SpeechChange)]
+    after = np.searchsorted([change.time_s for change in changes], time_s, side="right")
+    return np.array([False, *(change.active for change in changes)])[after]
+
+
+def _loud_s(heard: HeardClip) -> Array:
+    """When the sound is less than 30 dB below the loudest, seconds."""
+    if not heard.levels:
+        return np.zeros(0)
+    end_s, level_db = np.array(heard.levels).T
+    is_loud = level_db > np.percentile(level_db, 95) - _SPEECH_RANGE_DB
+    loud_s: Array = end_s[is_loud] - LEVEL_STEP_S / 2.0
+    return loud_s
+
+
+def phones_shaped(heard: HeardClip, viseme: str) -> list[Phone]:
+    """Phones of a clip that begin with a viseme; none where the language is not the model's."""
+    if heard.clip.language != heard.inventory.code:
+        return []
+    visemes = heard.inventory.visemes
+    return [
+        phone
+        for phone in heard.aligned or heard.recognised
+        if visemes[phone.symbol][0][0] == viseme
+    ]
+
+
+def quietest_moments(clip: LipClip, phones: Sequence[Phone]) -> Array:
+    """When some phones of a clip are quietest, seconds."""
     hop = round(_QUIETEST_HOP_S * SAMPLE_RATE_HZ)
     power = np.square(clip.samples[: len(clip.samples) // hop * hop], dtype=float)
     level = power.reshape(-1, hop).mean(axis=1)
@@ -217,6 +263,6 @@ def acoustic_closures(clip: LipClip, phones: Sequence[Phone]) -> Array:
     for phone in phones:
         first = round(phone.onset_s / _QUIETEST_HOP_S)
         last = max(round((phone.onset_s + phone.duration_s) / _QUIETEST_HOP_S), first + 1)
-        if phone.symbol in "bpm" and first < len(level):
+        if first < len(level):
             moments.append((first + int(np.argmin(level[first:last])) + 0.5) * _QUIETEST_HOP_S)
     return np.array(moments)

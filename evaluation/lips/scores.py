@@ -20,10 +20,14 @@ source, a speaker.
   lips tremble by errors of tracking: smooth ones (an animator's rig) are the stricter measure.
 - The time from a real opening to the synthesized one, in media time: a viewer waits for the delay
   besides.
+- Pauses, half a second and more without speech (``schemes.pauses``): root mean square of the
+  opening's velocity at the video's frame rate, once the lips had 0.3 s to close, and that of the
+  real lips, whose tracking trembles; a mouth at rest has 0. The time from the last sound to lips
+  that are shut, synthesized and real, in media time, and in how many pauses they shut at all.
 
-Clips whose sound is not in sync with the picture count for no time: not for lags, closures and
-openings. The real lips of another speaker who says the same, a bound of what sound can tell, would
-need clips that share a sentence.
+Clips whose sound is not in sync with the picture count for no time: not for lags, closures,
+openings and pauses. The real lips of another speaker who says the same, a bound of what sound can
+tell, would need clips that share a sentence.
 
 Only clips that are held out are scored, and of them only those that the parameters have not seen.
 """
@@ -46,6 +50,7 @@ from evaluation.lips.clip_scores import (
     ClipScore,
     CurveSums,
     EventSums,
+    PauseSums,
     is_measured,
     score_clip,
 )
@@ -88,6 +93,21 @@ class HitScore:
 
 
 @dataclass(slots=True, kw_only=True)
+class PauseScore:
+    """The opening while nobody speaks; None where there is no pause."""
+
+    count: int
+    speed: float | None  # root mean square, FAP units a second, at the video's frame rate
+    real_speed: float | None
+    shut: int  # pauses in which the lips shut
+    real_shut: int
+    shut_after_p50_ms: float | None  # from the last sound
+    shut_after_p95_ms: float | None
+    real_shut_after_p50_ms: float | None
+    real_shut_after_p95_ms: float | None
+
+
+@dataclass(slots=True, kw_only=True)
 class LipScore:
     """One scheme on one group of clips."""
 
@@ -106,6 +126,7 @@ class LipScore:
     openings_met: int  # within 0.3 s
     opening_delay_p50_ms: float | None
     opening_delay_p95_ms: float | None
+    pauses: PauseScore
 
 
 def clips_to_score(
@@ -189,8 +210,8 @@ def _pooled(
         if any(measure in score.curves for score in scores)
     }
     events = reduce(add, (score.events for score in scores), EventSums())
-    delays_ms = 1e3 * np.array(events.opening_delays_s)
-    p50, p95 = np.percentile(delays_ms, [50, 95]).tolist() if delays_ms.size else (None, None)
+    pauses = reduce(add, (score.pauses for score in scores), PauseSums())
+    p50, p95 = _percentiles_ms(events.opening_delays_s)
     return LipScore(
         scheme=scheme,
         delay_ms=None if delay_s is None else round(1e3 * delay_s),
@@ -204,9 +225,10 @@ def _pooled(
         bpm=events.bpm,
         bpm_met=events.bpm_met,
         openings=events.num_openings,
-        openings_met=delays_ms.size,
+        openings_met=len(events.opening_delays_s),
         opening_delay_p50_ms=p50,
         opening_delay_p95_ms=p95,
+        pauses=_pause_score(pauses),
     )
 
 
@@ -235,6 +257,30 @@ def _hit_score(hits: Hits) -> HitScore:
         precision=hits.precision,
         f1=hits.f1,
     )
+
+
+def _pause_score(sums: PauseSums) -> PauseScore:
+    p50, p95 = _percentiles_ms(sums.shut_after_s)
+    real_p50, real_p95 = _percentiles_ms(sums.real_shut_after_s)
+    return PauseScore(
+        count=sums.count,
+        speed=sums.speed.rms,
+        real_speed=sums.real_speed.rms,
+        shut=len(sums.shut_after_s),
+        real_shut=len(sums.real_shut_after_s),
+        shut_after_p50_ms=p50,
+        shut_after_p95_ms=p95,
+        real_shut_after_p50_ms=real_p50,
+        real_shut_after_p95_ms=real_p95,
+    )
+
+
+def _percentiles_ms(times_s: Sequence[float]) -> tuple[float | None, float | None]:
+    """Return the median and the 95th percentile, ms; None without times."""
+    if not times_s:
+        return None, None
+    p50, p95 = 1e3 * np.percentile(times_s, [50, 95])
+    return float(p50), float(p95)
 
 
 def main(

@@ -36,7 +36,7 @@ from services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
 from services.synthesizer.offline import synthesize
 from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory, load_inventory
+from shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
@@ -168,14 +168,13 @@ def changes(learnt: VisemeParameters, guessed: VisemeParameters) -> list[Change]
 
 def main(folder: Path, parameters: Path | None, picture: Path | None) -> dict[str, Any]:
     """Fit all clips that were not learnt from, print tables and return the figures."""
-    model, inventory = load_model(), load_inventory()
+    model = load_model()
     learnt, guessed = load_parameters(parameters), initial_parameters()
-    lips = [DynamicVisemes(each, inventory) for each in (learnt, guessed)]
+    lips = [DynamicVisemes(each, model.inventory) for each in (learnt, guessed)]
+    clips = clips_to_score(folder, parameters, language=model.inventory.code)
     fitted = [
         fit_clip(clip, label_clip(model, clip), *lips)
-        for clip in track(
-            clips_to_score(folder, parameters, language="zh"), description="clips", transient=True
-        )
+        for clip in track(clips, description="clips", transient=True)
     ]
     errors, changed = errors_of_visemes(fitted), changes(learnt, guessed)
     console = Console()

@@ -22,6 +22,7 @@ from services.driver.head.head import Head
 from services.driver.render.camera import Camera
 from services.driver.render.renderer import Renderer
 from services.live_chain import sound_events
+from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.offline import recognize
 from services.recognizer.stream import SILENT_DB
@@ -39,7 +40,7 @@ from services.synthesizer.offline import synthesize
 from shared.errors import UserError
 from shared.face.faps import FAPS, MOUTH_FAPS, NUM_FAPS
 from shared.phones.events import EndOfSound, Phone, Progress, SoundEvent
-from shared.phones.inventory import PhoneInventory, load_inventory
+from shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
@@ -64,12 +65,13 @@ def plot_visemes(folder: Path, audio: Path, parameters_file: Path | None) -> lis
     UserError
         If the sound cannot be read or the pictures cannot be written.
     """
-    lips = DynamicVisemes(load_parameters(parameters_file), load_inventory())
+    model = load_model()
+    lips = DynamicVisemes(load_parameters(parameters_file), model.inventory)
     samples = read_mono_16k(audio)
     pictures: dict[str, Callable[[], Any]] = {
         "faces.png": lambda: faces_figure(lips),
         "dominance.png": lambda: dominance_figure(lips),
-        "sentence.png": lambda: sentence_figure(lips, samples),
+        "sentence.png": lambda: sentence_figure(lips, model, samples),
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -191,9 +193,10 @@ def _live_curve(lips: DynamicVisemes, phones: Sequence[Phone]) -> tuple[Array, A
     return time_s, frames[:, 2]
 
 
-def sentence_figure(lips: DynamicVisemes, samples: NDArray[np.float32]) -> Any:
+def sentence_figure(
+    lips: DynamicVisemes, model: AcousticModel, samples: NDArray[np.float32]
+) -> Any:
     """Draw FAP curves of a sentence under its waveform and phones, full model and live."""
-    model = load_model()
     phones = recognize(model, samples, SAMPLE_RATE_HZ)
     live = live_frames(lips, sound_events(model, samples), DEFAULT_DELAY_S, FRAME_RATE_HZ)
     live_s = np.arange(len(live)) / FRAME_RATE_HZ

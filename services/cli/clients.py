@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from services.cli.terminal import CONSOLE, JsonFile, print_message, write_json
+from services.cli.terminal import CONSOLE, JsonFile, VoiceFile, print_message, write_json
 from services.kinds import read_settings
 from shared.config import ServiceConfig
 
@@ -36,12 +36,15 @@ def speak(
     ] = False,
     rate: Annotated[int, typer.Option(help="Sample rate of '-', Hz.")] = 16000,
     channels: Annotated[int, typer.Option(help="Channels of '-'.")] = 1,
+    voice: VoiceFile = None,
     control: Control = "",
 ) -> None:
     """Stream a file, standard input or the microphone to a running system."""
     from services.cli.streaming import stream
+    from services.recognizer.voice import read_profile
     from shared.audio_file import microphone, open_audio, raw_audio
 
+    profile = b"" if voice is None else read_profile(voice)
     if source == "mic":
         audio = microphone()
     elif source == "-":
@@ -49,7 +52,13 @@ def speak(
     else:
         audio = open_audio(Path(source))
     summary = stream(
-        audio, _control_address(control), CONSOLE, session=session, record=record, paced=not fast
+        audio,
+        _control_address(control),
+        CONSOLE,
+        session=session,
+        record=record,
+        paced=not fast,
+        voice=profile,
     )
     print_message(
         f"session {summary.session}: {summary.num_phones} phones in {summary.duration_s:.1f} s"

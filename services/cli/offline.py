@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from services.cli.heads import DEFAULT_HEAD, HeadName
-from services.cli.terminal import CONSOLE, print_message, write_output
+from services.cli.terminal import CONSOLE, VoiceFile, print_message, write_output
 from services.driver.config import Framing
+from shared.face.lip_models import LipModelName
 
 Audio = Annotated[Path, typer.Argument(help="Audio file.")]
 Acoustic = Annotated[str, typer.Option(help="Model: neural, gmm, or a file.")]
@@ -38,10 +39,14 @@ def render(
     output: Annotated[
         Path,
         typer.Argument(
-            help="Video (.mp4, .mov, .webm), one picture (.png), or a picture for every image (a"
-            " folder, or a name with a number: face%05d.png)."
+            help="Video (.mp4, .mov, .webm, silent .webp), one picture (.png), or a picture for"
+            " every image (a folder, or a name with a number: face%05d.png)."
         ),
     ],
+    lips: Annotated[
+        list[LipModelName] | None,
+        typer.Option(help="Lip model for a sound; repeated: faces side by side, with captions."),
+    ] = None,
     head: HeadName = DEFAULT_HEAD,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "1280x720",
     background: Annotated[
@@ -58,6 +63,7 @@ def render(
     ] = None,
     sound: Annotated[Path | None, typer.Option(help="Sound for a .fap file.")] = None,
     at: Annotated[float | None, typer.Option(help="When one picture is taken, s.")] = None,
+    voice: VoiceFile = None,
 ) -> None:
     """Make a video or pictures of an audio or FAP file."""
     from services.cli.rendering import Shot, render_file
@@ -65,7 +71,7 @@ def render(
     shot = Shot(
         head=head, size=size, background=background, camera=camera, yaw_deg=yaw, pitch_deg=pitch
     )
-    render_file(source, output, shot, rate_hz=rate, sound=sound, at_s=at)
+    render_file(source, output, shot, lips=lips, rate_hz=rate, sound=sound, at_s=at, voice=voice)
 
 
 def phones(

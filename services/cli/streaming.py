@@ -45,8 +45,11 @@ def stream(
     session: str = "",
     record: bool = False,
     paced: bool = True,
+    voice: bytes = b"",
 ) -> StreamSummary:
     """Stream a source through a running system and wait for its last FAP frame.
+
+    ``voice`` is the profile of the speaker's voice, if any.
 
     Raises
     ------
@@ -61,6 +64,7 @@ def stream(
             num_channels=source.num_channels,
             record=record,
             paced=paced,
+            voice=voice,
         )
         output = opened.subscribe(EndOfFaps)
         phones = opened.subscribe(Phone)

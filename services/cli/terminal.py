@@ -14,6 +14,9 @@ from shared.errors import UserError
 
 CONSOLE = Console(stderr=True)
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the figures here.")]
+VoiceFile = Annotated[
+    Path | None, typer.Option("--voice", help="The speaker's own mouth, from kouxing adapt.")
+]
 
 
 def print_message(text: str) -> None:

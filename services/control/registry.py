@@ -154,6 +154,11 @@ class Registry:
         delays = (self._services[instance].heartbeat.delay_ms for instance in instances)
         return next(filter(None, delays), 0.0)
 
+    def lips(self, instances: Iterable[str]) -> str:
+        """Return the lip model that one of these services uses at first; empty if none does."""
+        models = (self._services[instance].heartbeat.lips for instance in instances)
+        return next(filter(None, models), "")
+
     def _choose(
         self, endpoint: str, placed: set[str], load: Mapping[str, int], language: str
     ) -> str:

@@ -26,12 +26,12 @@ class SessionRecord:
     endpoints: dict[str, str]  # address by endpoint
     language: str  # of the phones; empty if no worker states one
     delay_ms: float  # how much later than its sound a FAP frame is made
+    lips: str  # the lip model that moves the mouth; empty if no worker states one
     waiting_for: set[str]  # instances that have not started it yet
     epoch: int = 1  # counts its placements
     announced: bool = False  # the client was told that it is open
     moved: bool = False  # placed again, and the client was not told yet
     speaking: bool = False
-    lips: str = ""  # the lip model that the client has chosen
     next_sequence: int = 1  # of the first audio message that no recognizer is known to have
     resume_sequence: int = 0  # where a new recognizer begins; 0: it is the old one
 
@@ -85,6 +85,7 @@ class Sessions:
             endpoints=self._registry.endpoints(workers),
             language=self._registry.language(workers.values()),
             delay_ms=self._registry.delay_ms(workers.values()),
+            lips=self._registry.lips(workers.values()),
             waiting_for={*workers.values()} | self._registry.observers(),
         )
         self._records[name] = record
@@ -164,6 +165,7 @@ class Sessions:
             endpoints=record.endpoints,
             delay_ms=record.delay_ms,
             lips=record.lips,
+            voice=record.opening.voice,
         )
 
     def opened_message(self, record: SessionRecord, events: str) -> SessionOpened:

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import re
 import socket
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -22,10 +22,26 @@ from shared.errors import UserError
 from shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
-MODULES = PAGE / "node_modules" / "three"
-SUFFIXES = {".html", ".js", ".css", ".svg", ".glb"}  # files of the page that are served
+THREE = PAGE / "node_modules" / "three"
+FACE_MESH = PAGE / "node_modules" / "@mediapipe" / "face_mesh"
+# The files that are served: of the page, and of the module that finds a face in a picture.
+SUFFIXES = {
+    PAGE: {".html", ".js", ".css", ".svg", ".glb"},
+    FACE_MESH: {".js", ".wasm", ".data", ".binarypb"},
+}
 PING_S = 20.0  # a browser that has vanished is noticed within this
-MAX_MESSAGE_BYTES = 64 * 1024  # the most audio that one message of a session may carry
+MAX_MESSAGE_BYTES = 128 * 1024  # the most that one message of a session may carry
+MAX_UPLOAD_BYTES = 8 * 1024 * 1024
+FACE_MESH_FRAME = "face-mesh.html"
+# WebAssembly's own glue makes functions from text, so it runs in a frame of its own, which is
+# allowed that and is denied the camera and the microphone.
+_FACE_MESH_POLICIES = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self' 'unsafe-eval'; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+    ),
+    "Permissions-Policy": "camera=(), microphone=()",
+}
 _IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
 
 
@@ -53,6 +69,13 @@ def bind(host: str, port: int) -> socket.socket:
         ) from None
 
 
+def refuse_other_pages(request: web.Request) -> None:
+    """Raise an HTTP error for a browser that shows a page of another host."""
+    origin = request.headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
+        raise web.HTTPForbidden(text="only this gateway's own page may connect\n")
+
+
 class WebSockets:
     """The WebSockets that browsers have open."""
 
@@ -66,9 +89,7 @@ class WebSockets:
     @contextlib.asynccontextmanager
     async def accept(self, request: web.Request) -> AsyncIterator[web.WebSocketResponse]:
         """Open a WebSocket for a page of this host, and close it in the end."""
-        origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
-            raise web.HTTPForbidden(text="only this gateway's own page may connect\n")
+        refuse_other_pages(request)
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway stops\n")
         browser = web.WebSocketResponse(
@@ -93,7 +114,10 @@ class WebSockets:
 
 
 def make_application(
-    *, page_asset: str, is_loopback: Callable[[str], bool] | None, routes: Mapping[str, Handler]
+    *,
+    page_asset: str,
+    is_loopback: Callable[[str], bool] | None,
+    routes: Iterable[web.RouteDef],
 ) -> web.Application:
     """Return the web application.
 
@@ -105,20 +129,25 @@ def make_application(
         Tells whether a host name is this machine's alone; then no other may be asked for. None
         where any host name may be.
     routes
-        Handlers of further paths.
+        Further paths.
     """
-    application = web.Application(middlewares=[_guard(is_loopback)])
+    application = web.Application(
+        middlewares=[_guard(is_loopback)], client_max_size=MAX_UPLOAD_BYTES
+    )
 
-    async def serve_file(request: web.Request) -> web.StreamResponse:
+    async def serve_page(request: web.Request) -> web.StreamResponse:
         return _page_file(request.match_info.get("name", "index.html"), page_asset)
 
-    for path, handler in routes.items():
-        application.router.add_get(path, handler)
-    application.router.add_get("/", serve_file)
-    application.router.add_get("/{name}", serve_file)
-    if MODULES.is_dir():
+    async def serve_face_mesh(request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(_find(FACE_MESH, request.match_info["name"]))
+
+    application.add_routes(routes)
+    application.router.add_get("/", serve_page)
+    application.router.add_get("/{name}", serve_page)
+    application.router.add_get("/modules/face_mesh/{name}", serve_face_mesh)
+    if _has_modules():
         for folder in ("build", "examples/jsm"):
-            application.router.add_static(f"/modules/three/{folder}", MODULES / folder)
+            application.router.add_static(f"/modules/three/{folder}", THREE / folder)
     else:
         LOG.warning("the page's modules are missing; run 'npm ci' in %s", PAGE)
     return application
@@ -164,23 +193,34 @@ def _guard(is_loopback: Callable[[str], bool] | None) -> Middleware:
     return guard
 
 
-def _page_file(name: str, page_asset: str) -> web.StreamResponse:
-    path = PAGE / name
-    if name == "head.glb" and page_asset:
-        path = Path(page_asset)
-    elif path.parent != PAGE or path.suffix not in SUFFIXES:
+def _has_modules() -> bool:
+    return THREE.is_dir() and FACE_MESH.is_dir()
+
+
+def _find(folder: Path, name: str) -> Path:
+    """Return a file that is served."""
+    path = folder / name
+    if path.parent != folder or path.suffix not in SUFFIXES[folder] or not path.is_file():
         raise web.HTTPNotFound
-    if not path.is_file():
-        if name == "head.glb":
+    return path
+
+
+def _page_file(name: str, page_asset: str) -> web.StreamResponse:
+    if name == "head.glb":
+        path = Path(page_asset) if page_asset else PAGE / name
+        if not path.is_file():
             text = f"the head is missing; make it with 'kouxing head export {path}'\n"
             raise web.HTTPNotFound(text=text)
-        raise web.HTTPNotFound
-    if not MODULES.is_dir():
+    else:
+        path = _find(PAGE, name)
+    if not _has_modules():
         text = "the page's modules are missing; run 'npm ci' in services/gateway/page\n"
         raise web.HTTPServiceUnavailable(text=text)
     response = web.FileResponse(path)
     if name == "index.html":
         response.headers["Content-Security-Policy"] = _content_policy(path)
+    elif name == FACE_MESH_FRAME:
+        response.headers.update(_FACE_MESH_POLICIES)
     return response
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import secrets
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from importlib import resources
@@ -152,6 +153,7 @@ class Microphones:
             encoding=hello.encoding,
             sample_rate_hz=hello.sample_rate_hz,
             num_channels=hello.num_channels,
+            voice=hello.voice,
         ) as session:
             self._open[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})
@@ -188,27 +190,47 @@ def error_text(error: UserError) -> str:
     return wire.error_text(str(error))
 
 
-async def play_sample(name: str, own_sessions: OwnSessions, lips: str = "") -> None:
-    """Speak the sample sentence in real time, in a session of the given name.
+class Sample:
+    """The sample sentence, spoken once in a session of its own.
 
-    ``lips`` is the lip model that moves the mouth; empty: the synthesizer's own.
-
-    Raises
-    ------
-    UserError
-        If no session can be opened.
+    Parameters
+    ----------
+    own_sessions
+        Opens the session.
+    lips
+        The lip model that moves the mouth; empty: the synthesizer's own. It can be set anew while
+        the sentence is spoken.
     """
-    loop = asyncio.get_running_loop()
-    source = open_audio(SAMPLE)
-    async with own_sessions.open(
-        session=name, sample_rate_hz=source.sample_rate_hz, num_channels=source.num_channels
-    ) as session:
-        if lips:
-            await asyncio.to_thread(session.choose_lips, lips)
-        due_s = loop.time()
-        for block in source.blocks:
-            if not own_sessions.is_open(name):
-                break
-            own_sessions.send(session, (block * 32767).astype("<i2").tobytes(), len(block))
-            due_s += len(block) / source.sample_rate_hz
-            await asyncio.sleep(due_s - loop.time())
+
+    def __init__(self, own_sessions: OwnSessions, lips: str) -> None:
+        self.session = f"sample-{secrets.token_hex(4)}"
+        self.lips = lips
+        self._own_sessions = own_sessions
+
+    async def speak(self) -> None:
+        """Speak the sentence in real time.
+
+        Raises
+        ------
+        UserError
+            If no session can be opened.
+        """
+        loop = asyncio.get_running_loop()
+        source = open_audio(SAMPLE)
+        async with self._own_sessions.open(
+            session=self.session,
+            sample_rate_hz=source.sample_rate_hz,
+            num_channels=source.num_channels,
+        ) as session:
+            lips = ""
+            due_s = loop.time()
+            for block in source.blocks:
+                if not self._own_sessions.is_open(self.session):
+                    break
+                if lips != self.lips:
+                    lips = self.lips
+                    await asyncio.to_thread(session.choose_lips, lips)
+                pcm = (block * 32767).astype("<i2").tobytes()
+                self._own_sessions.send(session, pcm, len(block))
+                due_s += len(block) / source.sample_rate_hz
+                await asyncio.sleep(due_s - loop.time())

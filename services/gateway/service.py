@@ -1,6 +1,6 @@
 """The gateway as a service: sessions to browsers, a browser's microphone to a session.
 
-Reacts to: start-session, stop-session, status-report (control), fap-frame, end-of-faps
+Reacts to: start-session, stop-session, use-lips, status-report (control), fap-frame, end-of-faps
 (synthesizer), sound, phone, speech (recognizer), and to what browsers send. Emits: status-request
 (control), WebSocket messages (browsers), and, as an ordinary client, audio-chunk (recognizer).
 """
@@ -8,15 +8,17 @@ Reacts to: start-session, stop-session, status-report (control), fap-frame, end-
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import secrets
 import time
 from collections.abc import Coroutine
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from aiohttp import web
 
 from services.gateway import http, wire
 from services.gateway.config import GatewayConfig
-from services.gateway.microphone import Microphones, OwnSessions, error_text, play_sample
+from services.gateway.learn_mouth import MouthLearner
+from services.gateway.microphone import Microphones, OwnSessions, Sample, error_text
 from services.gateway.outbox import Kind
 from services.gateway.viewers import Viewers
 from shared.bus import Socket
@@ -57,25 +59,30 @@ class GatewayService(Service):
         self._listener = http.bind(config.host, config.port)
         self._runner = asyncio.Runner()
         self._loop = self._runner.get_loop()
-        self._has_input = asyncio.Event()
+        self._is_waiting = False
         super().__init__(config)
         host = config.advertise or config.host
         port = self._listener.getsockname()[1]
         self.endpoints = {"page": f"http://{f'[{host}]' if ':' in host else host}:{port}/"}
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
-        self._viewers = Viewers(self._web_sockets, self.metrics, self._play_sample)
+        self._viewers = Viewers(
+            self._web_sockets, self.metrics, self._play_sample, self._choose_sample_lips
+        )
         self._own_sessions = OwnSessions(config.control, self.warn)
         self._microphones = Microphones(self._web_sockets, self._own_sessions)
+        self._mouth_learner = MouthLearner()
         self._application = http.make_application(
             page_asset=config.head,
             is_loopback=is_loopback if is_loopback(config.host) else None,
-            routes={"/viewer": self._viewers.serve, "/microphone": self._microphones.serve},
+            routes=[
+                web.get("/viewer", self._viewers.serve),
+                web.get("/microphone", self._microphones.serve),
+                web.post("/learn-mouth", self._mouth_learner.serve),
+            ],
         )
         self._tasks: set[asyncio.Task[None]] = set()
-        self._sample: tuple[str, asyncio.Task[None]] | None = (
-            None  # its session, while it is spoken
-        )
+        self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is spoken
         self._closing: asyncio.Task[None] | None = None
         self._report_s = 0.0
         self._request_s = 0.0
@@ -101,13 +108,18 @@ class GatewayService(Service):
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Run HTTP until messages arrive or the time is over."""
-        self._loop.run_until_complete(self._wait_for_input(timeout_s))
+        # The descriptors are edge-triggered: what a full batch left behind waits for the tick.
+        timer = self._loop.call_later(timeout_s, self._loop.stop)
+        self._is_waiting = True
+        self._loop.run_forever()
+        self._is_waiting = False
+        timer.cancel()
         return super().wait(0)
 
     def register(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:
         """Handle messages that arrive on a socket, by their type."""
         super().register(socket, handlers)
-        self._loop.add_reader(socket.file_descriptor, self._has_input.set)
+        self._loop.add_reader(socket.file_descriptor, self._on_input)
 
     def unregister(self, socket: Socket) -> None:
         """Stop handling and close a socket."""
@@ -118,20 +130,20 @@ class GatewayService(Service):
         """Close every browser's connection; the last frames of their microphones still come."""
         if self._closing is None:
             self._closing = self._begin(self._web_sockets.close_all())
+            self._mouth_learner.close()
             if self._sample is not None:
                 self._sample[1].cancel()
-        return self._closing.done() and self._sample is None and not self._web_sockets
+        is_busy = self._mouth_learner.is_learning or self._sample is not None
+        return self._closing.done() and not is_busy and not self._web_sockets
 
     def on_stopped(self) -> None:
         """End HTTP."""
         self._loop.run_until_complete(self._server.cleanup())
         self._runner.close()
 
-    async def _wait_for_input(self, timeout_s: float) -> None:
-        # The descriptors are edge-triggered: what a full batch left behind waits for the tick.
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._has_input.wait(), timeout_s)
-        self._has_input.clear()
+    def _on_input(self) -> None:
+        if self._is_waiting:
+            self._loop.stop()
 
     def _begin(self, work: Coroutine[None, None, None]) -> asyncio.Task[None]:
         task = self._loop.create_task(work)
@@ -148,7 +160,7 @@ class GatewayService(Service):
             session = self._sessions[start.session] = self._make_session(start)
         session.start = start
         session.follower.start(start.epoch, start.endpoints)
-        self._viewers.add_session(start.session, start.epoch)
+        self._viewers.add_session(start.session, start.epoch, start.lips)
         return False
 
     def stop_session(self, session: str) -> None:
@@ -159,6 +171,13 @@ class GatewayService(Service):
         self._viewers.remove_session(session)
         self._own_sessions.on_closed(session)
         self._begin(self._microphones.close_session(session))
+
+    def use_lips(self, session: str, lips: str) -> None:
+        """Tell the viewers of a session that another lip model moves the mouth."""
+        found = self._sessions.get(session)
+        if found is not None:
+            found.start = replace(found.start, lips=lips)
+            self._viewers.set_lips(session, lips)
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Name the sessions followed, so that control can say which of them are no more."""
@@ -193,7 +212,9 @@ class GatewayService(Service):
                 Speech: self._on_speech,
             },
             on_complete=lambda: self.session_started(session.start),
-            on_restart=lambda: self._viewers.add_session(start.session, follower.epoch),
+            on_restart=lambda: self._viewers.add_session(
+                start.session, follower.epoch, session.start.lips
+            ),
         )
         session = _Session(start, follower)
         return session
@@ -232,14 +253,18 @@ class GatewayService(Service):
     def _play_sample(self, lips: str) -> str:
         """Speak the sample sentence, unless it is being spoken; return its session."""
         if self._sample is None:
-            name = f"sample-{secrets.token_hex(4)}"
-            self._sample = name, self._begin(self._speak_sample(name, lips))
-        return self._sample[0]
+            sample = Sample(self._own_sessions, lips)
+            self._sample = sample, self._begin(self._speak(sample))
+        return self._sample[0].session
 
-    async def _speak_sample(self, name: str, lips: str) -> None:
+    def _choose_sample_lips(self, lips: str) -> None:
+        if self._sample is not None:
+            self._sample[0].lips = lips
+
+    async def _speak(self, sample: Sample) -> None:
         error = ""
         try:
-            await play_sample(name, self._own_sessions, lips)
+            await sample.speak()
         except UserError as refusal:
             error = error_text(refusal)
         finally:

@@ -22,6 +22,12 @@ SEND_BUFFER_BYTES = 64 * 1024  # what the kernel may hold for a slow viewer, abo
 _SESSION = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
+@dataclass(slots=True)
+class _Session:
+    epoch: int
+    lips: str  # the lip model that moves the mouth; empty: not known
+
+
 @dataclass(slots=True, eq=False)
 class Viewer:
     """One browser that looks on."""
@@ -42,29 +48,41 @@ class Viewers:
         Counts what slow viewers lose.
     play_sample
         Starts to speak the sample sentence with a lip model, unless it is being spoken; returns its
-        session, which
-        counts as the newest only if there is no other.
+        session, which counts as the newest only if there is no other.
+    choose_sample_lips
+        Lets another lip model move the mouth while the sample sentence is spoken.
     """
 
     def __init__(
-        self, web_sockets: WebSockets, metrics: Metrics, play_sample: Callable[[str], str]
+        self,
+        web_sockets: WebSockets,
+        metrics: Metrics,
+        play_sample: Callable[[str], str],
+        choose_sample_lips: Callable[[str], None],
     ) -> None:
         self._web_sockets = web_sockets
         self._metrics = metrics
         self._play_sample = play_sample
+        self._choose_sample_lips = choose_sample_lips
         self._viewers: set[Viewer] = set()
-        self._epochs: dict[str, int] = {}  # by session, in the order they were opened
+        self._sessions: dict[str, _Session] = {}  # in the order they were opened
         self._sample = ""  # the session of the sample sentence, while it is spoken
         self._missing: tuple[str, ...] = ("control",)
 
-    def add_session(self, session: str, epoch: int) -> None:
+    def add_session(self, session: str, epoch: int, lips: str) -> None:
         """Show a session to whom it concerns; again when it goes on in another epoch."""
-        self._epochs[session] = epoch
+        self._sessions[session] = _Session(epoch, lips)
         self._notify_viewers()
+
+    def set_lips(self, session: str, lips: str) -> None:
+        """Say that another lip model moves the mouth of a session."""
+        if session in self._sessions:
+            self._sessions[session].lips = lips
+            self.forward(session, Kind.TEXT, wire.text("lips", lips=lips))
 
     def remove_session(self, session: str) -> None:
         """Show a session no longer."""
-        self._epochs.pop(session, None)
+        self._sessions.pop(session, None)
         self._notify_viewers()
 
     def end_sample(self, error: str = "") -> None:
@@ -128,12 +146,17 @@ class Viewers:
         try:
             command = wire.parse_object(message)
             session = command.get("follow")
+            lips = wire.parse_lips(command)
             if command.get("play") == "sample":
-                self._sample = viewer.chosen = self._play_sample(wire.parse_lips(command))
+                self._sample = viewer.chosen = self._play_sample(lips)
+            elif lips:
+                if not self._sample or viewer.chosen != self._sample:
+                    raise UserError("lips can be chosen here only for the sample sentence")
+                self._choose_sample_lips(lips)
             elif isinstance(session, str) and (not session or _SESSION.fullmatch(session)):
                 viewer.chosen = session
             else:
-                raise UserError("expected 'follow' with a session's name, or 'play'")
+                raise UserError("expected 'follow' with a session's name, 'play' or 'lips'")
         except UserError as error:
             self._put(viewer, Kind.TEXT, wire.error_text(str(error)))
         self._notify_viewer(viewer)
@@ -144,13 +167,20 @@ class Viewers:
 
     def _notify_viewer(self, viewer: Viewer) -> None:
         """Say which session the viewer sees now, if it is another than before."""
-        newest = (name for name in reversed(self._epochs) if name != self._sample)
+        newest = (name for name in reversed(self._sessions) if name != self._sample)
         name = viewer.chosen or next(newest, self._sample)
-        shown = (name, self._epochs[name]) if name in self._epochs else None
+        session = self._sessions.get(name)
+        shown = (name, session.epoch) if session else None
         if shown != viewer.shown:
             viewer.shown = shown
-            session, epoch = shown or (None, 0)
-            message = wire.text("session", session=session, chosen=viewer.chosen, epoch=epoch)
+            message = wire.text(
+                "session",
+                session=name if session else None,
+                chosen=viewer.chosen,
+                epoch=session.epoch if session else 0,
+                lips=session.lips if session else "",
+                sample=session is not None and name == viewer.chosen == self._sample,
+            )
             self._put(viewer, Kind.TEXT, message)
 
     def _put(self, viewer: Viewer, kind: Kind, message: str | bytes) -> None:

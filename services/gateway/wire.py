@@ -6,12 +6,13 @@ Binary messages, little-endian: u8 type, 3 zero bytes, u32 epoch, f64 media time
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from dataclasses import dataclass
 
 from shared.errors import UserError
-from shared.face.lip_models import LipModelName
+from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
@@ -44,6 +45,7 @@ class Hello:
     sample_rate_hz: int
     num_channels: int
     encoding: str  # s16le or f32le
+    voice: bytes  # of the speaker, for lips from sound; empty: anybody's
 
     @property
     def frame_bytes(self) -> int:
@@ -68,7 +70,22 @@ def parse_hello(message: str) -> Hello:
         raise UserError("num_channels must be 1 or 2")
     if not isinstance(encoding, str) or encoding not in SAMPLE_BYTES:
         raise UserError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
-    return Hello(sample_rate_hz=rate_hz, num_channels=num_channels, encoding=encoding)
+    return Hello(
+        sample_rate_hz=rate_hz,
+        num_channels=num_channels,
+        encoding=encoding,
+        voice=_parse_voice(fields.get("voice", "")),
+    )
+
+
+def _parse_voice(voice: object) -> bytes:
+    try:
+        profile = base64.b64decode(voice, validate=True) if isinstance(voice, str) else None
+    except ValueError:
+        profile = None
+    if profile is None or len(profile) > MAX_VOICE_BYTES:
+        raise UserError(f"voice must be at most {MAX_VOICE_BYTES >> 10} KiB in base64")
+    return profile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

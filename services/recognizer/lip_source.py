@@ -7,16 +7,16 @@ speaks, and makes lip frames of it. A model offers several delays; the recognize
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shared.phones.events import LipFrame
 
-# Frames of the face are due every 20 ms of sound, the network's positions end at most this long
-# before, because a window of 25 ms ends between two steps of 20 ms.
-_POSITION_LAG_S = 0.015
+# Frames of the face are due every 20 ms of sound, and the network's positions end this long before:
+# a window of 25 ms in steps of 20 ms can come no closer.
+POSITION_LAG_S = 0.005
 
 
 class LipFrameStream(Protocol):
@@ -55,6 +55,9 @@ class LipsFromSound(Protocol):
     def stream(self, delays_s: Sequence[float]) -> LipFrameStream:
         """Start a session's lips with these of the delays."""
 
+    def for_voice(self, profile: bytes) -> Self:
+        """Return the model with the voice of one speaker; ``UserError`` if that does not fit."""
+
 
 def delay_for(delays_s: Sequence[float], face_delay_s: float) -> float:
     """Choose the longest delay whose lip frames come before a face that is due.
@@ -62,9 +65,9 @@ def delay_for(delays_s: Sequence[float], face_delay_s: float) -> float:
     Parameters
     ----------
     delays_s
-        Delays of the lips to choose from, seconds, rising.
+        Delays of the lips to choose from, seconds, rising; one below 0 is a forecast.
     face_delay_s
         How much later than its sound a frame of the face is made.
     """
-    in_time = [each for each in delays_s if each + _POSITION_LAG_S <= face_delay_s + 1e-6]
+    in_time = [each for each in delays_s if each + POSITION_LAG_S <= face_delay_s + 1e-6]
     return max(in_time, default=min(delays_s))

@@ -32,9 +32,10 @@ Cost: about 4 ms of one core per second of speech.
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -47,6 +48,7 @@ from services.recognizer.acoustic.model_file import Archive, read_archive, write
 from services.recognizer.acoustic.network import NUM_INPUTS
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.front_end.whisper_mel import NUM_MELS
+from services.recognizer.voice import Voice, parse_profile
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import LipFrame
@@ -73,7 +75,7 @@ _PAIRS = [(MOUTH_FAPS.index(fap), MOUTH_FAPS.index(other)) for fap, other in OTH
 class LipPredictor:
     """A trained model of lips from sound, shared by any number of streams."""
 
-    delays: Floats  # (delays,) seconds, rising
+    delays: Floats  # (delays,) seconds, rising; below 0 the mouth is foretold
     feature_mean: Floats  # (features,)
     projection: Floats  # (features, components)
     entry_weights: Floats  # (components, units): U
@@ -107,6 +109,43 @@ class LipPredictor:
             )
         return LipPredictorStream(self, [self.delays_s.index(delay_s) for delay_s in delays_s])
 
+    @cached_property
+    def digest(self) -> bytes:
+        """SHA-256 of the weights, by which a voice knows its model."""
+        hasher = hashlib.sha256()
+        for field in fields(self):
+            hasher.update(getattr(self, field.name).tobytes())
+        return hasher.digest()
+
+    @property
+    def residual_shape(self) -> tuple[int, int, int]:
+        """Shape of the residual of a voice."""
+        num_inner, num_delays, _ = self.output_weights.shape
+        return num_inner, num_delays, len(LIP_FAPS)
+
+    def for_voice(self, profile: bytes) -> LipPredictor:
+        """Return the model with the voice of one speaker.
+
+        Raises
+        ------
+        UserError
+            If the profile is none, or was made for another model.
+        """
+        return self.with_voice(parse_profile(profile, self.digest, self.residual_shape))
+
+    def with_voice(self, voice: Voice) -> LipPredictor:
+        """Return the model with the voice of one speaker."""
+        faps = slice(len(LIP_FAPS))
+        history, output, bias = (
+            weights.copy()
+            for weights in (self.history_weights, self.output_weights, self.output_bias)
+        )
+        for weights in (history, output, bias):
+            weights[..., faps] *= voice.scale
+        output[..., faps] += voice.residual
+        bias[..., faps] += voice.offset
+        return replace(self, history_weights=history, output_weights=output, output_bias=bias)
+
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle), weights in 16 bits."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -124,6 +163,11 @@ class LipPredictorStream:
         The model of all streams.
     delays
         Which of its delays are asked for.
+
+    Attributes
+    ----------
+    inner : NDArray
+        [h, u] at the last position, shape (2 units,).
     """
 
     def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
@@ -144,6 +188,7 @@ class LipPredictorStream:
         nothing = np.zeros(components, np.float32)
         self._history = deque([nothing] * history, maxlen=history)
         self._state = np.zeros(len(self._model.state_weights), np.float32)
+        self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
     def accept(
         self, known_s: float, frames: Floats, keys: Floats, values: Floats
@@ -186,7 +231,8 @@ class LipPredictorStream:
         new = np.tanh(from_input[2 * size :] + reset * from_state[2 * size :])
         self._state = (1 - update) * new + update * self._state
         linear = np.concatenate(self._history) @ self._history_weights
-        recurrent = np.concatenate([self._state, entered]) @ self._output_weights
+        self.inner = np.concatenate([self._state, entered])
+        recurrent = self.inner @ self._output_weights
         outputs: Floats = (linear + recurrent).reshape(self._output_bias.shape)
         return outputs + self._output_bias
 
@@ -240,7 +286,7 @@ def lips_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | Non
 def lips_from(archive: Archive) -> LipPredictor:
     """Build the model after checking every size; ValueError says what does not fit."""
     delays = archive.floats("delays", *_sizes(archive, "delays", 1))
-    if len(delays) > _MAX_DELAYS or delays[0] < 0 or delays[-1] > _MAX_DELAY_S:
+    if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
         raise ValueError(f"its delays are {delays.tolist()}")
     if (np.diff(delays) <= 0).any():
         raise ValueError("its delays do not rise")

@@ -9,7 +9,7 @@ The least delay from a phone's onset to its first hypothesis is
 by default) and N is ``num_stable_frames`` (1 by default): 35 ms. A neural model scores two frames
 at a time, so half of the frames come 10 ms sooner. The paper, with N = 3 and differences that look
 40 ms ahead, leaves these out: it states 45 ms, in truth 85. At the beginning of speech the voice
-detector adds 32 to 64 ms; for input above 16 kHz the resampler adds about 10 ms.
+detector adds up to 32 ms; for input above 16 kHz the resampler adds 2 ms.
 """
 
 from __future__ import annotations

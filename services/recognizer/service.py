@@ -24,6 +24,7 @@ from services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Wavefo
 from shared.bus import AUDIO_QUEUE_LENGTH, Socket
 from shared.clock import MEDIA_RATE_HZ, to_samples
 from shared.endpoints import reachable
+from shared.errors import UserError
 from shared.logs import LOG
 from shared.phones.events import LipFrame, Phone, SpeechChange
 from shared.reliable import ReliableSender
@@ -52,6 +53,7 @@ class _Session:
         self.sequence_in = 0
         self.sequence_out = 0
         self.last_audio_s = time.monotonic()
+        self.voice_refusal = ""  # why the client's voice is not used, if it was not told yet
         self.finished = False
         self.num_gaps = 0  # of the stream's, counted
         self.late_since_s: float | None = None  # since when the synthesizer owes too much
@@ -82,6 +84,11 @@ class RecognizerService(Service):
         self._model = load_model(model_path(config.acoustic), look_ahead_ms=config.look_ahead_ms)
         self.language = self._model.inventory.language
         self._lips = lips or lips_for(self._model)
+        if self._lips is None:
+            LOG.warning(
+                "there are no lips from sound for this acoustic model: dynamic visemes move the "
+                "mouth; with synthesizer.lips=dynamic-visemes they have the delay that suits them"
+            )
         warm_up(self._model)
         self.register(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_end})
         self.register(self._phones, {})
@@ -96,7 +103,9 @@ class RecognizerService(Service):
         self._process_queued()
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
-            session = _Session(start, self._new_stream(start))
+            lips, voice_refusal = self._lips_of(start)
+            session = _Session(start, self._new_stream(start, lips))
+            session.voice_refusal = voice_refusal
             self._sessions[start.session] = session
         if session.link is None or session.start.epoch != start.epoch:
             session.start = start
@@ -107,14 +116,25 @@ class RecognizerService(Service):
                 session.link.send(message, time.monotonic())
         return True
 
-    def _new_stream(self, start: StartSession) -> SpeechStream:
+    def _lips_of(self, start: StartSession) -> tuple[LipsFromSound | None, str]:
+        """Return the model of lips with the session's voice, or without it and why."""
+        if not start.voice:
+            return self._lips, ""
+        if self._lips is None:
+            return None, "the voice is not used: this recognizer makes no lips from sound"
+        try:
+            return self._lips.for_voice(start.voice), ""
+        except UserError as error:
+            return self._lips, f"the voice is not used: {error}"
+
+    def _new_stream(self, start: StartSession, lips: LipsFromSound | None) -> SpeechStream:
         return SpeechStream(
             self._model,
             sample_rate_hz=start.sample_rate_hz,
             num_channels=start.num_channels,
             num_stable_frames=self._config.num_stable_frames,
             min_confidence=self._config.min_confidence,
-            lips=self._lips,
+            lips=lips,
             face_delay_s=start.delay_ms / 1e3,
         )
 
@@ -168,6 +188,9 @@ class RecognizerService(Service):
         session = self._admit(chunk, sender)
         if session is None:
             return
+        if session.voice_refusal:
+            self._refuse(chunk, sender, ErrorCode.BAD_VOICE, session.voice_refusal)
+            session.voice_refusal = ""
         start = session.start
         try:
             samples = samples_of(chunk.pcm, start.encoding, start.num_channels)

@@ -30,7 +30,9 @@ from shared.phones.events import LipFrame
 PRE_ROLL_S = 0.20  # sound before the detector's decision that counts as speech: weak consonants
 # The first position of the network has seen the frames 0 to 2, each further one two more.
 _FIRST_NEWEST_FRAME, _FRAMES_PER_POSITION = 2, 2
-_PRE_ROLL_FRAMES = round((PRE_ROLL_S + 2 * BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
+# Speech begins at an odd frame. So every position ends POSITION_LAG_S before a multiple of 20 ms.
+_FIRST_FRAME_PARITY = 1
+_PRE_ROLL_FRAMES = round((PRE_ROLL_S + BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,8 +143,10 @@ class SpeechScores:
     def _detect(self) -> ScoringTask[list[ScoreEvent]]:
         """Begin or end speech by the block that is complete."""
         speech = self._detector.accept_block(self._block).is_speech
-        if speech and not self._speaking:
+        if speech and not self._speaking and len(self._recent) >= _FRAMES_PER_POSITION:
             self._speaking = True
+            if (self._num_frames - len(self._recent)) % _FRAMES_PER_POSITION != _FIRST_FRAME_PARITY:
+                self._recent.popleft()
             start = SpeechStart(self._num_frames - len(self._recent))
             self._next_newest = start.frame + _FIRST_NEWEST_FRAME
             if self._lips is not None:

@@ -24,7 +24,7 @@ from services.recognizer.front_end.pcm import SLICE, level_db, slices
 from services.recognizer.front_end.resample import Resampler
 from services.recognizer.lip_source import LipsFromSound, delay_for
 from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
-from shared.clock import MEDIA_RATE_HZ, to_samples, to_seconds
+from shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent, SpeechChange
 
 MAX_JITTER = MEDIA_RATE_HZ // 10  # media time that jumps further ahead leaves a gap; samples
@@ -257,7 +257,7 @@ class _Segment:
             return replace(
                 result,
                 time_s=self._media_s(result.time_s),
-                delay_s=to_seconds(to_samples(result.delay_s)),
+                delay_s=to_seconds(duration_to_samples(result.delay_s)),
             )
         if isinstance(result, SpeechChange):
             return replace(result, time_s=self._media_s(result.time_s))

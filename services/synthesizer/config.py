@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from shared.config import BoundEndpoint, ServiceConfig
-from shared.face.lip_models import LipModelName
+from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+
+# Default delay of each lip model.
+DELAYS_MS: dict[str, float] = {LipModelName.LEARNT: 60.0, LipModelName.DYNAMIC_VISEMES: 160.0}
 
 
 class SynthesizerConfig(ServiceConfig):
@@ -19,9 +22,17 @@ class SynthesizerConfig(ServiceConfig):
     """Where FAP frames are published."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
     """FAP frames per second."""
-    delay_ms: Annotated[float, Field(ge=0, le=300)] = 160.0
-    """How much later than its sound a frame is made, in steps of 20 ms."""
-    lips: LipModelName = LipModelName.DYNAMIC_VISEMES
+    delay_ms: Annotated[float, Field(ge=0, le=300)] = DELAYS_MS[DEFAULT_LIP_MODEL]
+    """How much later than its sound a frame is made, in steps of 20 ms; 160 with dynamic-visemes,
+    unless another value is given."""
+    lips: LipModelName = DEFAULT_LIP_MODEL
     """Lip model: of recognised phones (dynamic-visemes), or of the sound itself (learnt)."""
     idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
     """Seed of blinks, gaze and head motion; with 0 the mouth alone moves."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _delay_of_the_lips(cls, values: dict[str, object]) -> dict[str, object]:
+        """Without a delay, take the default of the lip model that was chosen."""
+        lips = str(values.get("lips", DEFAULT_LIP_MODEL))
+        return {"delay_ms": DELAYS_MS[lips], **values} if lips in DELAYS_MS else values

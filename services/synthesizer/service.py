@@ -60,6 +60,7 @@ class SynthesizerService(Service):
         self._config = config
         self.frame_rate_hz = config.frame_rate_hz
         self.delay_ms = config.delay_ms
+        self.lips = config.lips
         self._sessions: dict[str, _Session] = {}
         self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input")
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps")

@@ -1,8 +1,10 @@
-"""The names of the lip models, for whoever chooses one."""
+"""What clients choose of lips: the lip model by its name, and a speaker's voice."""
 
 from __future__ import annotations
 
 from enum import StrEnum
+
+MAX_VOICE_BYTES = 64 * 1024
 
 
 class LipModelName(StrEnum):
@@ -10,3 +12,6 @@ class LipModelName(StrEnum):
 
     DYNAMIC_VISEMES = "dynamic-visemes"  # the recognised phones
     LEARNT = "learnt"  # the sound itself
+
+
+DEFAULT_LIP_MODEL = LipModelName.LEARNT

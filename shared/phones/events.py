@@ -32,7 +32,7 @@ class LipFrame:
     """The mouth as the sound itself tells it."""
 
     time_s: float  # seconds from the session's first sample
-    delay_s: float  # the sound was known up to time_s + delay_s
+    delay_s: float  # the sound was known up to time_s + delay_s; below 0: it is foretold
     faps: NDArray[np.float32]  # (28,) FAP units, in the order of MOUTH_FAPS; 0 where not tracked
     closure: float  # probability that the lips touch, 0 to 1
     lip_to_teeth: float  # probability that the lower lip touches the teeth, 0 to 1

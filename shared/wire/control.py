@@ -25,6 +25,7 @@ from shared.wire.message import (
     SampleRate,
     SessionName,
     Text,
+    VoiceProfile,
 )
 
 Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
@@ -113,6 +114,7 @@ class Heartbeat(Message):
     language: LanguageName = ""  # of the phones that it recognises
     frame_rate_hz: FrameRate = 0.0  # of the FAP frames that it makes
     delay_ms: Delay = 0.0  # how much later than its sound it makes a FAP frame
+    lips: LipsOrNone = ""  # the lip model that it uses until a client chooses one
     metrics: MetricMap = field(default_factory=dict)
     sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
         default_factory=dict
@@ -142,7 +144,8 @@ class StartSession(Message):
     language: LanguageName  # of the phones
     endpoints: EndpointMap  # of the session's workers: audio, phones, phone_input, faps, ...
     delay_ms: Delay = 0.0  # how much later than its sound a FAP frame is made
-    lips: LipsOrNone = ""  # the lip model that the client has chosen
+    lips: LipsOrNone = ""  # the lip model that moves the mouth at first
+    voice: VoiceProfile = b""  # of the speaker, for the recognizer's lips
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from shared.clock import to_samples, to_seconds
+from shared.clock import duration_to_samples, to_samples, to_seconds
 from shared.phones import events
 from shared.wire.message import Message
 from shared.wire.speech import EndOfPhones, Lips, Phone, Progress, Speech
@@ -31,7 +31,7 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
             return Lips(
                 media_time=to_samples(event.time_s),
                 values=event.faps.astype("<f4").tobytes(),
-                delay=to_samples(event.delay_s),
+                delay=duration_to_samples(event.delay_s),
                 closure=event.closure,
                 lip_to_teeth=event.lip_to_teeth,
             )

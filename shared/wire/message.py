@@ -15,7 +15,7 @@ from typing import Annotated, ClassVar
 from msgspec import Meta
 
 from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
-from shared.face.lip_models import LipModelName
+from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 VERSION = 2
 DOCUMENT = "proto/PROTOCOL.md"
@@ -28,6 +28,7 @@ Name = Annotated[str, Meta(min_length=1, max_length=128)]
 Text = Annotated[str, Meta(max_length=2000)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Samples = Annotated[int, Meta(ge=0, le=2**53)]
+LipDelay = Annotated[int, Meta(ge=-16_000, le=16_000)]  # samples at 16 kHz
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Encoding = Annotated[str, Meta(pattern="^(s16le|f32le)$")]
 SampleRate = Annotated[int, Meta(ge=8000, le=48000)]  # Hz
@@ -38,6 +39,7 @@ LanguageName = Annotated[str, Meta(max_length=64)]  # empty: not known
 PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
 LipsOrNone = Annotated[str, Meta(max_length=64)]  # empty: not chosen
 ChosenLips = Annotated[str, Meta(pattern=f"^({'|'.join(LipModelName)})$")]
+VoiceProfile = Annotated[bytes, Meta(max_length=MAX_VOICE_BYTES)]  # empty: anybody's
 Endpoint = Annotated[str, Meta(max_length=256)]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]
 LipValues = Annotated[bytes, Meta(min_length=4 * len(MOUTH_FAPS), max_length=4 * len(MOUTH_FAPS))]

@@ -20,6 +20,7 @@ from shared.wire.message import (
     NumChannels,
     SampleRate,
     Text,
+    VoiceProfile,
 )
 
 
@@ -29,6 +30,7 @@ class ErrorCode(StrEnum):
     BAD_MESSAGE = "bad-message"
     BAD_AUDIO = "bad-audio"
     BAD_TOKEN = "bad-token"  # noqa: S105 - no password
+    BAD_VOICE = "bad-voice"
     FINISHED = "finished"
     NO_SERVICE = "no-service"
     NO_VIDEO = "no-video"
@@ -49,6 +51,7 @@ class OpenSession(Message):
     num_channels: NumChannels = 1
     record: bool = False  # the driver writes a video named after the session
     paced: bool = True  # audio comes in real time; false: as fast as the services take it
+    voice: VoiceProfile = b""  # of the speaker, for lips from sound
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

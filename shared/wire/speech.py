@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from shared.wire.message import (
     Count,
+    LipDelay,
     LipValues,
     Message,
     PhoneSymbol,
@@ -40,7 +41,7 @@ class Lips(Message):
     """The mouth at media_time, from a lip model that works on the sound itself."""
 
     values: LipValues  # float32, little-endian, FAP units, in the order of MOUTH_FAPS
-    delay: Samples  # how much sound after media_time the model has used
+    delay: LipDelay  # how much sound after media_time the model has used; below 0: it foretells
     closure: Probability  # that the lips touch
     lip_to_teeth: Probability  # that the lower lip touches the teeth
 

@@ -107,7 +107,7 @@ def range_text(kind: msgspec.inspect.Type) -> str:
 def default_text(field: msgspec.inspect.Field) -> str:
     if field.required:
         return "required"
-    if field.default_factory is not msgspec.NODEFAULT:
+    if field.default_factory is not msgspec.NODEFAULT or field.default == b"":
         return "empty"
     if isinstance(field.default, float):
         return f"{field.default:g}"

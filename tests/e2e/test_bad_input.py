@@ -77,6 +77,18 @@ def test_nan_is_refused_and_the_session_goes_on(client: Client, witness: Session
     session.close()
 
 
+def test_a_bad_voice_is_refused_and_the_session_goes_on(client: Client, witness: Session) -> None:
+    session = client.open_session(encoding="f32le", voice=b"no voice")
+    output = session.subscribe(FapFrame)
+    session.send(np.zeros(8000, np.float32))
+    error = first_error(session)
+    assert (error.code, "no voice" in error.text) == ("bad-voice", True)
+    assert output.wait(5.0)
+    session.close()
+    with pytest.raises(Refused, match="bad-message"):
+        client.open_session(voice=bytes(70_000))
+
+
 def test_half_a_sample_is_refused(client: Client, witness: Session) -> None:
     session = client.open_session(encoding="s16le", num_channels=2)
     session.send_pcm(b"\0" * 6, 1)

@@ -10,6 +10,7 @@ import av
 import numpy as np
 import pytest
 
+from services.synthesizer.config import SynthesizerConfig
 from shared.client import Client, Subscription
 from shared.phones.inventory import load_inventory
 from shared.wire.face import FapFrame
@@ -17,6 +18,7 @@ from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.system import DEMO, System
 
 pytestmark = pytest.mark.e2e
+DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
 OPEN_JAW, RAISE_B_MIDLIP = 2, 4  # indices of FAP 3 and 5
 
 
@@ -143,7 +145,7 @@ def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
         output = session.subscribe(FapFrame)
         for begin in range(0, 24000, 8000):
             session.send(samples[begin : begin + 8000])
-        before = _frames_until(output, lambda frame: frame.media_time >= 24000 - 3200)
+        before = _frames_until(output, lambda frame: frame.media_time >= 24000 - DELAY)
         assert _opening(before[-1]) > 50, "the mouth is open in mid-sentence"
         session.flush()
         session.send(np.zeros(8000, np.float32))

@@ -23,9 +23,11 @@ from services.synthesizer.lips.load import load_lip_model
 from shared.client import Client, Refused
 from shared.clock import to_samples
 from shared.face.faps import MOUTH_FAPS
+from shared.face.lip_models import LipModelName
 from shared.phones.events import LipFrame, Phone
 from shared.wire.events import message_of
-from tests.e2e.following import samples_of_file, stream, stream_into
+from shared.wire.speech import Lips
+from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.lips import LIPS, clip_of
 from tests.made_up_lips import JAW, LoudLips
 from tests.system import DEMO, System
@@ -65,6 +67,10 @@ def test_services_send_the_frames_of_the_chain(
     ]
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     assert sent.faps[:, MOUTH].any()
+    assert lips_of(sent) == [
+        message_of(event) for event in chain.events if isinstance(event, LipFrame)
+    ]
+    assert sent.lips
     recognised = [event for event in chain.events if isinstance(event, Phone)]
     assert [
         (phone.index, phone.symbol, phone.media_time, phone.duration, phone.confidence, phone.final)
@@ -80,6 +86,30 @@ def test_services_send_the_frames_of_the_chain(
         )
         for phone in recognised
     ]
+
+
+@pytest.mark.parametrize(("lips", "rate_hz"), [("learnt", 48000), ("dynamic-visemes", 16000)])
+def test_services_send_the_frames_of_the_chain_with_chosen_lips(
+    tmp_path: Path, lips: LipModelName, rate_hz: int
+) -> None:
+    samples = at_rate(samples_of_file(DEMO / "vowels-male.wav"), rate_hz)
+    services = ("control", "recognizer", "synthesizer")
+    with System(services, tmp_path, settings={"KOUXING_SYNTHESIZER_LIPS": lips}) as running:
+        sent = stream(running.control, samples, chunk=997, sample_rate_hz=rate_hz)
+    chain = LiveChain(
+        load_model(),
+        load_lip_model(name=lips),
+        sample_rate_hz=rate_hz,
+        synthesizer=SynthesizerConfig(lips=lips),
+    )
+    frames = chain.accept_waveform(samples) + chain.input_finished()
+    np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
+    assert sent.faps[:, MOUTH[JAW]].max() > 50.0
+
+
+def lips_of(sent: Collected) -> list[Lips]:
+    """Lip frames without what is the session's own."""
+    return [replace(each, session="", epoch=0, sequence=0) for each in sent.lips]
 
 
 @contextlib.contextmanager
@@ -129,7 +159,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
 
     np.testing.assert_array_equal(sent.faps, np.array([faps for _, faps in frames]))
     lips = [message_of(event) for event in chain.events if isinstance(event, LipFrame)]
-    assert [replace(each, session="", epoch=0, sequence=0) for each in sent.lips] == lips
+    assert lips_of(sent) == lips
     (delay,) = {each.delay for each in sent.lips}
     assert delay == round(delay_for(LoudLips().delays_s, delay_ms / 1e3) * 16000)
     assert sent.faps[:, MOUTH[JAW]].max() > 50.0
@@ -139,8 +169,12 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "bilabials-female.wav")
     chain = LiveChain(load_model(), load_lip_model(name="learnt"), lips_from_sound=LoudLips())
     frames = chain.accept_waveform(samples) + chain.input_finished()
+    settings = {
+        "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",
+        "KOUXING_SYNTHESIZER_DELAY_MS": str(SynthesizerConfig(lips=LipModelName.LEARNT).delay_ms),
+    }
     with (
-        System(("control", "synthesizer"), tmp_path) as running,
+        System(("control", "synthesizer"), tmp_path, settings=settings) as running,
         recognizer_with_lips(running.control),
     ):
         running.wait_until(

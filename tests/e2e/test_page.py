@@ -6,47 +6,26 @@ the page has to show is known. The browser is driven by the Chrome DevTools Prot
 
 from __future__ import annotations
 
-import asyncio
-import base64
-import io
-import json
-import os
-import shutil
-import socket
 import subprocess
 import sys
-import threading
-import time
 import wave
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import aiohttp
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
-from services.control.config import ControlConfig
-from services.control.service import ControlService
-from services.recognizer.config import RecognizerConfig
-from services.synthesizer.config import SynthesizerConfig
 from shared.client import Client, Session
-from shared.face.faps import MASK_BYTES, NUM_FAPS
-from shared.service import Service
-from shared.wire.audio import AudioChunk, EndOfAudio, Sound
-from shared.wire.control import StartSession
-from shared.wire.face import FapFrame
-from shared.wire.speech import Phone
+from shared.face.faps import NUM_FAPS
+from tests.browser import SIZE_PX, Browser, wait_until
+from tests.scripted_system import LOOK_AHEAD_MS, Gateway, System
+from tests.system import ROOT, free_port
 
 pytestmark = pytest.mark.e2e
 
-ROOT = Path(__file__).parents[2]
 HEAD = ROOT / "services" / "gateway" / "page" / "head.glb"
-SIZE_PX = (640, 480)
-FRAME = 320  # samples; 20 ms
-LOOK_AHEAD_MS = 60
 # Rows 15 (a) and 13 (b) of the Mandarin viseme table: FAP number to value.
 FAP_COLUMNS = [*range(3, 15), 16, 17, 44, 45, 46, 47, *range(51, 61)]
 A_VALUES = [
@@ -66,304 +45,6 @@ def face(values: list[int]) -> NDArray[np.float32]:
 
 
 A_FACE, B_FACE = face(A_VALUES), face(B_VALUES)
-
-
-class ScriptedRecognizer(Service):
-    """Publishes what the test says, and keeps the audio that it gets."""
-
-    name = "recognizer"
-    role = "worker"
-    needs = ("phone_input",)
-
-    def __init__(self, control: str) -> None:
-        local = "tcp://127.0.0.1:*"
-        super().__init__(RecognizerConfig(control=control, audio=local, phones=local))
-        self.audio = self.bus.bind_router(local, "recognizer.audio")
-        self.phones = self.bus.bind_publisher(local, "recognizer.phones")
-        self.endpoints = {"audio": self.audio.endpoint, "phones": self.phones.endpoint}
-        self.pcm: dict[str, bytes] = {}
-        self.starts: dict[str, StartSession] = {}
-        self.finished: set[str] = set()
-        self.register(
-            self.audio,
-            {
-                AudioChunk: self._on_audio,
-                EndOfAudio: lambda end, _: self.finished.add(end.session),
-            },
-        )
-        self.register(self.phones, {})
-
-    def start_session(self, start: StartSession) -> bool:
-        self.starts[start.session] = start
-        return True
-
-    def _on_audio(self, chunk: AudioChunk, _sender: bytes) -> None:
-        self.pcm[chunk.session] = self.pcm.get(chunk.session, b"") + chunk.pcm
-
-
-class ScriptedSynthesizer(Service):
-    """Publishes the FAP frames that the test says."""
-
-    name = "synthesizer"
-    role = "worker"
-
-    def __init__(self, control: str) -> None:
-        local = "tcp://127.0.0.1:*"
-        super().__init__(SynthesizerConfig(control=control, phone_input=local, faps=local))
-        self.input = self.bus.bind_router(local, "synthesizer.phones")
-        self.faps = self.bus.bind_publisher(local, "synthesizer.faps")
-        self.endpoints = {"phone_input": self.input.endpoint, "faps": self.faps.endpoint}
-        self.lips: list[tuple[str, str]] = []  # session, lip model chosen
-        self.register(self.input, {})
-        self.register(self.faps, {})
-
-    def use_lips(self, session: str, lips: str) -> None:
-        self.lips.append((session, lips))
-
-
-class System:
-    """Control, and the two scripted services, on a thread that plays the script in real time."""
-
-    def __init__(self) -> None:
-        local = "tcp://127.0.0.1:*"
-        self.control = ControlService(ControlConfig(commands=local, events=local))
-        self.address = self.control.endpoints["commands"]
-        self.synthesizer = ScriptedSynthesizer(self.address)
-        self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(self.address)
-        self.shown: NDArray[np.float32] | None = None  # the face that is published; None: nothing
-        self.symbol = "a"
-        self.session = ""
-        self._media_time = 0
-        self._sequence = 0
-        self._stop = False
-        self._ask_recognizer_to_leave = False
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._stop = True
-        self._thread.join()
-
-    def lose_recognizer(self) -> None:
-        self._ask_recognizer_to_leave = True
-
-    def talk(self, session: str, shown: NDArray[np.float32], symbol: str) -> None:
-        self.session, self.symbol, self.shown = session, symbol, shown
-
-    def services(self) -> list[Service]:
-        services = [self.control, self.recognizer, self.synthesizer]
-        return [service for service in services if service is not None]
-
-    def _run(self) -> None:
-        due_s = time.monotonic()
-        while not self._stop:
-            for service in self.services():
-                service.step(0.001)
-            if self._ask_recognizer_to_leave and self.recognizer is not None:
-                self.recognizer.drain()
-                self.recognizer = None
-            now_s = time.monotonic()
-            if now_s >= due_s:
-                due_s = max(due_s + FRAME / 16000, now_s - 0.1)
-                self._publish()
-        for service in reversed(self.services()):
-            service.drain()
-
-    def _publish(self) -> None:
-        shown = self.shown
-        if shown is None or self.recognizer is None:
-            return
-        start = self.recognizer.starts.get(self.session)
-        if start is None:
-            return
-        self._sequence += 1
-        tone = 3000 * np.sin(2 * np.pi * 200 / 16000 * (self._media_time + np.arange(FRAME)))
-        stamp: dict[str, Any] = {
-            "session": self.session,
-            "epoch": start.epoch,
-            "sequence": self._sequence,
-        }
-        phones, faps = self.recognizer.phones, self.synthesizer.faps
-        pcm = tone.astype("<i2").tobytes()
-        phones.send(Sound(**stamp, media_time=self._media_time, pcm=pcm))
-        self._media_time += FRAME
-        frame_time = self._media_time - LOOK_AHEAD_MS * 16
-        if frame_time >= 0:
-            values = shown.astype("<f4").tobytes()
-            faps.send(
-                FapFrame(**stamp, media_time=frame_time, values=values, mask=bytes(MASK_BYTES))
-            )
-        if self._sequence % 10 == 0:
-            phones.send(
-                Phone(
-                    **stamp,
-                    media_time=self._media_time,
-                    index=self._sequence // 10,
-                    symbol=self.symbol,
-                    duration=3200,
-                    confidence=0.9,
-                    final=True,
-                )
-            )
-
-
-class Gateway:
-    """A gateway process."""
-
-    def __init__(self, control: str, port: int) -> None:
-        self.page = f"http://127.0.0.1:{port}/"
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "services.gateway"],
-            cwd=ROOT,
-            env={
-                **os.environ,
-                "KOUXING_CONTROL": control,
-                "KOUXING_GATEWAY_PORT": str(port),
-                "KOUXING_LOG_LEVEL": "error",
-            },
-        )
-
-    def stop(self) -> int:
-        self.process.terminate()
-        return self.process.wait(10)
-
-
-class Browser:
-    """A headless Chromium with one page."""
-
-    def __init__(self, folder: Path, microphone: Path) -> None:
-        program = shutil.which("chromium") or shutil.which("google-chrome")
-        if program is None:
-            pytest.fail("no Chromium is installed")
-        self._process = subprocess.Popen(
-            [
-                program,
-                *("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle"),
-                *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
-                *("--no-first-run", "--disable-background-networking", "--disable-sync"),
-                *(
-                    "--disable-component-update",
-                    "--autoplay-policy=document-user-activation-required",
-                ),
-                *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
-                f"--use-file-for-fake-audio-capture={microphone}",
-                f"--window-size={SIZE_PX[0]},{SIZE_PX[1]}",
-                f"--user-data-dir={folder}",
-                "--remote-debugging-port=0",
-                "about:blank",
-            ],
-            stderr=subprocess.DEVNULL,
-        )
-        self._loop = asyncio.new_event_loop()
-        self._num_sent = 0
-        self.complaints: list[str] = []
-        port_file = folder / "DevToolsActivePort"
-        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), 20)
-        self._port = int(port_file.read_text().split()[0])
-        self._loop.run_until_complete(self._connect())
-        self.command("Runtime.enable")
-        self.command("Log.enable")
-        self.command(
-            "Emulation.setDeviceMetricsOverride",
-            width=SIZE_PX[0],
-            height=SIZE_PX[1],
-            deviceScaleFactor=1,
-            mobile=False,
-        )
-
-    async def _connect(self) -> None:
-        self._http = aiohttp.ClientSession()
-        async with self._http.get(f"http://127.0.0.1:{self._port}/json/list") as answer:
-            targets = await answer.json()
-        url = next(target for target in targets if target["type"] == "page")["webSocketDebuggerUrl"]
-        self._socket = await self._http.ws_connect(url, max_msg_size=0)
-
-    def close(self) -> None:
-        async def close() -> None:
-            await self._socket.close()
-            await self._http.close()
-
-        self._loop.run_until_complete(close())
-        self._loop.close()
-        self._process.terminate()
-        self._process.wait(10)
-
-    def command(self, method: str, **parameters: object) -> dict[str, Any]:
-        """Run a command of the protocol."""
-        return self._loop.run_until_complete(self._command(method, parameters))
-
-    async def _command(self, method: str, parameters: dict[str, object]) -> dict[str, Any]:
-        self._num_sent += 1
-        message = {"id": self._num_sent, "method": method, "params": parameters}
-        await self._socket.send_json(message)
-        while True:
-            answer = await self._socket.receive_json(timeout=20)
-            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
-                self.complaints.append(json.dumps(answer["params"]))
-            if answer.get("id") == self._num_sent:
-                if "error" in answer:
-                    raise RuntimeError(answer["error"])
-                result: dict[str, Any] = answer["result"]
-                return result
-
-    def evaluate(self, script: str) -> Any:
-        """Return the value of an expression of the page."""
-        result = self.command(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
-        if "exceptionDetails" in result:
-            raise RuntimeError(result["exceptionDetails"])
-        return result["result"].get("value")
-
-    def click(self, name: str) -> None:
-        """Click on an element as a person does, which lets the page play sound."""
-        x, y = self.evaluate(
-            f"(() => {{ const box = document.getElementById('{name}').getBoundingClientRect();"
-            "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
-        )
-        for event in ("mousePressed", "mouseReleased"):
-            self.command(
-                "Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", clickCount=1
-            )
-
-    def wait_for(self, condition: str, limit_s: float = 20) -> None:
-        """Wait until an expression becomes true."""
-        try:
-            wait_until(lambda: bool(self.evaluate(condition)), limit_s)
-        except TimeoutError:
-            state = self.evaluate("JSON.stringify(window.kouxing?.state)")
-            raise TimeoutError(f"{condition}; state {state}; {self.complaints}") from None
-
-    def steady_image(self) -> NDArray[np.uint8]:
-        """Return the canvas once it no longer changes: every fade and redrawing is over."""
-        images = [self.image()]
-
-        def is_steady() -> bool:
-            images.append(self.image())
-            return np.array_equal(images[-1], images[-2])
-
-        wait_until(is_steady, 15)
-        return images[-1]
-
-    def image(self) -> NDArray[np.uint8]:
-        """Return the canvas as it is seen: shape (height, width, 3)."""
-        data = self.command("Page.captureScreenshot", format="png")["data"]
-        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
-            return np.asarray(image.convert("RGB"))
-
-
-def wait_until(condition: Any, limit_s: float) -> None:
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        if time.monotonic() > end_s:
-            raise TimeoutError
-        time.sleep(0.03)
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        port: int = listener.getsockname()[1]
-        return port
 
 
 def write_tone(path: Path) -> None:
@@ -612,19 +293,25 @@ def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser)
 
 
 def test_the_lips_are_switched_while_the_microphone_is_on(system: System, browser: Browser) -> None:
-    system.synthesizer.lips.clear()
-    browser.click("lips")  # counts for the microphone to come
+    system.synthesizer.chosen.clear()
+    assert browser.evaluate("document.getElementById('lips').disabled")  # another's session
+    browser.click("microphone")
+    browser.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips")
+    assert browser.evaluate("window.kouxing.state.lips") == "dynamic-visemes"
+    browser.click("lips")
     browser.wait_for("window.kouxing.state.lips === 'learnt'")
     browser.click("microphone")
-    wait_until(lambda: len(system.synthesizer.lips) == 1, 10)
+    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    browser.click("microphone")  # the choice counts for sessions to come
+    browser.wait_for("!document.getElementById('lips').disabled")
+    browser.wait_for("window.kouxing.state.lips === 'learnt'")
     browser.click("lips")
     browser.wait_for("window.kouxing.state.lips === 'dynamic-visemes'")
-    wait_until(lambda: len(system.synthesizer.lips) == 2, 10)
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
-    (first, second) = system.synthesizer.lips
-    assert first[0] == second[0] != "seen"
-    assert [first[1], second[1]] == ["learnt", "dynamic-visemes"]
+    sessions, lips = zip(*system.synthesizer.chosen, strict=True)
+    assert lips == ("learnt", "learnt", "dynamic-visemes")
+    assert sessions[0] != sessions[1] == sessions[2]
 
 
 def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None:

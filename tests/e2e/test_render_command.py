@@ -22,8 +22,11 @@ from services.driver.config import DriverConfig, Framing
 from services.driver.head.glb_export import export_glb
 from services.driver.head.head import Head
 from services.driver.video.film import frames_of
+from services.recognizer.lips import load_lips
+from services.recognizer.voice import Voice
 from shared.errors import UserError
 from shared.face.fap_file import FapAnimation, write_fap
+from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from tests.glb_writer import write_glb
 from tests.meshes import meshes
 from tests.system import DEMO, ROOT, free_port, kouxing
@@ -98,6 +101,8 @@ def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
         ("a.png", {"at": 9.0, "size": "64x48"}, "lasts from 0 to 0.45 s"),
         ("a.png", {"head": "nobody"}, "there is no head 'nobody'"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
+        ("a.mp4", {"lips": ["learnt"]}, "--lips is for a sound"),
+        ("a.mp4", {"voice": Path("me.voice")}, "--voice is for a sound"),
         ("no/a.mp4", {}, "cannot be written"),
         ("no/a.png", {"size": "64x48"}, "cannot be written"),
     ],
@@ -107,6 +112,41 @@ def test_what_does_not_fit_is_named(
 ) -> None:
     with pytest.raises(UserError, match=said):
         render(face, tmp_path / output, **options)
+
+
+def test_lip_models_side_by_side(tmp_path: Path) -> None:
+    alone, beside = tmp_path / "alone.png", tmp_path / "beside.png"
+    shot: dict[str, Any] = {"camera": Framing.MOUTH, "at": 1.2}
+    render(SENTENCE, alone, size="200x160", **shot)
+    lips = [LipModelName.DYNAMIC_VISEMES, LipModelName.LEARNT]
+    render(SENTENCE, beside, lips=lips, size="400x160", **shot)
+    default = np.asarray(Image.open(alone)).astype(int)
+    visemes, learnt = np.split(np.asarray(Image.open(beside)).astype(int), 2, axis=1)
+    assert DEFAULT_LIP_MODEL is LipModelName.LEARNT
+    np.testing.assert_array_equal(learnt[:140], default[:140])
+    assert np.abs(visemes - learnt)[:140].max() > 40
+    assert default[140:].min(axis=2).max() < 200 < learnt[140:].min(axis=2).max(), "a caption"
+    with pytest.raises(UserError, match="a width that they can share"):
+        render(SENTENCE, beside, lips=lips, size="401x160", **shot)
+
+
+def test_a_voice_moves_the_mouth(tmp_path: Path) -> None:
+    lips = load_lips()
+    voice, nobodys = tmp_path / "me.voice", tmp_path / "nobodys.voice"
+    profile = Voice(
+        scale=np.full(15, 3, np.float32),
+        offset=np.zeros(15, np.float32),
+        residual=np.zeros(lips.residual_shape, np.float32),
+    )
+    voice.write_bytes(profile.to_profile(lips.digest))
+    nobodys.write_bytes(profile.to_profile(bytes(32)))
+    with pytest.raises(UserError, match=r"nobodys\.voice: it was made for another model"):
+        render(SENTENCE, tmp_path / "a.png", voice=nobodys, size="160x128")
+    shot: dict[str, Any] = {"camera": Framing.MOUTH, "at": 1.2, "size": "160x128"}
+    render(SENTENCE, tmp_path / "plain.png", **shot)
+    render(SENTENCE, tmp_path / "wide.png", voice=voice, **shot)
+    plain, wide = (np.asarray(Image.open(tmp_path / f"{name}.png")) for name in ("plain", "wide"))
+    assert np.abs(plain.astype(int) - wide).max() > 40
 
 
 def test_a_definition_of_a_viseme_holds_the_whole_shape() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import os
 import queue
@@ -33,6 +34,7 @@ from shared.wire.control import (
     StatusReport,
     StatusRequest,
     StopSession,
+    UseLips,
 )
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
@@ -73,6 +75,7 @@ class ScriptedSystem:
         self.closed: list[str] = []
         self.flushed: list[str] = []
         self.chosen: list[tuple[str, str]] = []  # session, lip model
+        self.voices: list[bytes] = []  # of the sessions opened
         self.audio_messages: list[Message] = []
         self.forget()
         self._openings: dict[str, tuple[OpenSession, bytes]] = {}
@@ -92,6 +95,7 @@ class ScriptedSystem:
         for received in (self.started, self.closed, self.flushed, self.audio_messages):
             received.clear()
         self.chosen.clear()
+        self.voices.clear()
 
     def do(self, job: Callable[[], object]) -> None:
         """Run something on the thread that owns the sockets, and wait for it."""
@@ -118,6 +122,7 @@ class ScriptedSystem:
             paced=True,
             language="mandarin",
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
+            lips="dynamic-visemes",
         )
         self.commands.send(message, to=self.gateway)
 
@@ -173,6 +178,7 @@ class ScriptedSystem:
             case OpenSession() if self.refuse:
                 answer = Error(code="no-service", text="start one", request=message.request)
             case OpenSession():
+                self.voices.append(message.voice)
                 session = message.session or f"s{len(self._openings)}"
                 self._openings[session] = (message, sender)
                 self.start(session)
@@ -185,6 +191,8 @@ class ScriptedSystem:
                 answer = Done(session=message.session, request=message.request)
             case ChooseLips():
                 self.chosen.append((message.session, message.lips))
+                use = UseLips(session=message.session, lips=message.lips)
+                self.commands.send(use, to=self.gateway)
                 answer = Done(session=message.session, request=message.request)
             case StatusRequest():
                 states = [
@@ -327,7 +335,9 @@ def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayP
             system.do(lambda: system.start("one"))
             await until(lambda: system.started == ["one"])
             system.do(lambda: system.publish_all("one"))
-            assert (await receive_json(newest, "session"))["session"] == "one"
+            shown = await receive_json(newest, "session")
+            assert (shown["session"], shown["lips"]) == ("one", "dynamic-visemes")
+            assert shown["sample"] is False
             got = [await newest.receive(5) for _ in range(4)]
             binary = {m.data[0]: m.data for m in got if m.type is aiohttp.WSMsgType.BINARY}
             texts = [json.loads(m.data) for m in got if m.type is aiohttp.WSMsgType.TEXT]
@@ -485,15 +495,28 @@ def test_microphone_and_sample_may_choose_their_lips(
             await until(lambda: len(system.chosen) == 1)
             await browser.send_json({"lips": "dynamic-visemes"})
             await until(lambda: len(system.chosen) == 2)
+            assert (await receive_json(viewer, "lips"))["lips"] == "learnt"
+            assert (await receive_json(viewer, "lips"))["lips"] == "dynamic-visemes"
             await viewer.send_json({"play": "sample", "lips": "ferguson"})
             assert "lips must be one of" in (await receive_json(viewer, "error"))["text"]
+            await viewer.send_json({"lips": "learnt"})
+            assert "only for the sample" in (await receive_json(viewer, "error"))["text"]
             await viewer.send_json({"play": "sample", "lips": "learnt"})
             await until(lambda: len(system.chosen) == 3)
+            while not (await receive_json(viewer, "session"))["sample"]:
+                pass
+            await viewer.send_json({"lips": "dynamic-visemes"})
+            await until(lambda: len(system.chosen) == 4)
+            sample = system.chosen[3][0]
+            system.do(lambda: system.commands.send(StopSession(session=sample), to=system.gateway))
+            while (shown := await receive_json(viewer, "session"))["session"] == sample:
+                pass
+            assert shown["sample"] is False
 
     asyncio.run(choose())
-    (first, second, third) = system.chosen
-    assert first[0] == second[0] != third[0]
-    assert [first[1], second[1], third[1]] == ["learnt", "dynamic-visemes", "learnt"]
+    (first, second, third, fourth) = system.chosen
+    assert first[0] == second[0] != third[0] == fourth[0]
+    assert [first[1], second[1]] == [third[1], fourth[1]] == ["learnt", "dynamic-visemes"]
 
 
 def test_bad_microphones_are_told_why(system: ScriptedSystem, gateway: GatewayProcess) -> None:
@@ -576,9 +599,56 @@ def test_strange_pages_and_paths_are_refused(gateway: GatewayProcess) -> None:
             ):
                 assert await status(http, path) in (403, 404)
             async with http.get(gateway.page) as answer:
-                assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+                policy = answer.headers["Content-Security-Policy"]
+                assert "default-src 'self'" in policy
+                assert "unsafe" not in policy
 
     asyncio.run(knock())
+
+
+def test_only_the_face_meshs_frame_may_make_functions_from_text_and_it_sees_no_camera(
+    gateway: GatewayProcess,
+) -> None:
+    async def look() -> None:
+        async with aiohttp.ClientSession() as http:
+            async with http.get(f"{gateway.page}face-mesh.html") as answer:
+                policy = answer.headers["Content-Security-Policy"]
+                assert "script-src 'self' 'unsafe-eval'" in policy
+                assert "frame-ancestors 'self'" in policy
+                assert answer.headers["Permissions-Policy"] == "camera=(), microphone=()"
+            for name, kind in (
+                ("face_mesh.js", "javascript"),
+                ("face_mesh.binarypb", "application/octet-stream"),
+                ("face_mesh_solution_simd_wasm_bin.wasm", "application/wasm"),
+                ("face_mesh_solution_packed_assets.data", "application/octet-stream"),
+            ):
+                async with http.get(f"{gateway.page}modules/face_mesh/{name}") as answer:
+                    assert answer.status == 200
+                    assert answer.content_type.endswith(kind)
+                    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+            for name in ("package.json", "index.d.ts", "..%2F..%2Fthree%2Fpackage.json", "no.js"):
+                async with http.get(f"{gateway.page}modules/face_mesh/{name}") as answer:
+                    assert answer.status == 404
+
+    asyncio.run(look())
+
+
+def test_a_voice_goes_with_the_microphones_session(
+    system: ScriptedSystem, gateway: GatewayProcess
+) -> None:
+    profile = bytes(range(256)) * 256  # 64 KiB, the largest
+
+    async def speak() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}microphone") as browser,
+        ):
+            voice = base64.b64encode(profile).decode()
+            await browser.send_json({"sample_rate_hz": 16000, "voice": voice})
+            await receive_json(browser, "opened")
+
+    asyncio.run(speak())
+    assert system.voices == [profile]
 
 
 def test_sigterm_closes_with_a_reason_and_exits_0(own_gateway: GatewayProcess) -> None:

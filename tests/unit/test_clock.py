@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from shared.clock import ClockOffset, to_samples, to_seconds
+from shared.clock import ClockOffset, duration_to_samples, to_samples, to_seconds
 
 pytestmark = pytest.mark.unit
 
@@ -11,6 +11,7 @@ def test_media_time_is_samples_at_16_khz() -> None:
     assert to_samples(1.5) == 24000
     assert to_seconds(24000) == 1.5
     assert to_samples(-0.1) == 0
+    assert duration_to_samples(-0.005) == -80
 
 
 def test_the_exchange_with_the_least_round_trip_gives_the_offset() -> None:

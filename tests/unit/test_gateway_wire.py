@@ -9,7 +9,7 @@ import pytest
 
 from services.gateway import wire
 from shared.errors import UserError
-from shared.face.lip_models import LipModelName
+from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 pytestmark = pytest.mark.unit
 
@@ -27,6 +27,8 @@ def test_a_hello_describes_the_audio() -> None:
     assert (hello.sample_rate_hz, hello.num_channels, hello.encoding) == (44100, 2, "f32le")
     assert hello.frame_bytes == 8
     assert wire.parse_hello('{"sample_rate_hz": 8000}').frame_bytes == 2
+    assert hello.voice == b""
+    assert wire.parse_hello('{"sample_rate_hz": 8000, "voice": "YWJj"}').voice == b"abc"
 
 
 @pytest.mark.parametrize(
@@ -39,6 +41,10 @@ def test_a_hello_describes_the_audio() -> None:
         ({"sample_rate_hz": 16000, "num_channels": 3}, "num_channels"),
         ({"sample_rate_hz": 16000, "encoding": "opus"}, "encoding"),
         ({"sample_rate_hz": 16000, "encoding": ["s16le"]}, "encoding"),
+        ({"sample_rate_hz": 16000, "voice": "no base64!"}, "voice"),
+        ({"sample_rate_hz": 16000, "voice": "ü"}, "voice"),
+        ({"sample_rate_hz": 16000, "voice": ["YWJj"]}, "voice"),
+        ({"sample_rate_hz": 16000, "voice": "AAAA" * (MAX_VOICE_BYTES // 3 + 1)}, "voice"),
         ([1], "object"),
     ],
 )

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.learnt.closures import shut_share
+from services.synthesizer.lips.learnt.closures import ClosingPhones, shut_share
 from services.synthesizer.lips.learnt.model import LearntLips
 from services.synthesizer.lips.learnt.track import LipTrack
 from services.synthesizer.lips.load import load_lip_model
@@ -25,6 +25,7 @@ JAW, LOWER_LIP, TONGUE = 2, 4, 43  # columns of FAPs 3, 5, 44
 HEIGHTS = np.array([4, 5, 8, 9, 10, 11]) - 1  # of the inner lips
 DELAY_S = 0.1
 LIPS_DELAY_S = 0.085
+NEUTRAL = np.zeros(len(MOUTH_FAPS))
 OPEN = {3: 300.0} | dict.fromkeys((4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58), -200.0)
 
 
@@ -129,7 +130,7 @@ def test_position_and_velocity_are_continuous(delay_s: float) -> None:
     assert jaw.max() > 100.0
     assert np.abs(steps).max() < 0.12 * 300.0  # 4 ms
     # a corner would change the step at once by as much as the steepest one
-    assert np.abs(np.diff(steps)).max() < 0.5 * np.abs(steps).max()
+    assert np.abs(np.diff(steps)).max() < 0.8 * np.abs(steps).max()
 
 
 def test_silence_shuts_the_mouth_within_150_ms_and_nothing_twitches() -> None:
@@ -185,7 +186,7 @@ def test_the_sound_alone_shuts_the_lips_whatever_phone_is_recognised() -> None:
 
 @pytest.mark.parametrize(
     ("closure", "confidence", "shuts"),
-    [(0.3, 0.95, True), (0.3, 0.5, False), (0.02, 0.99, False), (0.95, 0.5, True)],
+    [(0.1, 0.95, True), (0.1, 0.5, False), (0.003, 0.95, False), (0.95, 0.5, True)],
 )
 def test_sound_and_phone_decide_a_closure_together(
     closure: float, confidence: float, shuts: bool
@@ -201,12 +202,26 @@ def test_sound_and_phone_decide_a_closure_together(
     assert height < 10.0 if shuts else height > 190.0
 
 
+def test_a_phone_that_comes_after_its_onset_shuts_the_lips_all_the_same() -> None:
+    face = make_face(delay_s=0.06)
+    speak(face)
+
+    def make(time_s: float) -> LipFrame:
+        return lip_frame(time_s + LIPS_DELAY_S - 0.055, closure=0.1)
+
+    # known when the mouth of 0.54 s is made, 80 ms after the onset
+    frames = run(face, 0.0, 1.0, make, [(0.6, phone("p", 0.46))])
+    heights = [float(np.abs(faps[HEIGHTS]).max()) for _, faps in frames]
+    assert min(heights[round(0.54 * 50) : round(0.6 * 50)]) < 10.0
+    assert min(heights[round(0.3 * 50) : round(0.53 * 50)]) > 190.0
+
+
 def test_a_phone_that_is_taken_back_shuts_nothing() -> None:
     face = make_face()
     speak(face)
 
     def make(time_s: float) -> LipFrame:
-        return lip_frame(time_s, closure=0.3)
+        return lip_frame(time_s, closure=0.1)
 
     phones = [(0.5, phone("m", 0.46)), (0.52, phone("n", 0.46))]
     frames = run(face, 0.0, 1.0, make, phones)
@@ -216,11 +231,7 @@ def test_a_phone_that_is_taken_back_shuts_nothing() -> None:
 def test_f_brings_the_lower_lip_alone_to_the_teeth() -> None:
     face = make_face()
     speak(face)
-
-    def make(time_s: float) -> LipFrame:
-        return lip_frame(time_s, lip_to_teeth=0.9 if 0.45 < time_s < 0.55 else 0.02)
-
-    frames = run(face, 0.0, 1.0, make)
+    frames = run(face, 0.0, 1.0, lip_frame, [(0.5, phone("f", 0.46))])
     assert at(frames, 0.5)[LOWER_LIP] > -10.0
     assert at(frames, 0.5)[3] == pytest.approx(-200.0)  # FAP 4, upper lip
 
@@ -235,7 +246,7 @@ def test_closing_is_no_jerk() -> None:
     lip = values(run(face, 0.2, 1.0, make), LOWER_LIP)
     steps = np.diff(lip[60:])
     assert np.abs(steps).max() > 20.0
-    assert np.abs(np.diff(steps)).max() < 0.4 * np.abs(steps).max()
+    assert np.abs(np.diff(steps)).max() < 0.8 * np.abs(steps).max()
 
 
 def test_the_tongue_comes_from_the_visemes_and_the_lips_do_not() -> None:
@@ -333,25 +344,66 @@ def test_a_restart_begins_anew() -> None:
     np.testing.assert_array_equal([f for _, f in first][:15], [f for _, f in again][:15])
 
 
-def test_a_track_is_a_quadratic_spline() -> None:
-    neutral = np.zeros(1)
-    times = np.arange(50, 55) / 50.0
-    rows = np.array([0.0, 0.0, 8.0, 0.0, 0.0])[:, None]
-    track = LipTrack(times, rows, neutral, 0.0)
-    found = [track.at(float(time_s)).value[0] for time_s in times]
-    np.testing.assert_allclose(found, [0.0, 1.0, 6.0, 1.0, 0.0], atol=1e-6)
-    for time_s in np.linspace(0.9, 1.3, 50):
-        step = 1e-6
-        slope = (track.at(time_s + step).value - track.at(time_s - step).value) / (2 * step)
-        np.testing.assert_allclose(track.at(float(time_s)).slope, slope, atol=1e-2)
+def test_a_track_passes_through_its_frames_without_a_corner() -> None:
+    rng = np.random.default_rng(2)
+    track, values = LipTrack(NEUTRAL), rng.normal(size=(8, len(MOUTH_FAPS)))
+    for number, value in enumerate(values):
+        track.append(1.0 + number / 50.0, value)
+    track.hold_s = 0.04
+    found = [track.at(1.0 + number / 50.0).value for number in range(8)]
+    np.testing.assert_allclose(found, values, atol=1e-9)
+    step = 1e-6
+    for time_s in np.linspace(0.9, 1.4, 101) + step / 3.0:  # at each frame, too, and beyond
+        before, here, after = (track.at(float(time_s + k * step)) for k in (-1, 0, 1))
+        np.testing.assert_allclose(here.slope, (after.value - before.value) / (2 * step), atol=1e-2)
+    assert not track.at(0.94).value.any()
+    assert not track.at(1.28).value.any()
+
+
+def test_a_frame_that_comes_does_not_change_what_was_before() -> None:
+    track = LipTrack(NEUTRAL)
+    times, shown = np.linspace(0.0, 0.1, 51), np.full(51, np.nan)
+    for number in range(6):
+        track.append(number / 50.0, NEUTRAL + number % 3)
+        now = np.array([track.at(float(time_s)).value[0] for time_s in times])
+        known = ~np.isnan(shown)
+        np.testing.assert_array_equal(now[known], shown[known])
+        shown = np.where(times <= number / 50.0, now, np.nan)
+
+
+def test_trembling_is_steadied_and_movement_is_not() -> None:
+    face = make_face()
+    speak(face)
+
+    def make(time_s: float) -> LipFrame:
+        trembling = 0.01 * (-1.0) ** round(time_s / 0.02)  # of 300 FAP units
+        return lip_frame(time_s, opening=(0.5 if time_s < 1.0 else 1.0) + trembling)
+
+    frames = run(face, 0.0, 2.0, make)
+    for begin_s, end_s in ((0.5, 0.9), (1.1, 1.8)):
+        jaw = values([each for each in frames if begin_s < each[0] < end_s], JAW)
+        assert np.abs(np.diff(jaw)).max() < 0.25 * 6.0
+    assert at(frames, 0.98)[JAW] == pytest.approx(150.0, abs=5.0)
+    assert at(frames, 1.04)[JAW] == pytest.approx(300.0, abs=5.0)
+
+
+def test_lips_do_not_pass_through_each_other() -> None:
+    face = make_face()
+    speak(face)
+    frames = run(face, 0.0, 1.0, lambda time_s: lip_frame(time_s, opening=-0.2))
+    faps = at(frames, 0.8)
+    np.testing.assert_allclose(faps[HEIGHTS[::2]] + faps[HEIGHTS[1::2]], 0.0, atol=1.0)
 
 
 def test_phones_are_no_evidence_against_a_closure() -> None:
-    probability = np.array([0.9, 0.5, 0.1])
-    alone = shut_share(probability, np.zeros(3))
-    assert alone[0] == 1.0
-    assert alone[2] < 0.5
-    assert (shut_share(probability, np.full(3, 2.2)) >= alone).all()
+    phones = ClosingPhones(LIPS.inventory, "b", 3.0)
+    log_odds = [phones.log_odds(0.5)]
+    phones.accept(phone("t", 0.46), 0.4)
+    log_odds.append(phones.log_odds(0.5))
+    assert log_odds == [0.0, 0.0]
+    phones.accept(phone("p", 0.46, index=1), 0.4)
+    assert phones.log_odds(0.5) > 2.0
+    assert [shut_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
 
 
 def test_learnt_lips_are_found_by_name() -> None:

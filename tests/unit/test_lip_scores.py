@@ -20,13 +20,16 @@ from evaluation.lips.schemes import (
     DELAYS_S,
     HeardClip,
     Scheme,
-    acoustic_closures,
     is_speech,
     loudness_frames,
+    pauses,
+    phones_shaped,
+    quietest_moments,
 )
 from evaluation.lips.scores import LipScore, clips_to_score, pool
 from evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
 from evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
+from services.recognizer.acoustic.load import load_model
 from services.synthesizer.lips.dynamic_visemes.blending import blend
 from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -57,6 +60,7 @@ def heard(
         num_frames=0,
         levels=level_track(clip.samples),
         events={delay_s: list(events) for delay_s in DELAYS_S},
+        inventory=INVENTORY,
         recognised=list(phones),
         aligned=None,
     )
@@ -161,6 +165,34 @@ def test_speech_is_loud_voice_activity() -> None:
     assert not is_speech(heard(clip), times_s).any()
 
 
+def test_lips_that_twitch_and_close_late_in_a_pause_are_found() -> None:
+    time_s = np.arange(0.0, 4.0, 0.02)
+    frames = np.zeros((len(time_s), NUM_FAPS))
+    frames[time_s < 1.05, 4] = -300.0
+    samples = np.full(4 * SAMPLE_RATE_HZ, 1e-4, dtype=np.float32)
+    samples[:SAMPLE_RATE_HZ] = samples[round(2.5 * SAMPLE_RATE_HZ) : 3 * SAMPLE_RATE_HZ] = 0.1
+    events = [SpeechChange(active=True, time_s=0.0), SpeechChange(active=False, time_s=3.5)]
+    lips = heard(replace(clip_of(time_s, frames[:, MOUTH]), samples=samples), events=events)
+    np.testing.assert_allclose(pauses(lips), [[0.99, 2.51], [2.99, 4.0]])
+    late = np.roll(frames, 5, axis=0)
+    late[:5] = late[5]
+    twitching = late.copy()
+    twitching[70:80:2, 4] = -10.0  # at 1.4 to 1.6 s
+    gaping = np.full_like(frames, -300.0)
+    found = {
+        score.scheme: score.pauses
+        for score in scores_of(lips, {"late": late, "twitching": twitching, "gaping": gaping})
+        if score.kind == "all"
+    }
+    assert found["late"].count == found["late"].shut == found["late"].real_shut == 2
+    assert found["late"].speed == found["late"].real_speed == 0.0
+    assert found["late"].real_shut_after_p95_ms == pytest.approx(70.0, abs=5.0)
+    assert found["late"].shut_after_p95_ms == pytest.approx(165.0, abs=10.0)
+    # ten steps of 10 units in 20 ms, among those of 1.29 to 2.31 s and of 3.29 to 3.8 s
+    assert found["twitching"].speed == pytest.approx(500.0 * np.sqrt(10 / 75), rel=0.02)
+    assert (found["gaping"].shut, found["gaping"].shut_after_p50_ms) == (0, None)
+
+
 def test_closures_outside_speech_are_told_apart() -> None:
     time_s = np.arange(0.0, 4.0, 0.02)
     frames = np.zeros((len(time_s), NUM_FAPS))
@@ -211,7 +243,7 @@ def test_loudness_opens_the_mouth() -> None:
     np.testing.assert_array_equal(loudness_frames(samples, 0.3), faps)
 
 
-def test_acoustic_closures_are_where_the_phone_is_quietest() -> None:
+def test_a_closure_is_sought_where_the_phone_is_quietest() -> None:
     phones = utterance(4, 20)
     labials = [phone for phone in phones if phone.symbol == "b"]
     samples = np.random.default_rng(0).normal(0.0, 0.1, 8 * SAMPLE_RATE_HZ).astype(np.float32)
@@ -220,7 +252,14 @@ def test_acoustic_closures_are_where_the_phone_is_quietest() -> None:
         middle = round(time_s * SAMPLE_RATE_HZ)
         samples[middle - 200 : middle + 200] = 0.0
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    np.testing.assert_allclose(acoustic_closures(clip, phones), quiet_s, atol=0.011)
+    found = phones_shaped(heard(clip, phones), "b")
+    np.testing.assert_allclose(quietest_moments(clip, found), quiet_s, atol=0.011)
+    # phones count in the language of the model alone, whichever that is
+    english = replace(clip, language="en")
+    assert phones_shaped(heard(english, phones), "b") == []
+    theirs = replace(INVENTORY, code="en", visemes={**INVENTORY.visemes, "d": (("b", 1.0),)})
+    lips = replace(heard(english, phones), inventory=theirs)
+    assert {phone.symbol for phone in phones_shaped(lips, "b")} == {"b", "d"}
 
 
 def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: str = "zh") -> None:
@@ -309,14 +348,15 @@ def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_sentence_is_drawn_with_the_parameters_given() -> None:
+    model = load_model()
     samples, _ = read_audio(DEMO / "vowels-male.wav")
     still = replace(START, target=np.zeros_like(START.target))
     for parameters, moves in ((START, True), (still, False)):
         lips = DynamicVisemes(parameters, INVENTORY)
-        jaw = sentence_figure(lips, samples[:24_000, 0]).axes[1]
+        jaw = sentence_figure(lips, model, samples[:24_000, 0]).axes[1]
         full, live = (np.asarray(line.get_ydata()) for line in jaw.get_lines()[:2])
         assert (np.ptp(full) > 100.0, np.ptp(live) > 100.0) == (moves, moves)
-    assert len(sentence_figure(LIPS, np.zeros(10, np.float32)).axes) == 6
+    assert len(sentence_figure(LIPS, model, np.zeros(10, np.float32)).axes) == 6
 
 
 def test_pictures_without_matplotlib_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

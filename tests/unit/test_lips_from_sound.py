@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.acoustic.model_file import write_archive
@@ -25,37 +24,12 @@ from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import LipFrame
 from tests.e2e.following import samples_of_file
+from tests.lip_predictors import DELAYS_S, HISTORY, NUM_FEATURES, UNITS, made_up_model
 from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
 
-WIDTH = 512  # of the shipped network
-NUM_FEATURES, NUM_COMPONENTS, UNITS, HISTORY = 160 + 2 * WIDTH, 6, 5, 3
-DELAYS_S = (0.0, 0.05, 0.16)
 SAMPLES = samples_of_file(DEMO / "vowels-male.wav")[:32_000]
-
-
-def made_up_model() -> LipPredictor:
-    rng = np.random.default_rng(0)
-    outputs = (len(DELAYS_S), NUM_OUTPUTS)
-
-    def draw(*shape: int, spread: float = 0.3) -> NDArray[np.float32]:
-        return rng.normal(0, spread, shape).astype(np.float32)
-
-    return LipPredictor(
-        delays=np.array(DELAYS_S, np.float32),
-        feature_mean=draw(NUM_FEATURES),
-        projection=draw(NUM_FEATURES, NUM_COMPONENTS, spread=0.01),
-        entry_weights=draw(NUM_COMPONENTS, UNITS),
-        entry_bias=draw(UNITS),
-        input_weights=draw(UNITS, 3 * UNITS),
-        input_bias=draw(3 * UNITS),
-        state_weights=draw(UNITS, 3 * UNITS),
-        state_bias=draw(3 * UNITS),
-        history_weights=draw(HISTORY, NUM_COMPONENTS, *outputs),
-        output_weights=draw(2 * UNITS, *outputs),
-        output_bias=draw(*outputs),
-    )
 
 
 MODEL = made_up_model()
@@ -110,12 +84,12 @@ def test_reset_forgets_everything() -> None:
 def test_each_delay_has_its_own_outputs_and_times() -> None:
     frames, keys, values = np.ones((2, 80)), np.ones((8, 64)), np.ones((8, 64))
     position = [array.astype(np.float32) for array in (frames, keys, values)]
-    both = MODEL.stream([0.05, 0.16]).accept(1.0, position[0], position[1], position[2])
-    alone = MODEL.stream([0.16]).accept(1.0, position[0], position[1], position[2])
-    assert [(lip.time_s, lip.delay_s) for lip in both] == [(0.95, 0.05), (0.84, 0.16)]
+    both = MODEL.stream([-0.005, 0.155]).accept(1.0, position[0], position[1], position[2])
+    alone = MODEL.stream([0.155]).accept(1.0, position[0], position[1], position[2])
+    assert [(lip.time_s, lip.delay_s) for lip in both] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
     assert 0 < both[0].closure < 1
-    outputs = MODEL.stream([0.16]).step(np.concatenate(position, axis=None))
+    outputs = MODEL.stream([0.155]).step(np.concatenate(position, axis=None))
     assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
 
 
@@ -151,6 +125,7 @@ def test_a_model_comes_back_from_its_file(tmp_path: Path) -> None:
         ("format", np.array("neural 5"), "format 'neural 5'"),
         ("delays", np.array([0.05, 0.0], np.float32), "do not rise"),
         ("delays", np.array([0.0, 3.0], np.float32), "delays are"),
+        ("delays", np.array([-3.0, 0.0], np.float32), "delays are"),
         ("projection", np.ones((NUM_FEATURES, 7), np.float32), "entry_weights has shape"),
         ("state_weights", np.ones((UNITS, 2), np.float32), "state_weights has shape"),
         ("output_bias", np.full((3, NUM_OUTPUTS), np.nan, np.float32), "not finite"),
@@ -172,7 +147,7 @@ def test_a_missing_array_or_delay_is_named(tmp_path: Path) -> None:
     write_archive(tmp_path / "bad.npz", arrays)
     with pytest.raises(UserError, match="entry_bias is missing"):
         load_lips(tmp_path / "bad.npz")
-    with pytest.raises(UserError, match="no delay of 70 ms; give one of 0, 50, 160"):
+    with pytest.raises(UserError, match="no delay of 70 ms; give one of -5, 55, 155"):
         MODEL.stream([0.07])
 
 

@@ -10,9 +10,10 @@ import pytest
 
 from services.recognizer.acoustic.load import load_model, model_path
 from services.recognizer.config import RecognizerConfig
-from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for
+from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
 from services.recognizer.service import MAX_QUEUED_S, RecognizerService
 from services.recognizer.stream import SpeechStream
+from services.recognizer.voice import Voice
 from shared.phones.events import LipFrame
 from shared.wire.audio import AudioChunk
 from shared.wire.control import StartSession
@@ -32,6 +33,10 @@ class Watched(RecognizerService):
         nobody = f"tcp://127.0.0.1:{free_port()}"
         super().__init__(RecognizerConfig(control=nobody, audio=local, phones=local))
         self.media_times: list[int] = [0]
+        self.warnings_given: list[tuple[str, str]] = []
+
+    def warn(self, reason: str, text: str, session: str = "") -> None:
+        self.warnings_given.append((reason, text))
 
     def beat_if_due(self) -> None:
         self.media_times += [session.stream.media_time for session in self._sessions.values()]
@@ -44,8 +49,8 @@ def service() -> Iterator[Watched]:
     made.bus.close()
 
 
-def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(service: Watched) -> None:
-    start = StartSession(
+def start_of(voice: bytes = b"") -> StartSession:
+    return StartSession(
         session="s",
         epoch=1,
         request="r",
@@ -57,8 +62,12 @@ def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(servic
         paced=False,
         language="mandarin",
         endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
+        voice=voice,
     )
-    service.start_session(start)
+
+
+def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(service: Watched) -> None:
+    service.start_session(start_of())
     pcm = bytes(MAX_AUDIO_BYTES)
     service._on_audio(AudioChunk(session="s", token="t", sequence=1, pcm=pcm), b"")
     service._process_queued()
@@ -71,6 +80,49 @@ def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(servic
     assert service.media_times[-1] == pytest.approx(
         MAX_AUDIO_BYTES, abs=320
     )  # 2 bytes at half the rate
+
+
+@pytest.mark.parametrize(
+    "voice",
+    [
+        b"no voice",
+        Voice(
+            scale=np.ones(15, np.float32),
+            offset=np.zeros(15, np.float32),
+            residual=np.zeros((2, 2, 15), np.float32),
+        ).to_profile(bytes(32)),
+    ],
+)
+def test_a_voice_that_does_not_fit_is_refused_once_and_the_session_goes_on(
+    service: Watched, voice: bytes
+) -> None:
+    service.start_session(start_of(voice))
+    for sequence in (1, 2):
+        service._on_audio(
+            AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)), b""
+        )
+    service._process_queued()
+    service.beat_if_due()
+    assert [reason for reason, _ in service.warnings_given] == ["bad-voice"]
+    assert "the voice is not used" in service.warnings_given[0][1]
+    assert service.media_times[-1] == pytest.approx(6400, abs=640)
+
+
+def test_a_session_has_the_lips_of_its_voice(service: Watched) -> None:
+    lips = load_lips()
+    voice = Voice(
+        scale=np.zeros(15, np.float32),
+        offset=np.full(15, 77, np.float32),
+        residual=np.zeros(lips.residual_shape, np.float32),
+    )
+    start = start_of(voice.to_profile(lips.digest))
+    service.start_session(start)
+    stream = service._sessions["s"].stream
+    events = stream.accept_waveform(samples_of_file(DEMO / "vowels-male.wav")[:16_000])
+    frames = [event for event in events if isinstance(event, LipFrame)]
+    assert len(frames) > 5
+    assert {frame.faps[0] for frame in frames} == {77.0}
+    assert not service.warnings_given
 
 
 def tiny_lips(num_features: int) -> LipPredictor:

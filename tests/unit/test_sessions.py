@@ -29,6 +29,7 @@ def worker(service: str, instance: str, state: str = "ready") -> Heartbeat:
         language="mandarin" if service == "recognizer" else "",
         frame_rate_hz=50.0 if service == "synthesizer" else 0.0,
         delay_ms=100.0 if service == "synthesizer" else 0.0,
+        lips="dynamic-visemes" if service == "synthesizer" else "",
     )
 
 
@@ -72,18 +73,24 @@ def test_a_session_gets_a_name_a_token_and_its_services(made: Made) -> None:
     }
 
 
-def test_the_services_are_told_the_delay_of_the_face_and_the_lips_that_were_chosen(
+def test_the_services_are_told_the_delay_of_the_face_and_its_lips(
     made: Made,
 ) -> None:
     record = made.open()
     start = made.sessions.start_message(record)
-    assert (start.delay_ms, start.lips) == (100.0, "")
+    assert (start.delay_ms, start.lips) == (100.0, "dynamic-visemes")
     record.lips = "learnt"
     made.registry.remove("synthesizer-1")
     made.add(dataclasses.replace(worker("synthesizer", "synthesizer-2"), delay_ms=40.0))
     assert made.sessions.replace(record, 1.0)
     start = made.sessions.start_message(record)
     assert (start.delay_ms, start.lips) == (40.0, "learnt")
+
+
+def test_the_services_are_told_the_voice_of_the_speaker(made: Made) -> None:
+    opening = OpenSession(request="r", voice=b"a voice")
+    record = made.sessions.open(opening, b"client", 0.0)
+    assert made.sessions.start_message(record).voice == b"a voice"
 
 
 def test_the_client_and_the_services_are_told_the_endpoints(made: Made) -> None:

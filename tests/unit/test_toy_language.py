@@ -29,10 +29,12 @@ from services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormaliz
 from services.recognizer.offline import recognize
 from services.recognizer.recognizer import Recognizer
 from services.recognizer.speech_scores import frame_time_s
+from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.face import Face
 from services.synthesizer.lips.load import load_lip_model
 from shared.audio_file import read_audio
 from shared.errors import UserError
+from shared.face.lip_models import LipModelName
 from shared.phones.events import Phone, Progress
 from shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import flat_language, install_language
@@ -150,7 +152,12 @@ def test_text_is_aligned(toy: PhoneInventory, tmp_path: Path) -> None:
 
 
 def test_its_sound_opens_the_mouth(toy: PhoneInventory, tmp_path: Path) -> None:
-    chain = LiveChain(loaded(toy, tmp_path), load_lip_model("toy"))
+    visemes = LipModelName.DYNAMIC_VISEMES
+    chain = LiveChain(
+        loaded(toy, tmp_path),
+        load_lip_model("toy", visemes),
+        synthesizer=SynthesizerConfig(lips=visemes),
+    )
     samples, labels = vowels()
     frames = chain.accept_waveform(samples) + chain.input_finished()
     assert {event.symbol for event in chain.events if isinstance(event, Phone)} <= set(toy.phones)

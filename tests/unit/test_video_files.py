@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from services.driver.video.writer import VideoWriter, open_writer, write_picture
 from shared.errors import UserError
@@ -45,6 +45,21 @@ def test_alpha_is_in_the_video(tmp_path: Path, name: str) -> None:
     inner[12:28, 12:38] = inner[32:38, 12:38] = inner[:8] = True  # away from smoothed edges
     np.testing.assert_allclose(got[inner, 3].astype(int), PICTURE[inner, 3], atol=3)
     np.testing.assert_allclose(got[20, 20].astype(int), [200, 50, 20, 255], atol=6)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_moving_picture_for_a_page(tmp_path: Path, channels: int) -> None:
+    path = tmp_path / "face.webp"
+    with VideoWriter(path, 64, 48, 20.0, 16000, transparent=channels == 4) as writer:
+        for number in range(3):
+            writer.write_image(np.roll(PICTURE[..., :channels], 4 * number, axis=1))
+            writer.write_sound(np.zeros(800, np.float32))
+    with Image.open(path) as moving:
+        images = [np.asarray(image.convert("RGBA")) for image in ImageSequence.Iterator(moving)]
+        assert (len(images), moving.info["loop"], moving.info["duration"]) == (3, 0, 50)
+    got = images[2].astype(int)
+    np.testing.assert_allclose(got[20, 28], [200, 50, 20, 255], atol=12)
+    assert (got[..., 3].min() == 255) == (channels == 3)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from training.lips.targets import touches
 
 Floats = NDArray[np.float32]
 
+_ABOUT = Path(__file__).with_name("about.md")  # what no figure says, and what others measured
 _SHOWN_FAPS = [LIP_FAPS.index(fap) for fap in (3, 4, 5, 6)]  # of opening, width and jaw
 
 
@@ -66,6 +67,8 @@ def write_card(
         groups[f"{clip.language}, {clip.speaker} ({known})"].append(clip)
     lines = [
         "# Lips from sound",
+        "",
+        *_ABOUT.read_text(encoding="utf-8").splitlines(),
         "",
         f"Made by `kouxing train lips --clips DIR --seed {trained.seed}`. See",
         "`training/lips/recipe.py` for how and `services/recognizer/lips.py` for what it computes.",

@@ -1,8 +1,7 @@
 """What the acoustic network computes at every position of a recording, as in the product.
 
-The voice detector and the sound before its decision are those of the live recognizer, so the
-network starts again with each stretch of speech. Augmented copies of a clip have other speeds,
-rooms, noises, lines and levels; their lips move at the same speed.
+Augmented copies of a clip have other speeds, rooms, noises, lines and levels; their lips move at
+the same speed.
 
 Positions are kept in the cache folder, 16 bits a number: 2.4 KB for each 20 ms of speech.
 """
@@ -11,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,17 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corpora.feature_cache import cache_folder
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from corpora.lip_clips import LipClip
 from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.speech_scores import SpeechScores
-from shared.phones.events import LipFrame
+from services.recognizer.lip_positions import lip_positions
 from training.neural.augmentation import augment_samples, scale_level
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-_PIECE = SAMPLE_RATE_HZ // 10
 _FORMAT = "1"  # raise when the positions change
 
 
@@ -41,28 +37,6 @@ class Speech:
     features: NDArray[np.float16]  # (positions, features) as `LipModel` takes them
     known_s: Array  # (positions,) media time up to which the sound is known
     speed: float  # of the copy; above 1 is faster than the clip
-
-
-class _Recorder:
-    """Keeps what lips from sound would be told."""
-
-    def __init__(self) -> None:
-        self.starts: list[int] = []  # first position of each stretch of speech
-        self.known_s: list[float] = []
-        self.features: list[NDArray[np.float16]] = []
-
-    def accept(
-        self, known_s: float, frames: Floats, keys: Floats, values: Floats
-    ) -> list[LipFrame]:
-        """Take what the network computes at a position."""
-        self.known_s.append(known_s)
-        features = np.concatenate([frames, keys, values], axis=None)
-        self.features.append(features.astype(np.float16))
-        return []
-
-    def reset(self) -> None:
-        """Note that a stretch of speech begins."""
-        self.starts.append(len(self.known_s))
 
 
 def speech_of(model: NeuralModel, clip: LipClip, copy: int = 0) -> list[Speech]:
@@ -90,24 +64,15 @@ def _positions(model: NeuralModel, samples: Floats) -> dict[str, NDArray[Any]]:
     if path.is_file():
         with np.load(path, allow_pickle=False) as kept:
             return dict(kept)
-    recorder = _Recorder()
-    scores = SpeechScores(model, SAMPLE_RATE_HZ, lips=recorder)
-    for piece in _pieces(samples):
-        run_scoring_tasks(model, [scores.process(piece)])
-    run_scoring_tasks(model, [scores.finish()])
-    num_positions = len(recorder.known_s)
+    recorded = lip_positions(model, samples)
+    num_positions = len(recorded.known_s)
     positions: dict[str, NDArray[Any]] = {
-        "starts": np.array(recorder.starts, dtype=np.int64),
-        "known_s": np.array(recorder.known_s, dtype=np.float64),
-        "features": np.array(recorder.features, dtype=np.float16).reshape(num_positions, -1),
+        "starts": np.array(recorded.starts, dtype=np.int64),
+        "known_s": np.array(recorded.known_s, dtype=np.float64),
+        "features": np.array(recorded.features, dtype=np.float16).reshape(num_positions, -1),
     }
     np.savez(path, allow_pickle=False, **positions)
     return positions
-
-
-def _pieces(samples: Floats) -> Iterator[Floats]:
-    for start in range(0, len(samples), _PIECE):
-        yield samples[start : start + _PIECE]
 
 
 def features_of(speech: Sequence[Speech]) -> Floats:

@@ -33,7 +33,9 @@ from training.lips.targets import Touch, targets_at, touches
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-DELAYS_S = (0.0, 0.02, 0.05, 0.1, 0.16)
+# 5 ms less than a face's delay of 0, 20, 50, 60, 100 or 160 ms: so long before a frame of the face
+# the sound of a position ends.
+DELAYS_S = (-0.005, 0.015, 0.045, 0.055, 0.095, 0.155)
 LANGUAGE = "zh"  # of the acoustic model, as the clips name it
 NUM_COPIES = 2  # augmented, of each clip
 NUM_EPOCHS = 12

@@ -19,14 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corpora.lip_clips import LipClip
-from services.recognizer.lips import CLOSURE, LIP_FAPS
-from training.lips.targets import Touch, lip_tracks, opening
+from services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
+from services.recognizer.lips import CLOSURE
+from training.lips.targets import Touch, opening
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-MEASURES = ("opening", "width", "jaw")
-_JAW, _UPPER_LIP, _LOWER_LIP, _CORNER = (LIP_FAPS.index(fap) for fap in (3, 4, 5, 6))
 _TO_REST_S = 0.06  # after the last lip frame
 _CLOSURE_WINDOW_S = 0.04
 _OPEN_WINDOW_S = 0.2
@@ -41,13 +40,6 @@ class Stretch:
 
 
 Made = Mapping[str, Sequence[Stretch]]  # by clip
-
-
-def measures_of(lips: NDArray[np.floating]) -> Array:
-    """Return opening, width and jaw, (n, 3), of FAPs, (n, 15 or more)."""
-    height = -lips[:, _UPPER_LIP] - lips[:, _LOWER_LIP]
-    measures: Array = np.stack([height, 2 * lips[:, _CORNER], lips[:, _JAW]], axis=1)
-    return measures
 
 
 def correlations(
@@ -80,7 +72,7 @@ def _compared(
     time_s = np.concatenate(times)
     order = np.argsort(time_s, kind="stable")
     made = np.concatenate(values)[order]
-    tracked = measures_of(lip_tracks(clip))
+    tracked = measures_of(lip_tracks(clip.faps))
     pairs = []
     for measure in range(len(MEASURES)):
         known = ~np.isnan(tracked[:, measure]) & (spoken if in_speech else True)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corpora.lip_clips import LipClip
-from services.recognizer.lips import LIP_FAPS, OTHER_SIDE
+from services.recognizer.lip_tracks import lip_tracks, values_at
 from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import Phone
 
@@ -31,7 +31,6 @@ Array = NDArray[np.float64]
 
 _CLOSED_SHARE, _OPEN_SHARE = 0.1, 0.5  # of the range of a speaker's opening
 _RANGE_PERCENTILES = (1.0, 99.0)
-_MAX_GAP_S = 0.1  # between two tracked frames that are interpolated
 _LIP_TO_TEETH = "f"
 
 
@@ -41,14 +40,6 @@ class Touch:
 
     closed_below: float  # the lips touch
     half_open: float
-
-
-def lip_tracks(clip: LipClip) -> Array:
-    """Return the tracked FAPs, left and right averaged, (num_frames, len(LIP_FAPS))."""
-    sides = [
-        [MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] for fap in LIP_FAPS
-    ]
-    return np.stack([clip.faps[:, pair].mean(axis=1) for pair in sides], axis=1)
 
 
 def opening(clip: LipClip) -> Array:
@@ -103,8 +94,8 @@ def targets_at(
         FAPs in FAP units, closure, lip to teeth (0 or 1), (n, delays, 17); NaN where unknown.
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
-    faps = [_at(clip.time_s, track, time_s) for track in lip_tracks(clip).T]
-    height = _at(clip.time_s, opening(clip), time_s)
+    faps = [values_at(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]
+    height = values_at(clip.time_s, opening(clip), time_s)
     closure = np.where(np.isnan(height), np.nan, height < touch.closed_below)
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
     for phone in phones or ():
@@ -112,16 +103,3 @@ def targets_at(
             end_s = phone.onset_s + phone.duration_s
             lip_to_teeth[(time_s >= phone.onset_s) & (time_s < end_s)] = 1.0
     return np.stack([*faps, closure, lip_to_teeth], axis=-1).astype(np.float32)
-
-
-def _at(frame_s: Array, values: Array, time_s: Array) -> Array:
-    """Interpolate a track; NaN outside it and within its gaps."""
-    known = ~np.isnan(values)
-    if known.sum() < 2:
-        return np.full(time_s.shape, np.nan)
-    frame_s, values = frame_s[known], values[known]
-    after = np.clip(np.searchsorted(frame_s, time_s), 1, len(frame_s) - 1)
-    is_gap = frame_s[after] - frame_s[after - 1] > _MAX_GAP_S
-    outside = (time_s < frame_s[0]) | (time_s > frame_s[-1])
-    made: Array = np.interp(time_s, frame_s, values)
-    return np.where(is_gap | outside, np.nan, made)

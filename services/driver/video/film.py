@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.driver.render.renderer import Renderer
+from services.driver.render.side_by_side import SideBySide
 from services.driver.video.recording import Recording, between
 from services.driver.video.writer import write_picture
 from shared.clock import MEDIA_RATE_HZ
@@ -16,7 +17,8 @@ from shared.errors import UserError
 from shared.face.fap_file import FapAnimation
 from shared.face.high_level import expression_faps, viseme_faps
 
-Frame = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+# media time in seconds; FAPs (68,), side by side (num_faces, 68)
+Frame = tuple[float, NDArray[np.float32]]
 
 
 def frames_of(animation: FapAnimation) -> list[Frame]:
@@ -38,10 +40,18 @@ def frames_of(animation: FapAnimation) -> list[Frame]:
     return [(number / animation.frame_rate_hz, row) for number, row in enumerate(faps)]
 
 
+def beside(faces: Sequence[list[Frame]]) -> list[Frame]:
+    """Join the frames of several faces, which are at the same times, for ``SideBySide``."""
+    return [
+        (frames[0][0], np.stack([faps for _, faps in frames]))
+        for frames in zip(*faces, strict=True)
+    ]
+
+
 def render_video(
     frames: list[Frame],
     path: Path,
-    renderer: Renderer,
+    renderer: Renderer | SideBySide,
     *,
     frame_rate_hz: float,
     samples: NDArray[np.float32] | None = None,
@@ -86,7 +96,9 @@ def render_video(
     return recording.num_images
 
 
-def render_picture(frames: list[Frame], path: Path, renderer: Renderer, at_s: float) -> None:
+def render_picture(
+    frames: list[Frame], path: Path, renderer: Renderer | SideBySide, at_s: float
+) -> None:
     """Write the picture (PNG) at a time.
 
     Raises

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.driver.render.renderer import Renderer
+from services.driver.render.side_by_side import SideBySide
 from services.driver.video.writer import open_writer
 from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
@@ -42,7 +43,12 @@ class Recording:
     """
 
     def __init__(
-        self, path: Path, renderer: Renderer, frame_rate_hz: float, *, sound: bool = True
+        self,
+        path: Path,
+        renderer: Renderer | SideBySide,
+        frame_rate_hz: float,
+        *,
+        sound: bool = True,
     ) -> None:
         self.path = path
         self.num_images = 0
@@ -65,7 +71,7 @@ class Recording:
         return self.num_images / self._frame_rate_hz
 
     def accept_frame(self, time_s: float, faps: Faps) -> None:
-        """Take a FAP frame; times do not decrease."""
+        """Take a FAP frame as the renderer draws it; times do not decrease."""
         if not self._frames or time_s > self._frames[-1][0]:
             self._frames.append((time_s, faps))
 
@@ -112,7 +118,7 @@ class Recording:
 
 
 def between(before: tuple[float, Faps], after: tuple[float, Faps], time_s: float) -> Faps:
-    """Return the FAPs (68,) at a time between two frames; outside, the nearer frame's."""
+    """Return the FAPs at a time between two frames; outside, the nearer frame's."""
     (begin_s, begin), (end_s, end) = before, after
     if end_s <= begin_s:
         return begin

@@ -1,4 +1,4 @@
-"""Write pictures and sound in sync: MP4, MOV, WebM, or a sequence of PNG files.
+"""Write pictures and sound in sync: MP4, MOV, WebM; or pictures alone: WebP, PNG files.
 
 Picture ``n`` is shown at ``n / frame_rate_hz``, sound sample ``n`` is heard at
 ``n / sample_rate_hz``, both from the file's start.
@@ -9,6 +9,7 @@ file                    opaque                                with a transparent
 ``.mp4``                H.264 and AAC                         not possible
 ``.mov``                H.264 and AAC                         ProRes 4444 and AAC
 ``.webm``               VP9 and Opus                          VP9 with alpha and Opus
+``.webp``               WebP, animated for ever, no sound     WebP with alpha, no sound
 folder, ``name%05d``    PNG, no sound                         PNG with alpha, no sound
 ======================  ====================================  ==============================
 """
@@ -38,7 +39,7 @@ UInt8 = NDArray[np.uint8]
 
 AAC_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 OPUS_RATES_HZ = (8000, 12000, 16000, 24000, 48000)
-VIDEO_SUFFIXES = (".mp4", ".mov", ".webm")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".webp")
 _NUMBER = re.compile(r"%0?\d?d")  # in the name of a sequence's pictures
 
 
@@ -51,17 +52,32 @@ class _Codec:
     options: dict[str, str] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class _Format:
+    """What a file's suffix stands for."""
+
+    opaque: _Codec
+    transparent: _Codec | None
+    sound: str | None  # its codec
+    sample_rates_hz: tuple[int, ...]
+    options: dict[str, str] = field(default_factory=dict)  # of the container
+
+
 # visually lossless
 _H264 = _Codec("libx264", "yuv420p", {"crf": "18", "preset": "veryfast"})
 _PRORES = _Codec("prores_ks", "yuva444p10le", {"profile": "4444"})
 _VP9_OPTIONS = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "6"}
 _VP9 = _Codec("libvpx-vp9", "yuv420p", _VP9_OPTIONS)
 _VP9_ALPHA = _Codec("libvpx-vp9", "yuva420p", _VP9_OPTIONS)
-# suffix: codecs of opaque and of transparent pictures, codec of the sound, its rates
+# at less quality, what moves leaves traces
+_WEBP = _Codec("libwebp_anim", "bgra", {"quality": "80"})
+_INDEX_FIRST = {"movflags": "faststart"}
+_FOR_EVER = {"loop": "0"}
 _FORMATS = {
-    ".mp4": (_H264, None, "aac", AAC_RATES_HZ),
-    ".mov": (_H264, _PRORES, "aac", AAC_RATES_HZ),
-    ".webm": (_VP9, _VP9_ALPHA, "libopus", OPUS_RATES_HZ),
+    ".mp4": _Format(_H264, None, "aac", AAC_RATES_HZ, _INDEX_FIRST),
+    ".mov": _Format(_H264, _PRORES, "aac", AAC_RATES_HZ, _INDEX_FIRST),
+    ".webm": _Format(_VP9, _VP9_ALPHA, "libopus", OPUS_RATES_HZ),
+    ".webp": _Format(_WEBP, _WEBP, None, (), _FOR_EVER),
 }
 
 
@@ -138,7 +154,8 @@ class VideoWriter:
     frame_rate_hz
         Pictures a second, 1 to 1000.
     sample_rate_hz
-        One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``; None for no sound.
+        One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``; None for no sound. ``.webp``
+        has none.
     transparent
         The pictures have an alpha channel.
 
@@ -159,10 +176,8 @@ class VideoWriter:
         transparent: bool = False,
     ) -> None:
         self._path = Path(path)
-        opaque, with_alpha, sound_codec, rates_hz = _FORMATS.get(
-            self._path.suffix, _FORMATS[".mp4"]
-        )
-        codec = with_alpha if transparent else opaque
+        form = _FORMATS.get(self._path.suffix, _FORMATS[".mp4"])
+        codec = form.transparent if transparent else form.opaque
         if codec is None:
             raise UserError(
                 f"{self._path}: MP4 has no transparency; write .mov, .webm, or pictures (a folder)"
@@ -173,8 +188,9 @@ class VideoWriter:
             )
         if not 1 <= frame_rate_hz <= 1000:
             raise UserError(f"a frame rate of {frame_rate_hz} Hz; give one from 1 to 1000")
-        if sample_rate_hz is not None and sample_rate_hz not in rates_hz:
-            rates = ", ".join(str(rate) for rate in rates_hz)
+        sound_codec = None if sample_rate_hz is None else form.sound
+        if sound_codec is not None and sample_rate_hz not in form.sample_rates_hz:
+            rates = ", ".join(str(rate) for rate in form.sample_rates_hz)
             raise UserError(
                 f"{sound_codec} has no sample rate of {sample_rate_hz} Hz; give one of {rates}"
             )
@@ -188,8 +204,9 @@ class VideoWriter:
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
             self._unfinished.touch()  # FFmpeg would open it only at the first packet
             container = self._path.suffix.removeprefix(".") or "mp4"
-            options = {} if container == "webm" else {"movflags": "faststart"}
-            self._container = av.open(str(self._unfinished), "w", format=container, options=options)
+            self._container = av.open(
+                str(self._unfinished), "w", format=container, options=form.options
+            )
         except OSError as error:
             raise _unwritable(self._path, error) from error
         rate = Fraction(frame_rate_hz).limit_denominator(1001)
@@ -204,7 +221,7 @@ class VideoWriter:
         context.color_primaries = context.color_trc = context.colorspace = Colorspace.ITU709
         context.color_range = ColorRange.MPEG
         self._sound: Any = None
-        if sample_rate_hz is not None:
+        if sound_codec is not None:
             self._sound = self._container.add_stream(
                 sound_codec, rate=sample_rate_hz, layout="mono"
             )

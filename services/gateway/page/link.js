@@ -37,6 +37,11 @@ export class Link {
     this.#send(lips === null ? { play: what } : { play: what, lips });
   }
 
+  /** Let another lip model move the mouth of the sample sentence while it is spoken. */
+  chooseLips(lips) {
+    this.#send({ lips });
+  }
+
   #send(command) {
     if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
   }

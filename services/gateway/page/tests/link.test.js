@@ -108,6 +108,11 @@ test("the sample sentence is spoken with the lips that were chosen", () => {
   FakeWebSocket.made[0].open();
   link.play("sample", null);
   link.play("sample", "learnt");
-  const expected = [{ play: "sample" }, { play: "sample", lips: "learnt" }];
+  link.chooseLips("dynamic-visemes");
+  const expected = [
+    { play: "sample" },
+    { play: "sample", lips: "learnt" },
+    { lips: "dynamic-visemes" },
+  ];
   assert.deepEqual(FakeWebSocket.made[0].sent, expected);
 });

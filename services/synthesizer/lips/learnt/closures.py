@@ -1,30 +1,49 @@
 """Lips that meet: by what the sound tells of the lips and of the phone, decided together.
 
 Either source errs: the one confuses p with t, the other rounds closures off. Their evidence is
-added as log odds: a recognised b, p, m (or f) raises the odds of a closure, and a probability of
-the sound that is high enough needs no phone. Phones are no evidence against a closure, so a p that
-is taken for a t cannot open lips that the sound has shut; and no phone alone can shut lips that
-the sound tells to be open.
+added as log odds: a recognised b, p, m raises the odds of a closure, and a probability of the sound
+that is high enough needs no phone. Phones are no evidence against a closure, so a p that is taken
+for a t cannot open lips that the sound has shut; and no phone alone can shut lips that the sound
+tells to be wide open.
+
+Lower lip to upper teeth, as in f, is the phone's to decide: the sound tells it too badly.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import Phone
 from shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
-MAX_PHONE_LOG_ODDS = 2.2  # of a phone of confidence 0.9; a closure needs 0.1 from the sound then
 _LOWEST, _HIGHEST = 0.002, 0.998  # probabilities that count
-_OPEN, _SHUT = 0.4, 0.6  # probabilities below and above which nothing is left to doubt
-_NEIGHBOUR = 0.8  # a closure takes the frames beside it along, so that averaging leaves it shut
-_HELD_S = 0.08  # after its onset a phone's lips are shut for so long at most
-_EDGE_S = 0.03  # in which a phone's evidence rises and falls
+_HELD_S = 0.08  # after its onset a phone's lips are shut for so long at most,
+_DECIDED_S = 0.04  # and for so long after the phone is known, if it comes late,
+_LATEST_S = 0.1  # but not this long after its onset
+_EDGE_S = 0.02  # in which a phone's evidence rises and falls
+
+
+@dataclass(frozen=True, slots=True)
+class ClosureRule:
+    """How the evidence is weighed.
+
+    ``kouxing evaluate closures`` compares values on clips for choices, and chose these.
+    """
+
+    sound: float = 1.5  # added to the sound's log odds: it rather misses a closure than invents one
+    phone: float = 3.0  # log odds that a phone adds at most
+    doubt: float = 0.8  # log odds around 0 within which lips are led part of the way
+
+
+_UPPER_LIP = [(4, 51), (8, 55), (9, 56)]  # FAPs of the inner and the outer lip
+_LOWER_LIP = [(5, 52), (10, 57), (11, 58)]
 
 
 class ClosingPhones:
@@ -36,60 +55,82 @@ class ClosingPhones:
         The language.
     viseme
         First viseme of the phones: "b" or "f".
+    most
+        Log odds that a phone adds at most.
     """
 
-    def __init__(self, inventory: PhoneInventory, viseme: str) -> None:
+    def __init__(self, inventory: PhoneInventory, viseme: str, most: float) -> None:
+        self._most = most
         self._symbols = {
             symbol for symbol, shares in inventory.visemes.items() if shares[0][0] == viseme
         }
-        self._phones: dict[int, Phone] = {}  # by index
+        self._phones: dict[int, tuple[Phone, float]] = {}  # by index, with when they were known
 
-    def accept(self, phone: Phone) -> bool:
-        """Take a phone or a revision; return whether it changes anything."""
-        known = self._phones.pop(phone.index, None)
+    def accept(self, phone: Phone, now_s: float) -> None:
+        """Take a phone or a revision; ``now_s`` is the time of the mouth that is due."""
+        known, known_s = self._phones.pop(phone.index, (None, now_s))
         if known is not None and known.final and not phone.final:
-            self._phones[phone.index] = known
-            return False
+            phone = known
         if phone.symbol in self._symbols and math.isfinite(phone.onset_s + phone.duration_s):
-            self._phones[phone.index] = phone
-        return known != self._phones.get(phone.index)
+            self._phones[phone.index] = (phone, known_s)
 
     def forget_before(self, time_s: float) -> None:
         """Forget phones that began before a time."""
-        self._phones = {i: phone for i, phone in self._phones.items() if phone.onset_s >= time_s}
+        self._phones = {i: each for i, each in self._phones.items() if each[0].onset_s >= time_s}
 
-    def log_odds(self, time_s: Array) -> Array:
-        """Return what the phones add to the log odds of a closure at some times, shape (n,)."""
-        added = np.zeros(len(time_s))
-        for phone in self._phones.values():
-            confidence = min(max(phone.confidence, 0.5), _HIGHEST)
-            most = min(math.log(confidence / (1.0 - confidence)), MAX_PHONE_LOG_ODDS)
-            end_s = phone.onset_s + min(phone.duration_s, _HELD_S)
-            away_s = np.maximum(phone.onset_s - time_s, time_s - end_s)
-            added = np.maximum(added, most * np.clip(1.0 - away_s / _EDGE_S, 0.0, 1.0))
-        return added
+    def clear(self) -> None:
+        """Forget all phones."""
+        self._phones.clear()
+
+    def log_odds(self, time_s: float) -> float:
+        """Return what the phones add to the log odds of a closure at a time."""
+        return max((self._of(*each, time_s) for each in self._phones.values()), default=0.0)
+
+    def _of(self, phone: Phone, known_s: float, time_s: float) -> float:
+        most = min(log_odds_of(max(phone.confidence, 0.5)), self._most)
+        end_s = phone.onset_s + min(phone.duration_s, _HELD_S)
+        if known_s < phone.onset_s + _LATEST_S:
+            end_s = max(end_s, known_s + _DECIDED_S)
+        away_s = max(phone.onset_s - time_s, time_s - end_s, 0.0)
+        return most * max(0.0, 1.0 - away_s / _EDGE_S)
 
 
-def shut_share(probability: Array, phone_log_odds: Array) -> Array:
-    """Tell how far lips are led to their closure.
+def log_odds_of(probability: float) -> float:
+    """Return the log odds of a probability, which counts from 0.002 to 0.998."""
+    counted = min(max(probability, _LOWEST), _HIGHEST)
+    return math.log(counted / (1.0 - counted))
 
-    Parameters
-    ----------
-    probability
-        Of a closure, from the sound, at every lip frame, shape (n,).
-    phone_log_odds
-        What recognised phones add, shape (n,).
 
-    Returns
-    -------
-    array (n,)
-        0: they stay as they are, 1: shut.
-    """
-    from_sound = np.clip(probability, _LOWEST, _HIGHEST)
-    log_odds = np.log(from_sound / (1.0 - from_sound)) + phone_log_odds
-    part = np.clip((1.0 / (1.0 + np.exp(-log_odds)) - _OPEN) / (_SHUT - _OPEN), 0.0, 1.0)
-    share = part * part * (3.0 - 2.0 * part)
-    widened = share.copy()
-    widened[1:] = np.maximum(widened[1:], _NEIGHBOUR * share[:-1])
-    widened[:-1] = np.maximum(widened[:-1], _NEIGHBOUR * share[1:])
-    return widened
+def shut_share(log_odds: float, doubt: float) -> float:
+    """Tell how far lips are led to their closure: 0, they stay as they are, to 1, shut."""
+    part = min(max(0.5 + 0.5 * log_odds / doubt, 0.0), 1.0)
+    return part * part * (3.0 - 2.0 * part)
+
+
+def close_lips(faps: Array, share: float) -> None:
+    """Lead both lips, FAPs (num_mouth_faps,), towards where they meet, in place."""
+    _lead_home(faps, share, _UPPER_LIP + _LOWER_LIP)
+
+
+def lip_to_teeth(faps: Array, share: float) -> None:
+    """Lead the lower lip towards the upper teeth, in place."""
+    _lead_home(faps, share, _LOWER_LIP)
+
+
+def part_lips(faps: Array) -> None:
+    """Take apart lips that pass through each other, in place."""
+    for (upper, upper_outer), (lower, lower_outer) in zip(_UPPER_LIP, _LOWER_LIP, strict=True):
+        crossed = max(0.0, faps[_column(upper)] + faps[_column(lower)])
+        faps[[_column(fap) for fap in (upper, upper_outer, lower, lower_outer)]] -= 0.5 * crossed
+
+
+def _lead_home(faps: Array, share: float, lips: list[tuple[int, int]]) -> None:
+    """Lead inner lips to their place at rest; the outer ones go along."""
+    for inner, outer in lips:
+        moved = share * faps[_column(inner)]
+        faps[_column(inner)] -= moved
+        faps[_column(outer)] -= moved
+
+
+def _column(fap: int) -> int:
+    return MOUTH_FAPS.index(fap)

@@ -1,23 +1,32 @@
 """A mouth over time, from lip frames.
 
-Lip frames are joined by straight lines and averaged over the 20 ms around each time. Where frames
-come every 20 ms this is a quadratic B-spline: position and velocity are continuous, and no frame
-counts beyond its two neighbours. Where frames are missing, the mouth goes to rest and comes back.
+Lip frames are joined by cubic Hermite splines. The slope at a frame is that of the line from the
+frame before, so position and velocity are continuous and no frame waits for the next one. Where
+frames are missing, the mouth goes to rest and comes back.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.trajectory import Motion
+from services.synthesizer.lips.dynamic_visemes.trajectory import Motion, motionless
 
 Array = NDArray[np.float64]
 
 HOLD_S = 0.04  # a frame that is late may come this long after it was due
 CLOSE_S = 0.1  # from the last frame to rest
 _OPEN_S = 0.06  # from rest to the first frame
-_REACH_S = 0.01  # half of the time that is averaged
+MAX_GAP_S = CLOSE_S + _OPEN_S  # between two frames that are joined
+
+
+@dataclass(frozen=True, slots=True)
+class _Knot:
+    time_s: float
+    motion: Motion
 
 
 class LipTrack:
@@ -25,57 +34,75 @@ class LipTrack:
 
     Parameters
     ----------
-    time_s
-        Times of the lip frames, shape (n,), rising; media time.
-    faps
-        Their FAPs, shape (n, num_mouth_faps), FAP units.
     neutral
-        The mouth at rest, shape (num_mouth_faps,).
-    hold_s
+        The mouth at rest, shape (num_mouth_faps,), FAP units.
+
+    Attributes
+    ----------
+    hold_s : float
         How long the last frame holds before the mouth goes to rest.
     """
 
-    def __init__(self, time_s: Array, faps: Array, neutral: Array, hold_s: float) -> None:
-        times: list[float] = []
-        rows: list[Array] = []
-        last_s = -np.inf
-        for frame_s, row in zip(time_s, faps, strict=True):
-            if frame_s - last_s > CLOSE_S + _OPEN_S:
-                if rows:
-                    times.append(last_s + CLOSE_S)
-                    rows.append(neutral)
-                times.append(frame_s - _OPEN_S)
-                rows.append(neutral)
-            times.append(frame_s)
-            rows.append(row)
-            last_s = frame_s
-        if rows:
-            if hold_s > 0.0:
-                times.append(last_s + hold_s)
-                rows.append(rows[-1])
-            times.append(last_s + hold_s + CLOSE_S)
-            rows.append(neutral)
-        self._times = np.array([*times, np.inf])
-        self._rows = np.array([*rows, neutral])
-        self._neutral = neutral
+    def __init__(self, neutral: Array) -> None:
+        self.hold_s = 0.0
+        self._rest = motionless(neutral)
+        self._knots: list[_Knot] = []
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last frame, seconds; before the first one minus infinity."""
+        return self._knots[-1].time_s if self._knots else -np.inf
+
+    def append(self, time_s: float, faps: Array) -> None:
+        """Add a frame behind the last one: media time, FAPs (num_mouth_faps,)."""
+        slope = np.zeros_like(faps)
+        if time_s - self.end_s <= MAX_GAP_S:
+            slope = (faps - self._knots[-1].motion.value) / (time_s - self.end_s)
+        else:
+            if self._knots:
+                self._knots.append(_Knot(self.end_s + CLOSE_S, self._rest))
+            self._knots.append(_Knot(time_s - _OPEN_S, self._rest))
+        self._knots.append(_Knot(time_s, Motion(faps, slope)))
+
+    def forget_before(self, time_s: float) -> None:
+        """Forget frames that no time from here on needs."""
+        first = bisect_right(self._knots, time_s, key=lambda knot: knot.time_s) - 1
+        del self._knots[: max(0, first)]
 
     def at(self, time_s: float) -> Motion:
         """Return the mouth and its velocity at a media time."""
-        begin_s, end_s = time_s - _REACH_S, time_s + _REACH_S
-        first, last = np.searchsorted(self._times, [begin_s, end_s])
-        begin, end = self._line(begin_s), self._line(end_s)
-        times = np.array([begin_s, *self._times[first:last], end_s])
-        rows = np.array([begin, *self._rows[first:last], end])
-        area = np.diff(times) @ (rows[1:] + rows[:-1]) / 2.0
-        width_s = end_s - begin_s
-        return Motion(area / width_s, (end - begin) / width_s)
+        knots = self._knots
+        if not knots or time_s < knots[0].time_s:
+            return self._rest
+        if time_s >= knots[-1].time_s:
+            knots = [*knots[-1:], *self._after_the_last()]
+        after = bisect_right(knots, time_s, key=lambda knot: knot.time_s)
+        if after == len(knots):
+            return self._rest
+        return _between(knots[after - 1], knots[after], time_s)
 
-    def _line(self, time_s: float) -> Array:
-        """Return the straight line between two frames at a time."""
-        after = int(np.searchsorted(self._times, time_s))
-        if after == 0 or after == len(self._times) - 1:
-            return self._neutral
-        begin_s, end_s = self._times[after - 1 : after + 1]
-        share = (time_s - begin_s) / (end_s - begin_s)
-        line: Array = (1.0 - share) * self._rows[after - 1] + share * self._rows[after]
-        return line
+    def _after_the_last(self) -> list[_Knot]:
+        value = self._knots[-1].motion.value
+        rest = _Knot(self.end_s + self.hold_s + CLOSE_S, self._rest)
+        if self.hold_s == 0.0:
+            return [rest]
+        return [_Knot(self.end_s + self.hold_s, motionless(value)), rest]
+
+
+def _between(one: _Knot, other: _Knot, time_s: float) -> Motion:
+    """Return the cubic Hermite spline from one knot to another at a time between them."""
+    duration_s = other.time_s - one.time_s
+    u = (time_s - one.time_s) / duration_s
+    begin, end = one.motion, other.motion
+    step = end.value - begin.value
+    value = (
+        begin.value
+        + u * u * (3.0 - 2.0 * u) * step
+        + u * (1.0 - u) * duration_s * ((1.0 - u) * begin.slope - u * end.slope)
+    )
+    slope = (
+        6.0 * u * (1.0 - u) * step / duration_s
+        + (1.0 - u) * (1.0 - 3.0 * u) * begin.slope
+        + u * (3.0 * u - 2.0) * end.slope
+    )
+    return Motion(value, slope)

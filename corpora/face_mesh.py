@@ -1,0 +1,140 @@
+"""MediaPipe's face mesh: 468 landmarks of the face in each picture of a video.
+
+Sources: Bazarevsky et al. 2019, "BlazeFace: sub-millisecond neural face detection on mobile GPUs";
+Kartynnik et al. 2019, "Real-time facial surface geometry from monocular video on mobile GPUs". The
+two networks are MediaPipe's (Apache-2.0), converted by ``python -m training.face_mesh``.
+
+The detector looks at the whole picture, and again where the face was lost. The mesh looks at a
+square around the face, turned so that the eyes are level: where the detector, or the landmarks of
+the picture before, say the face is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+Floats = NDArray[np.float32]
+Array = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+NUM_LANDMARKS = 468
+
+_MODELS = Path(__file__).parent / "models"
+_DETECTOR_PX, _MESH_PX = 128, 192  # sides of the networks' squares
+_STRIDES_PX = {8: 2, 16: 6}  # of the detector's grids, with anchors in each cell
+_MARGIN = 1.5  # of the square around a face, in the face's longer side
+_RIGHT_EYE, _LEFT_EYE = 33, 263  # landmarks: the outer corners
+
+
+@dataclass(frozen=True, slots=True)
+class _Square:
+    """A square in a picture."""
+
+    centre: Array  # (2,) px
+    side: float  # px
+    angle: float  # by which it is turned clockwise, radians
+
+    def to_picture(self, points: Array) -> Array:
+        """Return the pixels of points in units of the side, from the centre, (..., 2)."""
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        turned = points @ np.array([[cos, sin], [-sin, cos]])
+        return np.asarray(self.centre + self.side * turned)
+
+
+class FaceMesh:
+    """Follows the face in the pictures of a video."""
+
+    def __init__(self) -> None:
+        self._detector = _session("face_detector.onnx")
+        self._mesh = _session("face_mesh.onnx")
+        self._anchors = _anchors()
+        self._face: _Square | None = None  # where it was last
+
+    def accept(self, picture: UInt8) -> Floats | None:
+        """Take the next picture; return the landmarks of the face that stands out most, if any.
+
+        Parameters
+        ----------
+        picture
+            RGB, shape (height, width, 3).
+
+        Returns
+        -------
+        NDArray or None
+            x to the right, y down, z away from the camera, pixels, shape (468, 3).
+        """
+        was_lost = self._face is None
+        landmarks = self._landmarks(picture)
+        if landmarks is None and not was_lost:
+            landmarks = self._landmarks(picture)  # the detector looks
+        return landmarks
+
+    def _landmarks(self, picture: UInt8) -> Floats | None:
+        face = self._face or self._detect(picture)
+        self._face = None
+        if face is None:
+            return None
+        pixels = _cut_out(picture, face, _MESH_PX) / np.float32(255)
+        points, presence = self._mesh.run(None, {"input0": pixels[None]})
+        if presence.item() < 0:  # log odds
+            return None
+        relative = points.reshape(NUM_LANDMARKS, 3).astype(np.float64) / _MESH_PX
+        landmarks = np.empty((NUM_LANDMARKS, 3))
+        landmarks[:, :2] = face.to_picture(relative[:, :2] - 0.5)
+        landmarks[:, 2] = face.side * relative[:, 2]
+        low, high = landmarks[:, :2].min(axis=0), landmarks[:, :2].max(axis=0)
+        eyes = landmarks[_LEFT_EYE, :2] - landmarks[_RIGHT_EYE, :2]
+        self._face = _face_square((low + high) / 2, high - low, eyes)
+        return landmarks.astype(np.float32)
+
+    def _detect(self, picture: UInt8) -> _Square | None:
+        height, width, _ = picture.shape
+        whole = _Square(np.array([width, height]) / 2, float(max(width, height)), 0.0)
+        pixels = _cut_out(picture, whole, _DETECTOR_PX) / np.float32(127.5) - 1
+        boxes, scores = self._detector.run(None, {"input0": pixels[None]})
+        best = int(scores[0, :, 0].argmax())
+        if scores[0, best, 0] < 0:  # log odds
+            return None
+        centre, size, right_eye, left_eye = boxes[0, best, :8].reshape(4, 2).astype(np.float64)
+        origin = whole.to_picture(self._anchors[best] + centre / _DETECTOR_PX - 0.5)
+        return _face_square(origin, whole.side * size / _DETECTOR_PX, left_eye - right_eye)
+
+
+def _session(name: str) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(_MODELS / name, options, providers=["CPUExecutionProvider"])
+
+
+def _anchors() -> Array:
+    """Return the centres of the detector's anchors, in units of its square, (896, 2)."""
+    grids = []
+    for stride_px, num_anchors in _STRIDES_PX.items():
+        cells = (np.arange(_DETECTOR_PX // stride_px) + 0.5) * stride_px / _DETECTOR_PX
+        y, x = np.meshgrid(cells, cells, indexing="ij")
+        grids.append(np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), num_anchors, axis=0))
+    return np.concatenate(grids)
+
+
+def _face_square(centre: Array, size: Array, right_to_left_eye: Array) -> _Square:
+    x, y = right_to_left_eye
+    return _Square(centre, _MARGIN * float(size.max()), float(np.arctan2(y, x)))
+
+
+def _cut_out(picture: UInt8, square: _Square, side_px: int) -> Floats:
+    """Return a square of a picture, (side_px, side_px, 3), black outside the picture."""
+    steps = (np.arange(side_px) + 0.5) / side_px - 0.5
+    y, x = np.meshgrid(steps, steps, indexing="ij")
+    at = square.to_picture(np.stack([x, y], axis=-1)) - 0.5
+    rows_columns = at[..., ::-1].transpose(2, 0, 1)
+    colours = [
+        map_coordinates(picture[..., colour], rows_columns, np.float32, order=1)
+        for colour in range(3)
+    ]
+    return np.stack(colours, axis=-1)

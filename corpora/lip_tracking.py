@@ -1,0 +1,81 @@
+"""From a video of a speaker to a lip clip: the sound and the motion of the lips, no picture."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import soundfile
+from numpy.typing import NDArray
+
+from corpora.face_landmarks import LANDMARKS, mouth_faps
+from corpora.face_mesh import FaceMesh
+from corpora.landmark_file import MIN_FRAMES
+from corpora.lip_clips import SAMPLE_RATE_HZ, level_track
+from corpora.video_file import read_video
+from shared.errors import UserError
+from shared.face.faps import FAPS, MOUTH_FAPS
+
+
+def track_video(video: Path, clip: Path) -> tuple[int, int]:
+    """Track the lips in a video; write the clip's ``.flac``, ``.csv`` and ``.json``.
+
+    Returns
+    -------
+    tuple
+        Pictures with a face, and all pictures.
+
+    Raises
+    ------
+    UserError
+        If the video cannot be read, or shows too little of a face.
+    """
+    mesh = FaceMesh()
+    times: list[float] = []
+    found: list[NDArray[np.float32] | None] = []
+
+    def take(time_s: float, picture: NDArray[np.uint8]) -> None:
+        landmarks = mesh.accept(picture)
+        times.append(time_s)
+        found.append(None if landmarks is None else landmarks[list(LANDMARKS)])
+
+    samples = read_video(video, take)
+    seen = np.array([landmarks is not None for landmarks in found])
+    if seen.sum() < MIN_FRAMES:
+        raise UserError(
+            f"{video}: a face is seen in {seen.sum()} pictures only; film it from the front, in "
+            "light, for 20 s or more"
+        )
+    time_s = np.array(times)
+    faps = np.full((len(seen), len(MOUTH_FAPS)), np.nan)
+    levels = np.array(level_track(samples))
+    landmarks = np.stack([each for each in found if each is not None])
+    faps[seen] = mouth_faps(landmarks, np.interp(time_s[seen], levels[:, 0], levels[:, 1]))
+    soundfile.write(clip.with_suffix(".flac"), samples, SAMPLE_RATE_HZ)
+    _write_tracks(clip.with_suffix(".csv"), time_s, faps)
+    about = {
+        "clip": clip.stem,
+        "kind": "tracked video (MediaPipe face mesh)",
+        "licence": "",
+        "speaker": clip.stem,
+        "language": "",
+        "transcript": "",
+        "frames": len(seen),
+        "frames_ok": int(seen.sum()),
+    }
+    clip.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    return int(seen.sum()), len(seen)
+
+
+def _write_tracks(path: Path, time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> None:
+    tracked = [index for index in range(faps.shape[1]) if not np.isnan(faps[:, index]).all()]
+    names = [f"F{MOUTH_FAPS[index]}_{FAPS[MOUTH_FAPS[index] - 1].name}" for index in tracked]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["t", "ok", *names])
+        for time, row in zip(time_s, faps[:, tracked], strict=True):
+            is_seen = not np.isnan(row).any()
+            values = [f"{value:.1f}" if is_seen else "" for value in row]
+            writer.writerow([f"{time:.4f}", int(is_seen), *values])

@@ -1,0 +1,73 @@
+"""A video of a tracked clip: the faces that lip models make of its sound, beside its real lips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.lip_clips import LipClip, read_clips
+from evaluation.lips.schemes import FRAME_RATE_HZ, live_frames
+from services.driver.config import Framing
+from services.driver.render import scene
+from services.driver.render.renderer import Renderer
+from services.driver.render.side_by_side import SideBySide
+from services.driver.video import film
+from services.driver.video.writer import check_name
+from services.live_chain import sound_events
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.lips import lips_for
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.lips.load import load_lip_model
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from shared.face.lip_models import LipModelName
+
+_FACE_PX = (480, 360)
+_IMAGES_PER_S = 25.0
+_INNER_FAPS = dict(zip(range(51, 61), range(4, 14), strict=True))  # of the outer ones
+
+
+def film_clip(folder: Path, name: str, output: Path) -> None:
+    """Write a video, with sound, of every lip model by its default settings and the tracked lips.
+
+    Raises
+    ------
+    UserError
+        If there is no such clip, or the video cannot be written.
+    """
+    check_name(output)
+    clip = next((clip for clip in read_clips(folder, language=None) if clip.name == name), None)
+    if clip is None:
+        raise UserError(f"there is no clip {name} in {folder}")
+    model = load_model()
+    faces = []
+    for lips in LipModelName:
+        delay_s = SynthesizerConfig(lips=lips).delay_ms / 1e3
+        events = sound_events(model, clip.samples, lips_for(model), delay_s)
+        faces.append(live_frames(load_lip_model(name=lips), events, delay_s, FRAME_RATE_HZ))
+    times_s = np.arange(len(faces[0])) / FRAME_RATE_HZ
+    faces.append(tracked_frames(clip, times_s))
+    frames = list(zip(times_s, np.stack(faces, axis=1).astype(np.float32), strict=True))
+    captions = [*(f"lips: {lips}" for lips in LipModelName), "tracked lips"]
+    head = scene.load_head()
+    camera = scene.camera(head, Framing.MOUTH)
+    renderer = SideBySide(Renderer(head, *_FACE_PX, camera=camera), captions)
+    film.render_video(frames, output, renderer, frame_rate_hz=_IMAGES_PER_S, samples=clip.samples)
+    renderer.close()
+
+
+def tracked_frames(clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the tracked mouth at some times, FAPs (n, 68).
+
+    Where the outer contour was not measured, it follows the inner one; all else is at rest then.
+    """
+    faps = np.zeros((len(times_s), NUM_FAPS))
+    for fap, track in zip(MOUTH_FAPS, clip.faps.T, strict=True):
+        seen = np.isfinite(track)
+        if seen.any():
+            faps[:, fap - 1] = np.interp(times_s, clip.time_s[seen], track[seen])
+        elif fap in _INNER_FAPS:
+            faps[:, fap - 1] = faps[:, _INNER_FAPS[fap] - 1]
+    return faps

@@ -1,0 +1,140 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { curvePath, extent, figures, verdict } from "../lip-curves.js";
+import { FaceRecording, LANDMARKS, NO_FACE, TOO_QUIET, TOO_SLOW } from "../recording.js";
+import { VoiceStore } from "../voice.js";
+
+const RATE_HZ = 48000;
+const CHUNK = Int16Array.from({ length: 960 }, (_, i) => i);
+const LOUD = 0.1;
+
+/** Landmarks of a face: that of index i is at (i, i + 0.25, -i). */
+function face() {
+  return Float32Array.from({ length: 478 * 3 }, (_, k) => {
+    const index = Math.floor(k / 3);
+    return [index, index + 0.25, -index][k % 3];
+  });
+}
+
+/** Record sound in real time from 1000 ms on, and pictures. */
+function record({ seconds, rms = LOUD, seen = () => true, everyMs = 40 }) {
+  const recording = new FaceRecording(RATE_HZ);
+  for (let ms = 0; ms < 1000 * seconds; ms += 20) {
+    recording.addSound(1020 + ms, CHUNK, rms);
+    if (ms % everyMs === 0) recording.addFace(1010 + ms, seen(ms) ? face() : null);
+  }
+  return recording;
+}
+
+async function parse(recording) {
+  const bytes = await recording.encode().arrayBuffer();
+  const view = new DataView(bytes);
+  const numHeader = view.getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(bytes.slice(4, 4 + numHeader)));
+  let at = 4 + numHeader;
+  const times = Array.from({ length: header.times }, (_, i) => view.getFloat64(at + 8 * i, true));
+  at += 8 * header.times;
+  const frame = Array.from({ length: 3 * header.points }, (_, i) => view.getFloat32(at + 4 * i, true));
+  at += 12 * header.points * header.times;
+  return { header, times, frame, sound: new Int16Array(bytes.slice(at)) };
+}
+
+test("a recording becomes a landmark file", async () => {
+  const { header, times, frame, sound } = await parse(record({ seconds: 1 }));
+  assert.deepEqual(header, { times: 25, points: 43, sample_rate_hz: RATE_HZ });
+  times.forEach((time, i) => assert.ok(Math.abs(time - 0.01 - 0.04 * i) < 1e-9, `${time}`));
+  assert.deepEqual(frame.slice(0, 6), [0, 0.25, -0, 2, 2.25, -2]);
+  assert.deepEqual(frame.slice(-3), [420, 420.25, -420]);
+  assert.equal(sound.length, RATE_HZ);
+  assert.deepEqual(sound.subarray(960, 1920), CHUNK);
+});
+
+test("times rise from the first sample on, whatever the clocks do", async () => {
+  const recording = new FaceRecording(RATE_HZ);
+  recording.addFace(900, face()); // before the sound begins
+  recording.addSound(1050, CHUNK, LOUD); // handed over 30 ms late
+  recording.addSound(1040, CHUNK, LOUD);
+  for (const ms of [1010, 1010, 1005, 1030]) recording.addFace(ms, face());
+  assert.deepEqual((await parse(recording)).times, [0.01, 0.03]);
+});
+
+test("frames without a face are left out", async () => {
+  const { header } = await parse(record({ seconds: 2, seen: (ms) => ms % 400 !== 0 }));
+  assert.equal(header.times, 45);
+});
+
+test("forty seconds fit into what the gateway takes", () => {
+  assert.ok(record({ seconds: 43 }).encode().size < 8 * 1024 * 1024);
+});
+
+test("while one reads, it is said when the face is gone or nothing is heard", () => {
+  const good = record({ seconds: 6 });
+  assert.equal(good.advice(7000), "");
+  assert.equal(good.advice(8100), NO_FACE);
+  assert.equal(record({ seconds: 6, rms: 0 }).advice(7000), TOO_QUIET);
+  assert.equal(record({ seconds: 3, rms: 0 }).advice(4000), "", "one may pause");
+});
+
+test("nothing is learnt without a face or without a voice", () => {
+  assert.equal(record({ seconds: 6 }).problem(), "");
+  assert.equal(record({ seconds: 6, seen: (ms) => ms < 3000 }).problem(), NO_FACE);
+  assert.equal(record({ seconds: 6, rms: 0.001 }).problem(), TOO_QUIET);
+  assert.equal(new FaceRecording(RATE_HZ).problem(), NO_FACE);
+  assert.equal(record({ seconds: 6, everyMs: 120 }).problem(), TOO_SLOW);
+});
+
+test("a landmark is kept once, in rising order", () => {
+  assert.deepEqual(LANDMARKS, [...new Set(LANDMARKS)].sort((a, b) => a - b));
+});
+
+test("a curve is drawn into its box, with gaps where nothing is known", () => {
+  const box = { width: 100, height: 10, low: 0, high: 20 };
+  const times = [5, 5.02, 5.04, 5.06, 5.08, 5.5, 6];
+  const path = curvePath(times, [0, 20, null, 10, 10, 10, 0], box);
+  assert.equal(path, "M0.0 10.0L2.0 0.0M6.0 5.0L8.0 5.0M50.0 5.0M100.0 10.0");
+  assert.deepEqual(extent([3, null], [null, -1, 2]), { low: -1, high: 3 });
+});
+
+test("the figures are put into words", () => {
+  const before = { opening: 0.5, width: 0.412, jaw: null };
+  const with_ = (opening) => ({ before, after: { ...before, opening } });
+  assert.deepEqual(figures(with_(0.6)), [
+    ["Opening 张口", "0.50", "0.60"],
+    ["Width 宽度", "0.41", "0.41"],
+    ["Jaw 下颌", "–", "–"],
+  ]);
+  assert.match(verdict(with_(0.6)), /more closely/);
+  assert.match(verdict(with_(0.51)), /about as well/);
+  assert.match(verdict(with_(0.4)), /discard/);
+  const nothing = { opening: 0.1, width: 0.1, jaw: 0 };
+  assert.match(verdict({ before: nothing, after: { ...nothing, opening: 0.3 } }), /discard/);
+});
+
+class FakeStorage {
+  items = new Map();
+  getItem(key) { return this.items.get(key) ?? null; }
+  setItem(key, text) { this.items.set(key, text); }
+  removeItem(key) { this.items.delete(key); }
+}
+
+test("a voice is kept until it is forgotten", () => {
+  const storage = new FakeStorage();
+  const voice = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
+  new VoiceStore(storage).keep(voice);
+  const later = new VoiceStore(storage);
+  assert.deepEqual(later.voice, voice);
+  later.forget();
+  assert.equal(later.voice, null);
+  assert.equal(new VoiceStore(storage).voice, null);
+});
+
+test("without a storage a voice is kept for now, and rubbish in it is none", () => {
+  const now = new VoiceStore(null);
+  now.keep({ profile: "YWJj" });
+  assert.equal(now.voice.profile, "YWJj");
+  for (const text of ["{", "1", '{"profile": 5}', '{"profile": ""}']) {
+    const storage = new FakeStorage();
+    storage.getItem = () => text;
+    assert.equal(new VoiceStore(storage).voice, null);
+  }
+});

@@ -1,0 +1,70 @@
+"""What a model of lips from sound is told of a whole recording, as in the product.
+
+The voice detector and the sound before its decision are those of the live recognizer, so the
+network starts again with each stretch of speech.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.speech_scores import SpeechScores
+from shared.clock import MEDIA_RATE_HZ
+from shared.phones.events import LipFrame
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_PIECE = MEDIA_RATE_HZ // 10
+
+
+class LipPositions:
+    """Keeps what lips from sound are told.
+
+    Attributes
+    ----------
+    starts : list of int
+        First position of each stretch of speech.
+    known_s : list of float
+        Media time up to which the sound is known at each position.
+    features : list of NDArray
+        Of each position as ``LipPredictor`` takes them, (features,).
+    """
+
+    def __init__(self) -> None:
+        self.starts: list[int] = []
+        self.known_s: list[float] = []
+        self.features: list[NDArray[np.float16]] = []
+
+    def accept(
+        self, known_s: float, frames: Floats, keys: Floats, values: Floats
+    ) -> list[LipFrame]:
+        """Take what the network computes at a position."""
+        self.known_s.append(known_s)
+        features = np.concatenate([frames, keys, values], axis=None)
+        self.features.append(features.astype(np.float16))
+        return []
+
+    def reset(self) -> None:
+        """Note that a stretch of speech begins."""
+        self.starts.append(len(self.known_s))
+
+
+def lip_positions(model: NeuralModel, samples: Floats) -> LipPositions:
+    """Return all positions of a recording, 16 kHz mono, shape (n,)."""
+    positions = LipPositions()
+    scores = SpeechScores(model, MEDIA_RATE_HZ, lips=positions)
+    for piece in _pieces(samples):
+        run_scoring_tasks(model, [scores.process(piece)])
+    run_scoring_tasks(model, [scores.finish()])
+    return positions
+
+
+def _pieces(samples: Floats) -> Iterator[Floats]:
+    for start in range(0, len(samples), _PIECE):
+        yield samples[start : start + _PIECE]

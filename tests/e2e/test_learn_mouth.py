@@ -1,0 +1,178 @@
+"""*Learn my mouth* on the page: camera and microphone in, a voice out.
+
+``kouxing adapt`` is the real one. The camera sees one of our own heads, which opens and closes its
+mouth.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from PIL import Image
+
+from corpora.face_landmarks import LANDMARKS
+from corpora.landmark_file import landmark_file
+from services.driver.head.head import neutral_faps
+from services.driver.render.renderer import Renderer
+from shared.client import Client
+from tests import heads
+from tests.browser import Browser, wait_until
+from tests.scripted_system import Gateway, System
+from tests.system import DEMO, free_port
+
+pytestmark = pytest.mark.e2e
+
+NUM_PICTURES = 8
+
+
+def write_speaking_head(path: Path) -> None:
+    """Write a second of a head whose mouth opens and closes."""
+    renderer = Renderer(heads.load("woman", "coarse"), 320, 240, samples=0)
+    rest, opened = neutral_faps(), heads.OPEN
+    shares = np.linspace(0, 1, NUM_PICTURES, dtype=np.float32)
+    pictures = [renderer.draw(rest + share * (opened - rest)) for share in shares]
+    renderer.close()
+    with path.open("wb") as file:
+        for picture in [*pictures, *reversed(pictures)]:
+            for _ in range(2):
+                Image.fromarray(picture).convert("RGB").save(file, "JPEG", quality=90)
+
+
+@pytest.fixture(scope="module")
+def system() -> Iterator[System]:
+    system = System()
+    yield system
+    system.close()
+
+
+@pytest.fixture(scope="module")
+def browser(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    folder = tmp_path_factory.mktemp("browser")
+    write_speaking_head(folder / "head.mjpeg")
+    gateway = Gateway(system.address, free_port())
+    browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg")
+    with Client(system.address) as client:
+        wait_until(lambda: len(client.status().services) == 4, 30)
+    browser.command("Page.navigate", url=gateway.page)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    yield browser
+    browser.close()
+    assert gateway.stop() == 0
+
+
+def text_of(browser: Browser, name: str) -> str:
+    text: str = browser.evaluate(f"document.getElementById('{name}').innerText")
+    return text
+
+
+def read_aloud(browser: Browser) -> None:
+    """Record for a second, and wait for what comes of it."""
+    browser.evaluate("window.kouxing.readingS = 1")
+    browser.click("learn")
+    browser.click("lesson-start")
+    browser.wait_for("document.getElementById('lesson-reading').classList.contains('due')", 90)
+    browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
+
+
+def longer(recording: bytes) -> bytes:
+    """Return a longer recording of the same face, whose lips open with the sound's loudness."""
+    size = 4 + int.from_bytes(recording[:4], "little")
+    num_frames = json.loads(recording[4:size])["times"]
+    points = np.frombuffer(recording, "<f4", 3 * len(LANDMARKS), size + 8 * num_frames)
+    samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", dtype="int16")
+    sound = np.tile(samples, 4)
+    time_s = np.arange(0, len(sound) / rate_hz - 0.1, 0.04)
+    starts = (time_s * rate_hz).astype(int)
+    loudness = np.sqrt([np.square(sound[at : at + 1600].astype(float)).mean() for at in starts])
+    landmarks = np.tile(points.reshape(-1, 3), (len(time_s), 1, 1))
+    lower = [LANDMARKS.index(point) for point in (14, 17, 152, 178, 181, 402, 405)]
+    landmarks[:, lower, 1] += 8 * (loudness / loudness.max())[:, None]  # pixels
+    return landmark_file(time_s, landmarks, sound, rate_hz)
+
+
+@pytest.mark.timeout(400)  # of a busy machine
+def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Browser) -> None:
+    browser.evaluate(
+        "window.realFetch = fetch; window.fetch = (url, options) => realFetch(url,"
+        " { ...options, body: (window.recording = window.longer ?? options.body) });"
+    )
+    read_aloud(browser)
+    assert "of speech with lips in view; film 10 s or more" in text_of(browser, "lesson-problem")
+
+    recording = browser.evaluate(
+        "recording.bytes().then((bytes) =>"
+        " Array.from(bytes, (byte) => String.fromCharCode(byte)).join(''))"
+    )
+    content = base64.b64encode(longer(recording.encode("latin-1"))).decode()
+    browser.evaluate(f"window.longer = Uint8Array.from(atob('{content}'), (c) => c.charCodeAt(0))")
+    browser.click("lesson-resend")
+    browser.wait_for("window.kouxing.state.lesson === 'result'", 180)
+    assert "more closely" in text_of(browser, "lesson-verdict")
+    assert "Opening" in text_of(browser, "lesson-figures")
+    for curve in ("tracked", "before", "after"):
+        path = f"document.getElementById('lesson-{curve}')"
+        assert browser.evaluate(f"{path}.getTotalLength()") > 100, curve
+
+    assert browser.evaluate("window.kouxing.state.voice") == ""
+    browser.click("lesson-keep")
+    browser.command("Page.reload")
+    browser.wait_for("window.kouxing?.state.connected && window.kouxing.state.voice !== ''")
+    profile = base64.b64decode(browser.evaluate("window.kouxing.state.voice"))
+    browser.click("microphone")
+    browser.wait_for("window.kouxing.state.microphone")
+    assert system.recognizer is not None
+    (start,) = system.recognizer.starts.values()
+    assert start.voice == profile
+    wait_until(lambda: system.synthesizer.chosen == [(start.session, "learnt")], 10)
+    browser.click("microphone")
+    browser.wait_for("!window.kouxing.state.microphone")
+
+    browser.click("learn")
+    assert "opening" in text_of(browser, "lesson-voice")
+    browser.click("lesson-forget")
+    assert browser.evaluate("window.kouxing.state.voice + localStorage.length") == "0"
+    wrong = [text for text in browser.complaints if '"error"' in text or "exception" in text]
+    assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
+
+
+def test_a_recording_that_could_not_be_sent_is_not_lost(browser: Browser) -> None:
+    browser.evaluate(
+        "window.bodies = []; window.fetch ="
+        " async (_, { body }) => { bodies.push(body); throw new Error('offline'); };"
+    )
+    read_aloud(browser)
+    assert "gateway does not answer" in text_of(browser, "lesson-problem")
+    browser.click("lesson-resend")
+    browser.wait_for("bodies.length === 2")
+    assert browser.evaluate("bodies[0] === bodies[1]")
+    browser.evaluate("document.getElementById('learn-mouth').close()")
+
+
+def test_the_page_keeps_the_landmarks_that_are_learnt_from(browser: Browser) -> None:
+    kept = browser.evaluate("(async () => (await import('/recording.js')).LANDMARKS)()")
+    assert tuple(kept) == LANDMARKS
+
+
+def test_without_a_camera_it_says_so(browser: Browser) -> None:
+    browser.evaluate(
+        "navigator.mediaDevices.getUserMedia ="
+        " () => Promise.reject(new DOMException('none', 'NotFoundError'))"
+    )
+    browser.click("learn")
+    browser.click("lesson-start")
+    browser.wait_for("window.kouxing.state.lesson === 'problem'")
+    assert "no camera" in text_of(browser, "lesson-problem")
+    browser.evaluate("document.getElementById('learn-mouth').close()")
+
+
+def test_where_no_camera_may_be_used_it_says_what_is_needed(browser: Browser) -> None:
+    browser.evaluate("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
+    browser.click("learn")
+    assert "https" in text_of(browser, "lesson-insecure")
+    assert browser.evaluate("document.getElementById('lesson-start').disabled")

@@ -1,0 +1,35 @@
+"""Models of lips from sound with random weights, for the shipped network."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.lips import NUM_OUTPUTS, LipPredictor
+
+WIDTH = 512  # of the shipped network
+NUM_FEATURES, NUM_COMPONENTS, UNITS, HISTORY = 160 + 2 * WIDTH, 6, 5, 3
+DELAYS_S = (-0.005, 0.055, 0.155)
+
+
+def made_up_model() -> LipPredictor:
+    rng = np.random.default_rng(0)
+    outputs = (len(DELAYS_S), NUM_OUTPUTS)
+
+    def draw(*shape: int, spread: float = 0.3) -> NDArray[np.float32]:
+        return rng.normal(0, spread, shape).astype(np.float32)
+
+    return LipPredictor(
+        delays=np.array(DELAYS_S, np.float32),
+        feature_mean=draw(NUM_FEATURES),
+        projection=draw(NUM_FEATURES, NUM_COMPONENTS, spread=0.01),
+        entry_weights=draw(NUM_COMPONENTS, UNITS),
+        entry_bias=draw(UNITS),
+        input_weights=draw(UNITS, 3 * UNITS),
+        input_bias=draw(3 * UNITS),
+        state_weights=draw(UNITS, 3 * UNITS),
+        state_bias=draw(3 * UNITS),
+        history_weights=draw(HISTORY, NUM_COMPONENTS, *outputs),
+        output_weights=draw(2 * UNITS, *outputs),
+        output_bias=draw(*outputs),
+    )

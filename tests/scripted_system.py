@@ -1,0 +1,189 @@
+"""Control and gateway for a page, with a recognizer and a synthesizer that play a script."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.control.config import ControlConfig
+from services.control.service import ControlService
+from services.recognizer.config import RecognizerConfig
+from services.synthesizer.config import SynthesizerConfig
+from shared.face.faps import MASK_BYTES
+from shared.service import Service
+from shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from shared.wire.control import StartSession
+from shared.wire.face import FapFrame
+from shared.wire.speech import Phone
+from tests.system import ROOT
+
+FRAME = 320  # samples; 20 ms
+LOOK_AHEAD_MS = 60
+
+
+class ScriptedRecognizer(Service):
+    """Publishes what the test says, and keeps the audio that it gets."""
+
+    name = "recognizer"
+    role = "worker"
+    needs = ("phone_input",)
+
+    def __init__(self, control: str) -> None:
+        local = "tcp://127.0.0.1:*"
+        super().__init__(RecognizerConfig(control=control, audio=local, phones=local))
+        self.audio = self.bus.bind_router(local, "recognizer.audio")
+        self.phones = self.bus.bind_publisher(local, "recognizer.phones")
+        self.endpoints = {"audio": self.audio.endpoint, "phones": self.phones.endpoint}
+        self.pcm: dict[str, bytes] = {}
+        self.starts: dict[str, StartSession] = {}
+        self.finished: set[str] = set()
+        self.register(
+            self.audio,
+            {
+                AudioChunk: self._on_audio,
+                EndOfAudio: lambda end, _: self.finished.add(end.session),
+            },
+        )
+        self.register(self.phones, {})
+
+    def start_session(self, start: StartSession) -> bool:
+        self.starts[start.session] = start
+        return True
+
+    def _on_audio(self, chunk: AudioChunk, _sender: bytes) -> None:
+        self.pcm[chunk.session] = self.pcm.get(chunk.session, b"") + chunk.pcm
+
+
+class ScriptedSynthesizer(Service):
+    """Publishes the FAP frames that the test says."""
+
+    name = "synthesizer"
+    role = "worker"
+
+    def __init__(self, control: str) -> None:
+        local = "tcp://127.0.0.1:*"
+        super().__init__(SynthesizerConfig(control=control, phone_input=local, faps=local))
+        self.input = self.bus.bind_router(local, "synthesizer.phones")
+        self.faps = self.bus.bind_publisher(local, "synthesizer.faps")
+        self.endpoints = {"phone_input": self.input.endpoint, "faps": self.faps.endpoint}
+        self.lips = "dynamic-visemes"
+        self.chosen: list[tuple[str, str]] = []  # session, lip model
+        self.register(self.input, {})
+        self.register(self.faps, {})
+
+    def use_lips(self, session: str, lips: str) -> None:
+        self.chosen.append((session, lips))
+
+
+class System:
+    """Control, and the two scripted services, on a thread that plays the script in real time."""
+
+    def __init__(self) -> None:
+        local = "tcp://127.0.0.1:*"
+        self.control = ControlService(ControlConfig(commands=local, events=local))
+        self.address = self.control.endpoints["commands"]
+        self.synthesizer = ScriptedSynthesizer(self.address)
+        self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(self.address)
+        self.shown: NDArray[np.float32] | None = None  # the face that is published; None: nothing
+        self.symbol = "a"
+        self.session = ""
+        self._media_time = 0
+        self._sequence = 0
+        self._stop = False
+        self._ask_recognizer_to_leave = False
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._stop = True
+        self._thread.join()
+
+    def lose_recognizer(self) -> None:
+        self._ask_recognizer_to_leave = True
+
+    def talk(self, session: str, shown: NDArray[np.float32], symbol: str) -> None:
+        self.session, self.symbol, self.shown = session, symbol, shown
+
+    def services(self) -> list[Service]:
+        services = [self.control, self.recognizer, self.synthesizer]
+        return [service for service in services if service is not None]
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        while not self._stop:
+            for service in self.services():
+                service.step(0.001)
+            if self._ask_recognizer_to_leave and self.recognizer is not None:
+                self.recognizer.drain()
+                self.recognizer = None
+            now_s = time.monotonic()
+            if now_s >= due_s:
+                due_s = max(due_s + FRAME / 16000, now_s - 0.1)
+                self._publish()
+        for service in reversed(self.services()):
+            service.drain()
+
+    def _publish(self) -> None:
+        shown = self.shown
+        if shown is None or self.recognizer is None:
+            return
+        start = self.recognizer.starts.get(self.session)
+        if start is None:
+            return
+        self._sequence += 1
+        tone = 3000 * np.sin(2 * np.pi * 200 / 16000 * (self._media_time + np.arange(FRAME)))
+        stamp: dict[str, Any] = {
+            "session": self.session,
+            "epoch": start.epoch,
+            "sequence": self._sequence,
+        }
+        phones, faps = self.recognizer.phones, self.synthesizer.faps
+        pcm = tone.astype("<i2").tobytes()
+        phones.send(Sound(**stamp, media_time=self._media_time, pcm=pcm))
+        self._media_time += FRAME
+        frame_time = self._media_time - LOOK_AHEAD_MS * 16
+        if frame_time >= 0:
+            values = shown.astype("<f4").tobytes()
+            faps.send(
+                FapFrame(**stamp, media_time=frame_time, values=values, mask=bytes(MASK_BYTES))
+            )
+        if self._sequence % 10 == 0:
+            phones.send(
+                Phone(
+                    **stamp,
+                    media_time=self._media_time,
+                    index=self._sequence // 10,
+                    symbol=self.symbol,
+                    duration=3200,
+                    confidence=0.9,
+                    final=True,
+                )
+            )
+
+
+class Gateway:
+    """A gateway process."""
+
+    def __init__(self, control: str, port: int) -> None:
+        self.page = f"http://127.0.0.1:{port}/"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "services.gateway"],
+            cwd=ROOT,
+            env={
+                **os.environ,
+                "KOUXING_CONTROL": control,
+                "KOUXING_GATEWAY_PORT": str(port),
+                "KOUXING_LOG_LEVEL": "error",
+            },
+        )
+
+    def stop(self) -> int:
+        self.process.terminate()
+        return self.process.wait(10)

@@ -1,0 +1,152 @@
+"""From landmarks to FAPs, and files of landmarks."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from corpora.face_landmarks import _STEADY, LANDMARKS, mouth_faps
+from corpora.landmark_file import landmark_file, read_landmark_file
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+
+pytestmark = pytest.mark.unit
+NUM_FRAMES = 60
+QUIET = np.full(NUM_FRAMES, -60.0)
+NOSE_TO_MOUTH, WIDTH = 2.0, 5.0
+MOUTH = {
+    2: (0, -2, 6), 13: (0, -3.99, 5.2), 14: (0, -4.01, 5.4), 78: (-2.2, -4, 4), 308: (2.2, -4, 4),
+    81: (-1, -3.99, 5), 311: (1, -3.99, 5), 178: (-1, -4.01, 5), 402: (1, -4.01, 5),
+    0: (0, -3.4, 6), 17: (0, -5, 5.6), 61: (-2.5, -4, 4.2), 291: (2.5, -4, 4.2),
+    39: (-1.2, -3.5, 5.6), 269: (1.2, -3.5, 5.6), 181: (-1.2, -4.9, 5.2), 405: (1.2, -4.9, 5.2),
+    152: (0, -9, 4.2),
+}  # fmt: skip
+FACE = np.array([(_STEADY | MOUTH)[point] for point in LANDMARKS], float)
+
+
+def film(moves: dict[int, tuple[float, float, float]], seed: int = 0) -> NDArray[np.float32]:
+    """Frames of a face that a camera sees in any pose; in the second half points are moved, cm."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for frame in range(NUM_FRAMES):
+        points = FACE.copy()
+        if frame >= NUM_FRAMES // 2:
+            for point, move in moves.items():
+                points[LANDMARKS.index(point)] += move
+        turned = Rotation.from_euler("xyz", rng.normal(0, 0.3, 3)).apply(points)
+        frames.append(rng.uniform(10, 40) * turned * (1, -1, -1) + rng.normal(300, 50, 3))
+    return np.array(frames, np.float32)
+
+
+def fap(values: NDArray[np.float64], number: int) -> float:
+    return float(np.median(values[NUM_FRAMES // 2 :, MOUTH_FAPS.index(number)]))
+
+
+def levels(speaking_db: float = -20.0) -> NDArray[np.float64]:
+    return np.where(np.arange(NUM_FRAMES) < NUM_FRAMES // 2, -60.0, speaking_db)
+
+
+@pytest.mark.parametrize(
+    ("point", "move", "number", "expected"),
+    [
+        (152, (0, -1, 0), 3, 512),
+        (13, (0, 0.5, 0), 4, -256),
+        (14, (0, -1, 0), 5, -512),
+        (308, (0.5, 0, 0), 6, 102.4),
+        (78, (0.5, 0, 0), 7, -102.4),
+        (78, (0, 0.5, 0), 13, 256),
+        (402, (0, -1, 0), 10, -512),
+        (39, (0, 1, 0), 56, -512),
+        (291, (0.5, 0, 0), 53, 102.4),
+    ],
+)
+def test_a_point_that_moves_is_its_fap_in_any_pose_of_the_head(
+    point: int, move: tuple[float, float, float], number: int, expected: float
+) -> None:
+    faps = mouth_faps(film({point: move}), levels())
+    assert fap(faps, number) == pytest.approx(expected, abs=1.0)
+    others = [
+        other for other in MOUTH_FAPS if other not in (number, *range(12, 18), *range(44, 48))
+    ]
+    assert max(abs(fap(faps, other)) for other in others) < 1.0
+    depths = [MOUTH_FAPS.index(other) for other in (14, 16, 17)]
+    assert np.isnan(faps[:, depths]).all()
+
+
+def test_the_neutral_face_is_silent_and_closed_or_else_the_most_closed() -> None:
+    open_mouth = {14: (0.0, -1.0, 0.0)}
+    assert fap(mouth_faps(film(open_mouth), levels()), 5) == pytest.approx(-512, abs=1)
+    assert fap(mouth_faps(film(open_mouth), QUIET), 5) == pytest.approx(-512, abs=1)
+    # the mouth is open in silence: those frames are not among the closed ones
+    assert fap(mouth_faps(film(open_mouth), -levels()), 5) == pytest.approx(-512, abs=1)
+
+
+def test_landmarks_of_no_face_are_refused() -> None:
+    with pytest.raises(UserError, match="coincide"):
+        mouth_faps(np.zeros((NUM_FRAMES, len(LANDMARKS), 3)), QUIET)
+    with pytest.raises(UserError, match="no upright face"):
+        mouth_faps(film({13: (0, 5, 0), 14: (0, 5, 0)})[NUM_FRAMES // 2 :], QUIET[::2])
+
+
+TIMES = np.arange(NUM_FRAMES) / 25
+PCM = np.random.default_rng(0).integers(-9000, 9000, 3 * 48_000).astype(np.int16)
+CONTENT = landmark_file(TIMES, film({14: (0, -1, 0)}), PCM, 48_000)
+HEADER_BYTES = int.from_bytes(CONTENT[:4], "little")
+BODY = CONTENT[4 + HEADER_BYTES :]
+
+
+def with_header(**changes: object) -> bytes:
+    fields = json.loads(CONTENT[4 : 4 + HEADER_BYTES]) | changes
+    header = json.dumps(fields).encode()
+    return len(header).to_bytes(4, "little") + header + BODY
+
+
+def test_a_landmark_file_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "me.landmarks"
+    path.write_bytes(CONTENT)
+    clip = read_landmark_file(path)
+    np.testing.assert_array_equal(clip.time_s, TIMES)
+    assert fap(clip.faps, 5) == pytest.approx(-512, abs=2)
+    assert len(clip.samples) == pytest.approx(3 * 16_000, abs=2)
+    assert clip.speaker == "me"
+
+
+def replaced(at: int, part: bytes) -> bytes:
+    return CONTENT[: 4 + HEADER_BYTES + at] + part + CONTENT[4 + HEADER_BYTES + at + len(part) :]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "no landmark file"),
+        (b"\xff\xff\xff\xff" + CONTENT[4:], "no landmark file"),
+        (CONTENT[: 4 + HEADER_BYTES], "cut off"),
+        (CONTENT[:-1], "cut off"),
+        (with_header(times=2**60), "cut off"),
+        (with_header(times=True), "whole numbers"),
+        (with_header(times=49), "49 frames only"),
+        (with_header(points=468), "468 landmarks"),
+        (with_header(sample_rate_hz=4000), "4000 samples"),
+        (b"\x04\x00\x00\x00null" + BODY, "whole numbers"),
+        (replaced(8, np.float64(np.nan).tobytes()), "times"),
+        (replaced(8, np.float64(9.0).tobytes()), "times"),
+        (replaced(8 * NUM_FRAMES, np.float32(np.nan).tobytes()), "pixels"),
+        (replaced(8 * NUM_FRAMES, np.float32(1e9).tobytes()), "pixels"),
+        (CONTENT[: 4 + HEADER_BYTES + NUM_FRAMES * (8 + 12 * 43) + 20], "second of sound"),
+    ],
+)
+def test_a_broken_landmark_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "me.landmarks"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=message):
+        read_landmark_file(path)
+
+
+def test_a_landmark_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"nobody\.landmarks: No such file"):
+        read_landmark_file(tmp_path / "nobody.landmarks")

@@ -1,0 +1,56 @@
+"""The face mesh finds what MediaPipe finds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from corpora.face_mesh import FaceMesh
+
+pytestmark = pytest.mark.unit
+PICTURES = Path(__file__).parents[1] / "golden"
+# x and y of landmarks as MediaPipe 0.10.14 finds them in the stored pictures
+MEDIAPIPE = {
+    "woman_a": {13: (95.8, 99.8), 14: (95.9, 103.0), 61: (85.6, 100.5), 291: (106.6, 100.5)},
+    "man_a": {13: (96.2, 97.7), 14: (96.4, 102.2), 152: (96.6, 123.8), 33: (71.2, 56.8)},
+    "woman_turned": {13: (117.3, 98.9), 61: (104.5, 99.6), 291: (123.9, 98.0), 4: (122.1, 82.7)},
+}
+
+
+def picture(name: str) -> NDArray[np.uint8]:
+    return np.asarray(Image.open(PICTURES / f"render_{name}.png").convert("RGB"))
+
+
+@pytest.mark.parametrize("name", MEDIAPIPE)
+def test_landmarks_are_those_of_mediapipe(name: str) -> None:
+    landmarks = FaceMesh().accept(picture(name))
+    assert landmarks is not None
+    for point, expected in MEDIAPIPE[name].items():
+        np.testing.assert_allclose(landmarks[point, :2], expected, atol=0.8)
+
+
+def test_a_picture_on_its_side_has_its_landmarks_on_their_side() -> None:
+    upright = picture("woman_a")
+    landmarks, turned = (FaceMesh().accept(each) for each in (upright, np.rot90(upright)))
+    assert landmarks is not None
+    assert turned is not None
+    back = np.stack([upright.shape[1] - turned[:, 1], turned[:, 0]], axis=1)
+    np.testing.assert_allclose(back, landmarks[:, :2], atol=2.0)
+
+
+def test_a_face_that_moves_is_followed_and_one_that_is_gone_is_found_again() -> None:
+    mesh = FaceMesh()
+    first = mesh.accept(picture("woman_a"))
+    moved = np.roll(picture("woman_a"), 6, axis=1)
+    second = mesh.accept(moved)
+    assert first is not None
+    assert second is not None
+    np.testing.assert_allclose(second[:, 0] - first[:, 0], 6, atol=1.5)
+    assert mesh.accept(np.zeros_like(moved)) is None
+    found = mesh.accept(moved)
+    assert found is not None
+    np.testing.assert_allclose(found, second, atol=1.5)

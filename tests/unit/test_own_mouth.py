@@ -1,0 +1,137 @@
+"""From a video to a clip, and from what a camera saw to a voice: the commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from typer.testing import CliRunner
+
+from corpora.commands import adapt_app, track_app
+from corpora.face_landmarks import LANDMARKS
+from corpora.landmark_file import landmark_file
+from corpora.lip_clips import read_clip
+from services.driver.render.renderer import Renderer
+from services.driver.video.film import render_video
+from services.driver.video.writer import VideoWriter
+from services.live_chain import LiveChain
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
+from services.recognizer.lips import load_lips
+from services.synthesizer.lips.load import load_lip_model
+from shared.errors import UserError
+from shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from tests.e2e.following import samples_of_file
+from tests.heads import load
+from tests.system import DEMO
+from tests.unit.test_face_landmarks import FACE
+
+pytestmark = pytest.mark.unit
+PICTURES = Path(__file__).parents[1] / "golden"
+RUNNER = CliRunner()
+
+
+def picture(name: str) -> NDArray[np.uint8]:
+    return np.array(Image.open(PICTURES / f"render_{name}.png").convert("RGB"))
+
+
+def write_video(path: Path, pictures: list[NDArray[np.uint8]], *, sound: bool = True) -> None:
+    with VideoWriter(path, 192, 144, 25.0, 16_000 if sound else None) as writer:
+        for each in pictures:
+            writer.write_image(each)
+            if sound:
+                writer.write_sound(np.zeros(640, np.float32))
+
+
+def run(app: object, *arguments: object) -> None:
+    RUNNER.invoke(app, [str(each) for each in arguments], catch_exceptions=False)  # type: ignore[arg-type]
+
+
+def test_a_video_becomes_a_clip_of_its_lips(tmp_path: Path) -> None:
+    shut, wide, nobody = (
+        picture("woman_rest"),
+        picture("woman_a"),
+        np.zeros((144, 192, 3), np.uint8),
+    )
+    write_video(tmp_path / "me.mp4", [*[shut] * 30, *[wide] * 25, *[nobody] * 3])
+    run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me")
+    clip = read_clip(tmp_path / "me.json")
+    assert clip.time_s == pytest.approx(np.arange(58) / 25, abs=0.03)
+    assert len(clip.samples) == pytest.approx(58 * 640, abs=2048)
+    jaw, lower_lip, depth = (clip.faps[:, MOUTH_FAPS.index(fap)] for fap in (3, 5, 16))
+    assert np.abs(lower_lip[:28]).max() < 60
+    assert np.median(lower_lip[32:53]) < -100
+    assert np.median(jaw[32:53]) > 80
+    assert np.isnan(depth).all()
+    assert np.isnan(clip.faps[55:]).all()
+
+
+@pytest.mark.slow
+def test_the_lips_of_a_rendered_head_are_tracked(tmp_path: Path) -> None:
+    """The head turns and nods while it speaks; the FAPs that move it are known."""
+    samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * 16_000]
+    chain = LiveChain(load_model(), load_lip_model())
+    frames = chain.accept_waveform(samples)
+    for time_s, faps in frames:
+        faps[FAP_NUMBER["head_yaw"] - 1] = 1e4 * np.sin(4 * time_s)
+        faps[FAP_NUMBER["head_pitch"] - 1] = 5e3 * np.sin(3 * time_s)
+    renderer = Renderer(load("woman", "coarse"), 320, 240)
+    render_video(frames, tmp_path / "me.mp4", renderer, frame_rate_hz=25.0, samples=samples)
+    renderer.close()
+    run(track_app, tmp_path / "me.mp4", "-o", tmp_path / "me")
+    clip = read_clip(tmp_path / "me.json")
+    frame_s = np.array([time_s for time_s, _ in frames])
+    mouth = np.array([faps[[fap - 1 for fap in MOUTH_FAPS]] for _, faps in frames])
+    true = np.stack([np.interp(clip.time_s, frame_s, fap) for fap in mouth.T], axis=1)
+    made, tracked = (measures_of(lip_tracks(faps)) for faps in (true, clip.faps))
+    for measure in range(len(MEASURES)):
+        assert np.corrcoef(made[:, measure], tracked[:, measure])[0, 1] > 0.65, MEASURES[measure]
+
+
+def test_videos_that_cannot_be_tracked_are_refused(tmp_path: Path) -> None:
+    video = tmp_path / "me.mp4"
+    write_video(video, [np.zeros((144, 192, 3), np.uint8)] * 3)
+    with pytest.raises(UserError, match="a face is seen in 0 pictures"):
+        run(track_app, video, "-o", tmp_path / "me")
+    write_video(video, [picture("woman_rest")] * 3, sound=False)
+    with pytest.raises(UserError, match="needs pictures and sound"):
+        run(track_app, video, "-o", tmp_path / "me")
+    video.write_bytes(b"no video")
+    with pytest.raises(UserError, match="cannot read the video"):
+        run(track_app, video, "-o", tmp_path / "me")
+    with pytest.raises(UserError, match="No such file"):
+        run(track_app, tmp_path / "nobody.mp4", "-o", tmp_path / "me")
+
+
+def test_what_a_camera_saw_becomes_a_voice(tmp_path: Path) -> None:
+    """The mouth opens with the loudness of the sound."""
+    sentences = [samples_of_file(DEMO / f"{name}.wav") for name in ("hello-female", "hello-male")]
+    samples = np.concatenate([*sentences, sentences[0]])
+    time_s = np.arange(0.02, len(samples) / 16_000 - 0.1, 0.04)
+    power = np.convolve(samples**2, np.ones(1600) / 1600, "same")
+    loudness = np.sqrt(power[(16_000 * time_s).astype(int)])
+    points = np.repeat(FACE[None], len(time_s), axis=0)
+    for point in (14, 17, 152, 178, 402):
+        points[:, LANDMARKS.index(point), 1] -= 5 * loudness
+    pcm = (32767 * samples).astype(np.int16)
+    seen = landmark_file(time_s, (20 * points * (1, -1, -1)).astype(np.float32), pcm, 16_000)
+    (tmp_path / "me.landmarks").write_bytes(seen)
+    voice, figures = tmp_path / "me.voice", tmp_path / "me.json"
+    run(adapt_app, tmp_path / "me.landmarks", "-o", voice, "--json", figures)
+    lips = load_lips()
+    assert lips.for_voice(voice.read_bytes()).digest != lips.digest
+    found = json.loads(figures.read_text(encoding="utf-8"))
+    assert found["held_back_s"] == pytest.approx(found["speech_s"] / 4, abs=0.05)
+    assert found["after"]["opening"] > found["before"]["opening"] + 0.05
+    assert found["before"]["width"] is None
+    curve = found["curves"]["opening"]
+    assert len(found["curves"]["time_s"]) == len(curve["before"]) == len(curve["tracked"]) > 100
+
+
+def test_clips_that_are_missing_are_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot read the clip nobody"):
+        run(adapt_app, tmp_path / "nobody.json", "-o", tmp_path / "me.voice")

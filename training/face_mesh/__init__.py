@@ -1,0 +1,1 @@
+"""MediaPipe's face mesh as ONNX; never imported by a command."""
