@@ -6,12 +6,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
+RIVALS := evaluation/lips/rivals
 SAMPLE := shared/demo/hello-female.wav
 LOCK := requirements.lock
 TORCH := torch==2.13.0
 TORCH_CPU := --index-url https://download.pytorch.org/whl/cpu --retries 0 --timeout 10
 PIP := $(BIN)/python -m pip install --quiet
-NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --prefix $(PAGE) --no-audit --no-fund --loglevel=error
+NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --no-audit --no-fund --loglevel=error --prefix
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: run demo setup test quick check lock clean
@@ -24,11 +25,11 @@ demo: setup
 
 setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(PAGE)/head.glb
 
-test: .venv/installed-dev setup
+test: .venv/installed-dev setup $(RIVALS)/node_modules/.package-lock.json
 	$(BIN)/python -m pytest
-	$(NPM) test
+	$(NPM) $(PAGE) test
 
-quick: .venv/installed-dev
+quick: .venv/installed-dev $(RIVALS)/node_modules/.package-lock.json
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 \
 		-m "(unit or property or contract) and not slow"
 
@@ -37,7 +38,8 @@ check: .venv/installed-dev $(PAGE)/node_modules/.bin/eslint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(NPM) run lint
+	$(NPM) $(PAGE) run lint
+	$(NPM) $(RIVALS) run lint
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
 
 # One lock for every system and Python >= 3.11; torch keeps its version, which training depends on.
@@ -47,7 +49,7 @@ lock: .venv/installed
 		--no-annotate --custom-compile-command 'make lock' --output-file $(LOCK) pyproject.toml -
 
 clean:
-	rm -rf .venv $(PAGE)/node_modules $(PAGE)/head.glb out
+	rm -rf .venv $(PAGE)/node_modules $(RIVALS)/node_modules $(PAGE)/head.glb out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
@@ -62,12 +64,16 @@ clean:
 	touch $@
 
 $(PAGE)/node_modules/.package-lock.json: $(PAGE)/package-lock.json | .venv/installed
-	$(NPM) ci --omit=dev
+	$(NPM) $(PAGE) ci --omit=dev
 	touch $@
 
 $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
-	$(NPM) ci
+	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
+
+$(RIVALS)/node_modules/.package-lock.json: $(RIVALS)/package-lock.json | .venv/installed
+	$(NPM) $(RIVALS) ci
+	touch $@
 
 $(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py | .venv/installed
 	$(BIN)/kouxing head export $@

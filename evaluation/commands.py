@@ -103,6 +103,30 @@ def lips(
 
 
 @app.command()
+def rivals(
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the figures over the delay (.png).")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare the lip models with HeadAudio, wLipSync and loudness at several delays.
+
+    These run in Node; 'npm ci' in evaluation/lips/rivals installs them.
+    """
+    from corpora.figures import save_figure
+    from evaluation.lips.report import print_comparison
+    from evaluation.lips.rivals.comparison import figure, main
+
+    check_output(picture, json_file)
+    scores = main(clips)
+    print_comparison(scores, Console())
+    if picture is not None:
+        save_figure(figure(scores), picture)
+    write_json(json_file, [asdict(score) for score in scores])
+
+
+@app.command()
 def closures(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     json_file: JsonFile = None,

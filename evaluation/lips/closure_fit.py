@@ -11,7 +11,7 @@ closures better than on a stranger's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -68,14 +68,15 @@ def main(folder: Path) -> list[RuleScore]:
         hear(model, clip, lips, (DEFAULT_DELAY_S,))
         for clip in track(clips, description="clips", transient=True)
     ]
-    visemes = DynamicVisemes(load_parameters(), model.inventory)
+    return compare(DynamicVisemes(load_parameters(), model.inventory), heard)
+
+
+def compare(visemes: DynamicVisemes, heard: Sequence[HeardClip]) -> list[RuleScore]:
+    """Score settings on some clips; the best of all comes last."""
     best = _score(visemes, ClosureRule(), heard)
     scores = []
-    for field in fields(ClosureRule):
-        tried = [
-            _score(visemes, replace(best.rule, **{field.name: value}), heard)
-            for value in TRIED[field.name]
-        ]
+    for name, values in TRIED.items():
+        tried = [_score(visemes, replace(best.rule, **{name: value}), heard) for value in values]
         scores += tried
         best = max(best, *tried, key=lambda score: score.total)
     return [*scores, best]

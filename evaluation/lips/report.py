@@ -38,6 +38,13 @@ def print_scores(scores: Sequence[LipScore], console: Console) -> None:
         )
 
 
+def print_comparison(scores: Sequence[LipScore], console: Console) -> None:
+    """Print the few figures that lip sync is compared by, a table for each language."""
+    by_language = [score for score in scores if score.kind == "language"]
+    title = "Correlation of opening, width, jaw; closures; lag of the opening in ms"
+    console.print(_table(title, COMPARED_COLUMNS, by_language))
+
+
 def _table(title: str, columns: Mapping[str, Cell], scores: Sequence[LipScore]) -> Table:
     table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0), title_justify="left")
     for column in ("clips; scheme, delay in ms", *columns):
@@ -132,6 +139,12 @@ TABLES: dict[str, dict[str, Cell]] = {
         "shut": _of_pauses("shut", "real_shut"),
         "of": lambda score: str(score.pauses.count),
     },
+}
+COMPARED_COLUMNS: dict[str, Cell] = {
+    "in speech": _of_curves(lambda curve: curve.correlation_in_speech),
+    "closures F1": lambda score: _figure(score.closures.f1),
+    "F1 in speech": lambda score: _figure(score.closures_in_speech.f1),
+    "lag": _of_opening(lambda curve: curve.best_lag_ms, "+.0f"),
 }
 SPEAKER_COLUMNS: dict[str, Cell] = {
     "all": _of_opening(lambda curve: curve.correlation),

@@ -5,7 +5,7 @@ Schemes of Li et al. 2011, section 3.2:
 1. forced alignment of the transcript, full model (Mandarin clips with a transcript);
 2. recognised phones with their times, full model;
 3. every lip model live, at several delays: the frames that the services would send;
-4. dynamic visemes live, but a phone counts only once the next one begins (delay 50 ms).
+4. dynamic visemes live, but a phone counts only once the next one begins (at the default delay).
 
 Two baselines need no phones: a mouth that opens with the loudness, at the same delays, and one
 that stands still at its mean.
@@ -13,9 +13,11 @@ that stands still at its mean.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from corpora.scoring import is_emitted
 from evaluation.lips.measures import is_near
 from services.live_chain import sound_events
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.lip_source import LipsFromSound
+from services.recognizer.lip_source import LipFrameStream, LipsFromSound, delay_for
 from services.recognizer.offline import recognize
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.face import Face
@@ -33,7 +35,7 @@ from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from services.synthesizer.lips.lip_model import LipModel
 from services.synthesizer.offline import synthesize
 from shared.face.faps import NUM_FAPS
-from shared.phones.events import Phone, SoundEvent, SpeechChange
+from shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
 from shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
@@ -87,11 +89,47 @@ def hear(
         clip=clip,
         num_frames=int(len(clip.samples) / SAMPLE_RATE_HZ * FRAME_RATE_HZ) + 1,
         levels=level_track(clip.samples),
-        events={delay_s: sound_events(model, clip.samples, lips, delay_s) for delay_s in delays_s},
+        events=live_events(model, clip.samples, lips, delays_s),
         inventory=model.inventory,
         recognised=recognize(model, clip.samples, SAMPLE_RATE_HZ),
         aligned=aligned_phones(model, clip),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _SeveralDelays:
+    """A model of lips that makes frames for faces of several delays at once."""
+
+    lips: LipsFromSound
+    delays_s: Sequence[float]
+
+    def stream(self, _delays_s: Sequence[float]) -> LipFrameStream:
+        return self.lips.stream(self.delays_s)
+
+    def for_voice(self, profile: bytes) -> Self:
+        return replace(self, lips=self.lips.for_voice(profile))
+
+
+def live_events(
+    model: AcousticModel,
+    samples: NDArray[np.float32],
+    lips: LipsFromSound | None,
+    delays_s: Sequence[float],
+) -> dict[float, list[SoundEvent]]:
+    """Return what ``sound_events`` returns for a face of each delay; the recognizer runs once."""
+    if lips is None:
+        return dict.fromkeys(delays_s, sound_events(model, samples))
+    chosen = {delay_s: delay_for(lips.delays_s, delay_s) for delay_s in delays_s}
+    several = _SeveralDelays(lips, sorted(set(chosen.values())))
+    events = sound_events(model, samples, several)
+    return {
+        delay_s: [
+            event
+            for event in events
+            if not isinstance(event, LipFrame) or math.isclose(event.delay_s, own, abs_tol=1e-4)
+        ]
+        for delay_s, own in chosen.items()
+    }
 
 
 def all_schemes(visemes: DynamicVisemes, lip_models: Mapping[str, LipModel]) -> list[Scheme]:
@@ -226,7 +264,7 @@ def pauses(heard: HeardClip) -> Array:
 
 def _is_active(heard: HeardClip, time_s: Array) -> NDArray[np.bool_]:
     """Tell of some times whether the recognizer's voice activity is on."""
-    events = heard.events[DEFAULT_DELAY_S]
+    events = next(iter(heard.events.values()))  # voice activity is the same for all delays
     changes = [event for event in events if isinstance(event, SpeechChange)]
     after = np.searchsorted([change.time_s for change in changes], time_s, side="right")
     return np.array([False, *(change.active for change in changes)])[after]

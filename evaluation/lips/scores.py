@@ -12,9 +12,9 @@ source, a speaker.
 - Closures: recall, precision and F1 (``measures.py``), and within speech only: lips that shut at
   the end of each word are nearly always right to. Lower lip to upper teeth: recall of the f
   that the tracks show, precision of what looks like it. How many b p m close: the synthesized lips
-  meet within 40 ms of the phone's quietest moment. The phones f b p m, in Mandarin only, are those
-  of the aligned text or, where that is unknown, of offline decoding, which the scheme of recognised
-  phones then meets by construction.
+  meet within 40 ms of the phone's quietest moment. The phones f b p m, only of clips in the
+  recognizer's language, are those of the aligned text or, where that is unknown, of offline
+  decoding, which the scheme of recognised phones then meets by construction.
 - Turns: sign changes of the velocity a second, and those of the real lips, both at the frame rate
   of the video; those at 50 Hz besides, since 25 images a second do not show all flicker. Tracked
   lips tremble by errors of tracking: smooth ones (an animator's rig) are the stricter measure.

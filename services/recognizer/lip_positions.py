@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.lips import features_at
 from services.recognizer.speech_scores import SpeechScores
 from shared.clock import MEDIA_RATE_HZ
 from shared.phones.events import LipFrame
@@ -41,13 +42,10 @@ class LipPositions:
         self.known_s: list[float] = []
         self.features: list[NDArray[np.float16]] = []
 
-    def accept(
-        self, known_s: float, frames: Floats, keys: Floats, values: Floats
-    ) -> list[LipFrame]:
+    def accept(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
         """Take what the network computes at a position."""
         self.known_s.append(known_s)
-        features = np.concatenate([frames, keys, values], axis=None)
-        self.features.append(features.astype(np.float16))
+        self.features.append(features_at(frames, values).astype(np.float16))
         return []
 
     def reset(self) -> None:

@@ -26,7 +26,6 @@ class LipFrameStream(Protocol):
         self,
         known_s: float,
         frames: NDArray[np.float32],
-        keys: NDArray[np.float32],
         values: NDArray[np.float32],
     ) -> list[LipFrame]:
         """Take what the network computes at a position; return the lip frames that follow.
@@ -37,8 +36,8 @@ class LipFrameStream(Protocol):
             Media time of the last sample that the position has seen, seconds.
         frames
             Its two newest log-mel frames, shape (2, 80).
-        keys, values
-            Of the last layer, shape (heads, size).
+        values
+            Of its layers, shape (layers, heads, size).
         """
 
     def reset(self) -> None:

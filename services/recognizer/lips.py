@@ -7,8 +7,8 @@ better than its phones do was measured here (``models/lips.md``).
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
 ======== ============================================================ ==================
-f        a position: its two log-mel frames, keys and values of the   (160 + 2 width,)
-         network's last layer
+f        a position: its two log-mel frames, and the values of the    (160 + 2 width,)
+         network's last two layers
 x        principal components of f                                    (components,)
 u        relu(U x + b_u)                                              (units,)
 h        state of the gated recurrent unit, driven by u               (units,)
@@ -21,7 +21,8 @@ y        for each delay the FAPs, and log odds of closure and of      (delays, 1
     y = A X + B [h, u] + c
 
 A is a ridge regression, which carries over to strangers; B [h, u] follows known voices closer. The
-two are fitted apart and averaged, so A and B hold half of each.
+two are fitted apart and averaged, so A and B hold half of each. The odds of a closure are
+doubled: lips that should have met are seen more than lips that met too often.
 
 There is a position every 20 ms while somebody speaks; outside speech there are no lips. A position
 that has seen the sound up to T gives, for every delay d, the mouth at T - d. The same sound gives
@@ -56,13 +57,14 @@ from shared.phones.events import LipFrame
 Floats = NDArray[np.float32]
 
 LIPS_PATH = Path(__file__).parent / "models" / "lips.npz"
-FORMAT = "lips 1"
+FORMAT = "lips 2"
 # FAPs that a camera tracks. Each of a pair on the left and on the right has the same value.
 LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 OTHER_SIDE = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
 CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outputs, after the FAPs
 NUM_OUTPUTS = len(LIP_FAPS) + 2
 FRAMES_PER_POSITION = 2
+NUM_LAYERS = 2  # of the network, the last ones
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0
 _MAX_SIZE = 4096  # of features, components, units
@@ -190,9 +192,7 @@ class LipPredictorStream:
         self._state = np.zeros(len(self._model.state_weights), np.float32)
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
-    def accept(
-        self, known_s: float, frames: Floats, keys: Floats, values: Floats
-    ) -> list[LipFrame]:
+    def accept(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
         """Take what the network computes at a position; return the lip frames, one a delay.
 
         Parameters
@@ -201,10 +201,10 @@ class LipPredictorStream:
             Media time of the last sample that the position has seen, seconds.
         frames
             Its two newest log-mel frames, shape (2, 80).
-        keys, values
-            Of the last layer, shape (heads, size).
+        values
+            Of its layers, shape (layers, heads, size).
         """
-        outputs = self.step(np.concatenate([frames, keys, values], axis=None))
+        outputs = self.step(features_at(frames, values))
         return [
             LipFrame(
                 time_s=known_s - delay_s,
@@ -235,6 +235,11 @@ class LipPredictorStream:
         recurrent = self.inner @ self._output_weights
         outputs: Floats = (linear + recurrent).reshape(self._output_bias.shape)
         return outputs + self._output_bias
+
+
+def features_at(frames: Floats, values: Floats) -> Floats:
+    """Return a position's features, (160 + 2 width,), of what `LipPredictorStream.accept` takes."""
+    return np.concatenate([frames, values[-NUM_LAYERS:]], axis=None)
 
 
 def mouth_faps(lips: Floats) -> Floats:
@@ -279,7 +284,7 @@ def lips_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | Non
         return None
     lips, sizes = load_lips(path), model.session.sizes
     width = sizes.num_heads * sizes.head_size
-    fits = len(lips.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + 2 * width
+    fits = len(lips.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + NUM_LAYERS * width
     return lips if fits else None
 
 

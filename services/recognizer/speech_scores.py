@@ -168,18 +168,13 @@ class SpeechScores:
         lip_frames, self._lip_frames = self._lip_frames, []
         return [*([scores] if len(scores) else []), *lip_frames]
 
-    def _take_position(
-        self,
-        frames: NDArray[np.float32],
-        keys: NDArray[np.float32],
-        values: NDArray[np.float32],
-    ) -> None:
+    def _take_position(self, frames: NDArray[np.float32], values: NDArray[np.float32]) -> None:
         """Pass on what the network has computed at a position."""
         newest, self._next_newest = self._next_newest, self._next_newest + _FRAMES_PER_POSITION
         # At the end of a segment the network sees its last frame again: no sound, no lips.
         if self._lips is not None and newest < self._num_frames:
             known_s = newest * HOP_S + WINDOW_S
-            self._lip_frames += self._lips.accept(known_s, frames, keys, values)
+            self._lip_frames += self._lips.accept(known_s, frames, values)
 
 
 def score_recording(

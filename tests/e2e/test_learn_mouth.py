@@ -76,8 +76,12 @@ def read_aloud(browser: Browser) -> None:
     browser.evaluate("window.kouxing.readingS = 1")
     browser.click("learn")
     browser.click("lesson-start")
-    browser.wait_for("document.getElementById('lesson-reading').classList.contains('due')", 90)
-    browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
+    for _ in range(5):
+        browser.wait_for("document.getElementById('lesson-reading').classList.contains('due')", 90)
+        browser.wait_for("!['reading', 'learning'].includes(window.kouxing.state.lesson)", 90)
+        if "too few pictures" not in text_of(browser, "lesson-problem"):
+            break
+        browser.click("lesson-again")  # the machine was busy with other things
 
 
 def longer(recording: bytes) -> bytes:

@@ -108,8 +108,9 @@ def test_flush_then_stall_is_at_rest_in_time_too() -> None:
     assert not face.relax(7)[6][1].round(3).any()
 
 
-def test_a_long_vowel_stays_open_while_no_news_comes() -> None:
-    face = make_face()
+@pytest.mark.parametrize("delay_s", [0.06, 0.16])
+def test_a_long_vowel_stays_open_while_no_news_comes(delay_s: float) -> None:
+    face = make_face(delay_s=delay_s)
     face.accept(SpeechChange(active=True, time_s=0.3))
     before = advance(face, 0.41)  # a recognizer needs a tenth of a second
     face.accept(phone(0, "a", 0.3, 0.15, final=False))
@@ -167,8 +168,8 @@ def test_value_and_slope_are_continuous_where_the_trajectory_changes() -> None:
     faps = values(frames[-3:] + advance(face, 0.54 + DELAY_S))[:, JAW]
     steps = np.diff(faps)
     assert abs(steps[1]) > 0.5
-    # a jump to the new trajectory would be fifty times as large, a corner ten times
-    assert abs(steps[2] - steps[1]) < 5.0
+    # a jump to the new trajectory would be 150, a corner 22
+    assert abs(steps[2] - steps[1]) < 10.0
 
 
 @pytest.mark.parametrize("symbol", INVENTORY.phones)

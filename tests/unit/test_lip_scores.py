@@ -14,6 +14,7 @@ from rich.console import Console
 from corpora.figures import new_figure, save_figure
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
 from evaluation.lips.clip_scores import score_clip
+from evaluation.lips.closure_fit import TRIED, compare
 from evaluation.lips.report import print_scores
 from evaluation.lips.schemes import (
     DEFAULT_DELAY_S,
@@ -21,6 +22,7 @@ from evaluation.lips.schemes import (
     HeardClip,
     Scheme,
     is_speech,
+    live_events,
     loudness_frames,
     pauses,
     phones_shaped,
@@ -29,7 +31,9 @@ from evaluation.lips.schemes import (
 from evaluation.lips.scores import LipScore, clips_to_score, pool
 from evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
 from evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
+from services.live_chain import sound_events
 from services.recognizer.acoustic.load import load_model
+from services.recognizer.lips import lips_for
 from services.synthesizer.lips.dynamic_visemes.blending import blend
 from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -42,7 +46,7 @@ from services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_tim
 from shared.audio_file import read_audio
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import Phone, SoundEvent, SpeechChange
+from shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import INVENTORY, LIPS, clip_of, utterance
 
 pytestmark = pytest.mark.unit
@@ -243,6 +247,34 @@ def test_loudness_opens_the_mouth() -> None:
     np.testing.assert_array_equal(loudness_frames(samples, 0.3), faps)
 
 
+def test_the_rule_of_closures_is_chosen_by_what_the_lips_do() -> None:
+    """The sound doubts closures of lips that it tells to be half open: it is to be believed."""
+    times = np.arange(100) / 50.0
+    is_shut = (times * 2.0) % 1.0 < 0.2
+    faps = np.zeros((100, len(MOUTH_FAPS)))
+    faps[:, MOUTH_FAPS.index(5)] = np.where(is_shut, 0.0, -300.0)
+    events: list[SoundEvent] = [SpeechChange(active=True, time_s=0.0)]
+    for time_s, shut in zip(times, is_shut, strict=True):
+        mouth = np.zeros(len(MOUTH_FAPS), np.float32)
+        mouth[MOUTH_FAPS.index(5)] = -150.0 if shut else -300.0
+        events.append(
+            LipFrame(
+                time_s=time_s,
+                delay_s=0.055,
+                faps=mouth,
+                closure=0.25 if shut else 0.01,
+                lip_to_teeth=0.0,
+            )
+        )
+        events.append(Progress(time_s=time_s + 0.06, level_db=-20.0))
+    lips = heard(clip_of(times, faps), events=events)
+    *tried, best = compare(LIPS, [lips])
+    assert len(tried) == sum(map(len, TRIED.values()))
+    assert best.rule.sound >= 1.0
+    assert best.f1 > 0.9
+    assert min(score.f1 for score in tried) < 0.5
+
+
 def test_a_closure_is_sought_where_the_phone_is_quietest() -> None:
     phones = utterance(4, 20)
     labials = [phone for phone in phones if phone.symbol == "b"]
@@ -266,6 +298,27 @@ def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: s
     (folder / f"{name}.json").write_text(json.dumps({"language": language, "licence": "MIT"}))
     (folder / f"{name}.csv").write_text(f"t,{column}\n0.0,1\n")
     (folder / f"{name}.flac").write_bytes(b"")
+
+
+@pytest.mark.slow
+def test_one_run_of_the_recognizer_serves_faces_of_all_delays() -> None:
+    model = load_model()
+    samples = read_audio(DEMO / "vowels-male.wav")[0][:, 0]
+    lips = lips_for(model)
+    found = live_events(model, samples, lips, DELAYS_S)
+    assert list(found) == DELAYS_S
+    alone = sound_events(model, samples, lips, DEFAULT_DELAY_S)
+    assert len(alone) == len(found[DEFAULT_DELAY_S]) > 200
+    for event, other in zip(alone, found[DEFAULT_DELAY_S], strict=True):
+        if isinstance(event, LipFrame) and isinstance(other, LipFrame):
+            assert (event.time_s, event.delay_s) == (other.time_s, other.delay_s)
+            np.testing.assert_allclose(event.faps, other.faps, rtol=1e-4, atol=1e-3)
+        else:
+            assert event == other
+    delays = [{e.delay_s for e in found[d] if isinstance(e, LipFrame)} for d in DELAYS_S]
+    assert all(len(each) == 1 for each in delays)
+    assert delays[0] != delays[-1]
+    assert live_events(model, samples, None, DELAYS_S)[0.0] == sound_events(model, samples)
 
 
 def test_clips_that_were_learnt_from_are_not_scored(

@@ -16,6 +16,7 @@ from services.recognizer.lips import (
     LIP_FAPS,
     NUM_OUTPUTS,
     LipPredictor,
+    features_at,
     load_lips,
     mouth_faps,
 )
@@ -82,14 +83,13 @@ def test_reset_forgets_everything() -> None:
 
 
 def test_each_delay_has_its_own_outputs_and_times() -> None:
-    frames, keys, values = np.ones((2, 80)), np.ones((8, 64)), np.ones((8, 64))
-    position = [array.astype(np.float32) for array in (frames, keys, values)]
-    both = MODEL.stream([-0.005, 0.155]).accept(1.0, position[0], position[1], position[2])
-    alone = MODEL.stream([0.155]).accept(1.0, position[0], position[1], position[2])
+    frames, values = np.ones((2, 80), np.float32), np.ones((4, 8, 64), np.float32)
+    both = MODEL.stream([-0.005, 0.155]).accept(1.0, frames, values)
+    alone = MODEL.stream([0.155]).accept(1.0, frames, values)
     assert [(lip.time_s, lip.delay_s) for lip in both] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
     assert 0 < both[0].closure < 1
-    outputs = MODEL.stream([0.155]).step(np.concatenate(position, axis=None))
+    outputs = MODEL.stream([0.155]).step(features_at(frames, values))
     assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+import torch
 
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, part_of
 from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS, load_lips
@@ -20,8 +21,9 @@ from tests.lips import clip_of
 from tests.system import DEMO
 from training.lips.card import lips_of
 from training.lips.positions import Speech
-from training.lips.recipe import DELAYS_S, fit, train_lips
-from training.lips.ridge import Products, fit_ridge, history_of
+from training.lips.recipe import DELAYS_S, Units, fit, joined, train_lips
+from training.lips.recurrent import LipNetwork
+from training.lips.ridge import HISTORY, Products, fit_ridge, history_of
 from training.lips.scores import Stretch, correlations, count_closures
 from training.lips.targets import Touch, targets_at, touches
 
@@ -118,6 +120,18 @@ def test_fitting_learns_lips_that_the_features_tell_in_each_speakers_units() -> 
         lower = LIP_FAPS.index(5)
         assert np.corrcoef(made[:, lower], targets[held][:, 2, lower])[0, 1] > 0.8
         assert not made[:, LIP_FAPS.index(16)].any()  # nobody tracked it
+
+
+def test_a_closure_is_told_from_a_probability_of_a_third_on() -> None:
+    torch.manual_seed(0)
+    network = LipNetwork(3, len(DELAYS_S), 1)
+    linear = np.zeros((3 * HISTORY + 1, len(DELAYS_S), len(LIP_FAPS)))
+    units = Units(np.zeros(len(LIP_FAPS), np.float32), np.ones(len(LIP_FAPS), np.float32))
+    model = joined(np.zeros(9, np.float32), np.ones((9, 3), np.float32), network, linear, units)
+    bias = network.output.bias.detach().numpy().reshape(-1, NUM_OUTPUTS)
+    even = 1 / (1 + np.exp(model.output_bias[:, CLOSURE] - bias[:, CLOSURE]))
+    np.testing.assert_allclose(even, 1 / 3, rtol=1e-5)
+    np.testing.assert_allclose(model.output_bias[:, CLOSURE + 1], bias[:, CLOSURE + 1])
 
 
 def stretch_of(clip: LipClip, delay_s: float, log_odds: np.ndarray) -> Stretch:

@@ -22,7 +22,14 @@ from corpora.speech_corpus import may_ship
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.front_end.whisper_mel import NUM_MELS
-from services.recognizer.lips import FRAMES_PER_POSITION, LIP_FAPS, NUM_OUTPUTS, LipPredictor
+from services.recognizer.lips import (
+    CLOSURE,
+    FRAMES_PER_POSITION,
+    LIP_FAPS,
+    NUM_LAYERS,
+    NUM_OUTPUTS,
+    LipPredictor,
+)
 from shared.errors import UserError
 from training.lips.card import Trained, write_card
 from training.lips.positions import Speech, components_of, features_of, speech_of
@@ -37,12 +44,15 @@ Array = NDArray[np.float64]
 # the sound of a position ends.
 DELAYS_S = (-0.005, 0.015, 0.045, 0.055, 0.095, 0.155)
 LANGUAGE = "zh"  # of the acoustic model, as the clips name it
-NUM_COPIES = 2  # augmented, of each clip
+NUM_COPIES = 1  # augmented, of each clip
 NUM_EPOCHS = 12
-NUM_COMPONENTS = (32, 128)  # of the log-mel frames, and of the last layer's keys and values
+# Of the log-mel frames and of each layer's values: components, and extent of the first and of the
+# last. What is small counts less, in the network and in the ridge: it holds the speaker.
+COMPONENTS = ((32, 0.5, 0.5), *[(96, 1.0, 0.2)] * NUM_LAYERS)
 _NUM_MEL_FEATURES = FRAMES_PER_POSITION * NUM_MELS
 _NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
+_MISSED_CLOSURE = 2.0  # false ones that a missed closure is worth
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,24 +154,24 @@ def fit(
 
 
 def principal_components(features: Floats) -> tuple[Floats, Floats]:
-    """Return the mean of features, (n, features), and the projection to components of variance 1.
+    """Return the mean of features, (n, features), and the projection to their components.
 
-    The log-mel frames and the last layer have components of their own.
+    The log-mel frames and each layer have components of their own.
     """
     mean = features.mean(axis=0)
-    num_features = len(mean)
-    parts = (slice(0, _NUM_MEL_FEATURES), slice(_NUM_MEL_FEATURES, num_features))
-    projection = np.zeros((num_features, sum(NUM_COMPONENTS)), np.float32)
+    ends = np.linspace(_NUM_MEL_FEATURES, len(mean), NUM_LAYERS + 1).astype(int)
+    parts = np.split(np.arange(len(mean)), ends[:-1])
+    projection = np.zeros((len(mean), sum(number for number, _, _ in COMPONENTS)), np.float32)
     first = 0
-    for part, num_components in zip(parts, NUM_COMPONENTS, strict=True):
+    for part, (number, first_extent, last_extent) in zip(parts, COMPONENTS, strict=True):
         centred = features[:, part] - mean[part]
         covariance = (centred.T @ centred).astype(np.float64) / len(centred)
         variances, directions = np.linalg.eigh(covariance)
-        variances, directions = variances[::-1], directions[:, ::-1]
-        kept = min(num_components, len(variances))
-        scaled = directions[:, :kept] / np.sqrt(np.maximum(variances[:kept], _MIN_VARIANCE))
-        projection[part, first : first + kept] = scaled
-        first += num_components
+        kept = min(number, len(part))
+        extents = np.linspace(first_extent, last_extent, kept)
+        scale = extents / np.sqrt(np.maximum(variances[::-1][:kept], _MIN_VARIANCE))
+        projection[part, first : first + kept] = directions[:, ::-1][:, :kept] * scale
+        first += number
     return mean, projection
 
 
@@ -193,7 +203,10 @@ def canonical(example: Example, network: LipNetwork) -> Floats:
 def joined(
     mean: Floats, projection: Floats, network: LipNetwork, linear: Array, units: Units
 ) -> LipPredictor:
-    """Join both parts, half of each; closure and lip to teeth come from the network alone."""
+    """Join both parts, half of each; closure and lip to teeth come from the network alone.
+
+    A closure is told where that costs least (Bayes' decision), so its log odds are raised.
+    """
     weights = {name: value.numpy() for name, value in network.state_dict().items()}
     num_components = projection.shape[1]
     num_delays = linear.shape[1]
@@ -204,6 +217,7 @@ def joined(
     shape = (num_delays, NUM_OUTPUTS)
     bias = weights["output.bias"].reshape(shape) * share
     bias[:, :_NUM_FAPS] += linear[-1] * share[:_NUM_FAPS] + units.mean
+    bias[:, CLOSURE] += np.log(_MISSED_CLOSURE)
     output = weights["output.weight"].T.reshape(-1, *shape) * share
     exact = LipPredictor(
         delays=np.array(DELAYS_S, np.float32),

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-HISTORY = 12  # positions: 240 ms
-RIDGE = 3000.0  # weight of zero, positions
+HISTORY = 8  # positions: 160 ms
+RIDGE = 0.5  # weight of zero, share of the positions
+_TINY = 1e-9
 
 
 def history_of(components: Floats) -> Floats:
@@ -64,10 +65,12 @@ class Products:
         )
 
     def solve(self) -> Array:
-        """Return the weights, (columns of X, columns of Y)."""
-        size = len(self.of_histories)
-        ridge = RIDGE * np.eye(size)
-        return np.linalg.solve(self.of_histories + ridge, self.with_targets).astype(np.float64)
+        """Return the weights, (columns of X, columns of Y); the last column of X is 1."""
+        num_positions = self.of_histories[-1, -1]
+        ridge = np.full(len(self.of_histories), RIDGE * num_positions)
+        ridge[-1] = _TINY  # the constant is free
+        penalised = self.of_histories + np.diag(ridge)
+        return np.linalg.solve(penalised, self.with_targets).astype(np.float64)
 
 
 def fit_ridge(histories: Sequence[Floats], targets: Sequence[Floats]) -> Array:

@@ -82,9 +82,8 @@ _MIN_ROWS = 2  # in a call
 _MAX_LOOK_AHEAD = 100  # feature frames
 _PAST_MASKS = past_masks()
 
-# Is told of a position: its two newest frames, (2, 80); keys and values of the last layer, (heads,
-# size) each.
-OnPosition: TypeAlias = Callable[[Floats, Floats, Floats], None]
+# Is told of a position: its two newest frames, (2, 80), and its values, (layers, heads, size).
+OnPosition: TypeAlias = Callable[[Floats, Floats], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +289,7 @@ class NeuralStream:
         self.cache.keys[:, self.row, :, :, slot] = keys
         self.cache.values[:, self.row, :, slot] = values
         if self.on_position:
-            self.on_position(self._frames[SEEN_FRAMES - 2 : SEEN_FRAMES], keys[-1], values[-1])
+            self.on_position(self._frames[SEEN_FRAMES - 2 : SEEN_FRAMES], values)
         self._num_positions += 1
         self._frames = self._frames[2:]
         if self.position == 0:  # the table has ended

@@ -45,9 +45,8 @@ from shared.phones.events import Phone, SoundEvent, SpeechChange
 from shared.phones.inventory import PhoneInventory
 
 _REST_S = 0.3  # to rest when no sound comes
-_TRANSITION_S = 0.04  # from one target trajectory to the next
+_TRANSITION_S = 0.03  # from one target trajectory to the next
 _SLOW_TRANSITION_S = 0.14  # to rest after an interruption, and back from rest
-_RECOGNISED_AFTER_S = 0.12  # most phones are recognised within this time after their onset
 _MEMORY_S = 1.5  # phones that ended longer ago have no weight left
 
 
@@ -134,7 +133,7 @@ class VisemeStream:
         if self._pending_s is not None:
             self._closures.forget(self._known.forget_before(self._time_s - _MEMORY_S))
             self._timeline = self._known.timeline()
-        extended = self._timeline.extend_open_phone(time_s + self._delay_s - _RECOGNISED_AFTER_S)
+        extended = self._timeline.extend_open_phone(time_s + self._delay_s)
         self._seen, is_postponed = self._closures.postpone(extended, self._time_s, time_s)
         active = self._seen.select(active_visemes(self._seen, time_s, self._delay_s))
         is_same = active.same_visemes(self._trajectory.timeline)

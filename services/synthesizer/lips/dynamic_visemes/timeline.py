@@ -27,7 +27,8 @@ from shared.phones.inventory import PhoneInventory
 EXPECTED = -1
 MAX_HOLD_S = 1.5  # a phone lasts up to this long beyond its estimate if nothing follows
 _HOLD_SOFTNESS_S = 0.03
-_HOLD_FACTOR = 3.0  # below, a long vowel half closes before it is held
+_HOLD_FACTOR = 2.0  # below, a long vowel half closes before it is held
+_RECOGNISED_AFTER_S = 0.09  # most phones are recognised within this time after their onset
 _EXPECTED_AFTER_S = 0.3  # how long the expected viseme lasts before the mouth relaxes
 # What usually follows looks like: a middling vowel; after a vowel, a mouth less open, which keeps
 # its rounding.
@@ -89,16 +90,18 @@ class Timeline:
         distance_s = np.maximum(self.apex_start_s - time_s, time_s - self.apex_end_s)
         return int(self.viseme[np.argmin(distance_s)])
 
-    def extend_open_phone(self, until_s: float) -> Timeline:
-        """Let an open phone last: nothing that follows it has begun at ``until_s``.
+    def extend_open_phone(self, known_s: float) -> Timeline:
+        """Let an open phone last: with the sound known up to ``known_s``, nothing follows it yet.
 
-        Its end moves from the estimate to ``until_s``, smoothly, and that of a held one beyond,
-        since what has lasted long is not about to end; by up to ``MAX_HOLD_S``.
+        What began `_RECOGNISED_AFTER_S` before would be known. The phone's end moves from the
+        estimate to there, smoothly, and that of a held one beyond, since what has lasted long is
+        not about to end; by up to ``MAX_HOLD_S``.
         """
         if self.open_phone is None:
             return self
+        begun_s = known_s - _RECOGNISED_AFTER_S
         overdue_s = _HOLD_SOFTNESS_S * np.logaddexp(
-            0.0, (until_s - self.open_phone.end_s) / _HOLD_SOFTNESS_S
+            0.0, (begun_s - self.open_phone.end_s) / _HOLD_SOFTNESS_S
         )
         factor = _HOLD_FACTOR if self.open_phone.is_held else 1.0
         later_s = min(factor * float(overdue_s), MAX_HOLD_S)
