@@ -72,7 +72,7 @@ def log_mel_of(
 
 def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
     """Return the samples of every utterance, 16 kHz; none where the audio cannot be read."""
-    return _cached(utterances, "samples", np.empty(0, dtype=np.int16), _as_integers)
+    return _cached(utterances, "samples", np.empty(0, dtype=np.int16), as_integers)
 
 
 def as_floats(samples: NDArray[np.int16]) -> NDArray[np.float32]:
@@ -84,7 +84,8 @@ def _log_mel(samples: NDArray[np.float32]) -> NDArray[np.float16]:
     return LogMel().accept_waveform(samples).astype(np.float16)
 
 
-def _as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
+def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
+    """Convert samples in [-1, 1] to those that the cache keeps."""
     whole = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
     integers: NDArray[np.int16] = whole.astype(np.int16)
     return integers

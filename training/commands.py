@@ -182,6 +182,16 @@ def lips(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
     ] = Path("services/recognizer/models/lips.npz"),
+    speech: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of speech without lips, in any language, which the teacher labels; repeat "
+            "for several."
+        ),
+    ] = None,
+    whisper: Annotated[
+        Path | None, typer.Option(help="Folder of Whisper base for faster-whisper: the teacher.")
+    ] = None,
     seed: Seed = 0,
     any_licence: AnyLicence = False,
 ) -> None:
@@ -194,4 +204,11 @@ def lips(
             f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
         ) from error
 
-    train_lips(clips, output, seed=seed, any_licence=any_licence)
+    train_lips(
+        clips,
+        output,
+        speech=speech or [],
+        whisper=whisper,
+        seed=seed,
+        any_licence=any_licence,
+    )

@@ -41,7 +41,7 @@ from shared.phones.inventory import PhoneInventory
 Array = NDArray[np.float64]
 
 DEFAULT_DELAY_S = SynthesizerConfig().delay_ms / 1e3
-DELAYS_S = sorted({0.0, 0.1, 0.16, 0.3, DEFAULT_DELAY_S})
+DELAYS_S = sorted({0.0, 0.05, 0.1, 0.16, 0.3, DEFAULT_DELAY_S})
 NEXT_PHONE_DELAY_S = DEFAULT_DELAY_S
 FRAME_RATE_HZ = 50.0
 _HOP_S = 1.0 / FRAME_RATE_HZ

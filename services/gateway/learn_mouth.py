@@ -27,7 +27,7 @@ UPLOAD_LIMIT_S = 60.0
 LEARNING_LIMIT_S = 180.0
 PRESENCE_CHECK_S = 0.5  # a browser that has left is noticed within this
 ADAPT = (sys.executable, "-m", "services", "adapt")
-_NICENESS = 10  # live sessions come first
+_NICENESS = 19  # live sessions come first
 _USERS_MISTAKE = 2  # exit status
 
 

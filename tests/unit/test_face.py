@@ -169,7 +169,7 @@ def test_value_and_slope_are_continuous_where_the_trajectory_changes() -> None:
     steps = np.diff(faps)
     assert abs(steps[1]) > 0.5
     # a jump to the new trajectory would be 150, a corner 22
-    assert abs(steps[2] - steps[1]) < 10.0
+    assert abs(steps[2] - steps[1]) < 5.0
 
 
 @pytest.mark.parametrize("symbol", INVENTORY.phones)

@@ -19,6 +19,7 @@ from shared.phones.events import Phone
 from tests.e2e.following import samples_of_file
 from tests.lips import clip_of
 from tests.system import DEMO
+from training.lips import recipe
 from training.lips.card import lips_of
 from training.lips.positions import Speech
 from training.lips.recipe import DELAYS_S, Units, fit, joined, train_lips
@@ -26,6 +27,8 @@ from training.lips.recurrent import LipNetwork
 from training.lips.ridge import HISTORY, Products, fit_ridge, history_of
 from training.lips.scores import Stretch, correlations, count_closures
 from training.lips.targets import Touch, targets_at, touches
+from training.neural.network import Shape
+from training.neural.teacher import WholeEncoder
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
@@ -199,6 +202,25 @@ def test_the_command_makes_a_model_and_a_card_from_clips_that_may_be_used(
     assert "academic" not in card
     assert "| en, clara (not in training) | 1 |" in card
     assert "| en, anna | 1 |" in card
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_speech_without_lips_is_labelled_and_told_on_the_card(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder, output = tmp_path / "clips", tmp_path / "lips.npz"
+    folder.mkdir()
+    write_clip(folder, name_for("train"), "anna", "CC0")
+    with pytest.raises(UserError, match="give --whisper too"):
+        train_lips(folder, output, speech=[folder])
+    small = Shape(num_states=0, look_aheads=(), width=32, heads=2, layers=4, inner=48)
+    monkeypatch.setattr(recipe, "load_encoder", lambda _: WholeEncoder(small, (0, 1, 2, 3)).eval())
+    train_lips(folder, output, speech=[folder], whisper=tmp_path)
+    assert load_lips(output).delays_s == DELAYS_S
+    card = output.with_suffix(".md").read_text()
+    assert "--speech DIR --whisper DIR" in card
+    assert "speech without lips in 1 recordings" in card
 
 
 def test_clips_that_may_not_be_used_are_refused(tmp_path: Path) -> None:

@@ -22,9 +22,11 @@ from services.live_chain import LiveChain
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
 from services.recognizer.lips import load_lips
+from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.lips.load import load_lip_model
 from shared.errors import UserError
 from shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from shared.face.lip_models import LipModelName
 from tests.e2e.following import samples_of_file
 from tests.heads import load
 from tests.system import DEMO
@@ -74,7 +76,9 @@ def test_a_video_becomes_a_clip_of_its_lips(tmp_path: Path) -> None:
 def test_the_lips_of_a_rendered_head_are_tracked(tmp_path: Path) -> None:
     """The head turns and nods while it speaks; the FAPs that move it are known."""
     samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * 16_000]
-    chain = LiveChain(load_model(), load_lip_model())
+    visemes = LipModelName.DYNAMIC_VISEMES
+    settings = SynthesizerConfig(lips=visemes)
+    chain = LiveChain(load_model(), load_lip_model(name=visemes), synthesizer=settings)
     frames = chain.accept_waveform(samples)
     for time_s, faps in frames:
         faps[FAP_NUMBER["head_yaw"] - 1] = 1e4 * np.sin(4 * time_s)

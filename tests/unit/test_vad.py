@@ -32,7 +32,7 @@ def test_silence_and_noise_are_quiet() -> None:
 def test_three_states() -> None:
     detector = VoiceActivityDetector()
     assert detector.state is QUIET
-    assert detector.accept_probability(0.4) is QUIET
+    assert detector.accept_probability(0.1) is QUIET
     assert detector.accept_probability(0.9) is SPEAKING
     assert detector.accept_probability(0.4) is SPEAKING  # weaker, but not improbable
     assert detector.accept_probability(0.1) is STOPPING

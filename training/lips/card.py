@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS, LipPredictor
-from training.lips.positions import Speech, components_of
+from training.lips.positions import POSITION_S, Speech, components_of
 from training.lips.ridge import Products, history_of
 from training.lips.scores import Made, Stretch, correlations, count_closures
 from training.lips.targets import touches
+from training.lips.teacher import Lessons
 
 Floats = NDArray[np.float32]
 
@@ -34,6 +35,7 @@ class Trained:
     clips: Sequence[LipClip]
     speech: Sequence[Speech]  # of the clips as they are
     targets: Sequence[Floats]  # of each stretch, FAP units, (positions, delays, 17)
+    lessons: Lessons | None  # what a teacher labelled besides
     seed: int
 
 
@@ -65,18 +67,20 @@ def write_card(
         groups[f"{clip.language}, all held clips"].append(clip)
         groups[f"{clip.language}, speakers {known}"].append(clip)
         groups[f"{clip.language}, {clip.speaker} ({known})"].append(clip)
+    options = " --speech DIR --whisper DIR" if trained.lessons else ""
     lines = [
         "# Lips from sound",
         "",
         *_ABOUT.read_text(encoding="utf-8").splitlines(),
         "",
-        f"Made by `kouxing train lips --clips DIR --seed {trained.seed}`. See",
+        f"Made by `kouxing train lips --clips DIR{options} --seed {trained.seed}`. See",
         "`training/lips/recipe.py` for how and `services/recognizer/lips.py` for what it computes.",
         "",
         "## Data",
         "",
         *_data_table(trained.clips),
         "",
+        *(_labelled(trained.lessons) if trained.lessons else []),
         "Mean training loss of each epoch: "
         + ", ".join(f"{loss:.3f}" for loss in trained.losses)
         + ".",
@@ -130,6 +134,16 @@ def _data_table(clips: Sequence[LipClip]) -> list[str]:
             f"{sum(len(clip.samples) for clip in group) / SAMPLE_RATE_HZ:.0f} |"
             for licence, group in sorted(by_licence.items())
         ),
+    ]
+
+
+def _labelled(lessons: Lessons) -> list[str]:
+    recordings = {each.clip.name for each in lessons.speech}
+    minutes = sum(len(each.known_s) for each in lessons.speech) * POSITION_S / 60
+    return [
+        f"A teacher labelled {minutes:.0f} minutes of speech without lips in {len(recordings)} "
+        "recordings.",
+        "",
     ]
 
 

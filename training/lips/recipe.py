@@ -4,7 +4,8 @@
     each speaker's units -> ridge regression in canonical units -> mean of the two
 
 Every clip that is not held out and whose licence allows it is trained on; no setting is chosen by
-them. Each goes in once as it is and in augmented copies, so that few voices stand for more.
+them. Each goes in once as it is and in augmented copies, so that few voices stand for more. A
+teacher may label further speech, which nobody filmed (:mod:`training.lips.teacher`).
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from training.lips.positions import Speech, components_of, features_of, speech_o
 from training.lips.recurrent import Example, LipNetwork, train_network
 from training.lips.ridge import HISTORY, fit_ridge, history_of
 from training.lips.targets import Touch, targets_at, touches
+from training.lips.teacher import Lessons, hear, load_encoder, read_recordings, teach
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -63,14 +65,42 @@ class Units:
     extent: Floats  # (15,)
 
 
-def train_lips(folder: Path, output: Path, *, seed: int = 0, any_licence: bool = False) -> None:
-    """Train lips from sound on the clips of a folder; write the model and its card.
+def train_lips(
+    folder: Path,
+    output: Path,
+    *,
+    speech: Sequence[Path] = (),
+    whisper: Path | None = None,
+    seed: int = 0,
+    any_licence: bool = False,
+) -> None:
+    """Train lips from sound; write the model and its card.
+
+    Parameters
+    ----------
+    folder
+        Clips with lips.
+    output
+        The ``.npz`` file to write; the card is written beside it as ``.md``.
+    speech
+        Folders of recordings without lips, in any language, which the teacher labels. Their
+        licences are unknown: name only folders that may be used.
+    whisper
+        Folder with Whisper base, see :func:`training.neural.whisper_weights.load_whisper`, for the
+        teacher.
+    seed
+        The same seed gives the same model.
+    any_licence
+        Train also on clips whose licence forbids giving the model away.
 
     Raises
     ------
     UserError
-        If no clip may be used, or the shipped acoustic model is not neural.
+        If no clip may be used, there is no teacher for speech without lips, the shipped acoustic
+        model is not neural, or a file cannot be read.
     """
+    if speech and whisper is None:
+        raise UserError("only a teacher can label what --speech names: give --whisper too")
     model = load_model()
     if not isinstance(model, NeuralModel):
         raise UserError("lips from sound need the neural acoustic model; reinstall it")
@@ -82,21 +112,27 @@ def train_lips(folder: Path, output: Path, *, seed: int = 0, any_licence: bool =
         raise UserError(
             f"no clip in {folder} may be used; give clips with a free licence, or --any-licence"
         )
-    speech = {clip.name: speech_of(model, clip) for clip in track(clips, description="clips")}
+    recordings = read_recordings(speech, seed)
+    positions = {clip.name: speech_of(model, clip) for clip in track(clips, description="clips")}
     copies = [
         stretch
         for clip in track(used, description="augmented copies")
         for copy in range(1, NUM_COPIES + 1)
         for stretch in speech_of(model, clip, copy)
     ]
-    trained_on = [stretch for clip in used for stretch in speech[clip.name]]
+    trained_on = [stretch for clip in used for stretch in positions[clip.name]]
     if not trained_on:
         raise UserError(f"nobody speaks in the clips of {folder}; give clips with speech")
     targets = _targets(model, [*trained_on, *copies], touches(clips))
-    lips, losses = fit([*trained_on, *copies], targets, trained_on, seed)
+    lessons = None
+    if whisper and recordings:
+        lessons = hear(load_encoder(whisper), model, [*trained_on, *copies], recordings)
+    lips, losses = fit([*trained_on, *copies], targets, trained_on, seed, lessons=lessons)
     lips.save(output)
     own = targets[: len(trained_on)]
-    write_card(output, Trained(lips, losses, used, trained_on, own, seed), clips, speech)
+    write_card(
+        output, Trained(lips, losses, used, trained_on, own, lessons, seed), clips, positions
+    )
 
 
 def _targets(model: NeuralModel, speech: Sequence[Speech], touch: dict[str, Touch]) -> list[Floats]:
@@ -123,6 +159,7 @@ def fit(
     unchanged: Sequence[Speech],
     seed: int,
     num_epochs: int = NUM_EPOCHS,
+    lessons: Lessons | None = None,
 ) -> tuple[LipPredictor, list[float]]:
     """Fit a model; return it and the mean loss of each epoch.
 
@@ -136,18 +173,28 @@ def fit(
         Those without augmentation, which the principal components are of.
     seed
         The same seed gives the same model.
+    num_epochs
+        Of the network, and of the teacher.
+    lessons
+        What a teacher labels.
     """
     mean, projection = principal_components(features_of(unchanged))
-    components = [components_of(each, mean, projection) for each in speech]
     units = units_of(targets)
     speakers = sorted({each.clip.speaker for each in speech})
     examples = [
-        Example(component, standardised(target, units), speakers.index(each.clip.speaker))
-        for component, target, each in zip(components, targets, speech, strict=True)
+        Example(
+            components_of(each, mean, projection),
+            standardised(target, units),
+            speakers.index(each.clip.speaker),
+        )
+        for each, target in zip(speech, targets, strict=True)
     ]
-    network, losses = train_network(examples, len(speakers), num_epochs=num_epochs, seed=seed)
+    if lessons:
+        known = [components_of(each, mean, projection) for each in lessons.speech]
+        examples += teach(lessons, examples, known, DELAYS_S, num_epochs=num_epochs, seed=seed)
+    network, losses = train_network(examples, num_epochs=num_epochs, seed=seed)
     linear = fit_ridge(
-        [history_of(component) for component in components],
+        [history_of(example.components) for example in examples],
         [canonical(example, network)[..., :_NUM_FAPS] for example in examples],
     )
     return joined(mean, projection, network, linear, units), losses

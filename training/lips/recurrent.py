@@ -34,14 +34,16 @@ _NUM_FAPS = len(LIP_FAPS)
 
 
 class LipNetwork(nn.Module):
-    """A gated recurrent unit behind a layer of rectified units."""
+    """A gated recurrent unit behind a layer of rectified units; a teacher's runs both ways."""
 
-    def __init__(self, num_components: int, num_delays: int, num_speakers: int) -> None:
+    def __init__(
+        self, num_components: int, num_delays: int, num_speakers: int, *, both_ways: bool = False
+    ) -> None:
         super().__init__()
         self.shape = (num_delays, NUM_OUTPUTS)
         self.entry = nn.Linear(num_components, UNITS)
-        self.recurrent = nn.GRU(UNITS, UNITS, batch_first=True)
-        self.output = nn.Linear(2 * UNITS, num_delays * NUM_OUTPUTS)
+        self.recurrent = nn.GRU(UNITS, UNITS, batch_first=True, bidirectional=both_ways)
+        self.output = nn.Linear((3 if both_ways else 2) * UNITS, num_delays * NUM_OUTPUTS)
         self.dropout = nn.Dropout(_DROPOUT)
         self.log_scale = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
         self.offset = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
@@ -82,7 +84,11 @@ class Example:
 
 
 def train_network(
-    examples: Sequence[Example], num_speakers: int, *, num_epochs: int, seed: int
+    examples: Sequence[Example],
+    *,
+    num_epochs: int,
+    seed: int,
+    both_ways: bool = False,
 ) -> tuple[LipNetwork, list[float]]:
     """Train; return the network and the mean loss of each epoch."""
     torch.manual_seed(seed)
@@ -90,7 +96,12 @@ def train_network(
     rng = np.random.default_rng(seed)
     pieces = _cut(examples)
     first = pieces[0]
-    network = LipNetwork(first.components.shape[1], first.targets.shape[1], num_speakers)
+    network = LipNetwork(
+        first.components.shape[1],
+        first.targets.shape[1],
+        1 + max(example.speaker for example in examples),
+        both_ways=both_ways,
+    )
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_WEIGHT_DECAY)
     num_batches = -(-len(pieces) // _BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(

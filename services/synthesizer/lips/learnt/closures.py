@@ -37,8 +37,8 @@ class ClosureRule:
     ``kouxing evaluate closures`` compares values on clips for choices, and chose these.
     """
 
-    sound: float = 1.5  # added to the sound's log odds: it rather misses a closure than invents one
-    phone: float = 3.0  # log odds that a phone adds at most
+    sound: float = 1.0  # added to the sound's log odds: it rather misses a closure than invents one
+    phone: float = 2.2  # log odds that a phone adds at most
     doubt: float = 0.8  # log odds around 0 within which lips are led part of the way
 
 
