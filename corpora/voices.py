@@ -13,10 +13,10 @@ from corpora.landmark_file import SUFFIX, read_landmark_file
 from corpora.lip_clips import LipClip, read_clip
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lip_tracks import MEASURES, lip_tracks
 from services.recognizer.lips import LIPS_PATH, LipPredictor, lips_for
 from services.recognizer.voice_learning import (
-    POSITION_S,
     FilmedSpeech,
     Material,
     VoiceGain,

@@ -19,11 +19,11 @@ from rich.table import Table
 from corpora.lip_clips import LipClip, read_clips
 from corpora.speech_corpus import may_ship
 from corpora.voices import clip_material, load_models
+from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lip_source import delay_for
 from services.recognizer.lip_tracks import MEASURES
 from services.recognizer.voice_learning import (
     FACE_DELAY_S,
-    POSITION_S,
     Material,
     correlations,
     learn_voice,

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_positions import lip_positions
+from services.recognizer.lip_positions import POSITION_S, lip_positions
 from services.recognizer.lip_source import delay_for
 from services.recognizer.lip_tracks import measures_of, values_at
 from services.recognizer.lips import LIP_FAPS, LipPredictor
@@ -44,7 +44,6 @@ Floats = NDArray[np.float32]
 STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # of the ridge, positions
 FACE_DELAY_S = 0.06  # of the face for which the gain is measured
 MIN_SPEECH_S = 10.0
-POSITION_S = 0.02
 
 _NUM_FAPS = len(LIP_FAPS)
 _BLOCK = 250  # positions that are left out together

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS
 from shared.errors import UserError
 from tests.lips import clip_of
 from tests.system import DEMO
-from training.lips.positions import POSITION_S, Speech
+from training.lips.positions import Speech
 from training.lips.recipe import DELAYS_S
 from training.lips.recurrent import Example
 from training.lips.teacher import TAUGHT_DELAY_S, Lessons, hear, read_recordings, teach

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS, LipPredictor
-from training.lips.positions import POSITION_S, Speech, components_of
+from training.lips.positions import Speech, components_of
 from training.lips.ridge import Products, history_of
 from training.lips.scores import Made, Stretch, correlations, count_closures
 from training.lips.targets import touches

@@ -20,15 +20,12 @@ from numpy.typing import NDArray
 from corpora.feature_cache import cache_folder
 from corpora.lip_clips import LipClip
 from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.features import HOP_S
 from services.recognizer.lip_positions import lip_positions
-from services.recognizer.lips import FRAMES_PER_POSITION
 from training.neural.augmentation import augment_samples, scale_level
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-POSITION_S = FRAMES_PER_POSITION * HOP_S
 _FORMAT = "2"  # raise when the positions change
 
 

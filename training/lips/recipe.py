@@ -45,7 +45,6 @@ Array = NDArray[np.float64]
 # 5 ms less than a face's delay of 0, 20, 50, 60, 100 or 160 ms: so long before a frame of the face
 # the sound of a position ends.
 DELAYS_S = (-0.005, 0.015, 0.045, 0.055, 0.095, 0.155)
-LANGUAGE = "zh"  # of the acoustic model, as the clips name it
 NUM_COPIES = 1  # augmented, of each clip
 NUM_EPOCHS = 12
 # Of the log-mel frames and of each layer's values: components, and extent of the first and of the
@@ -137,7 +136,8 @@ def train_lips(
 
 def _targets(model: NeuralModel, speech: Sequence[Speech], touch: dict[str, Touch]) -> list[Floats]:
     """Targets of every stretch, FAP units, (positions, delays, 17)."""
-    clips = {each.clip.name: each.clip for each in speech if each.clip.language == LANGUAGE}
+    code = model.inventory.code
+    clips = {each.clip.name: each.clip for each in speech if each.clip.language == code}
     phones = {
         name: label_clip(model, clip) for name, clip in track(clips.items(), description="phones")
     }

@@ -37,10 +37,11 @@ from corpora.feature_cache import as_integers, read_audio
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from corpora.speech_corpus import audio_files
 from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lips import LIP_FAPS
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
-from training.lips.positions import POSITION_S, Speech, speech_of
+from training.lips.positions import Speech, speech_of
 from training.lips.recurrent import Example, train_network
 from training.neural.network import Shape
 from training.neural.teacher import NUM_LAYERS, WholeEncoder
