@@ -39,6 +39,8 @@ def run(
     settings = read_settings(config)
     control, gateway = settings.load(ControlConfig), settings.load(GatewayConfig)
     driver = settings.load(DriverConfig)
+    for kind in KINDS.values():
+        settings.load(kind.config_type)  # nothing starts where any key is wrong
     arguments = ["--config", str(config)] if config else []
     out = Path(driver.out)
     environment = head_environment(head or driver.head, out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 from services.driver.config import DriverConfig
 from services.driver.render.renderer import Renderer
 from services.driver.render.scene import background, camera, load_head
-from services.driver.render.window import Window
 from services.driver.video.virtual_camera import VirtualCamera
 from shared.errors import UserError
 from shared.logs import LOG
+
+if TYPE_CHECKING:
+    from services.driver.render.window import Window
 
 
 class View:
@@ -89,6 +92,8 @@ class View:
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if config.view == "none" or (config.view == "auto" and not has_display):
             return None
+        from services.driver.render.window import Window  # noqa: PLC0415 - glfw starts processes
+
         head = load_head(config.head, "coarse")  # live, smooth motion is worth more than outlines
         try:
             return Window(
