@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.front_end.features import HOP_S
-from services.recognizer.lips import FRAMES_PER_POSITION, features_at
+from services.recognizer.lips import features_at
 from services.recognizer.speech_scores import SpeechScores
 from shared.clock import MEDIA_RATE_HZ
 from shared.phones.events import LipFrame

@@ -46,7 +46,7 @@ from scipy.special import expit
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
-from services.recognizer.acoustic.network import NUM_INPUTS
+from services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.front_end.whisper_mel import NUM_MELS
 from services.recognizer.voice import Voice, parse_profile
@@ -63,7 +63,6 @@ LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 OTHER_SIDE = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
 CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outputs, after the FAPs
 NUM_OUTPUTS = len(LIP_FAPS) + 2
-FRAMES_PER_POSITION = 2
 NUM_LAYERS = 2  # of the network, the last ones
 
 _MAX_DELAYS, _MAX_DELAY_S = 16, 1.0

@@ -20,6 +20,7 @@ from services.recognizer.acoustic.acoustic_model import (
     ScoringTask,
     run_scoring_tasks,
 )
+from services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from services.recognizer.acoustic.neural import NeuralStream
 from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
 from services.recognizer.front_end.resample import Resampler
@@ -28,8 +29,7 @@ from services.recognizer.lip_source import LipFrameStream
 from shared.phones.events import LipFrame
 
 PRE_ROLL_S = 0.20  # sound before the detector's decision that counts as speech: weak consonants
-# The first position of the network has seen the frames 0 to 2, each further one two more.
-_FIRST_NEWEST_FRAME, _FRAMES_PER_POSITION = 2, 2
+_FIRST_NEWEST_FRAME = 2  # the last one that the network's first position has seen
 # Speech begins at an odd frame. So every position ends POSITION_LAG_S before a multiple of 20 ms.
 _FIRST_FRAME_PARITY = 1
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
@@ -143,9 +143,9 @@ class SpeechScores:
     def _detect(self) -> ScoringTask[list[ScoreEvent]]:
         """Begin or end speech by the block that is complete."""
         speech = self._detector.accept_block(self._block).is_speech
-        if speech and not self._speaking and len(self._recent) >= _FRAMES_PER_POSITION:
+        if speech and not self._speaking and len(self._recent) >= FRAMES_PER_POSITION:
             self._speaking = True
-            if (self._num_frames - len(self._recent)) % _FRAMES_PER_POSITION != _FIRST_FRAME_PARITY:
+            if (self._num_frames - len(self._recent)) % FRAMES_PER_POSITION != _FIRST_FRAME_PARITY:
                 self._recent.popleft()
             start = SpeechStart(self._num_frames - len(self._recent))
             self._next_newest = start.frame + _FIRST_NEWEST_FRAME
@@ -170,7 +170,7 @@ class SpeechScores:
 
     def _take_position(self, frames: NDArray[np.float32], values: NDArray[np.float32]) -> None:
         """Pass on what the network has computed at a position."""
-        newest, self._next_newest = self._next_newest, self._next_newest + _FRAMES_PER_POSITION
+        newest, self._next_newest = self._next_newest, self._next_newest + FRAMES_PER_POSITION
         # At the end of a segment the network sees its last frame again: no sound, no lips.
         if self._lips is not None and newest < self._num_frames:
             known_s = newest * HOP_S + WINDOW_S

@@ -21,11 +21,11 @@ from rich.progress import track
 from corpora.lip_clips import label_clip, read_clips
 from corpora.speech_corpus import may_ship
 from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.front_end.whisper_mel import NUM_MELS
 from services.recognizer.lips import (
     CLOSURE,
-    FRAMES_PER_POSITION,
     LIP_FAPS,
     NUM_LAYERS,
     NUM_OUTPUTS,

@@ -21,6 +21,7 @@ NUM_INPUTS = NUM_MELS
 WINDOW = 128  # positions that one attends to, itself included
 MAX_POSITIONS = 1500  # rows of the table of positions
 SEEN_FRAMES = 5  # feature frames that enter at one position
+FRAMES_PER_POSITION = 2  # feature frames from one position to the next
 
 _OUTPUTS = ["log_posteriors", "keys", "values"]
 _MIN_WIDTH, _MAX_WIDTH = 4, 4096
