@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
+
+from services.recognizer.onnx_session import open_network
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -51,8 +52,8 @@ class FaceMesh:
     """Follows the face in the pictures of a video."""
 
     def __init__(self) -> None:
-        self._detector = _session("face_detector.onnx")
-        self._mesh = _session("face_mesh.onnx")
+        self._detector = open_network((_MODELS / "face_detector.onnx").read_bytes())
+        self._mesh = open_network((_MODELS / "face_mesh.onnx").read_bytes())
         self._anchors = _anchors()
         self._face: _Square | None = None  # where it was last
 
@@ -104,12 +105,6 @@ class FaceMesh:
         centre, size, right_eye, left_eye = boxes[0, best, :8].reshape(4, 2).astype(np.float64)
         origin = whole.to_picture(self._anchors[best] + centre / _DETECTOR_PX - 0.5)
         return _face_square(origin, whole.side * size / _DETECTOR_PX, left_eye - right_eye)
-
-
-def _session(name: str) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(_MODELS / name, options, providers=["CPUExecutionProvider"])
 
 
 def _anchors() -> Array:

@@ -186,14 +186,16 @@ def bench(
     json_file: JsonFile = None,
 ) -> None:
     """Measure latency, CPU and images per second of the whole chain on this machine."""
-    from evaluation.system import latency, rendering
+    from evaluation.system import latency, rendering, sessions
 
     delays = latency.measure(audio, repeats, CONSOLE)
+    costs = sessions.measure(audio)
     pictures = rendering.measure()
     out = Console()
     latency.show(delays, out)
+    sessions.show(costs, out)
     rendering.show(pictures, out)
-    write_json(json_file, asdict(delays) | {"rendering": asdict(pictures)})
+    write_json(json_file, asdict(delays) | {"sessions": costs, "rendering": asdict(pictures)})
 
 
 @plot_app.callback()

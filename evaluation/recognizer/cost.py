@@ -1,4 +1,4 @@
-"""CPU cost of the recognizer, by stage and with many sessions."""
+"""CPU cost of the recognizer, by stage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetect
 from services.recognizer.search.decoder import Decoder
 
 CHUNK_SAMPLES = 160  # 10 ms, as sound arrives live
-_BATCH_SIZE = 16  # sessions that are scored together
 
 
 def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, float]:
@@ -50,28 +49,3 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         "acoustic_model": run(stream.accept, np.split(frames, len(frames))),
         "decoder": run(decoder.accept, scores),
     }
-
-
-def sessions_per_core(
-    model: AcousticModel, samples: NDArray[np.float32], cost: dict[str, float]
-) -> float:
-    """Sessions that one core can recognise when 16 are scored together, on chunks of 10 ms.
-
-    Parameters
-    ----------
-    model
-        The acoustic model.
-    samples
-        A recording, shape (n,), 16 kHz.
-    cost
-        Result of :func:`cpu_by_stage`. The resampler is left out, because sound at 16 kHz does not
-        need it.
-    """
-    frames = model.front_end().accept_waveform(samples)
-    streams = [model.stream() for _ in range(_BATCH_SIZE)]
-    begin = time.process_time()
-    for frame in range(len(frames)):
-        model.score([(stream, frames[frame : frame + 1]) for stream in streams])
-    scoring = (time.process_time() - begin) * SAMPLE_RATE_HZ / len(samples) / _BATCH_SIZE
-    other_stages = ("voice_activity", "front_end", "decoder")
-    return 1 / (scoring + sum(cost[stage] for stage in other_stages))

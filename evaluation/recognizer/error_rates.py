@@ -38,7 +38,7 @@ from corpora.scoring import (
 )
 from corpora.speech_corpus import RowErrors, Utterance, read_corpus
 from evaluation.recognizer.confusions import Confusions
-from evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage, sessions_per_core
+from evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage
 from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
 from services.recognizer.alignment import align_phones, spoken
 from services.recognizer.front_end.features import SAMPLE_RATE_HZ
@@ -206,8 +206,7 @@ def evaluate_recognizer(
         "phones": list(inventory.phones),
         "silence": inventory.silence,
         "confusions": confusions.counts.tolist(),
-        "cpu_per_audio_second": (cost := cpu_by_stage(model, read_audio(used[0].path))),
-        "sessions_per_core": sessions_per_core(model, read_audio(used[0].path), cost),
+        "cpu_per_audio_second": cpu_by_stage(model, read_audio(used[0].path)),
     }
 
 

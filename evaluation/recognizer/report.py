@@ -28,7 +28,6 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
         cost = figures["cpu_per_audio_second"]
         parts = ", ".join(f"{stage} {seconds:.4f}" for stage, seconds in cost.items())
         console.print(f"CPU seconds per second of sound: {parts}; all {sum(cost.values()):.4f}")
-        console.print(f"Sessions per core, scored together: {figures['sessions_per_core']:.0f}")
     if len(results) > 1:
         console.print(_side_by_side(results))
     messages = dict.fromkeys(line for figures in results.values() for line in figures["bad_rows"])

@@ -42,7 +42,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
@@ -209,8 +208,8 @@ class LipPredictorStream:
                 time_s=known_s - delay_s,
                 delay_s=delay_s,
                 faps=mouth_faps(row[: len(LIP_FAPS)]),
-                closure=_probability(row[CLOSURE]),
-                lip_to_teeth=_probability(row[LIP_TO_TEETH]),
+                closure=float(_sigmoid(row[CLOSURE])),
+                lip_to_teeth=float(_sigmoid(row[LIP_TO_TEETH])),
             )
             for delay_s, row in zip(self._delays_s, outputs, strict=True)
         ]
@@ -225,7 +224,7 @@ class LipPredictorStream:
         from_input = entered @ model.input_weights + model.input_bias
         from_state = self._state @ model.state_weights + model.state_bias
         size = len(self._state)
-        gates = expit(from_input[: 2 * size] + from_state[: 2 * size])
+        gates = _sigmoid(from_input[: 2 * size] + from_state[: 2 * size])
         reset, update = gates[:size], gates[size:]
         new = np.tanh(from_input[2 * size :] + reset * from_state[2 * size :])
         self._state = (1 - update) * new + update * self._state
@@ -255,8 +254,11 @@ def _columns_of(weights: Floats, delays: Sequence[int]) -> Floats:
     return np.ascontiguousarray(weights[..., list(delays), :])
 
 
-def _probability(log_odds: np.float32) -> float:
-    return float(expit(log_odds))
+def _sigmoid(x: Floats) -> Floats:
+    """Return 1 / (1 + exp(-x)); this form cannot overflow."""
+    half = np.float32(0.5)
+    probability: Floats = half * np.tanh(half * x) + half
+    return probability
 
 
 def load_lips(path: Path = LIPS_PATH) -> LipPredictor:

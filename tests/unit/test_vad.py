@@ -9,6 +9,7 @@ from shared.audio_file import read_audio
 pytestmark = pytest.mark.unit
 
 DEMO = Path(__file__).parents[2] / "shared" / "demo"
+HELLO = read_audio(DEMO / "hello-female.wav")[0].reshape(-1)
 QUIET, SPEAKING, STOPPING = VoiceState
 
 
@@ -45,15 +46,26 @@ def test_three_states() -> None:
 def test_reset_gives_the_same_again() -> None:
     samples = np.random.default_rng(0).normal(0, 0.1, BLOCK_SAMPLES).astype(np.float32)
     detector = VoiceActivityDetector()
-    first = detector._network.process_samples(samples.tolist())
+    first = [detector.speech_probability(samples) for _ in range(2)]
+    assert first[0] != first[1]  # it remembers
     detector.reset()
-    assert detector._network.process_samples(samples.tolist()) == first
+    assert [detector.speech_probability(samples) for _ in range(2)] == first
+
+
+def test_detectors_share_the_network_only() -> None:
+    blocks = HELLO[: 20 * BLOCK_SAMPLES].reshape(-1, BLOCK_SAMPLES)
+    detector, other = VoiceActivityDetector(), VoiceActivityDetector()
+    alone = [detector.speech_probability(block) for block in blocks]
+    detector.reset()
+    beside = []
+    for block in blocks:
+        beside.append(detector.speech_probability(block))
+        other.speech_probability(-block[::-1])
+    assert beside == alone
 
 
 def test_speech_is_speech() -> None:
-    samples, rate_hz = read_audio(DEMO / "hello-female.wav")
-    heard = states(samples.reshape(-1))
-    assert rate_hz == 16_000
+    heard = states(HELLO)
     assert heard[0] is QUIET
     assert heard.count(SPEAKING) > 0.7 * len(heard)
     # the speech begins at about 0.38 s; it is noticed within 70 ms

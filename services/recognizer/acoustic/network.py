@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from services.recognizer.front_end.whisper_mel import NUM_MELS
+from services.recognizer.onnx_session import open_network
 
 NUM_INPUTS = NUM_MELS
 WINDOW = 128  # positions that one attends to, itself included
@@ -92,13 +92,9 @@ class NetworkSession:
     """
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
         try:
-            self._session = onnxruntime.InferenceSession(
-                file.tobytes(), options, providers=["CPUExecutionProvider"]
-            )
-        except Exception as error:  # onnxruntime's errors have no base of their own
+            self._session = open_network(file.tobytes())
+        except Exception as error:
             raise ValueError(f"its network cannot be read ({error})") from error
         self.sizes = _sizes_of({node.name: node.shape for node in self._session.get_inputs()})
 

@@ -69,5 +69,6 @@ def level_db(samples: NDArray[np.float32]) -> float:
     """Return the RMS level in decibels relative to full scale; -120 is silence."""
     if len(samples) == 0:
         return -120.0
-    power = float(np.mean(np.square(samples, dtype=np.float64)))
+    exact = samples.astype(np.float64)
+    power = float(exact @ exact) / len(exact)
     return max(-120.0, 10.0 * math.log10(power + 1e-12))

@@ -120,8 +120,8 @@ class Resampler:
             raise UserError(f"samples have shape {samples.shape}; expected {expected}")
         if not np.isfinite(samples).all():
             raise UserError("samples hold values that are not finite; send values in [-1, 1]")
-        mono = samples.reshape(len(samples), self._num_channels)
-        clipped: NDArray[np.float32] = np.clip(mono.mean(axis=1), -1.0, 1.0).astype(np.float32)
+        mono = samples.mean(axis=1) if self._num_channels > 1 else samples.reshape(-1)
+        clipped: NDArray[np.float32] = np.clip(mono, -1.0, 1.0).astype(np.float32)
         return clipped
 
 

@@ -22,8 +22,6 @@ import re
 import unicodedata
 from functools import lru_cache
 
-from pypinyin import Style, lazy_pinyin
-
 from shared.errors import UserError
 
 # Longest first, so that zh is not read as z + h.
@@ -128,6 +126,8 @@ def pinyin_of_text(text: str) -> tuple[str, ...]:
         raise UserError(
             f"cannot read {foreign.group()!r} as Mandarin; write it out in Chinese characters"
         )
+    from pypinyin import Style, lazy_pinyin  # noqa: PLC0415 (0.3 s; not all that know phones read)
+
     syllables = lazy_pinyin(
         text,
         style=Style.TONE3,

@@ -1,0 +1,64 @@
+"""CPU cost of one recognizer with several sessions at once: all that it does but messages."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.front_end.resample import to_16_khz
+from services.recognizer.lips import LipPredictor, lips_for
+from services.recognizer.recognizer import warm_up
+from services.recognizer.stream import SpeechStream
+from shared.audio_file import read_audio
+from shared.clock import MEDIA_RATE_HZ
+
+NUM_SESSIONS = (1, 16)
+_CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
+
+
+def measure(path: Path) -> dict[str, float]:
+    """Return CPU seconds per second of sound and session, by sessions, without and with lips."""
+    samples = to_16_khz(*read_audio(path))
+    model = load_model()
+    warm_up(model)
+    return {
+        f"{number} with lips" if lips else str(number): _cpu_s(model, lips, samples, number)
+        for number in NUM_SESSIONS
+        for lips in (None, lips_for(model))
+    }
+
+
+def show(costs: dict[str, float], console: Console) -> None:
+    """Print the costs as a table."""
+    table = Table("sessions of a recognizer", "CPU s per s of audio, each")
+    for name, value in costs.items():
+        table.add_row(name, f"{value:.3f}")
+    console.print(table)
+
+
+def _cpu_s(
+    model: AcousticModel,
+    lips: LipPredictor | None,
+    samples: NDArray[np.float32],
+    num_sessions: int,
+) -> float:
+    """Let every session go once around the recording, each from a place of its own."""
+    streams = [SpeechStream(model, lips=lips) for _ in range(num_sessions)]
+    starts = np.arange(num_sessions) * len(samples) // num_sessions
+    sounds = [np.roll(samples, -start) for start in starts]
+    begin_s = time.process_time()
+    for at in range(0, len(samples), _CHUNK):
+        tasks = [
+            stream.process([(at, sound[at : at + _CHUNK])])
+            for stream, sound in zip(streams, sounds, strict=True)
+        ]
+        run_scoring_tasks(model, tasks)
+    cpu_s = time.process_time() - begin_s
+    return cpu_s * MEDIA_RATE_HZ / len(samples) / num_sessions

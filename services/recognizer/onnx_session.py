@@ -1,0 +1,14 @@
+"""Networks are opened in one place: ONNX files, run by onnxruntime on one thread."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import onnxruntime
+
+
+def open_network(file: bytes) -> Any:
+    """Return the ``onnxruntime.InferenceSession`` of an ONNX file; its errors have no base."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
