@@ -25,8 +25,9 @@ demo: setup
 
 setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(PAGE)/head.glb
 
+# Two processes: one for the tests that start services, both for the others.
 test: .venv/installed-dev setup $(RIVALS)/node_modules/.package-lock.json
-	$(BIN)/python -m pytest
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder
 	$(NPM) $(PAGE) test
 
 quick: .venv/installed-dev $(RIVALS)/node_modules/.package-lock.json

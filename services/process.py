@@ -32,6 +32,7 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
     UserError
         If the configuration is wrong.
     """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while it starts is no error
     kind = KINDS[name]
     config = read_settings(file).load(kind.config_type, parse_assignments(assignments))
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # peers come and go

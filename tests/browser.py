@@ -62,7 +62,7 @@ class Browser:
         self._num_sent = 0
         self.complaints: list[str] = []
         port_file = folder / "DevToolsActivePort"
-        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), 20)
+        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), 60)
         self._port = int(port_file.read_text().split()[0])
         self._loop.run_until_complete(self._connect())
         self.command("Runtime.enable")
@@ -90,7 +90,7 @@ class Browser:
         self._loop.run_until_complete(close())
         self._loop.close()
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(60)
 
     def command(self, method: str, **parameters: object) -> dict[str, Any]:
         """Run a command of the protocol."""
@@ -101,7 +101,7 @@ class Browser:
         message = {"id": self._num_sent, "method": method, "params": parameters}
         await self._socket.send_json(message)
         while True:
-            answer = await self._socket.receive_json(timeout=20)
+            answer = await self._socket.receive_json(timeout=60)
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
                 self.complaints.append(json.dumps(answer["params"]))
             if answer.get("id") == self._num_sent:
@@ -130,7 +130,7 @@ class Browser:
                 "Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", clickCount=1
             )
 
-    def wait_for(self, condition: str, limit_s: float = 20) -> None:
+    def wait_for(self, condition: str, limit_s: float = 60) -> None:
         """Wait until an expression becomes true."""
         try:
             wait_until(lambda: bool(self.evaluate(condition)), limit_s)
@@ -146,7 +146,7 @@ class Browser:
             images.append(self.image())
             return np.array_equal(images[-1], images[-2])
 
-        wait_until(is_steady, 15)
+        wait_until(is_steady, 60)
         return images[-1]
 
     def image(self) -> NDArray[np.uint8]:

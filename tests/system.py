@@ -21,6 +21,7 @@ from shared.wire.control import StatusReport
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
+PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
 
 
@@ -89,6 +90,7 @@ class System:
             **os.environ,
             **ONE_THREAD,
             **headless(folder),
+            **PATIENT,
             **addresses,
             **(settings or {}),
         }
@@ -110,7 +112,7 @@ class System:
             process.terminate()
         for service, process in self.processes.items():
             try:
-                process.wait(15)
+                process.wait(60)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -143,7 +145,7 @@ class System:
         )
 
     def wait_until(
-        self, condition: Callable[[StatusReport], bool], deadline_s: float = 60.0
+        self, condition: Callable[[StatusReport], bool], deadline_s: float = 110.0
     ) -> None:
         """Wait until control reports what is wanted; no service may end meanwhile."""
         end_s = time.monotonic() + deadline_s

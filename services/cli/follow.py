@@ -41,7 +41,7 @@ def follow(session: str, output: Path | None, control: str, console: Console) ->
         with console.status(f"waiting for session {session}"):
             while (endpoints := _endpoints(session, client)) is None:
                 time.sleep(OPEN_POLL_S)
-        frames = _frames(session, endpoints, client)
+        frames = _frames(session, endpoints, client, console)
         try:
             if output is None:
                 num_frames = _print(frames, sys.stdout, _as_row)
@@ -63,12 +63,17 @@ def _endpoints(session: str, client: Client) -> dict[str, str] | None:
     return None
 
 
-def _frames(session: str, endpoints: dict[str, str], client: Client) -> Iterator[FapFrame]:
+def _frames(
+    session: str, endpoints: dict[str, str], client: Client, console: Console
+) -> Iterator[FapFrame]:
     """Yield frames, wherever the session moves, until it ends or the user interrupts."""
     frames: deque[FapFrame] = deque()
     loop = PollingLoop(client.bus)
     follower = SessionFollower(
-        loop, session, {FapFrame: frames.append, EndOfFaps: lambda _end: None}
+        loop,
+        session,
+        {FapFrame: frames.append, EndOfFaps: lambda _end: None},
+        on_complete=lambda: console.print(f"following session {session}", highlight=False),
     )
     follower.start(0, endpoints)
     try:

@@ -7,6 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import zmq
 
 from shared.bus import Bus, Socket
 from shared.client import Client, Refused, Session
-from shared.wire.audio import AudioChunk, EndOfAudio
+from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import Heartbeat, SessionInput
 from shared.wire.face import FapFrame
 from shared.wire.message import Message
@@ -39,7 +40,7 @@ def witness(system: System, client: Client) -> Iterator[Session]:
     output = opened.subscribe(FapFrame)
     yield opened
     opened.send(samples_of_file(DEMO / "hello-female.wav")[:16000])
-    end_s = time.monotonic() + 10
+    end_s = time.monotonic() + 60
     num_frames = 0
     while num_frames < 40:
         assert time.monotonic() < end_s, "the other session does not go on"
@@ -49,7 +50,7 @@ def witness(system: System, client: Client) -> Iterator[Session]:
     system.assert_all_alive()
 
 
-def answers(socket: Socket, deadline_s: float = 5.0) -> Iterator[Error]:
+def answers(socket: Socket, deadline_s: float = 60.0) -> Iterator[Error]:
     end_s = time.monotonic() + deadline_s
     while time.monotonic() < end_s:
         socket.wait(0.1)
@@ -59,7 +60,7 @@ def answers(socket: Socket, deadline_s: float = 5.0) -> Iterator[Error]:
 
 
 def first_error(session: Session) -> Error:
-    end_s = time.monotonic() + 5
+    end_s = time.monotonic() + 60
     while time.monotonic() < end_s:
         for error in session.errors():
             return error
@@ -73,7 +74,7 @@ def test_nan_is_refused_and_the_session_goes_on(client: Client, witness: Session
     assert first_error(session).code == "bad-audio"
     output = session.subscribe(FapFrame)
     session.send(np.zeros(8000, np.float32))
-    assert output.wait(5.0)
+    assert output.wait(60.0)
     session.close()
 
 
@@ -83,7 +84,7 @@ def test_a_bad_voice_is_refused_and_the_session_goes_on(client: Client, witness:
     session.send(np.zeros(8000, np.float32))
     error = first_error(session)
     assert (error.code, "no voice" in error.text) == ("bad-voice", True)
-    assert output.wait(5.0)
+    assert output.wait(60.0)
     session.close()
     with pytest.raises(Refused, match="bad-message"):
         client.open_session(voice=bytes(70_000))
@@ -104,7 +105,7 @@ def test_empty_chunks_and_silence_and_clipping_are_taken(client: Client, witness
     session.send(np.zeros(0, np.float32))
     session.send(np.zeros(8000, np.float32))
     session.send(np.full(8000, 1e9, np.float32))
-    end_s = time.monotonic() + 10
+    end_s = time.monotonic() + 60
     newest = -1
     while newest < 12000:
         assert time.monotonic() < end_s
@@ -137,8 +138,9 @@ def test_a_foreign_token_and_a_replay_are_refused(client: Client, witness: Sessi
         client.close_session(witness.name, "guess")
     assert caught.value.code == "bad-token"
     token = witness.opened.token
+    output = witness.subscribe(Sound)
     witness.send(np.zeros(320, np.float32))
-    time.sleep(0.2)
+    assert output.wait(60.0)
     thief.send(AudioChunk(session=witness.name, token=token, sequence=1, pcm=b""))
     assert next(answers(thief)).code == "replayed"
 
@@ -251,7 +253,7 @@ def test_a_gap_in_media_time_keeps_the_new_time(client: Client, witness: Session
                 pcm=pcm,
             )
         )
-    newest, end_s = 0, time.monotonic() + 10
+    newest, end_s = 0, time.monotonic() + 60
     while newest < 162_000:
         assert time.monotonic() < end_s, newest
         output.wait(0.1)
@@ -289,7 +291,7 @@ def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
             )
         )
     times: list[int] = []
-    end_s = time.monotonic() + 10
+    end_s = time.monotonic() + 60
     while not times or times[-1] < later:
         assert time.monotonic() < end_s
         output.wait(0.1)
@@ -344,12 +346,13 @@ def test_an_observer_that_never_answers_delays_no_session(
 ) -> None:
     with Bus() as bus:
         mute = bus.connect_dealer(system.control)
-        mute.send(
-            Heartbeat(service="gateway", instance="mute", role="observer", state="ready", sent_ns=0)
+        heartbeat = Heartbeat(
+            service="gateway", instance="mute", role="observer", state="ready", sent_ns=0
         )
-        time.sleep(0.2)
-        session = client.open_session(encoding="f32le")
-        session.close()
+        mute.send(heartbeat)
+        assert mute.wait(60.0), "control knows it"
+        client.open_session(encoding="f32le").close()
+        mute.send(replace(heartbeat, state="draining"))
 
 
 def test_a_client_that_goes_away_leaves_no_trace(system: System, witness: Session) -> None:

@@ -79,12 +79,14 @@ def test_frames_do_not_depend_on_the_chunks(
 
 def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
     samples = samples_of_file(DEMO / "vowels-male.wav")
-    for _ in range(3):  # a machine that stalls for 0.2 s gets frames of rest in between
-        live = stream(system.control, samples, paced=True)
-        if (np.diff([frame.media_time for frame in live.frames]) > 0).all():
-            break
     fast = stream(system.control, samples)
-    np.testing.assert_allclose(live.faps[: len(fast.faps)], fast.faps, atol=1e-3)
+    end_s = time.monotonic() + 90
+    while True:
+        live = stream(system.control, samples, paced=True)
+        if [frame.sequence for frame in live.frames] == [frame.sequence for frame in fast.frames]:
+            break  # a machine that stalls for 0.2 s gets frames of rest before, or in between
+        assert time.monotonic() < end_s, "this machine stalls too often for real time"
+    np.testing.assert_allclose(live.faps, fast.faps, atol=1e-3)
 
 
 @pytest.mark.parametrize(("rate_hz", "chunk"), [(48000, 128), (44100, 97)])
@@ -148,6 +150,7 @@ def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
         before = _frames_until(output, lambda frame: frame.media_time >= 24000 - DELAY)
         assert _opening(before[-1]) > 50, "the mouth is open in mid-sentence"
         session.flush()
+        client.open_session().close()  # every service has what control told it before
         session.send(np.zeros(8000, np.float32))
         after = _frames_until(output, lambda frame: frame.media_time >= 32000 - 3200)
         session.close()
@@ -162,7 +165,7 @@ def _opening(frame: FapFrame) -> float:
 def _frames_until(output: Subscription, last: Callable[[FapFrame], bool]) -> list[FapFrame]:
     """Return the frames up to the first that ``last`` holds for."""
     frames: list[FapFrame] = []
-    end_s = time.monotonic() + 30
+    end_s = time.monotonic() + 60
     while time.monotonic() < end_s:
         output.wait(0.1)
         for received in output.receive():

@@ -45,7 +45,7 @@ class Stranger:
     def socket(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
         made = self.context.socket(kind)
         made.setsockopt(zmq.LINGER, 1000)
-        made.setsockopt(zmq.RCVTIMEO, 20000)
+        made.setsockopt(zmq.RCVTIMEO, 60000)
         made.connect(endpoint)
         return made
 
@@ -216,13 +216,14 @@ def test_the_example_in_the_document_runs(spread: System) -> None:
 def test_services_share_no_folder_and_say_what_they_are(spread: System, tmp_path: Path) -> None:
     stranger = Stranger()
     control = stranger.socket(zmq.DEALER, spread.control)
-    end_s = time.monotonic() + 10
+    end_s = time.monotonic() + 60
     while True:
         send(control, "status-request", "", request=str(time.monotonic()))
         _, report = receive(control)
         offsets = {s["service"]: s["clock_offset_ms"] for s in report["services"]}
-        if set(offsets) == set(HOSTS) or time.monotonic() > end_s:
+        # One clock here, so the offsets are small.
+        if set(offsets) == set(HOSTS) and np.abs(list(offsets.values())).max() < 50:
             break
-    assert set(offsets) == set(HOSTS)
-    assert np.abs(list(offsets.values())).max() < 50, "one clock here, so the offsets are small"
+        assert time.monotonic() < end_s, offsets
+        time.sleep(0.1)
     stranger.close()

@@ -58,7 +58,7 @@ def browser(system: System, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     gateway = Gateway(system.address, free_port())
     browser = Browser(folder, DEMO / "hello-female.wav", folder / "head.mjpeg")
     with Client(system.address) as client:
-        wait_until(lambda: len(client.status().services) == 4, 30)
+        wait_until(lambda: len(client.status().services) == 4, 60)
     browser.command("Page.navigate", url=gateway.page)
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
     yield browser
@@ -90,7 +90,7 @@ def longer(recording: bytes) -> bytes:
     num_frames = json.loads(recording[4:size])["times"]
     points = np.frombuffer(recording, "<f4", 3 * len(LANDMARKS), size + 8 * num_frames)
     samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", dtype="int16")
-    sound = np.tile(samples, 4)
+    sound = np.tile(samples, 3)
     time_s = np.arange(0, len(sound) / rate_hz - 0.1, 0.04)
     starts = (time_s * rate_hz).astype(int)
     loudness = np.sqrt([np.square(sound[at : at + 1600].astype(float)).mean() for at in starts])
@@ -133,7 +133,7 @@ def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Brow
     assert system.recognizer is not None
     (start,) = system.recognizer.starts.values()
     assert start.voice == profile
-    wait_until(lambda: system.synthesizer.chosen == [(start.session, "learnt")], 10)
+    wait_until(lambda: system.synthesizer.chosen == [(start.session, "learnt")], 60)
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")
 

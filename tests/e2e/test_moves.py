@@ -20,7 +20,7 @@ SETTINGS = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
 def test_a_session_goes_on_elsewhere_when_its_worker_is_killed(
     tmp_path: Path, service: str
 ) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")[:80000]
+    samples = samples_of_file(DEMO / "hello-female.wav")[:56000]
     services = ("control", "recognizer", "synthesizer")
     with System(services, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
         session = client.open_session(encoding="f32le")
@@ -38,7 +38,7 @@ def test_a_session_goes_on_elsewhere_when_its_worker_is_killed(
         session.close()
         system.assert_all_alive()
 
-    assert (before.epoch, after.epoch) == (1, 2)
+    assert before.epoch == 1 < after.epoch
     moved = {
         name
         for name in ("audio", "phones", "faps")
@@ -46,9 +46,9 @@ def test_a_session_goes_on_elsewhere_when_its_worker_is_killed(
     }
     assert moved == ({"audio", "phones"} if service == "recognizer" else {"faps"})
     assert missing_samples(collected, len(samples)) == 0, "the lost audio was sent again"
-    later = [phone for phone in collected.phones if phone.epoch == 2]
+    later = [phone for phone in collected.phones if phone.epoch == after.epoch]
     assert any(phone.final for phone in later)
-    frames = [frame for frame in collected.frames if frame.epoch == 2]
+    frames = [frame for frame in collected.frames if frame.epoch == after.epoch]
     assert max(np.frombuffer(frame.values, "<f4")[OPEN_JAW] for frame in frames) > 100
     assert frames[-1].media_time >= len(samples)
 

@@ -87,7 +87,7 @@ def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Itera
 @pytest.fixture(scope="module")
 def session(system: System, gateway: Gateway) -> Iterator[Session]:
     with Client(system.address) as client:
-        wait_until(lambda: len(client.status().services) == 4, 30)
+        wait_until(lambda: len(client.status().services) == 4, 60)
         yield client.open_session(session="seen")
 
 
@@ -241,21 +241,16 @@ def test_sound_waits_for_a_click_where_the_browser_wants_one_and_then_meets_its_
     browser.wait_for("window.kouxing.state.sound === 'on'")
     played = browser.evaluate("window.kouxing.state.soundSamplesPlayed")
     browser.wait_for(f"window.kouxing.state.soundSamplesPlayed > {played + 16000}")
-    # Both are null while the sound waits for more, as it may on a busy machine.
-    settled = "state.playoutDelayMs !== null && state.playoutDelayMs < 400"
-    held = f"((state) => {settled} && state.soundMinusPictureMs !== null ? state : null)"
-    states: list[dict[str, Any]] = []
 
-    def is_settled() -> bool:
-        state = browser.evaluate(f"{held}(window.kouxing.state)")
-        if state is not None:
-            states.append(state)
-        return bool(states)
+    def is_in_sync() -> bool:
+        state = browser.evaluate("window.kouxing.state")
+        delay_ms, sound_ms = state["playoutDelayMs"], state["soundMinusPictureMs"]
+        if delay_ms is None or sound_ms is None:  # the sound waits for more
+            return False
+        # 45 ms are detectable according to ITU-R BT.1359.
+        return bool(LOOK_AHEAD_MS - 20 < delay_ms < 400 and abs(sound_ms) < 45)
 
-    wait_until(is_settled, 20)
-    (state,) = states
-    assert state["playoutDelayMs"] > LOOK_AHEAD_MS - 20
-    assert abs(state["soundMinusPictureMs"]) < 45  # detectable according to ITU-R BT.1359
+    wait_until(is_in_sync, 60)  # a busy machine takes some time
 
 
 def test_the_face_goes_to_rest_when_the_stream_stalls_and_comes_back(
@@ -264,9 +259,9 @@ def test_the_face_goes_to_rest_when_the_stream_stalls_and_comes_back(
     system.talk(session.name, A_FACE, "a")
     browser.wait_for("window.kouxing.state.faps[2] > 440")
     system.shown = None
-    browser.wait_for("window.kouxing.state.faps.every((value) => Math.abs(value) < 1)", 3)
+    browser.wait_for("window.kouxing.state.faps.every((value) => Math.abs(value) < 1)")
     system.shown = A_FACE
-    browser.wait_for("window.kouxing.state.faps[2] > 440", 3)
+    browser.wait_for("window.kouxing.state.faps[2] > 440")
 
 
 def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser) -> None:
@@ -276,11 +271,11 @@ def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser)
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.microphone")
     (name,) = set(recognizer.starts) - {"seen"}
-    wait_until(lambda: len(recognizer.pcm.get(name, b"")) > 2 * 48000, 10)
+    wait_until(lambda: len(recognizer.pcm.get(name, b"")) > 2 * 48000, 60)
     browser.wait_for(f"window.kouxing.state.session === '{name}'")
     assert browser.evaluate("window.kouxing.state.sound") == "off"  # one's own voice
     browser.click("microphone")
-    wait_until(lambda: name in recognizer.finished, 5)
+    wait_until(lambda: name in recognizer.finished, 60)
     browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
 
     start = recognizer.starts[name]
@@ -331,4 +326,4 @@ def test_the_page_connects_again_by_itself(
     browser.wait_for("!window.kouxing.state.connected")
     assert "connecting" in browser.evaluate("document.getElementById('status').textContent")
     gateway.process = Gateway(system.address, port).process
-    browser.wait_for("window.kouxing.state.connected", 15)
+    browser.wait_for("window.kouxing.state.connected")

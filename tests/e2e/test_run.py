@@ -50,7 +50,7 @@ def test_it_runs_until_it_is_interrupted(tmp_path: Path) -> None:
         spoken = kouxing("speak", SENTENCE, environment=environment)
         assert spoken.returncode == 0, spoken.stderr
         running.send_signal(signal.SIGINT)
-        _, log = running.communicate(timeout=30)
+        _, log = running.communicate(timeout=60)
     finally:
         running.kill()
         running.communicate()

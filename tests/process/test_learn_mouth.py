@@ -93,7 +93,7 @@ Use = Callable[[Gateway, aiohttp.ClientSession], Coroutine[None, None, None]]
 def run(script: str, use: Use) -> None:
     async def serve_and_use() -> None:
         async with serve(script) as gateway, aiohttp.ClientSession() as http:
-            await asyncio.wait_for(use(gateway, http), 20)
+            await asyncio.wait_for(use(gateway, http), 100)
 
     asyncio.run(serve_and_use())
 

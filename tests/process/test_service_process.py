@@ -37,11 +37,32 @@ def test_every_service_stops_cleanly_on_sigterm(tmp_path: Path) -> None:
         processes = dict(system.processes)
         for process in processes.values():
             process.send_signal(signal.SIGTERM)
-        statuses = {service: process.wait(15) for service, process in processes.items()}
+        statuses = {service: process.wait(60) for service, process in processes.items()}
     assert statuses == dict.fromkeys(processes, 0)
     for service in processes:
         assert '"message": "stopped"' in system.log(service)
         assert "traceback" not in system.log(service).lower()
+
+
+def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
+    addresses = free_addresses(["recognizer"])
+    port = int(addresses[variable("recognizer", "audio")].rpartition(":")[2])
+    process = subprocess.Popen(
+        [sys.executable, "-m", "services.recognizer"],
+        env={**os.environ, **addresses},
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    end_s = time.monotonic() + 60
+    with socket.socket() as probe:
+        while probe.connect_ex(("127.0.0.1", port)) != 0:  # bound, but no model is loaded yet
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, log = process.communicate(timeout=60)
+    assert process.returncode in (-signal.SIGINT, 0)
+    assert "Traceback" not in log
 
 
 @pytest.mark.parametrize(
@@ -68,16 +89,18 @@ def test_a_wrong_setting_is_named_before_anything_is_opened(service: str) -> Non
 
 
 def test_a_hung_loop_is_seen_as_a_lost_service(tmp_path: Path) -> None:
-    with System(("control", "recognizer", "synthesizer"), tmp_path) as system:
+    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
+    services = ("control", "recognizer", "synthesizer")
+    with System(services, tmp_path, settings=settings) as system:
         system.processes["recognizer"].send_signal(signal.SIGSTOP)
         with Client(system.control) as client:
-            end_s = time.monotonic() + 10
+            end_s = time.monotonic() + 50
             while "recognizer" in {service.service for service in client.status().services}:
                 assert time.monotonic() < end_s
                 time.sleep(0.1)
             system.processes["recognizer"].send_signal(signal.SIGCONT)
             while "recognizer" not in {service.service for service in client.status().services}:
-                assert time.monotonic() < end_s + 10
+                assert time.monotonic() < end_s + 50
                 time.sleep(0.1)
 
 
@@ -95,11 +118,11 @@ def test_a_service_ends_with_its_supervisor(tmp_path: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        timeout=30,
+        timeout=60,
         check=True,
     )
     process = int(parent.stdout)
-    end_s = time.monotonic() + 20
+    end_s = time.monotonic() + 100
     while Path(f"/proc/{process}").exists():
         assert time.monotonic() < end_s, "the service outlived its supervisor"
         time.sleep(0.1)

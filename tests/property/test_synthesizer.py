@@ -30,8 +30,8 @@ pytestmark = pytest.mark.property
 
 PARAMETERS = LIPS.parameters
 FRAME_S = 0.02
-examples = settings(max_examples=40, deadline=None, derandomize=True)
-few_examples = settings(max_examples=12, deadline=None, derandomize=True)
+examples = settings(max_examples=40)
+few_examples = settings(max_examples=12)
 CLOSED = 20.0  # FAP units: half a millimetre on a face
 CLOSED_IN_HASTE = 35.0  # recognised less than two frames before the apex
 # One step of a frame: from wide open to shut within the 20 ms that are left when a closure is

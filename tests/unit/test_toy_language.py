@@ -16,7 +16,7 @@ from services.live_chain import LiveChain
 from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, AcousticModel, Topology
 from services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
 from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.model_file import read_archive, write_archive
+from services.recognizer.acoustic.model_file import read_archive
 from services.recognizer.alignment import align_text, spoken
 from services.recognizer.front_end.features import (
     HOP_S,
@@ -193,7 +193,7 @@ def test_a_model_of_other_phones_is_refused(toy: PhoneInventory, tmp_path: Path)
     path = tmp_path / "toy.npz"
     trained(toy).save(path)
     arrays = read_archive(path).arrays
-    write_archive(path, {**arrays, "phones": arrays["phones"][::-1]})
+    np.savez(path, allow_pickle=False, **{**arrays, "phones": arrays["phones"][::-1]})
     with pytest.raises(UserError, match="phones are not those of the installed language toy"):
         load_model(path)
 
@@ -204,6 +204,6 @@ def test_a_model_of_a_language_that_is_not_installed_is_refused(
     path = tmp_path / "toy.npz"
     trained(toy).save(path)
     arrays = read_archive(path).arrays
-    write_archive(path, {**arrays, "language": np.array("klingon")})
+    np.savez(path, allow_pickle=False, **{**arrays, "language": np.array("klingon")})
     with pytest.raises(UserError, match=r"toy\.npz: language 'klingon' is not .*: mandarin, toy"):
         load_model(path)
