@@ -29,7 +29,13 @@ from services.synthesizer.lips.learnt.closures import ClosureRule
 from services.synthesizer.lips.learnt.model import LearntLips
 from shared.errors import UserError
 
-TRIED = {"sound": (0.0, 0.5, 1.0, 1.5, 2.0), "phone": (1.5, 2.2, 3.0), "doubt": (0.4, 0.8, 1.5)}
+TRIED = {
+    "sound": (1.0, 1.5, 2.0, 2.5),
+    "phone": (1.5, 2.2, 3.0),
+    "doubt": (0.4, 0.8, 1.2),
+    "parted": (0.0, 0.01, 0.02),
+    "rounded": (0.0, 0.012, 0.024),
+}
 
 
 @dataclass(frozen=True, slots=True)

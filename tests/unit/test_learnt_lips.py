@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.learnt.closures import ClosingPhones, shut_share
+from services.synthesizer.lips.learnt.closures import ClosingPhones, ClosureRule, shut_share
 from services.synthesizer.lips.learnt.model import LearntLips
 from services.synthesizer.lips.learnt.track import LipTrack
 from services.synthesizer.lips.load import load_lip_model
@@ -404,6 +404,18 @@ def test_phones_are_no_evidence_against_a_closure() -> None:
     phones.accept(phone("p", 0.46, index=1), 0.4)
     assert phones.log_odds(0.5) > 2.0
     assert [shut_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
+
+
+@pytest.mark.parametrize("doubtful", [{4: -100.0, 5: -100.0}, {6: -100.0, 7: -100.0}])
+def test_lips_told_apart_or_rounded_are_shut_for_a_phone_rather_than_for_the_sound(
+    doubtful: dict[int, float],
+) -> None:
+    rule = ClosureRule()
+    nearly_shut, other = np.zeros((2, len(MOUTH_FAPS)))
+    other[[MOUTH_FAPS.index(fap) for fap in doubtful]] = list(doubtful.values())
+    assert rule.log_odds(other, 0.0, 0.0) < rule.log_odds(nearly_shut, 0.0, 0.0) - 1.0
+    supported = [rule.log_odds(mouth, 0.0, rule.phone) for mouth in (nearly_shut, other)]
+    assert supported[0] == supported[1] == rule.sound + rule.phone
 
 
 def test_learnt_lips_are_found_by_name() -> None:

@@ -137,6 +137,20 @@ def test_a_closure_is_told_from_a_probability_of_a_third_on() -> None:
     np.testing.assert_allclose(model.output_bias[:, CLOSURE + 1], bias[:, CLOSURE + 1])
 
 
+def test_width_is_widened_around_its_mean() -> None:
+    torch.manual_seed(0)
+    network = LipNetwork(3, len(DELAYS_S), 1)
+    linear = np.zeros((3 * HISTORY + 1, len(DELAYS_S), len(LIP_FAPS)))
+    mean = np.arange(1.0, 1.0 + len(LIP_FAPS), dtype=np.float32)
+    units = Units(mean, np.full(len(LIP_FAPS), 2.0, np.float32))
+    model = joined(np.zeros(9, np.float32), np.ones((9, 3), np.float32), network, linear, units)
+    bias = network.output.bias.detach().numpy().reshape(-1, NUM_OUTPUTS)
+    for fap, gain in ((5, 1.0), (6, 1.3), (53, 1.3)):
+        column = LIP_FAPS.index(fap)
+        made = model.output_bias[:, column] - mean[column]
+        np.testing.assert_allclose(made, gain * bias[:, column], rtol=1e-4, atol=1e-5)
+
+
 def stretch_of(clip: LipClip, delay_s: float, log_odds: np.ndarray) -> Stretch:
     """Make lips that follow a clip exactly, with a closure's log odds at each frame."""
     outputs = np.zeros((len(clip.time_s), 1, NUM_OUTPUTS), np.float32)

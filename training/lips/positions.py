@@ -26,7 +26,7 @@ from training.neural.augmentation import augment_samples, scale_level
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-_FORMAT = "2"  # raise when the positions change
+_FORMAT = "3"  # raise when the positions change
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

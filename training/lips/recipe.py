@@ -54,6 +54,10 @@ _NUM_MEL_FEATURES = FRAMES_PER_POSITION * NUM_MELS
 _NUM_FAPS = len(LIP_FAPS)
 _MIN_VARIANCE = 1e-8
 _MISSED_CLOSURE = 2.0  # false ones that a missed closure is worth
+# A regression tells less than the lips do: on strangers its width has 0.6 of their extent. So much
+# more undoes the half of that, and rounds lips at u and ü, at no cost in the median error.
+_WIDENED = 1.3
+_WIDTH_FAPS = (6, 53)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,13 +256,15 @@ def joined(
 ) -> LipPredictor:
     """Join both parts, half of each; closure and lip to teeth come from the network alone.
 
-    A closure is told where that costs least (Bayes' decision), so its log odds are raised.
+    The width is widened around its mean. A closure is told where that costs least (Bayes'
+    decision), so its log odds are raised.
     """
     weights = {name: value.numpy() for name, value in network.state_dict().items()}
     num_components = projection.shape[1]
     num_delays = linear.shape[1]
     share = np.ones(NUM_OUTPUTS)
     share[:_NUM_FAPS] = 0.5 * units.extent
+    share[[LIP_FAPS.index(fap) for fap in _WIDTH_FAPS]] *= _WIDENED
     history = np.zeros((HISTORY * num_components, num_delays, NUM_OUTPUTS))
     history[..., :_NUM_FAPS] = linear[:-1] * share[:_NUM_FAPS]
     shape = (num_delays, NUM_OUTPUTS)

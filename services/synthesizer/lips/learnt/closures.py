@@ -2,9 +2,10 @@
 
 Either source errs: the one confuses p with t, the other rounds closures off. Their evidence is
 added as log odds: a recognised b, p, m raises the odds of a closure, and a probability of the sound
-that is high enough needs no phone. Phones are no evidence against a closure, so a p that is taken
-for a t cannot open lips that the sound has shut; and no phone alone can shut lips that the sound
-tells to be wide open.
+that is high enough needs no phone. Without a phone, lips are shut the less, the wider apart the
+sound tells them to be, so that they part in time, and the more it rounds them: in u and w they
+nearly meet. Phones are no evidence against a closure, so a p that is taken for a t cannot open lips
+that the sound has shut; and no phone alone can shut lips that the sound tells to be wide open.
 
 Lower lip to upper teeth, as in f, is the phone's to decide: the sound tells it too badly.
 """
@@ -28,18 +29,44 @@ _HELD_S = 0.08  # after its onset a phone's lips are shut for so long at most,
 _DECIDED_S = 0.04  # and for so long after the phone is known, if it comes late,
 _LATEST_S = 0.1  # but not this long after its onset
 _EDGE_S = 0.02  # in which a phone's evidence rises and falls
+_PARTED, _WIDE_APART = 100.0, 300.0  # FAP units of opening
+_ROUNDED = -100.0  # FAP units of width
+_INNER_LIPS, _CORNERS = ([MOUTH_FAPS.index(fap) for fap in pair] for pair in ((4, 5), (6, 7)))
 
 
 @dataclass(frozen=True, slots=True)
 class ClosureRule:
     """How the evidence is weighed.
 
-    ``kouxing evaluate closures`` compares values on clips for choices, and chose these.
+    Chosen on speakers left out of training; ``kouxing evaluate closures`` compares values on clips
+    for choices.
     """
 
-    sound: float = 1.0  # added to the sound's log odds: it rather misses a closure than invents one
+    sound: float = 2.0  # added to the sound's log odds: it rather misses a closure than invents one
     phone: float = 2.2  # log odds that a phone adds at most
     doubt: float = 0.8  # log odds around 0 within which lips are led part of the way
+    # log odds lost, unless a phone tells the closure, for each FAP unit
+    parted: float = 0.02  # of an opening above 100, up to 300
+    rounded: float = 0.012  # of a width below -100
+
+    def log_odds(self, faps: Array, sound: float, phones: float) -> float:
+        """Weigh the evidence of a closure.
+
+        Parameters
+        ----------
+        faps
+            The mouth that the sound tells, (num_mouth_faps,), FAP units.
+        sound
+            Log odds of a closure that the sound tells.
+        phones
+            Log odds that the recognised phones add.
+        """
+        opening = -float(faps[_INNER_LIPS].sum())
+        width = float(faps[_CORNERS].sum())
+        apart = self.parted * (min(max(opening, _PARTED), _WIDE_APART) - _PARTED)
+        narrow = self.rounded * max(0.0, _ROUNDED - width)
+        unsupported = 1.0 - phones / self.phone
+        return self.sound + sound + phones - unsupported * (apart + narrow)
 
 
 _UPPER_LIP = [(4, 51), (8, 55), (9, 56)]  # FAPs of the inner and the outer lip

@@ -210,11 +210,13 @@ class LearntStream:
         self._steady = faps
         faps = faps.copy()
         part_lips(faps)
-        doubt = self._rule.doubt
+        rule = self._rule
         teeth = self._labiodentals.log_odds(frame.time_s) - _TEETH_LOG_ODDS
-        lip_to_teeth(faps, shut_share(teeth, doubt))
-        closure = self._bilabials.log_odds(frame.time_s) + self._rule.sound
-        close_lips(faps, shut_share(closure + log_odds_of(frame.closure), doubt))
+        closure = rule.log_odds(
+            faps, log_odds_of(frame.closure), self._bilabials.log_odds(frame.time_s)
+        )
+        lip_to_teeth(faps, shut_share(teeth, rule.doubt))
+        close_lips(faps, shut_share(closure, rule.doubt))
         return faps
 
     def _frame(self, articulation: Articulation) -> MouthFrame:
