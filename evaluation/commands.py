@@ -23,11 +23,11 @@ def recognizer(
     manifest: Annotated[Path, typer.Option(help="Manifest or corpus folder.")],
     split: Annotated[str, typer.Option(help="Its split.")] = "test",
     acoustic: Annotated[
-        list[str] | None, typer.Option(help="neural, gmm or a model file; repeatable.")
+        list[str] | None, typer.Option(help="neural, window, gmm or a model file; repeatable.")
     ] = None,
     look_ahead: Annotated[
         list[float] | None,
-        typer.Option("--look-ahead-ms", help="Look-ahead of the neural model; repeatable."),
+        typer.Option("--look-ahead-ms", help="Look-ahead, neural or window; repeatable."),
     ] = None,
     confusions: Annotated[
         Path | None, typer.Option(help="Picture of the last model's confusions (.png).")
@@ -58,7 +58,7 @@ def robustness(
     manifest: Annotated[Path, typer.Option(help="Manifest or corpus folder.")],
     split: Annotated[str, typer.Option(help="Its split.")] = "test",
     acoustic: Annotated[
-        list[str] | None, typer.Option(help="neural, gmm or a model file; repeatable.")
+        list[str] | None, typer.Option(help="neural, window, gmm or a model file; repeatable.")
     ] = None,
     other_language: Annotated[
         Path | None, typer.Option(help="Folder of recordings in another language.")

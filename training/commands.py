@@ -164,6 +164,55 @@ def neural(
 
 
 @app.command()
+def window(
+    corpus: Corpora,
+    output: Model,
+    whisper: Annotated[
+        Path, typer.Option(help="Folder of Whisper base for faster-whisper: the encoder.")
+    ],
+    start_from: Annotated[
+        Path | None,
+        typer.Option(
+            help="Neural model that aligns, and whose HMMs and phone language model are used; "
+            "without it the shipped one."
+        ),
+    ] = None,
+    untranscribed: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of recordings without text, in any language, which the teacher labels; "
+            "repeat for several."
+        ),
+    ] = None,
+    seed: Seed = 0,
+    steps: Annotated[int, typer.Option(min=1, help="Batches of 70 s of sound.")] = 450,
+    any_licence: AnyLicence = False,
+) -> None:
+    """Train the window model; a model card is written beside it.
+
+    A run that was interrupted goes on when the command is given again.
+    """
+    check_output(output)
+    try:
+        from training.window.recipe import train_window
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
+        ) from error
+
+    train_window(
+        corpus,
+        output,
+        whisper=whisper,
+        start=start_from,
+        untranscribed=untranscribed or [],
+        seed=seed,
+        num_steps=steps,
+        shipping=not any_licence,
+    )
+
+
+@app.command()
 def visemes(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],

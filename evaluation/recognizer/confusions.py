@@ -13,6 +13,8 @@ from corpora.figures import new_figure, save_figure
 from corpora.scoring import matched_pairs
 from shared.phones.inventory import PhoneInventory
 
+_LABIALS = {"b", "f"}  # visemes: b p m, f
+
 
 class Confusions:
     """Counts of reference phones (rows) against recognised phones (columns).
@@ -46,6 +48,24 @@ class Confusions:
             }
             for row, column in zip(*np.unravel_index(order, wrong.shape), strict=True)
         ]
+
+    def at_lips(self) -> dict[str, float | None]:
+        """Recall and precision of the consonants made at the lips: viewers see them being shut.
+
+        A consonant counts as found if another one made at the lips is recognised in its place.
+        None if there is none.
+        """
+        inventory = self._inventory
+        is_labial = np.array([
+            inventory.visemes[phone][0][0] in _LABIALS if phone != inventory.silence else False
+            for phone in inventory.phones
+        ])  # fmt: skip
+        found = int(self.counts[np.ix_(is_labial, is_labial)].sum())
+        spoken, recognized = self.counts[is_labial].sum(), self.counts[:, is_labial].sum()
+        return {
+            "recall": found / int(spoken) if spoken else None,
+            "precision": found / int(recognized) if recognized else None,
+        }
 
 
 def draw_confusions(figures: Mapping[str, Any], path: Path) -> None:

@@ -203,6 +203,7 @@ def evaluate_recognizer(
         "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (offline, *live)],
         "most_confused": confusions.most_frequent(),
+        "labials": confusions.at_lips(),
         "phones": list(inventory.phones),
         "silence": inventory.silence,
         "confusions": confusions.counts.tolist(),

@@ -25,6 +25,9 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
         console.rule(name)
         console.print(_outputs(figures))
         console.print(_speakers(figures))
+        labials = {name: rate for name, rate in figures["labials"].items() if rate is not None}
+        rates = ", ".join(f"{name} {_percent(rate)} %" for name, rate in labials.items())
+        console.print(f"p, b, m and f, offline: {rates or 'none'}")
         cost = figures["cpu_per_audio_second"]
         parts = ", ".join(f"{stage} {seconds:.4f}" for stage, seconds in cost.items())
         console.print(f"CPU seconds per second of sound: {parts}; all {sum(cost.values()):.4f}")

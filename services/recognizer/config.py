@@ -17,9 +17,9 @@ class RecognizerConfig(ServiceConfig):
     phones: BoundEndpoint = "tcp://127.0.0.1:5561"
     """Where phones and sound are published."""
     acoustic: str = "neural"
-    """Acoustic model: neural, gmm, or a model file."""
+    """Acoustic model: neural, window, gmm, or a model file."""
     look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0
-    """Future audio that the neural model waits for: 10, 30, 60, 100 or 200 ms."""
+    """Future audio that a frame waits for, ms: neural 10, 30, 60, 100, 200; window 0, 10, 20..."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = 1
     """Frames that must agree before a phone is emitted (N of Li 2011, who has 3)."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.9

@@ -110,6 +110,15 @@ def test_confusions_are_ranked() -> None:
     assert second == {"reference": "sil", "recognized": "b", "count": 1}  # an insertion
 
 
+def test_consonants_at_the_lips_have_recall_and_precision() -> None:
+    confusions = Confusions(MANDARIN)
+    assert confusions.at_lips() == {"recall": None, "precision": None}
+    confusions.add(["p", "a", "m", "i", "f", "u"], ["t", "a", "b", "i", "f", "u"])
+    confusions.add(["b", "a"], ["a"])
+    confusions.add(["d", "a", "a"], ["b", "a", "m", "a"])
+    assert confusions.at_lips() == {"recall": 2 / 4, "precision": 2 / 4}
+
+
 @pytest.mark.slow
 def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     vowels = DEMO / "vowels-male.wav"

@@ -16,7 +16,6 @@ from services.recognizer.front_end.whisper_mel import WhisperMel
 from training.neural.augmentation import (
     augment_samples,
     change_tempo,
-    mask,
     scale_level,
     source_frames,
 )
@@ -88,7 +87,6 @@ def augment(recording: Recording, rng: np.random.Generator) -> tuple[NDArray[np.
         start = int(rng.integers(len(frames) - _MAX_FRAMES + 1))
         crop = slice(start, start + _MAX_FRAMES)
         frames, targets = frames[crop], targets.of(crop)
-    mask(frames, rng)
     return frames, targets
 
 

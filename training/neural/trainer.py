@@ -41,6 +41,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
+from training.neural.augmentation import mask
 from training.neural.batches import Recording, Sample, augment, batches_of, sampling_probs
 from training.neural.network import Network, mixed_precision, output_frames
 
@@ -110,7 +111,10 @@ class Trainer:
         probs = sampling_probs(recordings)
 
         def draw() -> Sample:
-            return augment(recordings[self._rng.choice(len(probs), p=probs)], self._rng)
+            number = self._rng.choice(len(probs), p=probs)
+            frames, targets = augment(recordings[number], self._rng)
+            mask(frames, self._rng)
+            return frames, targets
 
         self._batches = batches_of(draw, _BATCH_FRAMES, self._rng)
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from services.recognizer.acoustic import gmm, neural
+from services.recognizer.acoustic import gmm, neural, window
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.acoustic.model_file import Archive, read_archive
 from shared.errors import UserError
 
 MODELS = Path(__file__).parents[1] / "models"
-SHIPPED = ("gmm", "neural")
+SHIPPED = ("gmm", "neural", "window")
 DEFAULT_MODEL = "neural"
 MODEL_PATH = MODELS / f"{DEFAULT_MODEL}.npz"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_from,
     neural.FORMAT: neural.neural_from,
+    window.FORMAT: window.window_from,
 }
 
 
@@ -31,10 +32,11 @@ def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -
     Parameters
     ----------
     path
-        A file that ``GmmModel.save`` or ``NeuralModel.save`` wrote.
+        A file that the ``save`` of a model wrote.
     look_ahead_ms
-        How far a neural model looks ahead, one of those it was trained for; None is its default. A
-        Gaussian mixture model has a fixed look-ahead and ignores this.
+        How far a neural model looks ahead, one of those it was trained for, or the right context
+        of a window model; None is the model's default. A Gaussian mixture model has a fixed
+        look-ahead and ignores this.
 
     Raises
     ------
@@ -55,6 +57,6 @@ def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -
         raise UserError(f"acoustic model {path}: {error}; train it again") from error
     except UserError as error:
         raise UserError(f"acoustic model {path}: {error}") from error
-    if look_ahead_ms is not None and isinstance(model, neural.NeuralModel):
+    if look_ahead_ms is not None and isinstance(model, neural.NeuralModel | window.WindowModel):
         return model.with_look_ahead(look_ahead_ms)
     return model

@@ -77,6 +77,14 @@ def input_names(num_layers: int) -> list[str]:
     return ["frames", "position", "output_layer", "past_mask", *caches]
 
 
+def open_session(file: NDArray[np.uint8]) -> Any:
+    """Open a model's ONNX file, given as its bytes; ValueError if it is none."""
+    try:
+        return open_network(file.tobytes())
+    except Exception as error:  # onnxruntime's errors have no base of their own
+        raise ValueError(f"its network cannot be read ({error})") from error
+
+
 class NetworkSession:
     """A network that is ready to run, on one thread.
 
@@ -92,10 +100,7 @@ class NetworkSession:
     """
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
-        try:
-            self._session = open_network(file.tobytes())
-        except Exception as error:
-            raise ValueError(f"its network cannot be read ({error})") from error
+        self._session = open_session(file)
         self.sizes = _sizes_of({node.name: node.shape for node in self._session.get_inputs()})
 
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[Floats]:

@@ -1,0 +1,134 @@
+"""Target states of all recordings, from the alignment and from the teacher, kept in a file.
+
+The model that ships aligns the recordings that have a text. The teacher
+(:mod:`training.neural.teacher`) learns this alignment and labels all recordings, heard whole and
+clean. A target is the average of alignment and teacher; without a text it is the teacher's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corpora.speech_corpus import RowErrors, is_synthetic
+from services.recognizer.acoustic.neural import NeuralModel
+from training.neural.alignment import align_all, aligner_scores
+from training.neural.batches import Recording, Targets
+from training.neural.scoring import samples_of
+from training.neural.teacher import WholeEncoder, process_all, train_teacher
+from training.progress import Report
+from training.training_set import Example, load_untranscribed
+
+# Fraction of the windows that each kind of speech fills, and the most recordings of it.
+_SHARES = {"sentence": (0.35, 400), "word": (0.05, 150), "synthetic": (0.30, 450)}
+_UNTRANSCRIBED_SHARE = 0.30
+_MAX_UNTRANSCRIBED = 250  # pieces of each folder
+
+
+def label(
+    examples: Sequence[Example],
+    untranscribed: Sequence[Path],
+    *,
+    aligner: NeuralModel,
+    encoder: WholeEncoder,
+    errors: RowErrors,
+    seed: int,
+    report: Report,
+) -> list[Recording]:
+    """Align and label recordings; of each kind at most some, drawn at random.
+
+    Parameters
+    ----------
+    examples
+        Recordings with text and samples.
+    untranscribed
+        Folders of recordings without text.
+    aligner
+        A model of the examples' language.
+    encoder
+        Whisper's, for the teacher.
+    errors
+        Receives a message for every file that cannot be used.
+    seed
+        Of the draw, and of the teacher's training.
+    report
+        Receives lines of progress.
+    """
+    rng = np.random.default_rng(seed)
+    drawn: list[Example] = []
+    for kind, (_, most) in _SHARES.items():
+        of_kind = [example for example in examples if _kind(example) == kind]
+        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:most]]
+    sounds: list[NDArray[np.int16]] = []
+    for folder in untranscribed:
+        pieces = load_untranscribed([folder], errors)
+        sounds += [pieces[place] for place in rng.permutation(len(pieces))[:_MAX_UNTRANSCRIBED]]
+    aligned = align_all(aligner_scores(aligner, drawn), aligner.topology, drawn, report)
+    frames = dict.fromkeys(_SHARES, 0.0)
+    for one in aligned:
+        frames[_kind(one.example)] += one.example.weight * len(one.states)
+    recordings = []
+    for one in aligned:
+        kind = _kind(one.example)
+        weight = _SHARES[kind][0] * one.example.weight * len(one.states) / frames[kind]
+        targets = Targets.hard(one.states)
+        recordings.append(
+            Recording(samples=samples_of(one.example), targets=targets, weight=weight)
+        )
+    teacher = train_teacher(encoder, recordings, seed=seed, report=report)
+    all_sounds = [*(recording.samples for recording in recordings), *sounds]
+    labels = process_all(teacher.targets_of, all_sounds, "labelled by the teacher", report)
+    labelled = [
+        Recording(
+            samples=recording.samples,
+            targets=recording.targets.averaged_with(targets),
+            weight=recording.weight,
+        )
+        for recording, targets in zip(recordings, labels, strict=False)
+    ]
+    rest = labels[len(recordings) :]
+    num_frames = sum(map(len, rest))
+    for sound, targets in zip(sounds, rest, strict=True):
+        weight = _UNTRANSCRIBED_SHARE * len(targets) / num_frames
+        labelled.append(Recording(samples=sound, targets=targets, weight=weight))
+    return labelled
+
+
+def _kind(example: Example) -> str:
+    if is_synthetic(example.licence):
+        return "synthetic"
+    return "word" if example.is_word else "sentence"
+
+
+def save_labels(path: Path, recordings: Sequence[Recording]) -> None:
+    """Write labelled recordings, so that training can go on with them later."""
+    width = max(recording.targets.states.shape[1] for recording in recordings)
+
+    def padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
+        return np.pad(rows, ((0, 0), (0, width - rows.shape[1])))
+
+    np.savez(
+        path,
+        samples=np.concatenate([recording.samples for recording in recordings]),
+        num_samples=[len(recording.samples) for recording in recordings],
+        states=np.concatenate([padded(recording.targets.states) for recording in recordings]),
+        probs=np.concatenate([padded(recording.targets.probs) for recording in recordings]),
+        num_frames=[len(recording.targets) for recording in recordings],
+        weights=[recording.weight for recording in recordings],
+    )
+
+
+def load_labels(path: Path) -> list[Recording]:
+    """Read what :func:`save_labels` has written."""
+    with np.load(path, allow_pickle=False) as file:
+        kept = {name: file[name] for name in file.files}
+    samples = np.split(kept["samples"], np.cumsum(kept["num_samples"])[:-1])
+    bounds = np.cumsum(kept["num_frames"])[:-1]
+    states, probs = np.split(kept["states"], bounds), np.split(kept["probs"], bounds)
+    return [
+        Recording(samples=sound, targets=Targets(*pair), weight=float(weight))
+        for sound, *pair, weight in zip(samples, states, probs, kept["weights"], strict=True)
+    ]
