@@ -29,6 +29,10 @@ _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
 _SPOKEN_DB = 25.0  # sound this far below the loudest is no speech
 _CLOSURE_REACHES_S = (0.05, 0.06, 0.07, 0.08, 0.1)  # shorter ones are hardly visible
 _CLOSURE_WINDOW_S, _CLOSURE_NEIGHBOURS_S = 0.12, 1.0
+# The fit knows when a phone begins; live, it is told late, and the mouth is led to it. Of 0, 10,
+# 15, 20 and 40 ms this much takes most of the lips' lag away on clips for choices, 160 ms behind
+# the sound, and a long vowel still stays open.
+_LEAD_S = 0.015
 _SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apache-2.0"
 
 
@@ -87,6 +91,16 @@ def closure_reach(
     return min(_CLOSURE_REACHES_S, key=loss)
 
 
+def leading(parameters: VisemeParameters) -> VisemeParameters:
+    """Let every apex, and every beginning and end of speech, be a little sooner."""
+    return replace(
+        parameters,
+        offset_s=parameters.offset_s - _LEAD_S,
+        offset_left_s=parameters.offset_left_s - _LEAD_S,
+        offset_right_s=parameters.offset_right_s - _LEAD_S,
+    )
+
+
 def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> None:
     """Train viseme parameters on the clips of ``folder`` that are for training.
 
@@ -107,7 +121,7 @@ def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> N
     parameters = estimate(frames_of(used, labels, inventory))
     parameters = replace(parameters, level_db=usual_levels(used, labels, inventory))
     reach_s = closure_reach(parameters, used, labels, inventory)
-    parameters = replace(parameters, closure_reach_s=reach_s)
+    parameters = leading(replace(parameters, closure_reach_s=reach_s))
     licences = "; ".join(sorted({clip.licence for clip in used}))
     try:
         save_parameters(
