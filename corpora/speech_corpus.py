@@ -87,7 +87,12 @@ def is_synthetic(licence: str) -> bool:
 
 
 def read_corpus(
-    folder: Path, errors: RowErrors, inventory: PhoneInventory, *, split: str | None = None
+    folder: Path,
+    errors: RowErrors,
+    inventory: PhoneInventory,
+    *,
+    split: str | None = None,
+    audio: Path | None = None,
 ) -> list[Utterance]:
     """Read a corpus folder in any of the three layouts.
 
@@ -101,6 +106,8 @@ def read_corpus(
         The corpus's language.
     split
         Read only the rows of this split; None reads all.
+    audio
+        The folder that a manifest's paths start from; None is the manifest's own.
 
     Raises
     ------
@@ -108,9 +115,9 @@ def read_corpus(
         If the folder holds none of the layouts, or a list is missing or no UTF-8 text.
     """
     if folder.suffix == ".tsv" and folder.is_file():
-        rows = _manifest_rows(folder)
+        rows = _manifest_rows(folder, audio)
     elif (folder / "manifest.tsv").is_file():
-        rows = _manifest_rows(folder / "manifest.tsv")
+        rows = _manifest_rows(folder / "manifest.tsv", audio)
     elif (folder / "wav.scp").is_file():
         rows = _kaldi_rows(folder)
     elif (folder / "transcript").is_dir() and (folder / "wav").is_dir():
@@ -184,7 +191,7 @@ def _duration_s(path: Path) -> float:
         raise ValueError(f"cannot read {path}: {error}") from error
 
 
-def _manifest_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[str, str]]]:
     with path.open(encoding="utf-8-sig", newline="") as lines:
         reader = csv.DictReader(lines, delimiter="\t", quoting=csv.QUOTE_NONE)
         columns = set(reader.fieldnames or ())
@@ -196,7 +203,7 @@ def _manifest_rows(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
         for number, row in enumerate(reader, start=2):
             place = f"{path.name} row {number} ({row['utt_id']})"
             cells = {"text": "", **{key: value or "" for key, value in row.items() if key}}
-            yield place, {**cells, "path": str(path.parent / cells["path"])}
+            yield place, {**cells, "path": str((audio or path.parent) / cells["path"])}
 
 
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:

@@ -2,64 +2,81 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
+if TYPE_CHECKING:
+    from services.recognizer.acoustic.acoustic_model import AcousticModel
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure the models.")
 plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
 bench_app = typer.Typer(add_completion=False)
+
+Manifest = Annotated[Path, typer.Option(help="Manifest or corpus folder.")]
+Audio = Annotated[
+    Path | None,
+    typer.Option(help="Folder that the manifest's paths start from, instead of its own."),
+]
+Split = Annotated[str, typer.Option(help="Its split.")]
+Acoustic = Annotated[
+    list[str] | None, typer.Option(help="neural, window, gmm or a model file; repeatable.")
+]
+LookAhead = Annotated[
+    list[float] | None,
+    typer.Option("--look-ahead-ms", help="Look-ahead of models that have one; repeatable."),
+]
 
 SENTENCE = Path(__file__).parents[1] / "shared" / "demo" / "hello-female.wav"
 
 
 @app.command()
 def recognizer(
-    manifest: Annotated[Path, typer.Option(help="Manifest or corpus folder.")],
-    split: Annotated[str, typer.Option(help="Its split.")] = "test",
-    acoustic: Annotated[
-        list[str] | None, typer.Option(help="neural, window, gmm or a model file; repeatable.")
-    ] = None,
-    look_ahead: Annotated[
-        list[float] | None,
-        typer.Option("--look-ahead-ms", help="Look-ahead, neural or window; repeatable."),
-    ] = None,
+    manifest: Manifest,
+    audio: Audio = None,
+    split: Split = "test",
+    acoustic: Acoustic = None,
+    look_ahead: LookAhead = None,
     confusions: Annotated[
         Path | None, typer.Option(help="Picture of the last model's confusions (.png).")
+    ] = None,
+    curve: Annotated[
+        Path | None, typer.Option(help="Picture of the errors over the delay (.png).")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Measure phone and viseme errors, delays and cost of acoustic models, side by side."""
     from evaluation.recognizer.confusions import draw_confusions
+    from evaluation.recognizer.delay_curve import draw_delay_curve
     from evaluation.recognizer.error_rates import evaluate_recognizer
     from evaluation.recognizer.report import print_figures
-    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
 
-    check_output(confusions, json_file)
-    results = {}
-    for name in acoustic or [DEFAULT_MODEL]:
-        for look_ahead_ms in look_ahead or (None,):
-            model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
-            title = name if look_ahead_ms is None else f"{name}, {look_ahead_ms:g} ms look-ahead"
-            results[title] = evaluate_recognizer(model, manifest, split)
+    check_output(confusions, curve, json_file)
+    results = {
+        title: {"acoustic": name, **evaluate_recognizer(model, manifest, split, audio=audio)}
+        for title, name, model in _models(acoustic, look_ahead)
+    }
     print_figures(results, Console())
     write_json(json_file, results)
     if confusions is not None:
         draw_confusions(list(results.values())[-1], confusions)
+    if curve is not None:
+        draw_delay_curve(list(results.values()), curve)
 
 
 @app.command()
 def robustness(
-    manifest: Annotated[Path, typer.Option(help="Manifest or corpus folder.")],
-    split: Annotated[str, typer.Option(help="Its split.")] = "test",
-    acoustic: Annotated[
-        list[str] | None, typer.Option(help="neural, window, gmm or a model file; repeatable.")
-    ] = None,
+    manifest: Manifest,
+    audio: Audio = None,
+    split: Split = "test",
+    acoustic: Acoustic = None,
+    look_ahead: LookAhead = None,
     other_language: Annotated[
         Path | None, typer.Option(help="Folder of recordings in another language.")
     ] = None,
@@ -67,16 +84,32 @@ def robustness(
 ) -> None:
     """Measure errors in disturbed speech, and phones recognised in sounds without speech."""
     from evaluation.recognizer.robustness import evaluate_robustness, print_robustness
-    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
 
     check_output(json_file)
-    models = {name: load_model(model_path(name)) for name in acoustic or [DEFAULT_MODEL]}
     results = {
-        name: evaluate_robustness(model, manifest, split, other_language=other_language)
-        for name, model in models.items()
+        title: evaluate_robustness(
+            model, manifest, split, audio=audio, other_language=other_language
+        )
+        for title, _, model in _models(acoustic, look_ahead)
     }
     print_robustness(results, Console())
     write_json(json_file, results)
+
+
+def _models(
+    names: list[str] | None, look_aheads_ms: list[float] | None
+) -> Iterator[tuple[str, str, AcousticModel]]:
+    """Load models, those that have a look-ahead with each given; yield title, name and model."""
+    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
+
+    for name in names or [DEFAULT_MODEL]:
+        model = load_model(model_path(name))
+        if look_aheads_ms and hasattr(model, "with_look_ahead"):
+            for look_ahead_ms in look_aheads_ms:
+                title = f"{name}, {look_ahead_ms:g} ms look-ahead"
+                yield title, name, model.with_look_ahead(look_ahead_ms)
+        else:
+            yield name, name, model
 
 
 @app.command()

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corpora.feature_cache import log_mel_of, samples_of
+from corpora.kept_back import is_kept_back
 from corpora.speech_corpus import (
     RowErrors,
     Utterance,
@@ -151,7 +152,7 @@ def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[f
 
 
 def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArray[np.int16]]:
-    """Read recordings without text, in any language.
+    """Read recordings without text, in any language, but not those kept back.
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
     """
     pieces = []
     for folder in folders:
-        files = [_file_without_text(path) for path in audio_files(folder)]
+        files = [_file_without_text(path) for path in audio_files(folder) if not is_kept_back(path)]
         sounds = samples_of(files)
         for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
             if log_mel is None:

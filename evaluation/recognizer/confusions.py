@@ -13,7 +13,9 @@ from corpora.figures import new_figure, save_figure
 from corpora.scoring import matched_pairs
 from shared.phones.inventory import PhoneInventory
 
-_LABIALS = {"b", "f"}  # visemes: b p m, f
+# Visemes of consonants made at the lips (b p m, f), and of those that sound alike but are made with
+# the tongue (d t n, g k h).
+_LABIALS, _LINGUALS = {"b", "f"}, {"d", "g"}
 
 
 class Confusions:
@@ -50,22 +52,33 @@ class Confusions:
         ]
 
     def at_lips(self) -> dict[str, float | None]:
-        """Recall and precision of the consonants made at the lips: viewers see them being shut.
+        """Measure how the consonants made at the lips are recognised: viewers see them being shut.
 
-        A consonant counts as found if another one made at the lips is recognised in its place.
-        None if there is none.
+        Returns
+        -------
+        dict
+            ``recall``: fraction of those spoken in whose place another one, or the same, is
+            recognised; ``precision``: fraction of those recognised in whose place one is spoken;
+            ``as_lingual`` and ``for_lingual``: fractions of the same with one made with the tongue
+            instead. None if there is none.
         """
-        inventory = self._inventory
-        is_labial = np.array([
-            inventory.visemes[phone][0][0] in _LABIALS if phone != inventory.silence else False
-            for phone in inventory.phones
-        ])  # fmt: skip
-        found = int(self.counts[np.ix_(is_labial, is_labial)].sum())
-        spoken, recognized = self.counts[is_labial].sum(), self.counts[:, is_labial].sum()
+        labial, lingual = self._with_viseme(_LABIALS), self._with_viseme(_LINGUALS)
+        spoken, recognized = self.counts[labial], self.counts[:, labial]
+
+        def fraction(part: NDArray[np.int64], whole: NDArray[np.int64]) -> float | None:
+            return int(part.sum()) / int(whole.sum()) if whole.any() else None
+
         return {
-            "recall": found / int(spoken) if spoken else None,
-            "precision": found / int(recognized) if recognized else None,
+            "recall": fraction(spoken[:, labial], spoken),
+            "precision": fraction(recognized[labial], recognized),
+            "as_lingual": fraction(spoken[:, lingual], spoken),
+            "for_lingual": fraction(recognized[lingual], recognized),
         }
+
+    def _with_viseme(self, visemes: set[str]) -> NDArray[np.bool_]:
+        """Tell of each phone whether it begins with one of the visemes."""
+        inventory = self._inventory
+        return np.array([inventory.visemes[phone][0][0] in visemes for phone in inventory.phones])
 
 
 def draw_confusions(figures: Mapping[str, Any], path: Path) -> None:

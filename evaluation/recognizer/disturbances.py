@@ -4,7 +4,12 @@ Everything is drawn with fixed seeds, so that figures can be reproduced.
 
 ==================== ===========================================================================
 noise at so many dB  pink noise (power falling by 3 dB an octave), relative to the speech's level
+babble               six stretches of the recordings at once, likewise
+room                 echoes that fall by 60 dB in 0.5 s (noise with an exponential envelope, Polack
+                     1988), together as loud as the direct sound
 telephone band       300 to 3400 Hz, Butterworth of order 8
+MP3, Opus            coded with 16 and 9 kbit/s, and decoded
+clipped              at a fifth of the peak
 half, double level   samples times 0.5 and 2, clipped at full scale
 speech at 0.8x, 1.3x overlap-add of the most similar 20 ms pieces, the pitch stays (Verhelst and
                      Roelands 1993, "WSOLA")
@@ -17,16 +22,22 @@ breathing            noise between 300 and 3000 Hz, in and out every four second
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from io import BytesIO
 
 import numpy as np
+import soundfile
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfilt, sosfiltfilt
+from scipy.signal import butter, fftconvolve, sosfilt, sosfiltfilt
 
 from services.recognizer.front_end.features import SAMPLE_RATE_HZ
 
 Samples = NDArray[np.float32]  # (n,), 16 kHz, in [-1, 1]
 _TWELFTH = 2 ** (1 / 12)
+_REVERBERATION_S = 0.5  # in which a room's echoes fall by 60 dB
+_NUM_BABBLING = 6
+_MP3 = {"format": "MP3", "subtype": "MPEG_LAYER_III", "bitrate_mode": "CONSTANT"}
+_OPUS = {"format": "OGG", "subtype": "OPUS"}
 
 
 def pink_noise(num_samples: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -40,14 +51,52 @@ def pink_noise(num_samples: int, rng: np.random.Generator) -> NDArray[np.float64
 def with_noise(samples: Samples, below_db: float) -> Samples:
     """Add pink noise ``below_db`` decibels below the speech's level."""
     noise = pink_noise(len(samples), np.random.default_rng(len(samples)))
-    level = np.sqrt(np.mean(samples.astype(np.float64) ** 2))
-    return _clipped(samples + level * 10 ** (-below_db / 20) * noise)
+    return _mixed(samples, noise, below_db)
+
+
+def babble(voices: Sequence[Samples]) -> Samples:
+    """Lay six stretches of the recordings on each other, each recording equally loud."""
+    speech = np.concatenate([voice / max(1e-9, np.sqrt(np.mean(voice**2))) for voice in voices])
+    starts = np.arange(_NUM_BABBLING) * len(speech) // _NUM_BABBLING
+    together: Samples = np.sum([np.roll(speech, start) for start in starts], axis=0)
+    return together
+
+
+def with_sound(samples: Samples, sound: Samples, below_db: float) -> Samples:
+    """Add a stretch of a sound, repeated if need be, ``below_db`` below the speech's level."""
+    start = np.random.default_rng(len(samples)).integers(len(sound))
+    return _mixed(samples, np.resize(np.roll(sound, -start), len(samples)), below_db)
+
+
+def in_a_room(samples: Samples) -> Samples:
+    """Add echoes that are together as loud as the direct sound."""
+    num_samples = round(_REVERBERATION_S * SAMPLE_RATE_HZ)
+    decay = 10 ** (-3 * np.arange(num_samples) / num_samples)  # by 60 dB
+    echoes = np.random.default_rng(5).normal(size=num_samples) * decay
+    heard = fftconvolve(samples, echoes / np.sqrt(np.sum(echoes**2)))[: len(samples)]
+    return _clipped((samples + heard) / np.sqrt(2))
+
+
+def coded(samples: Samples, codec: dict[str, str], compression_level: float) -> Samples:
+    """Code speech and decode it; libsndfile turns its level, 0 to 1, into a bit rate."""
+    file = BytesIO()
+    soundfile.write(file, samples, SAMPLE_RATE_HZ, compression_level=compression_level, **codec)
+    file.seek(0)
+    decoded, _ = soundfile.read(file, dtype="float32")
+    return _clipped(decoded)
 
 
 def telephone(samples: Samples) -> Samples:
     """Keep 300 to 3400 Hz."""
     band = butter(8, [300, 3400], "bandpass", fs=SAMPLE_RATE_HZ, output="sos")
     return _clipped(sosfilt(band, samples))
+
+
+def clipped_at(samples: Samples, fraction: float) -> Samples:
+    """Clip the samples at a fraction of their peak."""
+    limit = fraction * np.abs(samples).max()
+    clipped: Samples = np.clip(samples, -limit, limit)
+    return clipped
 
 
 def louder(samples: Samples, factor: float) -> Samples:
@@ -81,7 +130,11 @@ SPEECH_CONDITIONS: dict[str, Callable[[Samples], Samples]] = {
     "noise 20 dB below": lambda samples: with_noise(samples, 20),
     "noise 10 dB below": lambda samples: with_noise(samples, 10),
     "noise 5 dB below": lambda samples: with_noise(samples, 5),
+    "room": in_a_room,
     "telephone band": telephone,
+    "MP3, 16 kbit/s": lambda samples: coded(samples, _MP3, 0.95),
+    "Opus, 9 kbit/s": lambda samples: coded(samples, _OPUS, 0.99),
+    "clipped at a fifth": lambda samples: clipped_at(samples, 0.2),
     "half level": lambda samples: louder(samples, 0.5),
     "double level": lambda samples: louder(samples, 2.0),
     "0.8 times the speed": lambda samples: faster(samples, 0.8),
@@ -151,6 +204,11 @@ SOUNDS: dict[str, Callable[[float], Samples]] = {
     "keyboard": keyboard,
     "breathing": breathing,
 }
+
+
+def _mixed(samples: Samples, sound: NDArray[np.floating], below_db: float) -> Samples:
+    gain = np.sqrt(np.mean(samples.astype(np.float64) ** 2) / np.mean(sound**2))
+    return _clipped(samples + gain * 10 ** (-below_db / 20) * sound)
 
 
 def _at_level(sound: NDArray[np.float64]) -> Samples:

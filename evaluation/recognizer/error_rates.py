@@ -130,6 +130,7 @@ def evaluate_recognizer(
     corpus: Path,
     split: str,
     *,
+    audio: Path | None = None,
     rules: Sequence[tuple[int, float]] = RULES,
 ) -> dict[str, object]:
     """Measure a model on one split of a corpus.
@@ -138,20 +139,22 @@ def evaluate_recognizer(
     ----------
     model
         The acoustic model.
-    corpus
-        A corpus folder, or a manifest, that :func:`corpora.speech_corpus.read_corpus` reads, in
-        the model's language.
+    corpus, audio
+        A corpus folder, or a manifest and the folder of its recordings, in the model's language,
+        as :func:`corpora.speech_corpus.read_corpus` reads them.
     split
         Its split, such as ``dev`` or ``test``.
     rules
-        Output rules to try: N, and the confidence that a frame needs.
+        Output rules to try: N, and the confidence that a frame needs. The last one is the
+        recognizer's own.
 
     Returns
     -------
     dict
         Figures for a JSON file. ``confusions`` counts reference phones (rows) against recognised
-        phones (columns), in the order of ``phones``; the row of ``silence`` counts insertions, its
-        column deletions. Rows that could not be used are in ``bad_rows``.
+        phones (columns) of offline decoding, in the order of ``phones``; the row of ``silence``
+        counts insertions, its column deletions. ``labials`` has the consonants made at the lips by
+        output. Rows that could not be used are in ``bad_rows``.
 
     Raises
     ------
@@ -160,10 +163,10 @@ def evaluate_recognizer(
     """
     inventory = model.inventory
     errors = RowErrors()
-    utterances = read_corpus(corpus, errors, inventory, split=split)
+    utterances = read_corpus(corpus, errors, inventory, split=split, audio=audio)
     offline = Score(name="full traceback")
     live = [Score(name=_rule_name(rule)) for rule in rules]
-    confusions = Confusions(inventory)
+    confusions = {output: Confusions(inventory) for output in ("offline", "first", "final")}
     used: list[Utterance] = []
     seconds = 0.0
     for utterance in track(utterances, description=f"recognising {split}"):
@@ -179,7 +182,6 @@ def evaluate_recognizer(
         scored = _scores(model, samples)
         decoded = decode_offline(model, (event for _, events in scored for event in events))
         recognized = spoken(decoded, inventory)
-        confusions.add(reference.phones, [phone.symbol for phone in recognized])
         reference.count(recognized, offline.phones, offline.visemes)
         # Offline decoding emits everything when the recording ends.
         offline.delays_s += [len(samples) / SAMPLE_RATE_HZ - phone.onset_s for phone in truth]
@@ -188,6 +190,10 @@ def evaluate_recognizer(
             reference.count(output.first, score.phones, score.visemes)
             reference.count(output.final, score.final_phones, score.final_visemes)
             score.delays_s += reference.delays_s(output)
+        for name, hypothesis in (
+            ("offline", recognized), ("first", output.first), ("final", output.final)
+        ):  # fmt: skip
+            confusions[name].add(reference.phones, [phone.symbol for phone in hypothesis])
     if not used:
         raise UserError(
             f"{corpus} has no usable recordings in the split {split!r}; name another split"
@@ -202,11 +208,11 @@ def evaluate_recognizer(
         "num_bad_rows": len(errors.messages),
         "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (offline, *live)],
-        "most_confused": confusions.most_frequent(),
-        "labials": confusions.at_lips(),
+        "most_confused": confusions["offline"].most_frequent(),
+        "labials": {output: counted.at_lips() for output, counted in confusions.items()},
         "phones": list(inventory.phones),
         "silence": inventory.silence,
-        "confusions": confusions.counts.tolist(),
+        "confusions": confusions["offline"].counts.tolist(),
         "cpu_per_audio_second": cpu_by_stage(model, read_audio(used[0].path)),
     }
 

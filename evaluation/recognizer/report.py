@@ -25,9 +25,7 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
         console.rule(name)
         console.print(_outputs(figures))
         console.print(_speakers(figures))
-        labials = {name: rate for name, rate in figures["labials"].items() if rate is not None}
-        rates = ", ".join(f"{name} {_percent(rate)} %" for name, rate in labials.items())
-        console.print(f"p, b, m and f, offline: {rates or 'none'}")
+        console.print(_labials(figures))
         cost = figures["cpu_per_audio_second"]
         parts = ", ".join(f"{stage} {seconds:.4f}" for stage, seconds in cost.items())
         console.print(f"CPU seconds per second of sound: {parts}; all {sum(cost.values()):.4f}")
@@ -49,12 +47,12 @@ def _outputs(figures: Figures) -> Table:
     for score in figures["scores"]:
         table.add_row(
             score["output"],
-            _percent(score["phone_error_rate"]),
+            percent(score["phone_error_rate"]),
             _interval(score["phone_interval_95"]),
             _kinds(score["phone_errors"]),
-            _percent(score["viseme_error_rate"]),
+            percent(score["viseme_error_rate"]),
             _interval(score["viseme_interval_95"]),
-            _final(score),
+            _rates(score, "final_"),
             _delay(score),
         )
     return table
@@ -69,24 +67,30 @@ def _speakers(figures: Figures) -> Table:
         table.add_row(
             speaker,
             str(errors["reference"]),
-            _percent(errors["rate"]),
+            percent(errors["rate"]),
             _kinds(errors),
-            _percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
-            _percent(live["phone_errors_by_speaker"][speaker]["rate"]),
-            _percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
+            percent(full["viseme_errors_by_speaker"][speaker]["rate"]),
+            percent(live["phone_errors_by_speaker"][speaker]["rate"]),
+            percent(live["final_phone_errors_by_speaker"][speaker]["rate"]),
         )
     return table
 
 
+def _labials(figures: Figures) -> Table:
+    columns = ("recall", "precision", "recognised as d t n g k h", "d t n g k h spoken")
+    table = _table("p, b, m and f, %", ("output", *columns))
+    for output, fractions in figures["labials"].items():
+        table.add_row(output, *map(percent, fractions.values()))
+    return table
+
+
 def _side_by_side(results: Mapping[str, Figures]) -> Table:
-    table = _table("side by side: phone / viseme error %, delay p50 ms", ("output", *results))
-    for scores in zip(*(figures["scores"] for figures in results.values()), strict=True):
-        cells = [
-            f"{_percent(score['phone_error_rate'])} / {_percent(score['viseme_error_rate'])}, "
-            + (f"{score['delay_ms']['p50']:.0f}" if "delay_ms" in score else "-")
-            for score in scores
-        ]
-        table.add_row(scores[0]["output"], *cells)
+    """Offline decoding, and both hypotheses of the recognizer's own output rule."""
+    columns = ("offline", "first hypothesis", "final hypothesis", "delay p50 / p95 ms")
+    table = _table("phone / viseme error %", ("model", *columns))
+    for name, figures in results.items():
+        offline, live = figures["scores"][0], figures["scores"][-1]
+        table.add_row(name, _rates(offline), _rates(live), _rates(live, "final_"), _delay(live))
     return table
 
 
@@ -97,23 +101,25 @@ def _table(title: str, columns: Iterable[str]) -> Table:
     return table
 
 
-def _percent(rate: float) -> str:
-    return f"{100 * rate:.1f}"
+def percent(rate: float | None) -> str:
+    """Write a rate as a table shows it; None is no rate."""
+    return "-" if rate is None else f"{100 * rate:.1f}"
 
 
-def _final(score: Figures) -> str:
-    if "final_phone_error_rate" not in score:
+def _rates(score: Figures, hypothesis: str = "") -> str:
+    if f"{hypothesis}phone_error_rate" not in score:
         return ""
-    return " / ".join(_percent(score[f"final_{kind}_error_rate"]) for kind in ("phone", "viseme"))
+    kinds = ("phone", "viseme")
+    return " / ".join(percent(score[f"{hypothesis}{kind}_error_rate"]) for kind in kinds)
 
 
 def _interval(bounds: tuple[float, float] | None) -> str:
-    return "-" if bounds is None else f"{_percent(bounds[0])} - {_percent(bounds[1])}"
+    return "-" if bounds is None else f"{percent(bounds[0])} - {percent(bounds[1])}"
 
 
 def _kinds(errors: Mapping[str, int]) -> str:
     kinds = ("insertions", "deletions", "substitutions")
-    return " / ".join(_percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
+    return " / ".join(percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
 
 
 def _delay(score: Figures) -> str:

@@ -1,11 +1,11 @@
-"""Robustness: phone errors in disturbed speech, and phones recognised in sounds without speech.
+"""Robustness: errors in disturbed speech, and phones recognised in sounds without speech.
 
 Both come from :mod:`evaluation.recognizer.disturbances`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,23 @@ from rich.table import Table
 from corpora.feature_cache import read_audio
 from corpora.scoring import ErrorCounts, count_errors, final_hypothesis, first_hypothesis
 from corpora.speech_corpus import RowErrors, audio_files, read_corpus
-from evaluation.recognizer.disturbances import SOUNDS, SPEECH_CONDITIONS
+from evaluation.recognizer.confusions import Confusions
+from evaluation.recognizer.disturbances import (
+    SOUNDS,
+    SPEECH_CONDITIONS,
+    Samples,
+    babble,
+    with_sound,
+)
+from evaluation.recognizer.error_rates import mouth_shapes
+from evaluation.recognizer.report import percent
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.alignment import spoken
 from services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from services.recognizer.offline import decode_offline
 from services.recognizer.recognizer import Emission, Recognizer
 from services.recognizer.speech_scores import ScoreEvent, score_recording
+from shared.phones.inventory import PhoneInventory
 
 _SOUND_S = 60.0
 _OTHER_RECORDINGS = 40  # of another language
@@ -36,7 +46,12 @@ _OUTPUTS = {  # key in the figures, column of the table
 
 
 def evaluate_robustness(
-    model: AcousticModel, corpus: Path, split: str, *, other_language: Path | None = None
+    model: AcousticModel,
+    corpus: Path,
+    split: str,
+    *,
+    audio: Path | None = None,
+    other_language: Path | None = None,
 ) -> dict[str, Any]:
     """Measure a model on disturbed speech and on sounds without its language.
 
@@ -44,9 +59,9 @@ def evaluate_robustness(
     ----------
     model
         The acoustic model.
-    corpus
-        A corpus folder, or a manifest, that :func:`corpora.speech_corpus.read_corpus` reads, in
-        the model's language.
+    corpus, audio
+        A corpus folder, or a manifest and the folder of its recordings, in the model's language,
+        as :func:`corpora.speech_corpus.read_corpus` reads them.
     split
         Its split, such as ``dev`` or ``test``.
     other_language
@@ -55,40 +70,81 @@ def evaluate_robustness(
     Returns
     -------
     dict
-        ``speech``: by condition, the phone error rates of offline decoding (full traceback), of the
-        first and of the final hypothesis; ``sounds``: phones per minute by sound.
+        ``speech``: by condition and output (offline decoding with the full traceback, first and
+        final hypothesis) the phone and viseme error rates, and ``labials``
+        (:meth:`evaluation.recognizer.confusions.Confusions.at_lips`); ``sounds``: phones per minute
+        by sound.
 
     Raises
     ------
     UserError
-        If there is no such corpus or split, or no recording in the other folder.
+        If there is no such corpus, no usable recording in the split or in the other folder.
     """
     phones = model.inventory.phones
-    utterances = read_corpus(corpus, RowErrors(), model.inventory, split=split)
+    errors = RowErrors()
     recordings = [
         ([phones[phone] for phone in utterance.phones], read_audio(utterance.path))
-        for utterance in utterances
+        for utterance in read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
     ]
+    if not recordings:
+        raise errors.nothing_left(f"in the split {split!r} of {corpus}")
+    voices = babble([samples for _, samples in recordings])
+    conditions: dict[str, Callable[[Samples], Samples]] = {
+        **SPEECH_CONDITIONS,
+        "babble 10 dB below": lambda samples: with_sound(samples, voices, 10),
+    }
     speech = {}
-    for name, disturbed in track(SPEECH_CONDITIONS.items(), description="disturbed speech"):
-        totals = {output: ErrorCounts() for output in _OUTPUTS}
+    for name, disturbed in track(conditions.items(), description="disturbed speech"):
+        tallies = {output: _Tally(model.inventory) for output in _OUTPUTS}
         for reference, samples in recordings:
             for output, recognized in _outputs(model, disturbed(samples)).items():
-                totals[output] += count_errors(reference, recognized)
-        speech[name] = {output: counts.rate for output, counts in totals.items()}
+                tallies[output].add(reference, recognized)
+        speech[name] = {output: tally.rates() for output, tally in tallies.items()}
     sounds = {name: _phones_per_minute(model, [make(_SOUND_S)]) for name, make in SOUNDS.items()}
     if other_language is not None:
         sounds["other language"] = _phones_per_minute(model, recordings_in(other_language))
     return {"split": split, "recordings": len(recordings), "speech": speech, "sounds": sounds}
 
 
+class _Tally:
+    """Errors of one output under one condition."""
+
+    def __init__(self, inventory: PhoneInventory) -> None:
+        self._inventory = inventory
+        self._phones, self._visemes = ErrorCounts(), ErrorCounts()
+        self._confusions = Confusions(inventory)
+
+    def add(self, reference: Sequence[str], recognized: Sequence[str]) -> None:
+        self._phones += count_errors(reference, recognized)
+        self._visemes += count_errors(
+            *(mouth_shapes(phones, self._inventory) for phones in (reference, recognized))
+        )
+        self._confusions.add(reference, recognized)
+
+    def rates(self) -> dict[str, Any]:
+        return {
+            "phone_error_rate": self._phones.rate,
+            "viseme_error_rate": self._visemes.rate,
+            "labials": self._confusions.at_lips(),
+        }
+
+
 def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> None:
     """Print the figures of several models as two tables."""
     for name, figures in results.items():
-        table = Table("phone error %", *_OUTPUTS.values(), title=f"{name}, {figures['split']}")
-        for condition, rates in figures["speech"].items():
-            cells = (f"{100 * rates[output]:.1f}" for output in _OUTPUTS)
-            table.add_row(condition, *cells)
+        title = f"{name}, {figures['split']}: phone / viseme error %"
+        labials = "p, b, m, f in the final hypothesis, recall / precision %"
+        table = Table("speech", *_OUTPUTS.values(), labials, title=title)
+        for condition, outputs in figures["speech"].items():
+            final = outputs["final_hypothesis"]["labials"]
+            table.add_row(
+                condition,
+                *(
+                    f"{percent(rates['phone_error_rate'])} / {percent(rates['viseme_error_rate'])}"
+                    for rates in outputs.values()
+                ),
+                f"{percent(final['recall'])} / {percent(final['precision'])}",
+            )
         console.print(table)
         table = Table("sound without speech", "phones per minute", title=name)
         for sound, rate in figures["sounds"].items():

@@ -654,6 +654,7 @@ def test_recordings_without_text_are_trimmed_and_cut(tmp_path: Path) -> None:
     soundfile.write(tmp_path / "b.wav", HELLO[:2000], 16_000)
     (tmp_path / "c.ogg").write_bytes(b"no sound")
     (tmp_path / "d.txt").write_text("no sound")
+    (tmp_path / "MOSS-TTSD_kept_back.ogg").write_bytes(b"not read")
     errors = RowErrors()
     first, second = load_untranscribed([tmp_path], errors)
     assert len(first) == 2000 * 160 + 240

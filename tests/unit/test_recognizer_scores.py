@@ -7,6 +7,7 @@ from rich.console import Console
 
 from corpora.scoring import ErrorCounts, count_errors, first_hypothesis, matched_pairs
 from evaluation.recognizer.confusions import Confusions, draw_confusions
+from evaluation.recognizer.delay_curve import draw_delay_curve
 from evaluation.recognizer.error_rates import (
     bootstrap_interval,
     evaluate_recognizer,
@@ -112,11 +113,17 @@ def test_confusions_are_ranked() -> None:
 
 def test_consonants_at_the_lips_have_recall_and_precision() -> None:
     confusions = Confusions(MANDARIN)
-    assert confusions.at_lips() == {"recall": None, "precision": None}
+    nothing = dict.fromkeys(("recall", "precision", "as_lingual", "for_lingual"))
+    assert confusions.at_lips() == nothing
     confusions.add(["p", "a", "m", "i", "f", "u"], ["t", "a", "b", "i", "f", "u"])
     confusions.add(["b", "a"], ["a"])
     confusions.add(["d", "a", "a"], ["b", "a", "m", "a"])
-    assert confusions.at_lips() == {"recall": 2 / 4, "precision": 2 / 4}
+    assert confusions.at_lips() == {
+        "recall": 2 / 4,
+        "precision": 2 / 4,
+        "as_lingual": 1 / 4,  # t
+        "for_lingual": 1 / 4,  # d
+    }
 
 
 @pytest.mark.slow
@@ -142,6 +149,9 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     picture = tmp_path / "confusions.png"
     draw_confusions(results, picture)
     assert picture.stat().st_size > 10_000
+    named = [{"acoustic": name, **results} for name in ("one", "one", "two")]
+    draw_delay_curve(named, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
     with (tmp_path / "out.txt").open("w") as file:
         console = Console(width=200, record=True, file=file)
         print_figures({"one": results, "two": results}, console)
@@ -154,8 +164,9 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
         "broken: cannot read",
         "5 rows skipped",
     )
-    for part in ("full traceback", "by speaker", "CPU seconds", "side by side", *reasons):
+    for part in ("full traceback", "by speaker", "p, b, m and f", "CPU seconds", *reasons):
         assert part in text, part
+    assert "first hypothesis ┃ final hypothesis" in text  # side by side
     assert text.count("lying") == 1  # once, not once a model
     with pytest.raises(UserError, match="'nothing'"):
         evaluate_recognizer(load_model(), tmp_path, "nothing")

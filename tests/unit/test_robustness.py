@@ -11,11 +11,15 @@ from evaluation.recognizer import robustness
 from evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
+    babble,
+    clipped_at,
     faster,
+    in_a_room,
     louder,
     pink_noise,
     telephone,
     with_noise,
+    with_sound,
 )
 from evaluation.recognizer.robustness import evaluate_robustness, print_robustness
 from services.recognizer.acoustic.load import load_model
@@ -56,6 +60,39 @@ def test_a_telephone_lets_its_band_through(frequency_hz: float, passes: bool) ->
     assert share == pytest.approx(1.0, abs=0.05) if passes else share < 0.03
 
 
+def test_babble_is_six_voices_as_loud_as_asked() -> None:
+    voices = [tone(frequency_hz) for frequency_hz in (200, 400, 600, 800, 1000, 1200)]
+    together = babble([(number + 1) * voice for number, voice in enumerate(voices)])
+    first_s = np.abs(np.fft.rfft(together[:RATE_HZ]))  # as each is one second long
+    assert set(np.argsort(first_s)[-6:]) == {200, 400, 600, 800, 1000, 1200}
+    speech = tone(440)
+    heard = with_sound(speech, together, 10.0) - speech
+    assert 20 * np.log10(level(speech) / level(heard)) == pytest.approx(10, abs=0.5)
+
+
+def test_a_room_echoes_for_half_a_second() -> None:
+    click = np.zeros(RATE_HZ, np.float32)
+    click[0] = 1
+    heard = in_a_room(click)
+    assert heard[0] == pytest.approx(np.sqrt(1 / 2), rel=0.1)
+    falls = level(heard[1:801]) / level(heard[4001:4801])
+    assert 20 * np.log10(falls) == pytest.approx(30, abs=2)  # in a quarter of a second
+    assert np.abs(heard[8000:]).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["MP3, 16 kbit/s", "Opus, 9 kbit/s"])
+def test_a_codec_keeps_length_and_speech(name: str) -> None:
+    speech = tone(440)
+    decoded = SPEECH_CONDITIONS[name](speech)
+    assert len(decoded) == pytest.approx(len(speech), abs=2000)
+    spectrum = np.abs(np.fft.rfft(decoded[4000:12_000]))
+    assert np.fft.rfftfreq(8000, 1 / RATE_HZ)[spectrum.argmax()] == 440
+
+
+def test_clipping_is_relative_to_the_peak() -> None:
+    assert np.abs(clipped_at(tone(440), 0.2)).max() == pytest.approx(0.06, abs=1e-3)
+
+
 def test_double_level_clips() -> None:
     assert louder(tone(440), 4.0).max() == 1.0
     np.testing.assert_array_equal(louder(tone(440), 0.5), tone(440) / 2)
@@ -88,13 +125,17 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness, "SPEECH_CONDITIONS", conditions)
     monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
     figures = evaluate_robustness(load_model(), tmp_path, "dev", other_language=DEMO)
-    assert set(figures["speech"]) == set(conditions)
-    assert figures["speech"]["as recorded"]["offline"] > 0  # the text is too short
+    assert set(figures["speech"]) == {*conditions, "babble 10 dB below"}
+    rates = figures["speech"]["as recorded"]["offline"]
+    assert rates["phone_error_rate"] > 0 < rates["viseme_error_rate"]  # the text is too short
+    assert rates["labials"]["recall"] is None  # no p, b, m, f in it
     assert figures["sounds"]["noise"] == 0
     assert figures["sounds"]["other language"] > 60
     output = io.StringIO()
     print_robustness({"a model": figures}, Console(file=output, width=120))
     assert "half level" in output.getvalue()
+    with pytest.raises(UserError, match="no usable recordings in the split 'test'"):
+        evaluate_robustness(load_model(), tmp_path, "test")
 
 
 def test_a_folder_without_sound(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 import soundfile
 
 from corpora import feature_cache
+from corpora.kept_back import CONVERSATION, is_kept_back
 from corpora.speech_corpus import RowErrors, may_ship, read_corpus
 from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST
 from services.recognizer.acoustic.load import load_model
@@ -103,6 +104,22 @@ def test_manifest_and_its_bad_rows(tmp_path: Path) -> None:
         strict=True,
     ):  # fmt: skip
         assert part in message
+
+
+def test_conversation_is_kept_back_and_readable(tmp_path: Path) -> None:
+    lines = CONVERSATION.read_text(encoding="utf-8").splitlines()[1:]
+    names = [line.split("\t")[0] for line in lines]
+    (tmp_path / "audio").mkdir()
+    soundfile.write(tmp_path / "any.ogg", np.zeros(16_000 * 15), 16_000)
+    for name in names:
+        (tmp_path / "audio" / f"{name}.ogg").hardlink_to(tmp_path / "any.ogg")
+    errors = RowErrors()
+    rows = read_corpus(CONVERSATION, errors, MANDARIN, split="conversation", audio=tmp_path)
+    assert not errors.messages
+    assert len(rows) == len(lines) == 17
+    assert len({row.speaker for row in rows}) == 6
+    assert all(is_kept_back(row.path) for row in rows)
+    assert not is_kept_back(tmp_path / "websdk-java-demo_16k_10_00.ogg")
 
 
 def test_kaldi_folder(tmp_path: Path) -> None:
