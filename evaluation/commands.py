@@ -59,8 +59,11 @@ def recognizer(
 
     check_output(confusions, curve, json_file)
     results = {
-        title: {"acoustic": name, **evaluate_recognizer(model, manifest, split, audio=audio)}
-        for title, name, model in _models(acoustic, look_ahead)
+        title: {
+            "acoustic": name,
+            **evaluate_recognizer(model, manifest, split, audio=audio, own_rule=rule),
+        }
+        for title, name, model, rule in _models(acoustic, look_ahead)
     }
     print_figures(results, Console())
     write_json(json_file, results)
@@ -88,9 +91,9 @@ def robustness(
     check_output(json_file)
     results = {
         title: evaluate_robustness(
-            model, manifest, split, audio=audio, other_language=other_language
+            model, manifest, split, audio=audio, own_rule=rule, other_language=other_language
         )
-        for title, _, model in _models(acoustic, look_ahead)
+        for title, _, model, rule in _models(acoustic, look_ahead)
     }
     print_robustness(results, Console())
     write_json(json_file, results)
@@ -98,18 +101,24 @@ def robustness(
 
 def _models(
     names: list[str] | None, look_aheads_ms: list[float] | None
-) -> Iterator[tuple[str, str, AcousticModel]]:
-    """Load models, those that have a look-ahead with each given; yield title, name and model."""
+) -> Iterator[tuple[str, str, AcousticModel, tuple[int, float]]]:
+    """Load models, those that have a look-ahead with each given or else the one that suits them.
+
+    Yields title, name, model, and the output rule that suits it.
+    """
     from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
+    from services.recognizer.config import RecognizerConfig
 
     for name in names or [DEFAULT_MODEL]:
-        model = load_model(model_path(name))
+        suited = RecognizerConfig(acoustic=name)
+        rule = suited.num_stable_frames, suited.min_confidence
+        model = load_model(model_path(name), look_ahead_ms=suited.look_ahead_ms)
         if look_aheads_ms and hasattr(model, "with_look_ahead"):
             for look_ahead_ms in look_aheads_ms:
                 title = f"{name}, {look_ahead_ms:g} ms look-ahead"
-                yield title, name, model.with_look_ahead(look_ahead_ms)
+                yield title, name, model.with_look_ahead(look_ahead_ms), rule
         else:
-            yield name, name, model
+            yield name, name, model, rule
 
 
 @app.command()

@@ -49,13 +49,12 @@ from shared.errors import UserError
 from shared.phones.events import Phone
 from shared.phones.inventory import PhoneInventory
 
-# Output rules, N and the confidence that a frame needs: the paper's, its N = 3 with confident
-# frames only, and the recognizer's own.
-RULES = (
+Rule = tuple[int, float]  # N, and the confidence that a frame needs
+# The paper's rule, and its N = 3 with confident frames only.
+RULES: tuple[Rule, ...] = (
     *((num_stable_frames, 0.0) for num_stable_frames in (1, 2, 3, 4, 5, 6)),
     (3, 0.95),
     (3, 0.99),
-    DEFAULT_RULE,
 )
 _NUM_RESAMPLES = 2000
 
@@ -131,7 +130,8 @@ def evaluate_recognizer(
     split: str,
     *,
     audio: Path | None = None,
-    rules: Sequence[tuple[int, float]] = RULES,
+    rules: Sequence[Rule] = RULES,
+    own_rule: Rule = DEFAULT_RULE,
 ) -> dict[str, object]:
     """Measure a model on one split of a corpus.
 
@@ -145,8 +145,9 @@ def evaluate_recognizer(
     split
         Its split, such as ``dev`` or ``test``.
     rules
-        Output rules to try: N, and the confidence that a frame needs. The last one is the
-        recognizer's own.
+        Output rules to try.
+    own_rule
+        The one that the recognizer has with this model; it comes last.
 
     Returns
     -------
@@ -164,6 +165,7 @@ def evaluate_recognizer(
     inventory = model.inventory
     errors = RowErrors()
     utterances = read_corpus(corpus, errors, inventory, split=split, audio=audio)
+    rules = [*(rule for rule in rules if rule != own_rule), own_rule]
     offline = Score(name="full traceback")
     live = [Score(name=_rule_name(rule)) for rule in rules]
     confusions = {output: Confusions(inventory) for output in ("offline", "first", "final")}

@@ -26,13 +26,13 @@ from evaluation.recognizer.disturbances import (
     babble,
     with_sound,
 )
-from evaluation.recognizer.error_rates import mouth_shapes
+from evaluation.recognizer.error_rates import Rule, mouth_shapes
 from evaluation.recognizer.report import percent
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.alignment import spoken
 from services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from services.recognizer.offline import decode_offline
-from services.recognizer.recognizer import Emission, Recognizer
+from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
 from services.recognizer.speech_scores import ScoreEvent, score_recording
 from shared.phones.inventory import PhoneInventory
 
@@ -51,6 +51,7 @@ def evaluate_robustness(
     split: str,
     *,
     audio: Path | None = None,
+    own_rule: Rule = DEFAULT_RULE,
     other_language: Path | None = None,
 ) -> dict[str, Any]:
     """Measure a model on disturbed speech and on sounds without its language.
@@ -64,6 +65,8 @@ def evaluate_robustness(
         as :func:`corpora.speech_corpus.read_corpus` reads them.
     split
         Its split, such as ``dev`` or ``test``.
+    own_rule
+        Output rule that the recognizer has with this model.
     other_language
         Folder of recordings in another language, of which forty are used.
 
@@ -97,13 +100,14 @@ def evaluate_robustness(
     for name, disturbed in track(conditions.items(), description="disturbed speech"):
         tallies = {output: _Tally(model.inventory) for output in _OUTPUTS}
         for reference, samples in recordings:
-            for output, recognized in _outputs(model, disturbed(samples)).items():
+            for output, recognized in _outputs(model, disturbed(samples), own_rule).items():
                 tallies[output].add(reference, recognized)
         speech[name] = {output: tally.rates() for output, tally in tallies.items()}
-    sounds = {name: _phones_per_minute(model, [make(_SOUND_S)]) for name, make in SOUNDS.items()}
+    sounds = {name: [make(_SOUND_S)] for name, make in SOUNDS.items()}
     if other_language is not None:
-        sounds["other language"] = _phones_per_minute(model, recordings_in(other_language))
-    return {"split": split, "recordings": len(recordings), "speech": speech, "sounds": sounds}
+        sounds["other language"] = recordings_in(other_language)
+    rates = {name: _phones_per_minute(model, each, own_rule) for name, each in sounds.items()}
+    return {"split": split, "recordings": len(recordings), "speech": speech, "sounds": rates}
 
 
 class _Tally:
@@ -152,10 +156,12 @@ def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> No
         console.print(table)
 
 
-def _outputs(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, list[str]]:
+def _outputs(
+    model: AcousticModel, samples: NDArray[np.float32], rule: Rule
+) -> dict[str, list[str]]:
     """Recognise a recording offline and live; return the phones of each of ``_OUTPUTS``."""
     scores = score_recording(model, samples, SAMPLE_RATE_HZ)
-    events = _decode_live(model, scores)
+    events = _decode_live(model, scores, rule)
     outputs = {
         "offline": decode_offline(model, scores),
         "first_hypothesis": first_hypothesis(events, set()),
@@ -167,15 +173,24 @@ def _outputs(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str, li
     }
 
 
-def _decode_live(model: AcousticModel, scores: Sequence[ScoreEvent]) -> list[Emission]:
-    return Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ).decode(scores)
+def _decode_live(model: AcousticModel, scores: Sequence[ScoreEvent], rule: Rule) -> list[Emission]:
+    num_stable_frames, min_confidence = rule
+    recognizer = Recognizer(
+        model,
+        sample_rate_hz=SAMPLE_RATE_HZ,
+        num_stable_frames=num_stable_frames,
+        min_confidence=min_confidence,
+    )
+    return recognizer.decode(scores)
 
 
-def _phones_per_minute(model: AcousticModel, sounds: Sequence[NDArray[np.float32]]) -> float:
+def _phones_per_minute(
+    model: AcousticModel, sounds: Sequence[NDArray[np.float32]], rule: Rule
+) -> float:
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
     num_phones = 0
     for samples in sounds:
-        events = _decode_live(model, score_recording(model, samples, SAMPLE_RATE_HZ))
+        events = _decode_live(model, score_recording(model, samples, SAMPLE_RATE_HZ), rule)
         num_phones += len(spoken(final_hypothesis(events), model.inventory))
     return num_phones / minutes
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from shared.config import BoundEndpoint, ServiceConfig
+
+# Settings that suit an acoustic model and differ from the defaults below. Who chooses the model
+# has them, unless others are given.
+_SUITED: dict[str, dict[str, Any]] = {
+    "window": {"look_ahead_ms": 0.0, "num_stable_frames": 3, "min_confidence": 0.99}
+}
 
 
 class RecognizerConfig(ServiceConfig):
@@ -19,8 +25,17 @@ class RecognizerConfig(ServiceConfig):
     acoustic: str = "neural"
     """Acoustic model: neural, window, gmm, or a model file."""
     look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0
-    """Future audio that a frame waits for, ms: neural 10, 30, 60, 100, 200; window 0, 10, 20..."""
+    """Future audio that a frame waits for, ms: neural 10, 30, 60, 100, 200; window 0, 10, 20...
+    (0 unless another value is given)."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = 1
-    """Frames that must agree before a phone is emitted (N of Li 2011, who has 3)."""
+    """Frames that must agree before a phone is emitted (N of Li 2011, who has 3); 3 with window,
+    unless another value is given."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.9
-    """Confidence that each of those frames must reach; 0 is the rule of Li 2011."""
+    """Confidence that each of those frames must reach; 0 is the rule of Li 2011; 0.99 with window,
+    unless another value is given."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _suited(cls, values: dict[str, object]) -> dict[str, object]:
+        """Take the settings that suit the acoustic model, where none are given."""
+        return {**_SUITED.get(str(values.get("acoustic")), {}), **values}

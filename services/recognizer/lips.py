@@ -44,6 +44,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.acoustic.lip_network import ModelWithLipNetwork
 from services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
 from services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
 from services.recognizer.acoustic.neural import NeuralModel
@@ -281,9 +282,10 @@ def load_lips(path: Path = LIPS_PATH) -> LipPredictor:
 
 def lips_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | None:
     """Read the model of lips that fits an acoustic model; None if it was trained on another one."""
-    if not isinstance(model, NeuralModel):
+    network = model.lips if isinstance(model, ModelWithLipNetwork) else model
+    if not isinstance(network, NeuralModel):
         return None
-    lips, sizes = load_lips(path), model.session.sizes
+    lips, sizes = load_lips(path), network.session.sizes
     width = sizes.num_heads * sizes.head_size
     fits = len(lips.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + NUM_LAYERS * width
     return lips if fits else None

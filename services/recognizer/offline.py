@@ -70,5 +70,5 @@ def decode_offline(model: AcousticModel, events: Iterable[ScoreEvent]) -> list[P
                     )
                 )
         elif not isinstance(event, LipFrame):
-            confidence += [decoder.accept(row)[2] for row in event]
+            confidence += [decoder.accept(row)[2] for row in event.settled]
     return phones

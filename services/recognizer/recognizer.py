@@ -34,6 +34,7 @@ from services.recognizer.lip_source import LipFrameStream
 from services.recognizer.search.decoder import Decoder, Segment, segments_after
 from services.recognizer.search.output_rule import OutputRule
 from services.recognizer.speech_scores import (
+    FrameScores,
     ScoreEvent,
     SpeechEnd,
     SpeechScores,
@@ -65,6 +66,10 @@ class Recognizer:
     the next one. A phone comes for the last time, with ``final`` true, ``FINALIZE_AFTER_S`` after
     its end or when speech ends. Silence within speech is a phone like any other.
 
+    Where the model has provisional scores, the search runs on over them, and starts again from the
+    last settled frame when the next scores come. The output rule hears each frame once, as soon as
+    it has a score of either kind. So phones come early, and are corrected by better scores.
+
     Parameters
     ----------
     model
@@ -78,7 +83,8 @@ class Recognizer:
     min_confidence
         Confidence that a frame needs to count for the output rule; 0 is the paper's rule.
     lips
-        The session's lips, if lip frames are to be emitted; they need a neural model.
+        The session's lips, if lip frames are to be emitted; their model's streams must be
+        ``PositionStream``s.
 
     Raises
     ------
@@ -107,7 +113,8 @@ class Recognizer:
         self._silence = model.inventory.index[model.inventory.silence]
         self._durations_s = model.topology.duration_mean_s
         self._scores = SpeechScores(model, sample_rate_hz, num_channels, lips)
-        self._decoder = Decoder(model.topology)
+        self._settled = Decoder(model.topology)  # the search over settled scores
+        self._ahead = Decoder(model.topology)  # the same, and on over the provisional ones
         self._rule = OutputRule(num_stable_frames, min_confidence, last_emitted=self._silence)
         self._num_final = 0
         self._start_speech(0)
@@ -171,20 +178,34 @@ class Recognizer:
                 out += self._revise(rest, num_following=0)
                 out.append(SpeechChange(active=False, time_s=frame_time_s(event.frame)))
             else:
-                for row in event:
-                    out += self._decode_frame(row)
+                out += self._decode_frames(event)
         return out
 
     def _start_speech(self, frame: int) -> None:
         self._start_frame = frame
         self._done = 0  # the decoder's frame up to which phones are final
-        self._decoder.reset()
+        self._num_heard = 0  # frames that the output rule has heard
+        self._settled.reset()
+        self._decoder = self._settled
         self._rule.reset()
         self._last_final = self._silence  # index of the last final phone
         self._open: list[Phone] = []  # emitted, not yet final
 
+    def _decode_frames(self, scores: FrameScores) -> list[Phone]:
+        self._decoder = self._settled
+        out = [phone for row in scores.settled for phone in self._decode_frame(row)]
+        if len(scores.provisional):
+            self._decoder = self._ahead
+            self._settled.forget_before(self._done)
+            self._decoder.go_on_from(self._settled)
+            out += [phone for row in scores.provisional for phone in self._decode_frame(row)]
+        return out
+
     def _decode_frame(self, scores: NDArray[np.float32]) -> list[Phone]:
         phone, start, confidence = self._decoder.accept(scores)
+        if self._decoder.num_frames <= self._num_heard:
+            return []
+        self._num_heard = self._decoder.num_frames
         if not self._rule.accept(phone, confidence):
             return []
         revised = self._revise(self._decoder.path_since(self._done), num_following=1)

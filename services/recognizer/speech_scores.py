@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
+    PositionStream,
     ScoringTask,
     run_scoring_tasks,
 )
 from services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from services.recognizer.acoustic.neural import NeuralStream
 from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
 from services.recognizer.front_end.resample import Resampler
 from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
@@ -49,7 +49,15 @@ class SpeechEnd:
     frame: int
 
 
-ScoreEvent = SpeechStart | SpeechEnd | LipFrame | NDArray[np.float32]  # scores: (frames, states)
+@dataclass(frozen=True, slots=True)
+class FrameScores:
+    """State scores of the next frames of speech."""
+
+    settled: NDArray[np.float32]  # (m, states) of the frames after those settled before
+    provisional: NDArray[np.float32]  # (k, states) of the frames after them, until the next come
+
+
+ScoreEvent = SpeechStart | SpeechEnd | LipFrame | FrameScores
 
 
 def frame_time_s(frame: int) -> float:
@@ -71,7 +79,7 @@ class SpeechScores:
     num_channels
         Channels of the input.
     lips
-        The session's lips; they need a neural model.
+        The session's lips; they need a model whose streams are ``PositionStream``s.
     """
 
     def __init__(
@@ -84,7 +92,7 @@ class SpeechScores:
         self._model = model
         self._stream = model.stream()
         self._lips = lips
-        if lips is not None and isinstance(self._stream, NeuralStream):
+        if lips is not None and isinstance(self._stream, PositionStream):
             self._stream.on_position = self._take_position
         self._resampler = Resampler(sample_rate_hz, num_channels)
         self._detector = VoiceActivityDetector()
@@ -101,7 +109,7 @@ class SpeechScores:
 
     @property
     def num_frames_done(self) -> int:
-        """Feature frames whose scores, if they are speech, have been returned."""
+        """Feature frames whose scores, if they are speech, are settled."""
         return max(0, self._num_frames - self._stream.look_ahead_frames)
 
     def process(self, samples: NDArray[np.float32]) -> ScoringTask[list[ScoreEvent]]:
@@ -164,9 +172,11 @@ class SpeechScores:
 
     def _score(self, frames: NDArray[np.float32] | None) -> ScoringTask[list[ScoreEvent]]:
         """Return the scores of frames, shape (n, k), or of a segment's end, and the lips."""
-        scores = yield self._stream, frames
+        before = self._stream.provisional
+        scores = FrameScores((yield self._stream, frames), self._stream.provisional)
         lip_frames, self._lip_frames = self._lip_frames, []
-        return [*([scores] if len(scores) else []), *lip_frames]
+        is_new = len(scores.settled) > 0 or scores.provisional is not before
+        return [*([scores] if is_new else []), *lip_frames]
 
     def _take_position(self, frames: NDArray[np.float32], values: NDArray[np.float32]) -> None:
         """Pass on what the network has computed at a position."""

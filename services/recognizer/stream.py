@@ -63,7 +63,7 @@ class SpeechStream:
         The output rule, as in ``Recognizer``.
     lips
         The model of lips, shared by any number of streams; None: no lip frames are emitted. It
-        needs a neural acoustic model.
+        needs a model whose streams are ``PositionStream``s.
     face_delay_s
         How much later than its sound a frame of the face is made: the lip frames have the longest
         delay that is in time for it.

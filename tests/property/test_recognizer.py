@@ -16,7 +16,9 @@ from services.recognizer.front_end.resample import Resampler, to_16_khz
 from services.recognizer.recognizer import Emission, Recognizer
 from services.recognizer.search.decoder import Decoder
 from services.recognizer.search.output_rule import OutputRule
+from services.recognizer.speech_scores import FrameScores, SpeechEnd, SpeechStart, score_recording
 from shared.audio_file import read_audio
+from shared.phones.events import Phone
 
 pytestmark = pytest.mark.property
 
@@ -141,3 +143,55 @@ def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
     for one, two in pairwise(segments):
         assert one.end == two.start
         assert one.end - one.start >= shortest[one.phone]
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**31), num_frames=st.integers(2, 300), data=st.data())
+def test_a_search_goes_on_from_where_another_stands(
+    seed: int, num_frames: int, data: st.DataObject
+) -> None:
+    topology = the_model().topology
+    rng = np.random.default_rng(seed)
+    rows = rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32)
+    at = data.draw(st.integers(0, num_frames - 1))
+    one, before, after = (Decoder(topology) for _ in range(3))
+    for row in rows[::-1]:
+        after.accept(row)  # it has searched something else
+    expected = [one.accept(row) for row in rows]
+    begun = [before.accept(row) for row in rows[:at]]
+    after.go_on_from(before)
+    for decoder in (after, before):
+        assert begun + [decoder.accept(row) for row in rows[at:]] == expected
+        assert decoder.path_since(0) == one.path_since(0)
+        assert decoder.finish() == one.finish()
+
+
+def test_provisional_scores_that_hold_give_the_same_phones_sooner() -> None:
+    model = the_model()
+    (_, *scores, _) = score_recording(model, HELLO, 16_000)
+    rows = np.concatenate([each.settled for each in scores if isinstance(each, FrameScores)])
+
+    def phones(num_provisional: int) -> tuple[list[Phone], list[int]]:
+        """All phones, and the frame known when each was emitted."""
+        recognizer = Recognizer(model, sample_rate_hz=16_000)
+        recognizer.decode([SpeechStart(0)])
+        found: list[Phone] = []
+        frames: list[int] = []
+        for start in range(0, len(rows), 10):
+            settled = rows[start : start + 10]
+            provisional = rows[start + 10 : start + 10 + num_provisional]
+            events = recognizer.decode([FrameScores(settled, provisional)])
+            found += [event for event in events if isinstance(event, Phone)]
+            frames += [start] * (len(found) - len(frames))
+        events = recognizer.decode([SpeechEnd(len(rows))])
+        return found + [event for event in events if isinstance(event, Phone)], frames
+
+    expected, late = phones(0)
+    found, early = phones(20)
+    assert [phone.symbol for phone in found if phone.final] == [
+        phone.symbol for phone in expected if phone.final
+    ]
+    first = {phone.index: phone for phone in reversed(found)}
+    assert first == {phone.index: phone for phone in reversed(expected)}
+    assert len(first) > 10
+    assert sum(late) - sum(early) > 15 * len(early)

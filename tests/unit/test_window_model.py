@@ -8,16 +8,19 @@ import pytest
 import torch
 
 from corpora.feature_cache import as_floats
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from services.recognizer.acoustic.load import load_model, model_path, with_lip_network
 from services.recognizer.acoustic.model_file import read_archive, write_archive
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.acoustic.window import WindowModel
 from services.recognizer.front_end.whisper_mel import WhisperMel
 from services.recognizer.lips import lips_for
-from services.recognizer.speech_scores import SpeechScores, score_recording
+from services.recognizer.recognizer import Emission, Recognizer
+from services.recognizer.speech_scores import FrameScores, SpeechScores, score_recording
+from services.recognizer.stream import SpeechStream
 from shared.audio_file import read_audio
 from shared.errors import UserError
+from shared.phones.events import LipFrame, Phone
 from tests.tones import tones
 from tests.unit.test_neural_training import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
@@ -94,13 +97,17 @@ def test_onnxruntime_computes_what_pytorch_does(num_frames: int) -> None:
 def test_scores_come_in_time(look_ahead_ms: float) -> None:
     model = window(look_ahead_ms)
     stream = model.stream()
-    right = int(look_ahead_ms) // 10
+    look_ahead = int(look_ahead_ms) // 10
+    right = max(look_ahead, 15)
     assert stream.look_ahead_frames == right + HOP - 1
-    num_scores = 0
+    num_settled = 0
     for number in range(1, len(FRAMES) + 1):
-        num_scores += len(stream.accept(FRAMES[number - 1 : number]))
-        assert num_scores == max(0, number // HOP * HOP - right)
-    assert num_scores + len(stream.finish()) == len(FRAMES)
+        num_settled += len(stream.accept(FRAMES[number - 1 : number]))
+        newest = number // HOP * HOP
+        assert num_settled == max(0, newest - right)
+        assert num_settled + len(stream.provisional) == max(0, newest - look_ahead)
+    assert num_settled + len(stream.finish()) == len(FRAMES)
+    assert len(stream.provisional) == 0
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 2, 9, 10, 11, 29, 30])
@@ -113,14 +120,24 @@ def test_every_frame_of_a_segment_is_scored_once(num_frames: int) -> None:
         assert len(stream.finish()) == 0
 
 
-def test_a_frame_is_scored_by_the_first_window_with_enough_after_it() -> None:
+def test_a_frame_is_settled_by_the_first_window_with_enough_after_it() -> None:
     model = window(30.0)
     found = scores_of(model, FRAMES)
-    for frame in (0, 6, 7, 56, 57, 66, 67, 100):
-        end = -(-(frame + 1 + 3) // HOP) * HOP
+    for frame in (0, 4, 5, 54, 55, 64, 65, 100):
+        end = -(-(frame + 1 + 15) // HOP) * HOP
         start = max(0, end - WINDOW)
         row = model.session.run(FRAMES[start:end])[frame - start]
         np.testing.assert_array_equal(found[frame], np.float32(0.5) * (row - model.log_prior))
+
+
+def test_provisional_scores_are_those_of_the_newest_window() -> None:
+    model = window(20.0)
+    stream = model.stream()
+    for end in range(10, 110, 10):
+        stream.accept(FRAMES[end - 10 : end])
+        frames = FRAMES[max(0, end - WINDOW) : end]
+        expected = model.score_window(frames)[len(frames) - min(end, 15) : -2]
+        np.testing.assert_array_equal(stream.provisional, expected)
 
 
 def test_scores_are_the_same_in_any_chunks_and_any_company() -> None:
@@ -148,19 +165,56 @@ def test_sessions_scored_together_give_what_each_gives_alone() -> None:
         alone = score_recording(model, sound, 16_000)
         assert len(first + last) == len(alone)
         for found, expected in zip(first + last, alone, strict=True):
-            np.testing.assert_array_equal(found, expected)
+            if isinstance(found, FrameScores) and isinstance(expected, FrameScores):
+                np.testing.assert_array_equal(found.settled, expected.settled)
+                np.testing.assert_array_equal(found.provisional, expected.provisional)
+            else:
+                assert found == expected
     assert together[0]
 
 
-def test_a_right_context_is_a_number_of_frames() -> None:
-    assert window().right_context_frames == 1
+def test_phones_are_the_same_in_any_chunks() -> None:
+    def phones(chunk: int) -> list[Emission]:
+        recognizer = Recognizer(window(), sample_rate_hz=16_000, min_confidence=0.0)
+        pieces = np.split(HELLO, range(chunk, len(HELLO), chunk))
+        events = [event for piece in pieces for event in recognizer.accept_waveform(piece)]
+        return events + recognizer.input_finished()
+
+    expected = phones(len(HELLO))
+    assert len(expected) > 5
+    assert phones(160) == phones(1111) == expected
+
+
+def test_a_look_ahead_is_a_number_of_frames() -> None:
+    assert window().look_ahead_frames == 1
     for refused in (5.0, -10.0, 310.0, float("nan")):
         with pytest.raises(UserError, match=r"look_ahead_ms is .*; give 0, 10, 20"):
             window().with_look_ahead(refused)
 
 
-def test_there_are_no_lips_from_sound_for_it() -> None:
+def test_the_lips_follow_the_causal_network_beside_it() -> None:
     assert lips_for(window()) is None
+    model, neural = with_lip_network(window()), load_model()
+    assert with_lip_network(neural) is neural
+    lips = lips_for(model)
+    assert lips is not None
+
+    def frames_and_phones(model: AcousticModel) -> tuple[list[LipFrame], list[Phone]]:
+        stream = SpeechStream(model, lips=lips, face_delay_s=0.06)
+        tasks = [stream.process([(0, HELLO)]), SpeechStream(model).process([(0, HELLO[4000:])])]
+        events = [*run_scoring_tasks(model, tasks)[0], *stream.input_finished()]
+        return (
+            [event for event in events if isinstance(event, LipFrame)],
+            [event for event in events if isinstance(event, Phone)],
+        )
+
+    found_frames, found_phones = frames_and_phones(model)
+    expected_frames, neural_phones = frames_and_phones(neural)
+    assert len(found_frames) > 40
+    for found, expected in zip(found_frames, expected_frames, strict=True):
+        assert (found.time_s, found.delay_s) == (expected.time_s, expected.delay_s)
+        np.testing.assert_array_equal(found.faps, expected.faps)
+    assert found_phones == frames_and_phones(window())[1] != neural_phones
 
 
 # --- the file

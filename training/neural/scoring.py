@@ -17,7 +17,7 @@ from services.recognizer.alignment import spoken
 from services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from services.recognizer.front_end.whisper_mel import WhisperMel
 from services.recognizer.recognizer import Recognizer
-from services.recognizer.speech_scores import SpeechEnd, SpeechStart
+from services.recognizer.speech_scores import FrameScores, SpeechEnd, SpeechStart
 from training.neural.network import Network
 from training.training_set import Example
 
@@ -85,7 +85,8 @@ def first_hypothesis_error_rate(
     total = ErrorCounts()
     for rows, example in zip(scores, examples, strict=True):
         recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
-        events = recognizer.decode([SpeechStart(0), rows, SpeechEnd(len(rows))])
+        scored = FrameScores(rows, provisional=rows[:0])
+        events = recognizer.decode([SpeechStart(0), scored, SpeechEnd(len(rows))])
         first = spoken(first_hypothesis(events, set()), inventory)
         reference = [inventory.phones[phone] for phone in example.phones]
         total += count_errors(reference, [phone.symbol for phone in first])

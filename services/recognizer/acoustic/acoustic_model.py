@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias, TypeVar
+from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,18 +55,42 @@ class FrontEnd(Protocol):
 
 
 class AcousticStream(Protocol):
-    """State scores of one speaker's speech, segment by segment."""
+    """State scores of one speaker's speech, segment by segment.
 
-    look_ahead_frames: int  # a frame's scores come at most this many frames after it
+    Scores that are returned are settled: each frame has them once. A stream may tell more, of the
+    frames that follow: provisional scores, made with less sound after the frame than it will have.
+    """
+
+    look_ahead_frames: int  # a frame's settled scores come at most this many frames after it
+
+    @property
+    def provisional(self) -> NDArray[np.float32]:
+        """Of the frames after the settled ones, (k, states); a new array when they change."""
 
     def accept(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take the front end's frames, shape (n, k); return the scores ready, (m, states)."""
+        """Take the front end's frames, shape (n, k); return the scores settled, (m, states)."""
 
     def finish(self) -> NDArray[np.float32]:
         """End the segment; return its remaining scores, (m, states)."""
 
     def reset(self) -> None:
         """Forget the segment and the speaker."""
+
+
+def no_scores(num_states: int) -> NDArray[np.float32]:
+    """Return the scores of no frames, (0, states)."""
+    return np.empty((0, num_states), np.float32)
+
+
+# Is told of a position: its two newest frames, (2, 80), and its values, (layers, heads, size).
+OnPosition: TypeAlias = Callable[[NDArray[np.float32], NDArray[np.float32]], None]
+
+
+@runtime_checkable
+class PositionStream(AcousticStream, Protocol):
+    """A stream whose network's positions may be heard as they come."""
+
+    on_position: OnPosition | None  # is called for every position, in order; None: nobody asks
 
 
 # A stream with the front end's next frames, (n, k), or None at the end of a segment.

@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology, Work
+from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
 from services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -167,6 +167,7 @@ class GmmStream:
         self._mean = LiveMean(model.prior_mean)
         self._differences = Differences(model.half_width)
         self.look_ahead_frames = self._differences.look_ahead_frames
+        self.provisional = no_scores(model.topology.num_states)
 
     def accept(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take log-mel frames with their pitch, shape (n, 43); return the scores ready."""

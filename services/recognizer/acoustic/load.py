@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 from services.recognizer.acoustic import gmm, neural, window
 from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.acoustic.lip_network import ModelWithLipNetwork
 from services.recognizer.acoustic.model_file import Archive, read_archive
 from shared.errors import UserError
 
@@ -60,3 +62,10 @@ def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -
     if look_ahead_ms is not None and isinstance(model, neural.NeuralModel | window.WindowModel):
         return model.with_look_ahead(look_ahead_ms)
     return model
+
+
+def with_lip_network(model: AcousticModel) -> AcousticModel:
+    """Let the shipped causal network run beside a window model: the lips follow its positions."""
+    if not isinstance(model, window.WindowModel):
+        return model
+    return ModelWithLipNetwork(model, cast(neural.NeuralModel, load_model()))

@@ -42,16 +42,16 @@ session's keys and values take 2 MB.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeAlias, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology, Work
+from services.recognizer.acoustic.acoustic_model import OnPosition, Topology, Work, no_scores
 from services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -81,9 +81,6 @@ _PADDING = 2  # frames of zeros before a segment's first
 _MIN_ROWS = 2  # in a call
 _MAX_LOOK_AHEAD = 100  # feature frames
 _PAST_MASKS = past_masks()
-
-# Is told of a position: its two newest frames, (2, 80), and its values, (layers, heads, size).
-OnPosition: TypeAlias = Callable[[Floats, Floats], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,6 +228,7 @@ class NeuralStream:
         self._model = model
         self.sizes = model.session.sizes
         self.look_ahead_frames = model.look_ahead_frames
+        self.provisional = no_scores(len(model.log_prior))
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
@@ -300,7 +298,7 @@ class NeuralStream:
         rows = self._rows[: self._num_frames - self._num_scored] if is_end else self._rows
         self._num_scored += len(rows)
         self._rows = []
-        return np.stack(rows) if rows else np.empty((0, len(self._model.log_prior)), np.float32)
+        return np.stack(rows) if rows else no_scores(len(self._model.log_prior))
 
 
 def neural_from(archive: Archive) -> NeuralModel:

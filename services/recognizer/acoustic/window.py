@@ -14,7 +14,8 @@ x              log-mel bands of a window's frames                    (frames, 80
 y              log posteriors of the states                          (frames, states)
 W              longest window                                        frames
 H              hop: there is a window at every H frames of a segment frames
-R              right context, the look-ahead that was asked for      frames
+L              look-ahead that was asked for, 0 or more              frames
+R              right context of settled scores, 15 or L if more      frames
 prior          prior of the states, to a power below one             (states,)
 acoustic_scale weight of the log scores, chosen on development data  1
 ============== ===================================================== ==========================
@@ -22,9 +23,10 @@ acoustic_scale weight of the log scores, chosen on development data  1
     log b(x) = acoustic_scale * (y - log prior)
 
 A segment's n-th window ends after its frame ``n H`` and begins ``W`` frames before, or with the
-segment. It scores the frames that no window has scored and that end at least ``R`` frames before
-it ends: so a frame is scored ``R`` to ``R + H - 1`` frames after it. At the end of a segment, a
-last window scores the frames that are left.
+segment. Its scores of the frames that end ``R`` frames or more before it ends are settled, if no
+window before has settled them: so a frame's score is settled ``R`` to ``R + H - 1`` frames after
+it. Those of the frames after them, up to ``L`` frames before the window's end, are provisional. At
+the end of a segment, a last window settles the frames that are left.
 
 Products are of 8-bit integers; a product's inputs are rounded with one scale for the window. So
 every window is computed alone, and a session's scores are the same to the last bit in any company
@@ -42,7 +44,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology, Work
+from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
 from services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -61,6 +63,7 @@ MAX_WINDOW_FRAMES = 250
 
 _INPUT, _OUTPUT = "frames", "log_posteriors"
 _MAX_LOOK_AHEAD = 30  # frames
+_RIGHT_CONTEXT = 15  # frames; a score changes little with more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +76,7 @@ class WindowModel:
     acoustic_scale: float
     window_frames: int  # W
     hop_frames: int  # H
-    right_context_frames: int = 1  # R
+    look_ahead_frames: int = 0  # L
 
     @property
     def inventory(self) -> PhoneInventory:
@@ -95,14 +98,14 @@ class WindowModel:
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
         """Score frames of several streams, one after the other; None ends a stream's segment."""
-        scores = []
-        for stream, frames in work:
-            rows = cast(WindowStream, stream).log_posteriors(frames)
-            scores.append(np.float32(self.acoustic_scale) * (rows - self.log_prior))
-        return scores
+        return [cast(WindowStream, stream).score(frames) for stream, frames in work]
+
+    def score_window(self, frames: Floats) -> Floats:
+        """Score a window's frames, (n, 80) to (n, states)."""
+        return np.float32(self.acoustic_scale) * (self.session.run(frames) - self.log_prior)
 
     def with_look_ahead(self, look_ahead_ms: float) -> WindowModel:
-        """Return the model with another right context.
+        """Return the model with another look-ahead.
 
         Raises
         ------
@@ -115,8 +118,8 @@ class WindowModel:
                 f"recognizer.look_ahead_ms is {look_ahead_ms:g}; give 0, 10, 20... up to "
                 f"{1000 * HOP_S * _MAX_LOOK_AHEAD:g}"
             )
-        model = replace(self, right_context_frames=int(num_frames))
-        vars(model)["session"] = self.session  # opened once for all right contexts
+        model = replace(self, look_ahead_frames=int(num_frames))
+        vars(model)["session"] = self.session  # opened once for all look-aheads
         return model
 
     def save(self, path: Path) -> None:
@@ -173,11 +176,12 @@ class WindowStream:
 
     def __init__(self, model: WindowModel) -> None:
         self._model = model
-        self.look_ahead_frames = model.right_context_frames + model.hop_frames - 1
+        self._right_context = max(_RIGHT_CONTEXT, model.look_ahead_frames)
+        self.look_ahead_frames = self._right_context + model.hop_frames - 1
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
-        """Take frames, shape (n, 80); return the scores ready, (m, states)."""
+        """Take frames, shape (n, 80); return the scores settled, (m, states)."""
         return self._model.score([(self, frames)])[0]
 
     def finish(self) -> Floats:
@@ -186,17 +190,19 @@ class WindowStream:
 
     def reset(self) -> None:
         """Forget the segment. Nothing is known of the speaker."""
+        self.provisional = no_scores(self._model.topology.num_states)
         self._window = np.empty((0, NUM_MELS), np.float32)  # the last frames of the segment
         self._num_frames = 0  # of the segment
-        self._num_scored = 0
+        self._num_settled = 0
 
-    def log_posteriors(self, frames: Floats | None) -> Floats:
-        """Take frames, (n, 80), or the segment's end; return the rows ready, (m, states)."""
-        rows = [np.empty((0, len(self._model.log_prior)), np.float32)]
+    def score(self, frames: Floats | None) -> Floats:
+        """Take frames, (n, 80), or the segment's end; return the scores settled, (m, states)."""
+        settled = [no_scores(self._model.topology.num_states)]
         if frames is None:
-            rows.append(self._score_until(self._num_frames))
+            if self._num_settled < self._num_frames:
+                settled.append(self._settle(self._num_frames))
             self.reset()
-            return np.concatenate(rows)
+            return np.concatenate(settled)
         hop = self._model.hop_frames
         while len(frames):
             piece = frames[: hop - self._num_frames % hop]
@@ -204,17 +210,17 @@ class WindowStream:
             self._window = np.concatenate([self._window, piece])[-self._model.window_frames :]
             self._num_frames += len(piece)
             if self._num_frames % hop == 0:
-                rows.append(self._score_until(self._num_frames - self._model.right_context_frames))
-        return np.concatenate(rows)
+                settled.append(self._settle(self._num_frames - self._right_context))
+        return np.concatenate(settled)
 
-    def _score_until(self, end: int) -> Floats:
-        """Score the frames before ``end`` that are not scored yet, by the window that ends now."""
-        if end <= self._num_scored:
-            return np.empty((0, len(self._model.log_prior)), np.float32)
-        window_start = self._num_frames - len(self._window)
-        rows = self._model.session.run(self._window)
-        start, self._num_scored = self._num_scored, end
-        return rows[start - window_start : end - window_start]
+    def _settle(self, end: int) -> Floats:
+        """Score the window that ends now; settle the frames before ``end``, in the segment."""
+        scores = self._model.score_window(self._window)
+        start = self._num_frames - len(self._window)
+        first, self._num_settled = self._num_settled, max(end, 0)
+        newest = self._num_frames - self._model.look_ahead_frames
+        self.provisional = scores[self._num_settled - start : max(newest - start, 0)]
+        return scores[first - start : self._num_settled - start]
 
 
 def window_from(archive: Archive) -> WindowModel:

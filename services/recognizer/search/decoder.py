@@ -82,6 +82,18 @@ class Decoder:
         self._score = np.full((_MAX_TOKENS, self._max_states), _IMPOSSIBLE, dtype=np.float32)
         self._link = np.full(self._score.shape, _NO_RECORD, dtype=np.int32)
 
+    def go_on_from(self, other: Decoder) -> None:
+        """Take over where another search of the same topology stands."""
+        self.num_frames, self._best = other.num_frames, other._best
+        self._shared, self._last_shared = list(other._shared), other._last_shared
+        self._num_records, self._num_tokens = other._num_records, other._num_tokens
+        if len(self._records) != len(other._records):
+            self._records = np.empty_like(other._records)
+        self._records[: self._num_records] = other._records[: self._num_records]
+        self._token_of[:] = other._token_of
+        for name in ("_context", "_top", "_score", "_link"):
+            getattr(self, name)[: self._num_tokens] = getattr(other, name)[: self._num_tokens]
+
     def accept(self, scores: NDArray[np.float32]) -> tuple[int, int, float]:
         """Take the state scores of one frame, shape (states,).
 
@@ -128,12 +140,15 @@ class Decoder:
     def path_since(self, frame: int) -> list[Segment]:
         """Phones of the best string so far that end after a frame, without its last phone.
 
-        They may still change. The first is cut to begin at the frame. Earlier phones that all
-        paths share are forgotten: later answers do not have them.
+        They may still change. The first is cut to begin at the frame. Earlier phones are forgotten.
         """
-        self._shared = segments_after(self._shared, frame)
+        self.forget_before(frame)
         path = self._trace(int(self._link[self._best]))
         return [*self._shared, *segments_after(path, frame)]
+
+    def forget_before(self, frame: int) -> None:
+        """Forget phones that all paths share and that end by a frame; no answer will have them."""
+        self._shared = segments_after(self._shared, frame)
 
     def finish(self) -> list[Segment]:
         """End the speech: the best string of all frames."""
