@@ -158,7 +158,7 @@ def _utterance(
         return None
     try:
         syllables = inventory.pronounce(row.get("pinyin") or row["text"])
-        seconds = float(row.get("seconds") or _duration_s(path))
+        seconds = float(row.get("seconds") or duration_s(path))
     except (UserError, ValueError) as error:
         errors.add(place, str(error))
         return None
@@ -182,7 +182,8 @@ def _utterance(
     )
 
 
-def _duration_s(path: Path) -> float:
+def duration_s(path: Path) -> float:
+    """Return the length of a recording; ValueError if the file is none that libsndfile reads."""
     import soundfile  # noqa: PLC0415  (manifests state the length; only bare layouts need to ask)
 
     try:

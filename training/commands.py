@@ -234,8 +234,8 @@ def lips(
     speech: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of speech without lips, in any language, which the teacher labels; repeat "
-            "for several."
+            help="Folder of speech without lips, in any language, of which the teacher labels an "
+            "hour; repeat for several."
         ),
     ] = None,
     whisper: Annotated[

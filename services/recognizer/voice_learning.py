@@ -108,7 +108,7 @@ class VoiceGain:
 
 def material_of(model: NeuralModel, lips: LipPredictor, filmed: FilmedSpeech) -> Material:
     """Return the positions of a recording; none without speech."""
-    positions = lip_positions(model, filmed.samples)
+    (positions,) = lip_positions(model, [filmed.samples])
     stream = lips.stream(lips.delays_s)
     made = np.zeros((len(positions.known_s), len(lips.delays_s), _NUM_FAPS), np.float32)
     inner = np.zeros((len(made), len(stream.inner)), np.float32)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import soundfile
+import torch
 from numpy.typing import NDArray
 
+from corpora.feature_cache import as_integers, read_audio
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.lip_positions import POSITION_S
@@ -15,10 +19,18 @@ from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS
 from shared.errors import UserError
 from tests.lips import clip_of
 from tests.system import DEMO
-from training.lips.positions import Speech
+from training.lips import teacher
+from training.lips.positions import Speech, speech_of
 from training.lips.recipe import DELAYS_S
-from training.lips.recurrent import Example
-from training.lips.teacher import TAUGHT_DELAY_S, Lessons, hear, read_recordings, teach
+from training.lips.recurrent import UNITS, Example, LipNetwork
+from training.lips.teacher import (
+    TAUGHT_DELAY_S,
+    Projection,
+    Teacher,
+    draw_recordings,
+    label_recordings,
+    train_teacher,
+)
 from training.neural.network import Shape
 from training.neural.teacher import WholeEncoder
 
@@ -38,57 +50,99 @@ class Clock(WholeEncoder):
         return POSITION_S * np.arange(1, len(samples) // 320, dtype=np.float16)[:, None]
 
 
-def test_the_teacher_hears_the_moment_of_the_mouth_that_it_learns(
+class Loudness(WholeEncoder):
+    """Hears how loud each 20 ms are."""
+
+    def __init__(self) -> None:
+        super().__init__(Shape(num_states=0, look_aheads=(), width=32, heads=2, inner=48))
+
+    def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
+        loud = np.abs(samples.astype(np.float32)).reshape(-1, 320)
+        level: NDArray[np.float16] = loud.mean(axis=1, keepdims=True).astype(np.float16)
+        return level
+
+
+def network_of(gain: np.ndarray) -> LipNetwork:
+    """Make a network whose lower lip is a weighted sum of its inputs, as long as it is positive."""
+    network = LipNetwork(len(gain), 1, 1, both_ways=True).eval()
+    for weights in network.parameters():
+        torch.nn.init.zeros_(weights)
+    network.entry.weight.data[0] = torch.from_numpy(gain)
+    network.output.weight.data[LOWER_LIP, 2 * UNITS] = 1.0
+    return network
+
+
+def test_labels_are_of_the_moment_of_the_mouth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = load_model()
     assert isinstance(model, NeuralModel)
-    (recording,) = (one for one in read_recordings([DEMO], 0) if one.name == "vowels-male.wav")
-    lessons = hear(Clock(), model, [], [recording])
-    assert lessons.speech
-    last_s = POSITION_S * (len(recording.samples) // 320 - 1)  # nothing is heard behind it
-    for speech, heard_s in zip(lessons.speech, lessons.unfilmed, strict=True):
-        mouth_s = np.minimum(speech.speed * (speech.known_s - TAUGHT_DELAY_S), last_s)
-        np.testing.assert_allclose(heard_s[:, 0], mouth_s, atol=0.011)
+    path, silent = DEMO / "vowels-male.wav", tmp_path / "silent.wav"
+    soundfile.write(silent, np.zeros(16_000), 16_000)
+    one = np.ones(1, np.float32)
+    known = 0.25  # is added to the time
+    projection = Projection(0 * one, one, one[:, None])
+    labelled = label_recordings(
+        Teacher(Clock(), projection, network_of(np.ones(2, np.float32))),
+        model,
+        [silent, path],
+        lambda speech: np.full((len(speech.known_s), 1), known, np.float32),
+        DELAYS_S,
+        speaker=7,
+    )
+    recording = clip_of(np.empty(0), np.empty((0, 28)))
+    recording = replace(recording, name=path.name, samples=read_audio(path))
+    (stretches,) = speech_of(model, [recording], copy=1)
+    assert len(labelled) == len(stretches) > 0
+    now, later = DELAYS_S.index(TAUGHT_DELAY_S), DELAYS_S.index(0.055)
+    for example, speech in zip(labelled, stretches, strict=True):
+        mouth_s = speech.speed * (speech.known_s - TAUGHT_DELAY_S)
+        label = example.targets[:, :, LOWER_LIP]
+        np.testing.assert_allclose(label[:, now], mouth_s + known, atol=0.02)
+        assert example.speaker == 7
+        assert np.isnan(label[:2, later]).all()
+        np.testing.assert_allclose(label[2:, later], label[:-2, now], atol=0.005)
+        assert (example.targets[:, now, CLOSURE] == 0.5).all()  # log odds of 0
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_labels_are_what_the_clips_taught_a_delay_ago() -> None:
+def test_the_teacher_learns_lips_from_the_whole_recording() -> None:
     rng = np.random.default_rng(0)
-    heard, speech, examples = [], [], []
-    for _ in range(16):
-        features = rng.normal(size=(100, 3)).astype(np.float16)
-        features[:, 0] = np.convolve(features[:, 0], np.ones(5) / 2, "same")
-        targets = np.full((100, len(DELAYS_S), NUM_OUTPUTS), np.nan, np.float32)
-        targets[..., LOWER_LIP] = features[:, :1] / 2
-        targets[..., CLOSURE] = features[:, :1] < -1
-        heard.append(features)
-        examples.append(Example(rng.normal(size=(100, 4)).astype(np.float32), targets, 0))
-        known_s = 1.0 + POSITION_S * np.arange(100, dtype=np.float64)
-        speech.append(Speech(clip=CLIP, features=features, known_s=known_s, speed=1.0))
-    known = [example.components for example in examples]
-    labelled = teach(
-        Lessons(heard[:12], speech[12:], heard[12:]),
-        examples[:12],
-        known[12:],
-        DELAYS_S,
-        num_epochs=25,
-        seed=0,
-    )
-    now, later = DELAYS_S.index(TAUGHT_DELAY_S), DELAYS_S.index(0.055)
-    for label, truth in zip(labelled, examples[12:], strict=True):
-        assert label.speaker == 1
-        wanted = truth.targets[:, now, LOWER_LIP]
-        assert np.corrcoef(label.targets[:, now, LOWER_LIP], wanted)[0, 1] > 0.8
-        is_shut = truth.targets[:, now, CLOSURE] > 0
-        closure = label.targets[:, now, CLOSURE]
-        assert 0 <= closure.min() < closure[is_shut].mean() / 2 < closure.max() <= 1
-        assert np.isnan(label.targets[:2, later]).all()
-        np.testing.assert_allclose(label.targets[2:, later], label.targets[:-2, now], atol=1e-4)
+    speech, examples = [], []
+    for number in range(12):
+        clip = replace(
+            CLIP, name=str(number), samples=rng.normal(0, 0.1, 32_000).astype(np.float32)
+        )
+        known_s = POSITION_S * np.arange(1, 100, dtype=np.float64) + TAUGHT_DELAY_S
+        features = np.zeros((99, 1), np.float16)
+        speech.append(Speech(clip=clip, features=features, known_s=known_s, speed=1.0))
+        level = Loudness().features(as_integers(clip.samples))[:99].astype(np.float32)
+        targets = np.full((99, len(DELAYS_S), NUM_OUTPUTS), np.nan, np.float32)
+        targets[..., LOWER_LIP] = (level - level.mean()) / level.std()
+        examples.append(Example(np.zeros((99, 4), np.float32), targets, 0))
+    taught = train_teacher(Loudness(), speech[1:], examples[1:], DELAYS_S, num_epochs=30, seed=0)
+    (label,) = taught.label(speech[:1], [examples[0].components], DELAYS_S, 1)
+    now = DELAYS_S.index(TAUGHT_DELAY_S)
+    made, wanted = (each.targets[:, now, LOWER_LIP] for each in (label, examples[0]))
+    assert np.corrcoef(made, wanted)[0, 1] > 0.8
+
+
+def test_recordings_are_drawn_from_each_folder_up_to_an_hour(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(teacher, "_MAX_FOLDER_S", 3.5)
+    for folder, number in (("one", 6), ("other", 2)):
+        (tmp_path / folder).mkdir()
+        for k in range(number):
+            soundfile.write(tmp_path / folder / f"{k}.wav", np.zeros(16_000), 16_000)
+    drawn = draw_recordings([tmp_path / "one", tmp_path / "other"], 0)
+    assert [path.parent.name for path in drawn] == ["one"] * 4 + ["other"] * 2
+    assert len(set(drawn)) == 6
+    assert drawn != draw_recordings([tmp_path / "one", tmp_path / "other"], 1)
 
 
 def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "noise.wav").write_bytes(b"no sound")
     with pytest.raises(UserError, match=r"noise\.wav.*remove it"):
-        read_recordings([tmp_path], 0)
+        draw_recordings([tmp_path], 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +20,19 @@ from shared.phones.events import Phone
 from tests.e2e.following import samples_of_file
 from tests.lips import clip_of
 from tests.system import DEMO
-from training.lips import recipe
+from training.lips import recipe, recurrent
 from training.lips.card import lips_of
 from training.lips.positions import Speech
-from training.lips.recipe import DELAYS_S, Units, fit, joined, train_lips
-from training.lips.recurrent import LipNetwork
+from training.lips.recipe import (
+    DELAYS_S,
+    Units,
+    basis_of,
+    examples_of,
+    fit,
+    joined,
+    train_lips,
+)
+from training.lips.recurrent import Example, LipNetwork, train_network
 from training.lips.ridge import HISTORY, Products, fit_ridge, history_of
 from training.lips.scores import Stretch, correlations, count_closures
 from training.lips.targets import Touch, targets_at, touches
@@ -114,15 +123,33 @@ def test_fitting_learns_lips_that_the_features_tell_in_each_speakers_units() -> 
             speech.append(Speech(clip=clip, features=features, known_s=POSITIONS_S, speed=1.0))
             targets.append(target)
     train = [number for number in range(24) if number % 12]
-    model, losses = fit(
-        [speech[k] for k in train], [targets[k] for k in train], speech, seed=3, num_epochs=6
-    )
+    basis = basis_of(speech, targets)
+    examples = examples_of([speech[k] for k in train], [targets[k] for k in train], basis)
+    model, losses = fit(examples, [], basis, seed=3, num_epochs=6)
     assert losses[-1] < losses[0]
     for held in (0, 12):
         made = lips_of(model, [speech[held]])[0].outputs[:, 2]
         lower = LIP_FAPS.index(5)
         assert np.corrcoef(made[:, lower], targets[held][:, 2, lower])[0, 1] > 0.8
         assert not made[:, LIP_FAPS.index(16)].any()  # nobody tracked it
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_every_epoch_hears_all_examples_and_another_share_of_what_was_labelled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    heard: list[float] = []
+    batch_of = recurrent._batch
+
+    def counted(pieces: Sequence[Example]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        heard.extend(float(piece.components[0, 0]) for piece in pieces)
+        return batch_of(pieces)
+
+    monkeypatch.setattr(recurrent, "_batch", counted)
+    targets = np.zeros((20, 1, NUM_OUTPUTS), np.float32)
+    examples = [Example(np.full((20, 3), k, np.float32), targets, 0) for k in range(32)]
+    train_network(examples[:2], examples[2:], num_epochs=5, seed=0)
+    assert sorted(heard) == sorted([*([0.0, 1.0] * 5), *range(2, 32)])
 
 
 def test_a_closure_is_told_from_a_probability_of_a_third_on() -> None:
@@ -234,7 +261,7 @@ def test_speech_without_lips_is_labelled_and_told_on_the_card(
     assert load_lips(output).delays_s == DELAYS_S
     card = output.with_suffix(".md").read_text()
     assert "--speech DIR --whisper DIR" in card
-    assert "speech without lips in 1 recordings" in card
+    assert "0.0 hours of speech without lips" in card
 
 
 def test_clips_that_may_not_be_used_are_refused(tmp_path: Path) -> None:

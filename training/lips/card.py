@@ -16,10 +16,10 @@ from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS, LipPredictor
 from training.lips.positions import Speech, components_of
+from training.lips.recurrent import Example
 from training.lips.ridge import Products, history_of
 from training.lips.scores import Made, Stretch, correlations, count_closures
 from training.lips.targets import touches
-from training.lips.teacher import Lessons
 
 Floats = NDArray[np.float32]
 
@@ -36,7 +36,7 @@ class Trained:
     clips: Sequence[LipClip]
     speech: Sequence[Speech]  # of the clips as they are
     targets: Sequence[Floats]  # of each stretch, FAP units, (positions, delays, 17)
-    lessons: Lessons | None  # what a teacher labelled besides
+    labelled: Sequence[Example]  # by a teacher, besides
     seed: int
 
 
@@ -68,7 +68,7 @@ def write_card(
         groups[f"{clip.language}, all held clips"].append(clip)
         groups[f"{clip.language}, speakers {known}"].append(clip)
         groups[f"{clip.language}, {clip.speaker} ({known})"].append(clip)
-    options = " --speech DIR --whisper DIR" if trained.lessons else ""
+    options = " --speech DIR --whisper DIR" if trained.labelled else ""
     lines = [
         "# Lips from sound",
         "",
@@ -81,7 +81,7 @@ def write_card(
         "",
         *_data_table(trained.clips),
         "",
-        *(_labelled(trained.lessons) if trained.lessons else []),
+        *(_labelled(trained.labelled) if trained.labelled else []),
         "Mean training loss of each epoch: "
         + ", ".join(f"{loss:.3f}" for loss in trained.losses)
         + ".",
@@ -138,12 +138,10 @@ def _data_table(clips: Sequence[LipClip]) -> list[str]:
     ]
 
 
-def _labelled(lessons: Lessons) -> list[str]:
-    recordings = {each.clip.name for each in lessons.speech}
-    minutes = sum(len(each.known_s) for each in lessons.speech) * POSITION_S / 60
+def _labelled(examples: Sequence[Example]) -> list[str]:
+    hours = sum(len(each.components) for each in examples) * POSITION_S / 3600
     return [
-        f"A teacher labelled {minutes:.0f} minutes of speech without lips in {len(recordings)} "
-        "recordings.",
+        f"A teacher labelled {hours:.1f} hours of speech without lips, {len(examples)} stretches.",
         "",
     ]
 

@@ -3,15 +3,18 @@
 Augmented copies of a clip have other speeds, rooms, noises, lines and levels; their lips move at
 the same speed.
 
-Positions are kept in the cache folder, 16 bits a number: 2.4 KB for each 20 ms of speech.
+Positions are kept in the cache folder, 16 bits a number: 2.4 KB for each 20 ms of speech, 0.4 GB
+for an hour.
 """
 
 from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +30,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _FORMAT = "3"  # raise when the positions change
+_NUM_TOGETHER = 24  # clips that the network hears side by side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,40 +43,63 @@ class Speech:
     speed: float  # of the copy; above 1 is faster than the clip
 
 
-def speech_of(model: NeuralModel, clip: LipClip, copy: int = 0) -> list[Speech]:
-    """Return the speech of a clip (copy 0), or of one of its augmented copies, always the same."""
-    samples, speed = clip.samples, 1.0
-    if copy:
-        rng = np.random.default_rng([copy, zlib.crc32(clip.name.encode())])
-        samples, speed = augment_samples(samples, rng)
-        samples = scale_level(samples, rng)
-    positions = _positions(model, samples)
-    parts = (np.split(positions[name], positions["starts"]) for name in ("features", "known_s"))
-    return [
-        Speech(clip=clip, features=features, known_s=known_s, speed=speed)
-        for features, known_s in zip(*parts, strict=True)
-        if len(known_s)
-    ]
+def speech_of(
+    model: NeuralModel, clips: Iterable[LipClip], copy: int = 0
+) -> Iterator[list[Speech]]:
+    """Yield the speech of each clip (copy 0), or of one of its augmented copies, always the same.
+
+    A few clips at a time are read and heard.
+    """
+    following = iter(clips)
+    while together := list(islice(following, _NUM_TOGETHER)):
+        sounds = [_sound_of(clip, copy) for clip in together]
+        heard = _positions(model, [samples for samples, _ in sounds])
+        for clip, (_, speed), positions in zip(together, sounds, heard, strict=True):
+            parts = [
+                np.split(positions[name], positions["starts"]) for name in ("features", "known_s")
+            ]
+            yield [
+                Speech(clip=clip, features=features, known_s=known_s, speed=speed)
+                for features, known_s in zip(*parts, strict=True)
+                if len(known_s)
+            ]
 
 
-def _positions(model: NeuralModel, samples: Floats) -> dict[str, NDArray[Any]]:
+def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
+    """Return the samples of a clip or of its copy, and the copy's speed."""
+    if not copy:
+        return clip.samples, 1.0
+    rng = np.random.default_rng([copy, zlib.crc32(clip.name.encode())])
+    samples, speed = augment_samples(clip.samples, rng)
+    return scale_level(samples, rng), speed
+
+
+def _positions(model: NeuralModel, sounds: Sequence[Floats]) -> list[dict[str, NDArray[Any]]]:
     """Features and times of all positions and the first of each stretch, cached or computed."""
-    key = hashlib.sha256(_FORMAT.encode())
-    key.update(model.network.tobytes())
-    key.update(samples.tobytes())
-    path = cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz"
-    if path.is_file():
+    of_model = hashlib.sha256(_FORMAT.encode())
+    of_model.update(model.network.tobytes())
+    paths = [_cache_path(of_model, samples) for samples in sounds]
+    new = [number for number, path in enumerate(paths) if not path.is_file()]
+    recorded = lip_positions(model, [sounds[number] for number in new])
+    for number, each in zip(new, recorded, strict=True):
+        np.savez(
+            paths[number],
+            allow_pickle=False,
+            starts=np.array(each.starts, dtype=np.int64),
+            known_s=np.array(each.known_s, dtype=np.float64),
+            features=np.array(each.features, dtype=np.float16),
+        )
+    positions = []
+    for path in paths:
         with np.load(path, allow_pickle=False) as kept:
-            return dict(kept)
-    recorded = lip_positions(model, samples)
-    num_positions = len(recorded.known_s)
-    positions: dict[str, NDArray[Any]] = {
-        "starts": np.array(recorded.starts, dtype=np.int64),
-        "known_s": np.array(recorded.known_s, dtype=np.float64),
-        "features": np.array(recorded.features, dtype=np.float16).reshape(num_positions, -1),
-    }
-    np.savez(path, allow_pickle=False, **positions)
+            positions.append(dict(kept))
     return positions
+
+
+def _cache_path(of_model: hashlib._Hash, samples: Floats) -> Path:
+    key = of_model.copy()
+    key.update(samples.tobytes())
+    return cache_folder() / f"lip_positions_{key.hexdigest()[:20]}.npz"
 
 
 def features_of(speech: Sequence[Speech]) -> Floats:

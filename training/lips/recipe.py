@@ -37,7 +37,7 @@ from training.lips.positions import Speech, components_of, features_of, speech_o
 from training.lips.recurrent import Example, LipNetwork, train_network
 from training.lips.ridge import HISTORY, fit_ridge, history_of
 from training.lips.targets import Touch, targets_at, touches
-from training.lips.teacher import Lessons, hear, load_encoder, read_recordings, teach
+from training.lips.teacher import draw_recordings, label_recordings, load_encoder, train_teacher
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
@@ -66,6 +66,15 @@ class Units:
 
     mean: Floats  # (15,)
     extent: Floats  # (15,)
+
+
+@dataclass(frozen=True, slots=True)
+class Basis:
+    """What the model's inputs and outputs are measured in."""
+
+    mean: Floats  # (features,)
+    projection: Floats  # (features, components)
+    units: Units
 
 
 def train_lips(
@@ -115,26 +124,42 @@ def train_lips(
         raise UserError(
             f"no clip in {folder} may be used; give clips with a free licence, or --any-licence"
         )
-    recordings = read_recordings(speech, seed)
-    positions = {clip.name: speech_of(model, clip) for clip in track(clips, description="clips")}
+    recordings = draw_recordings(speech, seed)
+    heard = track(speech_of(model, clips), description="clips", total=len(clips))
+    positions = {clip.name: stretches for clip, stretches in zip(clips, heard, strict=True)}
     copies = [
         stretch
-        for clip in track(used, description="augmented copies")
         for copy in range(1, NUM_COPIES + 1)
-        for stretch in speech_of(model, clip, copy)
+        for stretches in track(
+            speech_of(model, used, copy), description="augmented copies", total=len(used)
+        )
+        for stretch in stretches
     ]
     trained_on = [stretch for clip in used for stretch in positions[clip.name]]
     if not trained_on:
         raise UserError(f"nobody speaks in the clips of {folder}; give clips with speech")
-    targets = _targets(model, [*trained_on, *copies], touches(clips))
-    lessons = None
+    filmed = [*trained_on, *copies]
+    targets = _targets(model, filmed, touches(clips))
+    basis = basis_of(trained_on, targets)
+    examples = examples_of(filmed, targets, basis)
+    labelled = []
     if whisper and recordings:
-        lessons = hear(load_encoder(whisper), model, [*trained_on, *copies], recordings)
-    lips, losses = fit([*trained_on, *copies], targets, trained_on, seed, lessons=lessons)
+        teacher = train_teacher(
+            load_encoder(whisper), filmed, examples, DELAYS_S, num_epochs=NUM_EPOCHS, seed=seed
+        )
+        labelled = label_recordings(
+            teacher,
+            model,
+            recordings,
+            lambda stretch: components_of(stretch, basis.mean, basis.projection),
+            DELAYS_S,
+            speaker=1 + max(example.speaker for example in examples),
+        )
+    lips, losses = fit(examples, labelled, basis, seed)
     lips.save(output)
     own = targets[: len(trained_on)]
     write_card(
-        output, Trained(lips, losses, used, trained_on, own, lessons, seed), clips, positions
+        output, Trained(lips, losses, used, trained_on, own, labelled, seed), clips, positions
     )
 
 
@@ -157,51 +182,58 @@ def _targets(model: NeuralModel, speech: Sequence[Speech], touch: dict[str, Touc
     ]
 
 
+def basis_of(unchanged: Sequence[Speech], targets: Sequence[Floats]) -> Basis:
+    """Find the components of speech without augmentation and the units of targets, FAP units."""
+    return Basis(*principal_components(features_of(unchanged)), units_of(targets))
+
+
+def examples_of(speech: Sequence[Speech], targets: Sequence[Floats], basis: Basis) -> list[Example]:
+    """Return filmed stretches as examples; targets in FAP units, (positions, delays, 17) each."""
+    speakers = sorted({each.clip.speaker for each in speech})
+    return [
+        Example(
+            components_of(each, basis.mean, basis.projection),
+            standardised(target, basis.units),
+            speakers.index(each.clip.speaker),
+        )
+        for each, target in zip(speech, targets, strict=True)
+    ]
+
+
 def fit(
-    speech: Sequence[Speech],
-    targets: Sequence[Floats],
-    unchanged: Sequence[Speech],
+    examples: Sequence[Example],
+    labelled: Sequence[Example],
+    basis: Basis,
     seed: int,
     num_epochs: int = NUM_EPOCHS,
-    lessons: Lessons | None = None,
 ) -> tuple[LipPredictor, list[float]]:
     """Fit a model; return it and the mean loss of each epoch.
 
     Parameters
     ----------
-    speech
-        Stretches of speech.
-    targets
-        Of each, in FAP units, (positions, delays, 17).
-    unchanged
-        Those without augmentation, which the principal components are of.
+    examples
+        Filmed stretches.
+    labelled
+        Those that a teacher labelled. The ridge regression takes as many positions of them.
+    basis
+        What the examples are measured in.
     seed
         The same seed gives the same model.
     num_epochs
-        Of the network, and of the teacher.
-    lessons
-        What a teacher labels.
+        Of the network.
     """
-    mean, projection = principal_components(features_of(unchanged))
-    units = units_of(targets)
-    speakers = sorted({each.clip.speaker for each in speech})
-    examples = [
-        Example(
-            components_of(each, mean, projection),
-            standardised(target, units),
-            speakers.index(each.clip.speaker),
-        )
-        for each, target in zip(speech, targets, strict=True)
-    ]
-    if lessons:
-        known = [components_of(each, mean, projection) for each in lessons.speech]
-        examples += teach(lessons, examples, known, DELAYS_S, num_epochs=num_epochs, seed=seed)
-    network, losses = train_network(examples, num_epochs=num_epochs, seed=seed)
+    network, losses = train_network(examples, labelled, num_epochs=num_epochs, seed=seed)
+    every = max(1, round(_num_positions(labelled) / _num_positions(examples)))
+    linear_on = [*examples, *labelled[::every]]
     linear = fit_ridge(
-        [history_of(example.components) for example in examples],
-        [canonical(example, network)[..., :_NUM_FAPS] for example in examples],
+        [history_of(example.components) for example in linear_on],
+        [canonical(example, network)[..., :_NUM_FAPS] for example in linear_on],
     )
-    return joined(mean, projection, network, linear, units), losses
+    return joined(basis.mean, basis.projection, network, linear, basis.units), losses
+
+
+def _num_positions(examples: Sequence[Example]) -> int:
+    return sum(len(each.components) for each in examples)
 
 
 def principal_components(features: Floats) -> tuple[Floats, Floats]:

@@ -7,6 +7,7 @@ each speaker's scale and offset are learnt beside it, held near 1 and 0.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,6 +27,7 @@ _INPUT_NOISE = 0.1  # standard deviation; that of a component is 1
 _PIECE = 200  # positions
 _MIN_PIECE = 10
 _BATCH = 32  # pieces
+_LABELLED_SHARE = 3  # pieces that a teacher labelled, in an epoch, for each of the examples
 _RATE, _WEIGHT_DECAY = 2e-3, 1e-2
 _PROBABILITY_WEIGHT = 0.3  # of closure and of lip to teeth in the loss
 _UNITS_WEIGHT = 0.01  # of a speaker's squared scale (log) and offset
@@ -78,45 +80,64 @@ class LipNetwork(nn.Module):
 class Example:
     """A stretch of speech with its targets."""
 
-    components: Floats  # (positions, components)
-    targets: Floats  # (positions, delays, 17), FAPs standardised
+    components: NDArray[np.floating]  # (positions, components)
+    targets: NDArray[np.floating]  # (positions, delays, 17), FAPs standardised
     speaker: int
 
 
 def train_network(
     examples: Sequence[Example],
+    labelled: Sequence[Example] = (),
     *,
     num_epochs: int,
     seed: int,
     both_ways: bool = False,
 ) -> tuple[LipNetwork, list[float]]:
-    """Train; return the network and the mean loss of each epoch."""
+    """Train; return the network and the mean loss of each epoch.
+
+    Parameters
+    ----------
+    examples
+        Every epoch sees them.
+    labelled
+        Every epoch sees another share of these, three times as long as the examples.
+    num_epochs
+        Number of epochs.
+    seed
+        The same seed gives the same network.
+    both_ways
+        Whether the recurrent layer runs both ways.
+    """
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
-    pieces = _cut(examples)
+    pieces, further = _cut(examples), _cut(labelled)
+    share = min(len(further), _LABELLED_SHARE * len(pieces))
+    further = [further[number] for number in rng.permutation(len(further))]
     first = pieces[0]
     network = LipNetwork(
         first.components.shape[1],
         first.targets.shape[1],
-        1 + max(example.speaker for example in examples),
+        1 + max(example.speaker for example in [*examples, *labelled]),
         both_ways=both_ways,
     )
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_WEIGHT_DECAY)
-    num_batches = -(-len(pieces) // _BATCH)
+    num_batches = math.ceil((len(pieces) + share) / _BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, _RATE, total_steps=num_batches * num_epochs
     )
     losses = []
     network.train()
-    for _ in range(num_epochs):
+    for epoch in range(num_epochs):
         total = 0.0
+        turn = range(epoch * share, (epoch + 1) * share)
+        here = pieces + [further[number % len(further)] for number in turn]
         # Pieces of about the same length share a batch.
-        lengths = [len(piece.components) // 40 + rng.random() for piece in pieces]
+        lengths = [len(piece.components) // 40 + rng.random() for piece in here]
         batches = np.array_split(np.argsort(lengths), num_batches)
         for number in rng.permutation(num_batches):
             optimizer.zero_grad()
-            loss = network.loss(*_batch([pieces[k] for k in batches[number]]))
+            loss = network.loss(*_batch([here[k] for k in batches[number]]))
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT)
             optimizer.step()
@@ -140,9 +161,9 @@ def _batch(pieces: Sequence[Example]) -> tuple[Tensor, Tensor, Tensor]:
     """Stack pieces, padded at their ends: components, targets, speakers."""
     longest = max(len(piece.components) for piece in pieces)
 
-    def padded(rows: Floats, value: float) -> Floats:
+    def padded(rows: NDArray[np.floating], value: float) -> Floats:
         more = [(0, longest - len(rows)), *[(0, 0)] * (rows.ndim - 1)]
-        return np.pad(rows, more, constant_values=value)
+        return np.pad(rows.astype(np.float32), more, constant_values=value)
 
     components = np.stack([padded(piece.components, 0.0) for piece in pieces])
     targets = np.stack([padded(piece.targets, np.nan) for piece in pieces])

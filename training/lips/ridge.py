@@ -20,7 +20,7 @@ RIDGE = 0.5  # weight of zero, share of the positions
 _TINY = 1e-9
 
 
-def history_of(components: Floats) -> Floats:
+def history_of(components: NDArray[np.floating]) -> Floats:
     """Return each position's last components, oldest first, and a 1.
 
     Parameters
@@ -34,7 +34,7 @@ def history_of(components: Floats) -> Floats:
         Shape (positions, HISTORY * components + 1).
     """
     num_positions = len(components)
-    padded = np.pad(components, ((HISTORY - 1, 0), (0, 0)))
+    padded = np.pad(components.astype(np.float32, copy=False), ((HISTORY - 1, 0), (0, 0)))
     shifted = [padded[delay : delay + num_positions] for delay in range(HISTORY)]
     return np.concatenate([*shifted, np.ones((num_positions, 1), np.float32)], axis=1)
 

@@ -8,7 +8,8 @@ noise, the teacher does not).
 The teacher hears the whole recording, so it follows a stranger's lips more closely than a live
 model can: to what a position knows it adds Whisper's encoder of the clean recording, and its
 recurrent layer runs both ways. It learns the clips' lips at `TAUGHT_DELAY_S` in canonical units,
-and labels other recordings in the same units.
+and labels other recordings in the same units, one after the other: only what the live model knows
+and the labels are kept, 16 bits a number, 0.1 GB for an hour of speech.
 
     z = P clip((concat(h_2, h_4, h_6) - mean) / deviation, -6, 6)
 
@@ -23,9 +24,10 @@ z      joins the components that the live model knows      (128,)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -35,14 +37,14 @@ from scipy.special import expit
 
 from corpora.feature_cache import as_integers, read_audio
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from corpora.speech_corpus import audio_files
+from corpora.speech_corpus import audio_files, duration_s
 from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lips import LIP_FAPS
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
 from training.lips.positions import Speech, speech_of
-from training.lips.recurrent import Example, train_network
+from training.lips.recurrent import Example, LipNetwork, train_network
 from training.neural.network import Shape
 from training.neural.teacher import NUM_LAYERS, WholeEncoder
 from training.neural.whisper_weights import load_whisper
@@ -53,7 +55,7 @@ Array = NDArray[np.float64]
 
 _LAYERS = (1, 3, 5)  # of Whisper's encoder, the first is 0
 TAUGHT_DELAY_S = 0.015
-NUM_RECORDINGS = 100  # drawn from each folder
+_MAX_FOLDER_S = 3600.0  # drawn from each folder, so that none outweighs the others
 _MAX_SAMPLES = 20 * SAMPLE_RATE_HZ
 _NUM_COMPONENTS = 128
 _MAX_DEVIATIONS = 6.0
@@ -62,18 +64,11 @@ _STRIDE = 2  # positions, of those that the principal components are of
 
 _NUM_FAPS = len(LIP_FAPS)
 
-
-@dataclass(frozen=True, slots=True)
-class Lessons:
-    """What the teacher hears of filmed and of other speech."""
-
-    filmed: Sequence[Features]  # of each stretch that the model is fitted to, (positions, 1536)
-    speech: Sequence[Speech]  # stretches that nobody filmed, augmented
-    unfilmed: Sequence[Features]  # of each of them
+T = TypeVar("T", bound=np.generic)
 
 
-def read_recordings(folders: Sequence[Path], seed: int) -> list[LipClip]:
-    """Draw recordings of speech without lips, as many from each folder.
+def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
+    """Draw recordings of speech without lips, an hour of each folder or all it holds.
 
     Raises
     ------
@@ -81,19 +76,31 @@ def read_recordings(folders: Sequence[Path], seed: int) -> list[LipClip]:
         If a folder holds no recordings, or one of them cannot be read.
     """
     rng = np.random.default_rng(seed)
-    recordings = []
+    drawn = []
     for folder in folders:
         files = audio_files(folder)
-        for number in rng.permutation(len(files))[:NUM_RECORDINGS]:
+        total_s = 0.0
+        for number in rng.permutation(len(files)):
+            if total_s >= _MAX_FOLDER_S:
+                break
             try:
-                samples = read_audio(files[number])[:_MAX_SAMPLES]
+                total_s += duration_s(files[number])
             except ValueError as error:
-                raise UserError(f"{error}; remove it, or give another folder") from error
-            recordings.append(_without_lips(files[number], samples))
-    return recordings
+                raise _unreadable(error) from error
+            drawn.append(files[number])
+    return drawn
 
 
-def _without_lips(path: Path, samples: Floats) -> LipClip:
+def _unreadable(error: Exception) -> UserError:
+    return UserError(f"{error}; remove it, or give another folder")
+
+
+def _without_lips(path: Path) -> LipClip:
+    """Read a recording, as long as the teacher hears it."""
+    try:
+        samples = read_audio(path)[:_MAX_SAMPLES]
+    except ValueError as error:
+        raise _unreadable(error) from error
     return LipClip(
         name=path.name,
         speaker="",
@@ -121,102 +128,28 @@ def load_encoder(whisper: Path) -> WholeEncoder:
     return encoder.eval()
 
 
-def hear(
-    encoder: WholeEncoder,
-    model: NeuralModel,
-    filmed: Sequence[Speech],
-    recordings: Sequence[LipClip],
-) -> Lessons:
-    """Let the teacher hear the filmed speech and recordings; the latter are augmented too."""
-    clips = {each.clip.name: each.clip for each in filmed}
-    whole = {
-        name: encoder.features(as_integers(clip.samples))
-        for name, clip in track(clips.items(), description="clips for the teacher")
-    }
-    speech, unfilmed = [], []
-    for recording in track(recordings, description="recordings"):
-        if stretches := speech_of(model, recording, copy=1):
-            features = encoder.features(as_integers(recording.samples))
-            speech += stretches
-            unfilmed += [_at_positions(features, stretch) for stretch in stretches]
-    return Lessons(
-        [_at_positions(whole[each.clip.name], each) for each in filmed], speech, unfilmed
-    )
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """To principal components of variance 1 of the encoder's features."""
 
+    mean: Floats  # (features,)
+    deviation: Floats  # (features,)
+    directions: Floats  # (features, components)
 
-def _at_positions(features: Features, speech: Speech) -> Features:
-    """Return Whisper's features of the mouth that is taught at each position of a stretch."""
-    time_s = (speech.known_s - TAUGHT_DELAY_S) * speech.speed
-    places = np.rint(time_s / POSITION_S).astype(np.int64) - 1  # the first stands at 20 ms
-    return features[np.clip(places, 0, len(features) - 1)]
+    @classmethod
+    def of(cls, features: Features) -> Projection:
+        """Fit it to features, (n, features)."""
+        some = features[::_STRIDE].astype(np.float32)
+        mean, deviation = some.mean(axis=0), some.std(axis=0) + _MIN_DEVIATION
+        standard = _standard(some, mean, deviation)
+        variances, directions = np.linalg.eigh(standard.T @ standard / len(standard))
+        first = slice(-1, -1 - _NUM_COMPONENTS, -1)
+        scale = np.sqrt(np.maximum(variances[first], _MIN_DEVIATION))
+        return cls(mean, deviation, directions[:, first] / scale)
 
-
-def teach(
-    lessons: Lessons,
-    examples: Sequence[Example],
-    components: Sequence[Floats],
-    delays_s: Sequence[float],
-    *,
-    num_epochs: int,
-    seed: int,
-) -> list[Example]:
-    """Train a teacher and let it label.
-
-    Parameters
-    ----------
-    lessons
-        What it hears.
-    examples
-        The filmed stretches, from speakers 0, 1, ... on; `TAUGHT_DELAY_S` is one of the delays.
-    components
-        Of each stretch that nobody filmed, (positions, components).
-    delays_s
-        Delays of the examples' targets, seconds.
-
-    Returns
-    -------
-    list
-        The stretches that nobody filmed, with labels. They are one further speaker.
-    """
-    mean, deviation, projection = _principal_components(np.concatenate(list(lessons.filmed)))
-
-    def inputs(features: Features, known: Floats) -> Floats:
-        standard = _standard(features, mean, deviation)
-        return np.concatenate([standard @ projection, known], axis=1)
-
-    taught = delays_s.index(TAUGHT_DELAY_S)
-    network, _ = train_network(
-        [
-            replace(
-                example,
-                components=inputs(features, example.components),
-                targets=example.targets[:, taught : taught + 1],
-            )
-            for features, example in zip(lessons.filmed, examples, strict=True)
-        ],
-        num_epochs=num_epochs,
-        seed=seed,
-        both_ways=True,
-    )
-    speaker = 1 + max(example.speaker for example in examples)
-    labelled = []
-    for features, known, speech in zip(lessons.unfilmed, components, lessons.speech, strict=True):
-        with torch.no_grad():
-            outputs = network(torch.from_numpy(inputs(features, known))[None])[0, :, 0].numpy()
-        outputs[:, _NUM_FAPS:] = expit(outputs[:, _NUM_FAPS:])
-        labelled.append(Example(known, _delayed(outputs, speech.known_s, delays_s), speaker))
-    return labelled
-
-
-def _principal_components(features: Features) -> tuple[Floats, Floats, Floats]:
-    """Return mean, deviation and projection of features, (n, 1536)."""
-    some = features[::_STRIDE].astype(np.float32)
-    mean, deviation = some.mean(axis=0), some.std(axis=0) + _MIN_DEVIATION
-    standard = _standard(some, mean, deviation)
-    variances, directions = np.linalg.eigh(standard.T @ standard / len(standard))
-    first = slice(-1, -1 - _NUM_COMPONENTS, -1)
-    scaled = directions[:, first] / np.sqrt(np.maximum(variances[first], _MIN_DEVIATION))
-    return mean, deviation, scaled
+    def apply(self, features: Features) -> Floats:
+        """Project features, (n, features) to (n, components)."""
+        return _standard(features, self.mean, self.deviation) @ self.directions
 
 
 def _standard(features: NDArray[np.floating], mean: Floats, deviation: Floats) -> Floats:
@@ -224,7 +157,146 @@ def _standard(features: NDArray[np.floating], mean: Floats, deviation: Floats) -
     return standard.clip(-_MAX_DEVIATIONS, _MAX_DEVIATIONS)
 
 
-def _delayed(labels: Floats, known_s: Array, delays_s: Sequence[float]) -> Floats:
+@dataclass(frozen=True, slots=True)
+class Teacher:
+    """Tells the lips from what Whisper's encoder and the live model hear."""
+
+    encoder: WholeEncoder
+    projection: Projection
+    network: LipNetwork
+
+    @torch.no_grad()
+    def label(
+        self,
+        speech: Sequence[Speech],
+        components: Sequence[Floats],
+        delays_s: Sequence[float],
+        speaker: int,
+    ) -> list[Example]:
+        """Label the stretches of a recording.
+
+        Parameters
+        ----------
+        speech
+            Stretches of its augmented copy.
+        components
+            What the live model knows of each, (positions, components).
+        delays_s
+            Delays of the labels, seconds.
+        speaker
+            The examples' speaker.
+        """
+        if not speech:
+            return []
+        whole = self.projection.apply(_features_of(self.encoder, speech[0].clip))
+        examples = []
+        for each, known in zip(speech, components, strict=True):
+            inputs = np.concatenate([_at_positions(whole, each), known], axis=1)
+            outputs = self.network(torch.from_numpy(inputs)[None])[0, :, 0].numpy()
+            outputs[:, _NUM_FAPS:] = expit(outputs[:, _NUM_FAPS:])
+            labels = _delayed(outputs, each.known_s, delays_s)
+            examples.append(Example(known.astype(np.float16), labels, speaker))
+        return examples
+
+
+def train_teacher(
+    encoder: WholeEncoder,
+    speech: Sequence[Speech],
+    examples: Sequence[Example],
+    delays_s: Sequence[float],
+    *,
+    num_epochs: int,
+    seed: int,
+) -> Teacher:
+    """Train a teacher on filmed speech.
+
+    Parameters
+    ----------
+    encoder
+        Whisper's.
+    speech
+        Stretches of clips and of their augmented copies. The teacher hears the clips as they are.
+    examples
+        Of each stretch; `TAUGHT_DELAY_S` is one of the delays.
+    delays_s
+        Delays of the examples' targets, seconds.
+    num_epochs, seed
+        As for :func:`training.lips.recurrent.train_network`.
+    """
+    clips = {each.clip.name: each.clip for each in speech}
+    whole = {
+        name: _features_of(encoder, clip)
+        for name, clip in track(clips.items(), description="clips for the teacher")
+    }
+    heard = [_at_positions(whole[each.clip.name], each) for each in speech]
+    projection = Projection.of(np.concatenate(heard))
+    taught = delays_s.index(TAUGHT_DELAY_S)
+    network, _ = train_network(
+        [
+            replace(
+                example,
+                components=np.concatenate([projection.apply(features), example.components], axis=1),
+                targets=example.targets[:, taught : taught + 1],
+            )
+            for features, example in zip(heard, examples, strict=True)
+        ],
+        num_epochs=num_epochs,
+        seed=seed,
+        both_ways=True,
+    )
+    return Teacher(encoder, projection, network)
+
+
+def label_recordings(
+    teacher: Teacher,
+    model: NeuralModel,
+    recordings: Sequence[Path],
+    components: Callable[[Speech], Floats],
+    delays_s: Sequence[float],
+    speaker: int,
+) -> list[Example]:
+    """Let the teacher label recordings, and a student hear them with noise, rooms and lines added.
+
+    Parameters
+    ----------
+    teacher
+        Hears them as they are.
+    model
+        The acoustic model.
+    recordings
+        Their files.
+    components
+        Returns what the live model knows of a stretch, (positions, components).
+    delays_s, speaker
+        Delays of the labels, seconds, and the examples' speaker.
+
+    Raises
+    ------
+    UserError
+        If a recording cannot be read.
+    """
+    heard = speech_of(model, map(_without_lips, recordings), copy=1)
+    return [
+        example
+        for speech in track(heard, description="recordings", total=len(recordings))
+        for example in teacher.label(
+            speech, [components(each) for each in speech], delays_s, speaker
+        )
+    ]
+
+
+def _features_of(encoder: WholeEncoder, clip: LipClip) -> Features:
+    return encoder.features(as_integers(clip.samples))
+
+
+def _at_positions(whole: NDArray[T], speech: Speech) -> NDArray[T]:
+    """Return rows of a recording, one every 20 ms, of the mouth taught at a stretch's positions."""
+    time_s = (speech.known_s - TAUGHT_DELAY_S) * speech.speed
+    places = np.rint(time_s / POSITION_S).astype(np.int64) - 1  # the first stands at 20 ms
+    return whole[np.clip(places, 0, len(whole) - 1)]
+
+
+def _delayed(labels: Floats, known_s: Array, delays_s: Sequence[float]) -> NDArray[np.float16]:
     """Labels of each delay, (positions, delays, 17), from those of one, (positions, 17).
 
     They are unknown (NaN) where the mouth moved before or after the stretch.
@@ -232,4 +304,4 @@ def _delayed(labels: Floats, known_s: Array, delays_s: Sequence[float]) -> Float
     time_s = known_s - TAUGHT_DELAY_S
     wanted_s = known_s[:, None] - np.asarray(delays_s)
     tracks = [np.interp(wanted_s, time_s, track, np.nan, np.nan) for track in labels.T]
-    return np.stack(tracks, axis=-1).astype(np.float32)
+    return np.stack(tracks, axis=-1).astype(np.float16)
