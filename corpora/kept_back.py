@@ -1,4 +1,4 @@
-"""Natural recordings that no training uses, so that models can be measured on them.
+"""Natural recordings that no recogniser learns from, so that they can be measured on them.
 
 ``conversation.tsv`` is a manifest (:mod:`corpora.speech_corpus`) of those with a text: podcasts, a
 talk, a web seminar and a prompt, eight voices. The texts were published with the recordings: by

@@ -26,7 +26,7 @@ Audio = Annotated[
 ]
 Split = Annotated[str, typer.Option(help="Its split.")]
 Acoustic = Annotated[
-    list[str] | None, typer.Option(help="neural, window, gmm or a model file; repeatable.")
+    list[str] | None, typer.Option(help="neural, blocks, gmm or a model file; repeatable.")
 ]
 LookAhead = Annotated[
     list[float] | None,
@@ -102,23 +102,26 @@ def robustness(
 def _models(
     names: list[str] | None, look_aheads_ms: list[float] | None
 ) -> Iterator[tuple[str, str, AcousticModel, tuple[int, float]]]:
-    """Load models, those that have a look-ahead with each given or else the one that suits them.
+    """Load models, each with every look-ahead that is given, or else with the one that suits it.
 
     Yields title, name, model, and the output rule that suits it.
     """
-    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
+    from services.recognizer.acoustic.load import (
+        DEFAULT_MODEL,
+        load_model,
+        model_path,
+        with_early_network,
+    )
     from services.recognizer.config import RecognizerConfig
 
     for name in names or [DEFAULT_MODEL]:
         suited = RecognizerConfig(acoustic=name)
         rule = suited.num_stable_frames, suited.min_confidence
-        model = load_model(model_path(name), look_ahead_ms=suited.look_ahead_ms)
-        if look_aheads_ms and hasattr(model, "with_look_ahead"):
-            for look_ahead_ms in look_aheads_ms:
-                title = f"{name}, {look_ahead_ms:g} ms look-ahead"
-                yield title, name, model.with_look_ahead(look_ahead_ms), rule
-        else:
-            yield name, name, model, rule
+        for look_ahead_ms in look_aheads_ms or [suited.look_ahead_ms]:
+            model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
+            model = with_early_network(model, look_ahead_ms=look_ahead_ms)
+            title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_aheads_ms else name
+            yield title, name, model, rule
 
 
 @app.command()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -32,6 +34,34 @@ AnyLicence = Annotated[
     bool,
     typer.Option("--any-licence", help="Also use rows that forbid giving the model away."),
 ]
+Whisper = Annotated[
+    Path, typer.Option(help="Folder of Whisper base for faster-whisper: the encoder.")
+]
+StartFrom = Annotated[
+    Path | None,
+    typer.Option(
+        help="Neural model that aligns, and whose HMMs and phone language model are used; "
+        "without it the shipped one."
+    ),
+]
+Untranscribed = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Folder of recordings without text, in any language, which the teacher labels; "
+        "repeat for several."
+    ),
+]
+
+
+@contextmanager
+def _neural_training() -> Iterator[None]:
+    """Tell how to install what is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
+        ) from error
 
 
 @app.command()
@@ -141,12 +171,8 @@ def neural(
 ) -> None:
     """Train the neural recognizer; a model card and the training curves are written beside it."""
     check_output(output)
-    try:
+    with _neural_training():
         from training.neural.recipe import train_neural
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
-        ) from error
 
     train_neural(
         corpus,
@@ -164,49 +190,35 @@ def neural(
 
 
 @app.command()
-def window(
+def blocks(
     corpus: Corpora,
     output: Model,
-    whisper: Annotated[
-        Path, typer.Option(help="Folder of Whisper base for faster-whisper: the encoder.")
-    ],
-    start_from: Annotated[
-        Path | None,
-        typer.Option(
-            help="Neural model that aligns, and whose HMMs and phone language model are used; "
-            "without it the shipped one."
-        ),
-    ] = None,
-    untranscribed: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder of recordings without text, in any language, which the teacher labels; "
-            "repeat for several."
-        ),
-    ] = None,
+    whisper: Whisper,
+    start_from: StartFrom = None,
+    untranscribed: Untranscribed = None,
     seed: Seed = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Batches of 70 s of sound.")] = 450,
+    readout_steps: Annotated[
+        int, typer.Option(min=1, help="Batches of 70 s of sound for the first readout.")
+    ] = 450,
+    steps: Annotated[int, typer.Option(min=1, help="Batches of 32 s of sound.")] = 450,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the window model; a model card is written beside it.
+    """Train the block model; a model card is written beside it.
 
     A run that was interrupted goes on when the command is given again.
     """
     check_output(output)
-    try:
-        from training.window.recipe import train_window
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
-        ) from error
+    with _neural_training():
+        from training.blocks.recipe import train_blocks
 
-    train_window(
+    train_blocks(
         corpus,
         output,
         whisper=whisper,
         start=start_from,
         untranscribed=untranscribed or [],
         seed=seed,
+        num_readout_steps=readout_steps,
         num_steps=steps,
         shipping=not any_licence,
     )
@@ -246,12 +258,8 @@ def lips(
 ) -> None:
     """Train lips from sound on tracked lips; a model card is written beside it."""
     check_output(output)
-    try:
+    with _neural_training():
         from training.lips.recipe import train_lips
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
-        ) from error
 
     train_lips(
         clips,

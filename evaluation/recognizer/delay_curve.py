@@ -32,9 +32,9 @@ def draw_delay_curve(figures: Sequence[Mapping[str, Any]], path: Path) -> None:
     for axes, kind in zip(figure.subplots(1, 2), ("phone", "viseme"), strict=True):
         by_model = groupby(figures, key=lambda each: each["acoustic"])
         for number, (name, group) in enumerate(by_model):
-            scores = sorted(
-                (each["scores"][-1] for each in group), key=lambda score: score["delay_ms"]["p50"]
-            )
+            own = [each["scores"][-1] for each in group]
+            recognized = [score for score in own if "delay_ms" in score]  # any phone
+            scores = sorted(recognized, key=lambda score: score["delay_ms"]["p50"])
             delays_ms = [score["delay_ms"]["p50"] for score in scores]
             for prefix, (style, hypothesis) in _STYLES.items():
                 rates = [100 * score[f"{prefix}{kind}_error_rate"] for score in scores]

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_model, model_path, with_early_network
 from services.recognizer.front_end.resample import to_16_khz
 from services.recognizer.lips import LipPredictor, lips_for
 from services.recognizer.recognizer import warm_up
@@ -19,25 +19,27 @@ from services.recognizer.stream import SpeechStream
 from shared.audio_file import read_audio
 from shared.clock import MEDIA_RATE_HZ
 
+MODELS = ("neural", "blocks")
 NUM_SESSIONS = (1, 16)
 _CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 
 
 def measure(path: Path) -> dict[str, float]:
-    """Return CPU seconds per second of sound and session, by sessions, without and with lips."""
+    """Return CPU seconds per second of sound and session, by model and sessions."""
     samples = to_16_khz(*read_audio(path))
-    model = load_model()
-    warm_up(model)
-    return {
-        f"{number} with lips" if lips else str(number): _cpu_s(model, lips, samples, number)
-        for number in NUM_SESSIONS
-        for lips in (None, lips_for(model))
-    }
+    costs = {}
+    for name in MODELS:
+        model = with_early_network(load_model(model_path(name)))
+        warm_up(model)
+        for number in NUM_SESSIONS:
+            for lips, note in ((None, ""), (lips_for(model), " with lips")):
+                costs[f"{name}, {number}{note}"] = _cpu_s(model, lips, samples, number)
+    return costs
 
 
 def show(costs: dict[str, float], console: Console) -> None:
     """Print the costs as a table."""
-    table = Table("sessions of a recognizer", "CPU s per s of audio, each")
+    table = Table("model, sessions of a recognizer", "CPU s per s of audio, each")
     for name, value in costs.items():
         table.add_row(name, f"{value:.3f}")
     console.print(table)

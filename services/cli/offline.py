@@ -14,7 +14,7 @@ from services.driver.config import Framing
 from shared.face.lip_models import LipModelName
 
 Audio = Annotated[Path, typer.Argument(help="Audio file.")]
-Acoustic = Annotated[str, typer.Option(help="Model: neural, window, gmm, or a file.")]
+Acoustic = Annotated[str, typer.Option(help="Model: neural, blocks, gmm, or a file.")]
 
 
 class PhoneFormat(StrEnum):

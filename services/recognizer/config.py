@@ -10,9 +10,7 @@ from shared.config import BoundEndpoint, ServiceConfig
 
 # Settings that suit an acoustic model and differ from the defaults below. Who chooses the model
 # has them, unless others are given.
-_SUITED: dict[str, dict[str, Any]] = {
-    "window": {"look_ahead_ms": 0.0, "num_stable_frames": 3, "min_confidence": 0.99}
-}
+_SUITED: dict[str, dict[str, Any]] = {"blocks": {"num_stable_frames": 3, "min_confidence": 0.99}}
 
 
 class RecognizerConfig(ServiceConfig):
@@ -23,15 +21,15 @@ class RecognizerConfig(ServiceConfig):
     phones: BoundEndpoint = "tcp://127.0.0.1:5561"
     """Where phones and sound are published."""
     acoustic: str = "neural"
-    """Acoustic model: neural, window, gmm, or a model file."""
+    """Acoustic model: neural, blocks, gmm, or a model file."""
     look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0
-    """Future audio that a frame waits for, ms: neural 10, 30, 60, 100, 200; window 0, 10, 20...
-    (0 unless another value is given)."""
+    """Future audio that the neural model, which runs beside blocks too, waits for, ms: 10, 30, 60,
+    100, 200."""
     num_stable_frames: Annotated[int, Field(ge=1, le=20)] = 1
-    """Frames that must agree before a phone is emitted (N of Li 2011, who has 3); 3 with window,
+    """Frames that must agree before a phone is emitted (N of Li 2011, who has 3); 3 with blocks,
     unless another value is given."""
     min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.9
-    """Confidence that each of those frames must reach; 0 is the rule of Li 2011; 0.99 with window,
+    """Confidence that each of those frames must reach; 0 is the rule of Li 2011; 0.99 with blocks,
     unless another value is given."""
 
     @model_validator(mode="before")

@@ -44,10 +44,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.lip_network import ModelWithLipNetwork
 from services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
 from services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
 from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.acoustic.two_networks import TwoNetworks
 from services.recognizer.front_end.whisper_mel import NUM_MELS
 from services.recognizer.voice import Voice, parse_profile
 from shared.errors import UserError
@@ -282,7 +282,7 @@ def load_lips(path: Path = LIPS_PATH) -> LipPredictor:
 
 def lips_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | None:
     """Read the model of lips that fits an acoustic model; None if it was trained on another one."""
-    network = model.lips if isinstance(model, ModelWithLipNetwork) else model
+    network = model.early if isinstance(model, TwoNetworks) else model
     if not isinstance(network, NeuralModel):
         return None
     lips, sizes = load_lips(path), network.session.sizes

@@ -26,6 +26,7 @@ from services.recognizer.acoustic.acoustic_model import (
     INSIDE,
     AcousticModel,
     ScoringTask,
+    no_scores,
     run_scoring_tasks,
 )
 from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
@@ -63,8 +64,9 @@ class Recognizer:
     The paper never corrects an emitted phone. Here the best string corrects it whenever a phone is
     emitted: the ``index`` comes again with the measured onset and duration, or with another symbol
     if the search has changed its mind. Phones that the rule passed over are emitted together with
-    the next one. A phone comes for the last time, with ``final`` true, ``FINALIZE_AFTER_S`` after
-    its end or when speech ends. Silence within speech is a phone like any other.
+    the next one; one too many is withdrawn (``Phone.is_withdrawn``). A phone comes for the last
+    time, with ``final`` true, ``FINALIZE_AFTER_S`` after its end or when speech ends. Silence
+    within speech is a phone like any other.
 
     Where the model has provisional scores, the search runs on over them, and starts again from the
     last settled frame when the next scores come. The output rule hears each frame once, as soon as
@@ -185,6 +187,7 @@ class Recognizer:
         self._start_frame = frame
         self._done = 0  # the decoder's frame up to which phones are final
         self._num_heard = 0  # frames that the output rule has heard
+        self._provisional = no_scores(self._model.topology.num_states)  # that were searched last
         self._settled.reset()
         self._decoder = self._settled
         self._rule.reset()
@@ -192,13 +195,18 @@ class Recognizer:
         self._open: list[Phone] = []  # emitted, not yet final
 
     def _decode_frames(self, scores: FrameScores) -> list[Phone]:
+        known, self._provisional = self._provisional, scores.provisional
+        if len(scores.settled) or not np.array_equal(known, scores.provisional[: len(known)]):
+            known = known[:0]  # else the search ahead goes on where it stands
         self._decoder = self._settled
         out = [phone for row in scores.settled for phone in self._decode_frame(row)]
         if len(scores.provisional):
             self._decoder = self._ahead
-            self._settled.forget_before(self._done)
-            self._decoder.go_on_from(self._settled)
-            out += [phone for row in scores.provisional for phone in self._decode_frame(row)]
+            if not len(known):
+                self._settled.forget_before(self._done)
+                self._decoder.go_on_from(self._settled)
+            new = scores.provisional[len(known) :]
+            out += [phone for row in new for phone in self._decode_frame(row)]
         return out
 
     def _decode_frame(self, scores: NDArray[np.float32]) -> list[Phone]:
@@ -232,10 +240,10 @@ class Recognizer:
         if is_first and segments[0].phone == self._silence:
             segments = segments[1:]  # silence before the first phone is not emitted
         emitted: list[Phone] = []
-        while len(segments) < num_before:  # a phone too many was emitted: it stays
-            emitted.append(replace(self._open.pop(0), final=True))
-            self._finalize(emitted[-1])
-            segments, num_before = segments_after(segments, self._done), num_before - 1
+        while len(segments) < num_before:  # a phone too many was emitted: it is withdrawn
+            silence = self._symbols[self._silence]
+            emitted.append(replace(self._open.pop(0), symbol=silence, duration_s=0.0, final=True))
+            self._num_final, num_before = self._num_final + 1, num_before - 1
         final_until = self._decoder.num_frames - (_FINALIZE_AFTER_FRAMES if num_following else 0)
         known = dict(enumerate(self._open))
         self._open = []

@@ -141,12 +141,22 @@ class SpeechScores:
         return events
 
     def _take_frames(self, frames: NDArray[np.float32]) -> ScoringTask[list[ScoreEvent]]:
-        """Take the front end's frames, shape (n, k)."""
-        self._num_frames += len(frames)
+        """Take the front end's frames, shape (n, k).
+
+        They are scored up to the end of each position alone, so that in any chunking the same
+        provisional scores come.
+        """
         if not self._speaking:
+            self._num_frames += len(frames)
             self._recent.extend(frames)
             return []
-        return (yield from self._score(frames))
+        events: list[ScoreEvent] = []
+        while len(frames):
+            piece = frames[: FRAMES_PER_POSITION - self._num_frames % FRAMES_PER_POSITION]
+            frames = frames[len(piece) :]
+            self._num_frames += len(piece)
+            events += yield from self._score(piece)
+        return events
 
     def _detect(self) -> ScoringTask[list[ScoreEvent]]:
         """Begin or end speech by the block that is complete."""

@@ -16,7 +16,8 @@ class Phone:
     """One recognised phone.
 
     A live recognizer emits the same ``index`` at least twice: first with an estimated duration
-    (``final`` false), then with the measured onset and duration (``final`` true).
+    (``final`` false), then with the measured onset and duration (``final`` true). A phone that
+    proves one too many is withdrawn: it comes last as silence without duration.
     """
 
     index: int  # counts the phones of a session from 0
@@ -25,6 +26,11 @@ class Phone:
     duration_s: float  # seconds
     confidence: float  # 0 to 1
     final: bool
+
+    @property
+    def is_withdrawn(self) -> bool:
+        """Whether there was no such phone after all."""
+        return self.final and self.duration_s == 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

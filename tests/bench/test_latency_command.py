@@ -27,7 +27,10 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
     assert latency["sound_to_frame_ms"]["p50"] > latency["delay_ms"]
     assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
-    assert list(latency["sessions"]) == ["1", "1 with lips", "16", "16 with lips"]
+    kinds = [f"{number}{lips}" for number in (1, 16) for lips in ("", " with lips")]
+    assert list(latency["sessions"]) == [
+        f"{name}, {kind}" for name in ("neural", "blocks") for kind in kinds
+    ]
     assert all(cost > 0 for cost in latency["sessions"].values())
     rendering = latency["rendering"]
     assert all(rate > 0 for rate in rendering["images_per_s"].values())

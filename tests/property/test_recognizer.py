@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from corpora.scoring import count_errors
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
 from services.recognizer.front_end.features import Differences, LogMel, cepstra, with_differences
 from services.recognizer.front_end.resample import Resampler, to_16_khz
+from services.recognizer.offline import recognize
 from services.recognizer.recognizer import Emission, Recognizer
 from services.recognizer.search.decoder import Decoder
 from services.recognizer.search.output_rule import OutputRule
@@ -35,6 +37,11 @@ def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
 @cache
 def the_model(name: str = DEFAULT_MODEL) -> AcousticModel:
     return load_model(model_path(name))
+
+
+def settled_rows(model: AcousticModel) -> np.ndarray:
+    events = score_recording(model, HELLO, 16_000)
+    return np.concatenate([event.settled for event in events if isinstance(event, FrameScores)])
 
 
 def recognise(chunks: list[np.ndarray], rate_hz: int) -> list[Emission]:
@@ -166,10 +173,34 @@ def test_a_search_goes_on_from_where_another_stands(
         assert decoder.finish() == one.finish()
 
 
+def test_phones_too_many_are_withdrawn() -> None:
+    model = the_model()
+    silence = model.inventory.silence
+    rows = settled_rows(model)
+    recognizer = Recognizer(model, sample_rate_hz=16_000, min_confidence=0.0)
+    events = recognizer.decode([SpeechStart(0)])
+    for start in range(0, len(rows), 10):  # provisional scores of other sounds
+        other = np.roll(rows, 50, axis=0)[start : start + 20]
+        events += recognizer.decode([FrameScores(rows[start : start + 10], other)])
+    events += recognizer.decode([SpeechEnd(len(rows))])
+    phones = [event for event in events if isinstance(event, Phone)]
+    finals = [phone for phone in phones if phone.final]
+    assert [phone.index for phone in finals] == list(range(len(finals)))
+    assert {phone.index for phone in phones} == {phone.index for phone in finals}
+    withdrawn = [phone for phone in finals if phone.is_withdrawn]
+    assert len(withdrawn) > 1
+    assert {phone.symbol for phone in withdrawn} == {silence}
+    left = [phone for phone in finals if not phone.is_withdrawn]
+    for one, two in pairwise(left):
+        assert one.onset_s + one.duration_s <= two.onset_s + 1e-9
+    expected = [phone.symbol for phone in recognize(model, HELLO, 16_000)]
+    found = [phone.symbol for phone in left]
+    assert count_errors(expected[1:], found).rate < 0.2
+
+
 def test_provisional_scores_that_hold_give_the_same_phones_sooner() -> None:
     model = the_model()
-    (_, *scores, _) = score_recording(model, HELLO, 16_000)
-    rows = np.concatenate([each.settled for each in scores if isinstance(each, FrameScores)])
+    rows = settled_rows(model)
 
     def phones(num_provisional: int) -> tuple[list[Phone], list[int]]:
         """All phones, and the frame known when each was emitted."""

@@ -227,6 +227,15 @@ def test_what_was_flushed_and_estimates_overtaken_are_dropped() -> None:
     assert known.accept_phone(phone(1, "a", 0.6, 0.4))
 
 
+def test_a_phone_that_is_withdrawn_does_not_move_the_face() -> None:
+    face, other = make_face(), make_face()
+    for each in (face, other):
+        each.accept(phone(0, "a", 0.3, 0.2))
+    face.accept(phone(1, "b", 0.5, 0.1, final=False))
+    face.accept(phone(1, "sil", 0.5, 0.0))
+    np.testing.assert_array_equal(values(advance(face, 1.0)), values(advance(other, 1.0)))
+
+
 def test_an_overtaken_estimate_is_dropped() -> None:
     face, other = make_face(), make_face()
     for each in (face, other):

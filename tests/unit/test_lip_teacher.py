@@ -136,6 +136,7 @@ def test_recordings_are_drawn_from_each_folder_up_to_an_hour(
         (tmp_path / folder).mkdir()
         for k in range(number):
             soundfile.write(tmp_path / folder / f"{k}.wav", np.zeros(16_000), 16_000)
+    (tmp_path / "other" / "MOSS-TTSD_kept_back.wav").write_bytes(b"not read")
     drawn = draw_recordings([tmp_path / "one", tmp_path / "other"], 0)
     assert [path.parent.name for path in drawn] == ["one"] * 4 + ["other"] * 2
     assert len(set(drawn)) == 6

@@ -36,6 +36,7 @@ from rich.progress import track
 from scipy.special import expit
 
 from corpora.feature_cache import as_integers, read_audio
+from corpora.kept_back import is_kept_back
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from corpora.speech_corpus import audio_files, duration_s
 from services.recognizer.acoustic.neural import NeuralModel
@@ -70,6 +71,8 @@ T = TypeVar("T", bound=np.generic)
 def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
     """Draw recordings of speech without lips, an hour of each folder or all it holds.
 
+    Those that models are measured on stay out.
+
     Raises
     ------
     UserError
@@ -78,7 +81,7 @@ def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
     rng = np.random.default_rng(seed)
     drawn = []
     for folder in folders:
-        files = audio_files(folder)
+        files = [file for file in audio_files(folder) if not is_kept_back(file)]
         total_s = 0.0
         for number in rng.permutation(len(files)):
             if total_s >= _MAX_FOLDER_S:

@@ -76,11 +76,21 @@ def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples
     tuple
         The new samples, shape (n / speed,), and the speed.
     """
-    sound: Sound = samples
-    speed = 1.0
+    sound, speed = change_speed(samples, rng)
+    return disturb(sound, rng), speed
+
+
+def change_speed(samples: Sound, rng: np.random.Generator) -> tuple[Sound, float]:
+    """Change the speed of some recordings; return the new samples, (n / speed,), and the speed."""
     if rng.random() < _SPEED_PROB:
         steps = int(rng.integers(_MIN_STEPS, _MAX_STEPS + 1))
-        sound, speed = resample_poly(sound, steps, _SPEED_STEPS), _SPEED_STEPS / steps
+        return resample_poly(samples, steps, _SPEED_STEPS), _SPEED_STEPS / steps
+    return samples, 1.0
+
+
+def disturb(samples: Sound, rng: np.random.Generator) -> Samples:
+    """Draw a room, a noise, a line and a microphone for a recording, each at times."""
+    sound = samples
     if rng.random() < _ROOM_PROB:
         sound = fftconvolve(sound, _room(rng))[: len(sound)]
     if rng.random() < _NOISE_PROB:
@@ -88,7 +98,7 @@ def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples
     sound = _transmitted(sound, rng)
     if rng.random() < _COLOUR_PROB:
         sound = _coloured(sound, rng)
-    return sound.astype(np.float32), speed
+    return sound.astype(np.float32)
 
 
 def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:

@@ -60,7 +60,7 @@ from training.progress import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder
 _NUM_STEPS = 300  # batches of 70 s of sound
-_LAST_LAYERS = (-3, -2, -1)  # places among the layers
+KEPT_LAYERS = (-3, -2, -1)  # places among the layers
 _PIECE_FRAMES = 2960  # with the padding, less than 30 s
 _PADDING = np.zeros(4800, np.float32)  # samples after a piece
 _MIN_POWER, _FLOOR_DECADES = 1e-10, 8.0
@@ -90,13 +90,16 @@ T = TypeVar("T")
 class WholeEncoder(Encoder):
     """Whisper's encoder: every position attends to the whole recording."""
 
-    def __init__(self, shape: Shape, kept_layers: Sequence[int] = _LAST_LAYERS) -> None:
+    def __init__(self, shape: Shape, kept_layers: Sequence[int] = KEPT_LAYERS) -> None:
         super().__init__(shape, dropout=0.0, padding=1)
         self.kept_layers = kept_layers
 
-    def forward(self, bands: Tensor) -> Tensor:
-        """Return the kept layers: (batch, 80, frames) to (batch, positions, kept width)."""
-        hidden = self.embed(bands)
+    def forward(self, bands: Tensor, start: int = 0) -> Tensor:
+        """Return the kept layers: (batch, 80, frames) to (batch, positions, kept width).
+
+        ``start`` is the first position's row in the table.
+        """
+        hidden = self.embed(bands, start)
         after = []
         for layer in self.layers:
             hidden = layer(hidden)
@@ -137,7 +140,7 @@ class Readout(nn.Module):
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
-        num_inputs = len(_LAST_LAYERS) * shape.width
+        num_inputs = len(KEPT_LAYERS) * shape.width
         self.register_buffer("mean", torch.zeros(num_inputs))
         self.register_buffer("deviation", torch.ones(num_inputs))
         self.inner = nn.Linear(num_inputs, _INNER)

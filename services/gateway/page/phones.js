@@ -14,11 +14,15 @@ export class PhoneTrack {
     this.#phones = [];
   }
 
-  /** Take a phone; the same index again revises it. Times are in samples at 16 kHz. */
-  accept({ index, symbol, media_time: begin, duration }) {
+  /**
+   * Take a phone; the same index again revises it, or withdraws it if it is final and has no duration.
+   * Times are in samples at 16 kHz.
+   */
+  accept({ index, symbol, media_time: begin, duration, final }) {
     const phone = { index, symbol, begin, end: begin + duration };
     const known = this.#phones.findIndex((other) => other.index === index);
-    if (known >= 0) this.#phones[known] = phone;
+    if (final && duration === 0) this.#phones.splice(known, known >= 0 ? 1 : 0);
+    else if (known >= 0) this.#phones[known] = phone;
     else this.#phones.push(phone);
     if (this.#phones.length > MAX_PHONES) this.#phones.shift();
   }

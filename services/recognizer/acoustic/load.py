@@ -6,20 +6,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from services.recognizer.acoustic import gmm, neural, window
+from services.recognizer.acoustic import blocks, gmm, neural
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.lip_network import ModelWithLipNetwork
 from services.recognizer.acoustic.model_file import Archive, read_archive
+from services.recognizer.acoustic.two_networks import TwoNetworks
 from shared.errors import UserError
 
 MODELS = Path(__file__).parents[1] / "models"
-SHIPPED = ("gmm", "neural", "window")
+SHIPPED = ("blocks", "gmm", "neural")
 DEFAULT_MODEL = "neural"
 MODEL_PATH = MODELS / f"{DEFAULT_MODEL}.npz"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_from,
     neural.FORMAT: neural.neural_from,
-    window.FORMAT: window.window_from,
+    blocks.FORMAT: blocks.blocks_from,
 }
 
 
@@ -36,9 +36,8 @@ def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -
     path
         A file that the ``save`` of a model wrote.
     look_ahead_ms
-        How far a neural model looks ahead, one of those it was trained for, or the right context
-        of a window model; None is the model's default. A Gaussian mixture model has a fixed
-        look-ahead and ignores this.
+        How far a neural model looks ahead, one of those it was trained for; None is the model's
+        default. Other models have a fixed look-ahead and ignore this.
 
     Raises
     ------
@@ -59,13 +58,22 @@ def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -
         raise UserError(f"acoustic model {path}: {error}; train it again") from error
     except UserError as error:
         raise UserError(f"acoustic model {path}: {error}") from error
-    if look_ahead_ms is not None and isinstance(model, neural.NeuralModel | window.WindowModel):
+    if look_ahead_ms is not None and isinstance(model, neural.NeuralModel):
         return model.with_look_ahead(look_ahead_ms)
     return model
 
 
-def with_lip_network(model: AcousticModel) -> AcousticModel:
-    """Let the shipped causal network run beside a window model: the lips follow its positions."""
-    if not isinstance(model, window.WindowModel):
+def with_early_network(
+    model: AcousticModel, *, look_ahead_ms: float | None = None
+) -> AcousticModel:
+    """Let the shipped causal network, with its look-ahead, run beside a block model.
+
+    Raises
+    ------
+    UserError
+        If it was not trained for the look-ahead.
+    """
+    if not isinstance(model, blocks.BlockModel):
         return model
-    return ModelWithLipNetwork(model, cast(neural.NeuralModel, load_model()))
+    early = load_model(look_ahead_ms=look_ahead_ms)
+    return TwoNetworks(cast(neural.NeuralModel, early), model)

@@ -16,7 +16,7 @@ m        log-mel bands                                                    (frame
 
 Deviations from Whisper, which knows the whole recording: frame ``t`` begins at ``t * 10`` ms
 instead of being centred there, so it needs samples up to ``t * 10 + 25`` ms. The floor is a fixed
-power; Whisper's is eight decades below the recording's loudest band.
+power; Whisper's is eight decades below the recording's loudest band (``FLOOR_BANDS``).
 
 Cost: about 2 ms per second of sound that comes 10 ms at a time.
 """
@@ -37,6 +37,7 @@ from services.recognizer.front_end.features import (
 )
 
 NUM_MELS = 80
+FLOOR_BANDS = 2.0  # Whisper's floor, below the loudest band: eight decades
 
 _FLOOR = 1e-7  # power
 _HZ_PER_MEL = 200 / 3  # below the knee; Slaney's mels

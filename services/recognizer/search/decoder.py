@@ -138,16 +138,17 @@ class Decoder:
         return phone, self._end(self._link[token, state]), confidence
 
     def path_since(self, frame: int) -> list[Segment]:
-        """Phones of the best string so far that end after a frame, without its last phone.
+        """Phones of the best string so far after a frame, without its last phone.
 
-        They may still change. The first is cut to begin at the frame. Earlier phones are forgotten.
+        They may still change. The first is cut to begin at the frame, if less than half of it is
+        cut off; else it counts as earlier. Earlier phones are forgotten.
         """
         self.forget_before(frame)
         path = self._trace(int(self._link[self._best]))
         return [*self._shared, *segments_after(path, frame)]
 
     def forget_before(self, frame: int) -> None:
-        """Forget phones that all paths share and that end by a frame; no answer will have them."""
+        """Forget phones that all paths share before a frame; no answer will have them."""
         self._shared = segments_after(self._shared, frame)
 
     def finish(self) -> list[Segment]:
@@ -199,11 +200,11 @@ class Decoder:
 
 
 def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
-    """Return the segments that end after a frame; the first is cut to begin there."""
+    """Return the segments that lie after a frame, at least with the larger part; cut to there."""
     return [
         Segment(segment.phone, max(segment.start, frame), segment.end)
         for segment in segments
-        if segment.end > frame
+        if segment.end - frame > max(frame - segment.start, 0)
     ]
 
 

@@ -26,6 +26,13 @@ test("a phone can be revised", () => {
   assert.deepEqual(phones.at(1700), { current: "v", past: ["n"] });
 });
 
+test("a phone can be withdrawn", () => {
+  const phones = track("n", "i", "u");
+  phones.accept({ index: 1, symbol: "sil", media_time: 1600, duration: 0, final: true });
+  phones.accept({ index: 9, symbol: "sil", media_time: 1600, duration: 0, final: true });
+  assert.deepEqual(phones.at(3300), { current: "u", past: ["n"] });
+});
+
 test("the last phone is shown for a while, then it is past", () => {
   const phones = track("n", "i");
   assert.equal(phones.at(3200 + 8 * 16000).current, "i");

@@ -50,6 +50,8 @@ class KnownPhones:
         known = self._phones.get(phone.index)
         if known is not None and known.final and not phone.final:
             return False
+        if phone.is_withdrawn:
+            return self._phones.pop(phone.index, None) is not None
         self._phones[phone.index] = phone
         return True
 

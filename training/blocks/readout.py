@@ -42,11 +42,11 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax
 from torch.optim.swa_utils import AveragedModel
 
-from services.recognizer.acoustic.window import MAX_WINDOW_FRAMES
 from training.neural.batches import Batch, Recording, Targets, augment, sampling_probs
 from training.neural.trainer import cross_entropy, late_mean, take_step
 from training.progress import Report
 
+MAX_WINDOW_FRAMES = 250
 MAX_DEVIATIONS = 6.0
 _INNER, _GRU = 320, 192  # widths in the readout
 _DROPOUT = 0.2
@@ -89,12 +89,21 @@ class Readout(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Compute log posteriors: (batch, positions, features) to (batch, 2 positions, states)."""
+        inner = self.inner_of(features)
+        context, _ = self.gru(inner)
+        return self.log_posteriors(context, inner)
+
+    def inner_of(self, features: Tensor) -> Tensor:
+        """Compute the recurrent layer's input: (batch, positions, features) to (..., 320)."""
         standard = (features - self.mean) / self.deviation
         standard = standard.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
         if self.training:
             standard = standard + _NOISE * torch.randn_like(standard)
-        inner = self.dropout(gelu(self.inner(standard)))
-        context, _ = self.gru(inner)
+        inner: Tensor = self.dropout(gelu(self.inner(standard)))
+        return inner
+
+    def log_posteriors(self, context: Tensor, inner: Tensor) -> Tensor:
+        """Compute the output: (batch, positions, ...) to (batch, 2 positions, states)."""
         logits = self.output(self.dropout(torch.cat([context, inner], dim=-1)))
         return log_softmax(logits.unflatten(-1, (2, -1)).flatten(1, 2), dim=-1)
 

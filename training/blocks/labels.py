@@ -7,7 +7,8 @@ clean. A target is the average of alignment and teacher; without a text it is th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +21,25 @@ from training.neural.batches import Recording, Targets
 from training.neural.scoring import samples_of
 from training.neural.teacher import WholeEncoder, process_all, train_teacher
 from training.progress import Report
-from training.training_set import Example, load_untranscribed
+from training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
 
-# Fraction of the windows that each kind of speech fills, and the most recordings of it.
-_SHARES = {"sentence": (0.35, 400), "word": (0.05, 150), "synthetic": (0.30, 450)}
-_UNTRANSCRIBED_SHARE = 0.30
-_MAX_UNTRANSCRIBED = 250  # pieces of each folder
+_FULL_FOLDER_MINUTES = 35  # a folder with more counts no more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Draw:
+    """How much of each kind of speech is drawn, and the share that it has in training."""
+
+    kinds: Mapping[str, tuple[float, int]]  # share, and the most recordings
+    untranscribed_share: float
+    max_untranscribed: int  # pieces of each folder
 
 
 def label(
     examples: Sequence[Example],
     untranscribed: Sequence[Path],
     *,
+    draw: Draw,
     aligner: NeuralModel,
     encoder: WholeEncoder,
     errors: RowErrors,
@@ -46,6 +54,8 @@ def label(
         Recordings with text and samples.
     untranscribed
         Folders of recordings without text.
+    draw
+        Of both.
     aligner
         A model of the examples' language.
     encoder
@@ -59,27 +69,32 @@ def label(
     """
     rng = np.random.default_rng(seed)
     drawn: list[Example] = []
-    for kind, (_, most) in _SHARES.items():
+    for kind, (_, most) in draw.kinds.items():
         of_kind = [example for example in examples if _kind(example) == kind]
         drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:most]]
-    sounds: list[NDArray[np.int16]] = []
+    folders: list[list[NDArray[np.int16]]] = []
     for folder in untranscribed:
         pieces = load_untranscribed([folder], errors)
-        sounds += [pieces[place] for place in rng.permutation(len(pieces))[:_MAX_UNTRANSCRIBED]]
+        folders.append(
+            [pieces[place] for place in rng.permutation(len(pieces))[: draw.max_untranscribed]]
+        )
     aligned = align_all(aligner_scores(aligner, drawn), aligner.topology, drawn, report)
-    frames = dict.fromkeys(_SHARES, 0.0)
+    frames = dict.fromkeys(draw.kinds, 0.0)
     for one in aligned:
         frames[_kind(one.example)] += one.example.weight * len(one.states)
     recordings = []
     for one in aligned:
         kind = _kind(one.example)
-        weight = _SHARES[kind][0] * one.example.weight * len(one.states) / frames[kind]
+        weight = draw.kinds[kind][0] * one.example.weight * len(one.states) / frames[kind]
         targets = Targets.hard(one.states)
         recordings.append(
             Recording(samples=samples_of(one.example), targets=targets, weight=weight)
         )
     teacher = train_teacher(encoder, recordings, seed=seed, report=report)
-    all_sounds = [*(recording.samples for recording in recordings), *sounds]
+    all_sounds = [
+        *(recording.samples for recording in recordings),
+        *(sound for sounds in folders for sound in sounds),
+    ]
     labels = process_all(teacher.targets_of, all_sounds, "labelled by the teacher", report)
     labelled = [
         Recording(
@@ -89,11 +104,14 @@ def label(
         )
         for recording, targets in zip(recordings, labels, strict=False)
     ]
-    rest = labels[len(recordings) :]
-    num_frames = sum(map(len, rest))
-    for sound, targets in zip(sounds, rest, strict=True):
-        weight = _UNTRANSCRIBED_SHARE * len(targets) / num_frames
-        labelled.append(Recording(samples=sound, targets=targets, weight=weight))
+    rest = iter(labels[len(recordings) :])
+    of_folders = [list(zip(sounds, rest, strict=False)) for sounds in folders]
+    sizes = [sum(len(targets) for _, targets in pairs) for pairs in of_folders]
+    counted = [min(size, _FULL_FOLDER_MINUTES * FRAMES_PER_MINUTE) for size in sizes]
+    for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
+        for sound, targets in pairs:
+            weight = draw.untranscribed_share * count / sum(counted) * len(targets) / size
+            labelled.append(Recording(samples=sound, targets=targets, weight=weight))
     return labelled
 
 

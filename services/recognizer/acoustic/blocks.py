@@ -1,0 +1,408 @@
+"""Block model: Whisper's encoder on blocks of speech with a cached past, run by onnxruntime.
+
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
+encoder); Shi et al. 2021, "Emformer: efficient memory transformer based acoustic model for low
+latency streaming speech recognition" (blocks with a cached past, whose right context is computed
+anew); Bourlard and Morgan 1994, "Connectionist speech recognition" (scores are posteriors divided
+by priors). HMMs, search and output rule are those of Li et al. 2011. The network is that of
+:mod:`training.blocks.network`.
+
+============== ====================================================== ========================
+symbol         meaning                                                unit, shape
+============== ====================================================== ========================
+x              log-mel bands, none eight decades below the loudest    (frames, 80)
+               so far
+y              log posteriors of the states                           (frames, states)
+B, R           positions of a block, and of its right context         positions
+PAST           positions before a block that it attends to            positions
+prior          prior of the states, to a power below one              (states,)
+acoustic_scale weight of the log scores, chosen on development data   1
+============== ====================================================== ========================
+
+    log b(x) = acoustic_scale * (y - log prior)
+
+Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1`` and sees those from ``2 p - 2``
+(zeros stand before the first) to ``2 p + 2``. Whenever ``B`` more positions are there, the network
+runs on a block and on the ``R`` positions after it, which are the newest. The block's scores are
+settled, its keys and values kept. The scores of the right context are provisional. When speech
+begins, the first runs have fewer positions and settle none. The last one, in which the segment's
+last frame is repeated once or twice, settles all.
+
+The table of positions ends after 30 seconds. Longer speech without a pause starts again at the
+first row, with an empty past.
+
+Sessions that have a block at the same time share one run. A session's scores are the same to the
+last bit in any batch and any chunking, because the network rounds each row of a product with a
+scale of its own. Keys and values are rings, as attention does not depend on their order; those of a
+session take 3 MB while it speaks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
+from services.recognizer.acoustic.model_file import (
+    Archive,
+    topology_arrays,
+    topology_from,
+    write_archive,
+)
+from services.recognizer.acoustic.network import (
+    FRAMES_PER_POSITION,
+    MAX_POSITIONS,
+    Floats,
+    open_session,
+    position_table,
+)
+from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
+from shared.phones.inventory import PhoneInventory
+
+FORMAT = "blocks 1"
+
+_INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # before the caches
+_OUTPUTS = ["log_posteriors", "new_state", "new"]
+_PADDING = 2  # frames of zeros before a segment's first
+_SEEN_AFTER = 2  # frames that a position sees after its first
+_MAX_BATCH = 16  # sessions in a run; more would only take memory
+_MAX_SIZE = 4096
+_MAX_CACHE_BYTES = 6_000_000  # of a session
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockModel:
+    """A network with its front end; implements ``AcousticModel``."""
+
+    topology: Topology
+    network: NDArray[np.uint8]  # an ONNX file, see training.blocks.export
+    log_prior: Floats  # (states,)
+    acoustic_scale: float
+
+    @property
+    def inventory(self) -> PhoneInventory:
+        """The language's phones."""
+        return self.topology.inventory
+
+    @cached_property
+    def session(self) -> BlockSession:
+        """The network, ready to run."""
+        return BlockSession(self.network)
+
+    def front_end(self) -> WhisperMel:
+        """Start a front end for one session."""
+        return WhisperMel()
+
+    def stream(self) -> BlockStream:
+        """Start a stream of scores for one speaker."""
+        return BlockStream(self)
+
+    def score(self, work: Sequence[Work]) -> list[Floats]:
+        """Score frames of several streams in batches; None ends a stream's segment."""
+        streams = [cast(BlockStream, stream) for stream, _ in work]
+        for stream, (_, frames) in zip(streams, work, strict=True):
+            stream.take_frames(frames)
+        while ready := [stream for stream in streams if stream.is_due]:
+            for start in range(0, len(ready), _MAX_BATCH):
+                self._run(ready[start : start + _MAX_BATCH])
+        return [stream.take_settled() for stream in streams]
+
+    def _run(self, streams: Sequence[BlockStream]) -> None:
+        log_posteriors, states, new = self.session.run([stream.block() for stream in streams])
+        scores = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
+        for row, stream in enumerate(streams):
+            stream.take_outputs(scores[row], states[row], new[row])
+
+    def save(self, path: Path) -> None:
+        """Write the model as an npz file (arrays only, no pickle)."""
+        arrays = {
+            "format": np.array(FORMAT),
+            **topology_arrays(self.topology),
+            "network": self.network,
+            "log_prior": self.log_prior,
+            "acoustic_scale": np.array(self.acoustic_scale, np.float32),
+        }
+        write_archive(path, arrays)
+
+
+@dataclass(frozen=True, slots=True)
+class BlockSizes:
+    """Sizes of a network, read from its inputs and outputs."""
+
+    block: int  # B
+    length: int  # B + R
+    past: int  # PAST
+    width: int
+    state: int  # width of the recurrent layer
+    layers: int
+    heads: int
+    head_size: int
+
+
+@dataclass(slots=True)
+class Past:
+    """What a session's network has computed before a block."""
+
+    caches: Floats  # rings: keys of all layers, then values (2 layers, heads, PAST, size)
+    state: Floats  # of the recurrent layer, (width,)
+    num_cached: int = 0  # positions in the caches
+
+    @classmethod
+    def empty(cls, sizes: BlockSizes) -> Past:
+        """Return the past of a segment that begins."""
+        rings = (2 * sizes.layers, sizes.heads, sizes.past, sizes.head_size)
+        return cls(np.zeros(rings, np.float32), np.zeros(sizes.state, np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A block of one session with its right context, to be computed."""
+
+    frames: Floats  # (2 positions + 3, 80), from two before the first position's
+    row: int  # of the first position in the table
+    num_positions: int
+    past: Past
+
+
+class BlockSession:
+    """A network that is ready to run on blocks, on one thread.
+
+    Parameters
+    ----------
+    file
+        An ONNX file's bytes.
+
+    Raises
+    ------
+    ValueError
+        If it is no network of this kind.
+    """
+
+    def __init__(self, file: NDArray[np.uint8]) -> None:
+        self._session = open_session(file)
+        self.sizes = _sizes_of(self._session)
+        self._names = _cache_names(self.sizes.layers)
+        unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
+        self._positions = np.concatenate([position_table(self.sizes.width), unused])
+        self._caches = np.empty(
+            (0, 0), np.float32
+        )  # of the sessions in a run, (2 layers, sessions, ...)
+
+    def run(self, blocks: Sequence[Block]) -> list[Floats]:
+        """Run the network on a block of each session, with ``n`` the number of sessions.
+
+        Returns
+        -------
+        list
+            Log posteriors, (n, 2 (B + R), states), of which those of positions that a block does
+            not have mean nothing; the recurrent layer's new state, (n, width); keys of all layers
+            and then values of the block's own positions, (n, 2 layers, heads, B, size).
+
+        Raises
+        ------
+        ValueError
+            If the network does not run.
+        """
+        length = self.sizes.length
+        frames = np.zeros((len(blocks), 2 * length + 3, NUM_MELS), np.float32)
+        for row, block in enumerate(blocks):
+            frames[row, : len(block.frames)] = block.frames
+        inputs = {
+            "frames": frames,
+            "positions": np.stack([self._positions[b.row : b.row + length] for b in blocks]),
+            "num_positions": np.array([block.num_positions for block in blocks]),
+            "num_cached": np.array([block.past.num_cached for block in blocks]),
+            "state": np.stack([block.past.state for block in blocks]),
+            **dict(zip(self._names, self._joined([block.past for block in blocks]), strict=True)),
+        }
+        try:
+            outputs: list[Floats] = self._session.run(_OUTPUTS, inputs)
+        except Exception as error:  # onnxruntime's errors have no base of their own
+            raise ValueError(f"its network does not run ({error})") from error
+        return outputs
+
+    def _joined(self, pasts: Sequence[Past]) -> Floats:
+        """Return the sessions' caches as one array, (2 layers, n, heads, PAST, size)."""
+        if len(pasts) == 1:
+            return pasts[0].caches[:, None]
+        if self._caches.shape[1] < len(pasts):
+            rings, *of_ring = pasts[0].caches.shape
+            self._caches = np.zeros((rings, len(pasts), *of_ring), np.float32)
+        joined = self._caches[:, : len(pasts)]
+        for row, past in enumerate(pasts):  # what lies beyond is masked
+            joined[:, row, :, : past.num_cached] = past.caches[:, :, : past.num_cached]
+        return joined
+
+
+class BlockStream:
+    """Scores of one speaker's speech, segment by segment."""
+
+    def __init__(self, model: BlockModel) -> None:
+        self._model = model
+        self._sizes = model.session.sizes
+        self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
+        self._nothing = no_scores(model.topology.num_states)
+        self.reset()
+
+    def accept(self, frames: Floats) -> Floats:
+        """Take frames, shape (n, 80); return the scores settled, (m, states)."""
+        return self._model.score([(self, frames)])[0]
+
+    def finish(self) -> Floats:
+        """End the segment; return its remaining scores."""
+        return self._model.score([(self, None)])[0]
+
+    def reset(self) -> None:
+        """Forget the segment. Nothing is known of the speaker."""
+        self.provisional = self._nothing
+        self._settled: list[Floats] = []  # not yet returned
+        self._num_frames = 0  # of the segment
+        self._num_settled = 0
+        self._loudest = np.float32(-np.inf)  # band of the segment
+        self._frames = np.zeros((_PADDING, NUM_MELS), np.float32)  # from the next block's first on
+        self._ended = False
+        self._start_table()
+
+    def _start_table(self) -> None:
+        """Go to the first row of the table of positions, with nothing before it."""
+        self._row = 0  # of the next block
+        self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
+        self._past: Past | None = None
+
+    def take_frames(self, frames: Floats | None) -> None:
+        """Take frames, (n, 80), or the segment's end, at which its last frame is repeated."""
+        if frames is None:
+            self._ended = True
+            num_more = _SEEN_AFTER - (self._num_frames - 1) % FRAMES_PER_POSITION
+            frames = np.repeat(self._frames[-1:], num_more if self._num_frames else 0, axis=0)
+        elif len(frames):
+            self._num_frames += len(frames)
+            loudest = np.maximum(np.maximum.accumulate(frames.max(axis=1)), self._loudest)
+            self._loudest = loudest[-1]
+            frames = np.maximum(frames, (loudest - np.float32(FLOOR_BANDS))[:, None])
+        self._frames = np.concatenate([self._frames, frames])
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the network must run."""
+        num_positions = self._num_positions
+        return num_positions >= self._num_due or (self._ended and num_positions > 0)
+
+    @property
+    def _num_positions(self) -> int:
+        """Positions from the next block's first on whose frames are there."""
+        return max(0, (len(self._frames) - 1 - _SEEN_AFTER) // FRAMES_PER_POSITION)
+
+    def block(self) -> Block:
+        """Return what the network must compute next."""
+        if self._past is None:
+            self._past = Past.empty(self._sizes)
+        num_positions = min(self._num_positions, self._num_due)
+        frames = self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1]
+        return Block(frames, self._row, num_positions, self._past)
+
+    def take_outputs(self, scores: Floats, state: Floats, new: Floats) -> None:
+        """Take what the network computed: scores, (2 (B + R), states), state, keys and values."""
+        sizes, block = self._sizes, self.block()
+        ends_table = block.row + block.num_positions == MAX_POSITIONS
+        if ends_table or (self._ended and block.num_positions == self._num_positions):
+            num_settled = block.num_positions
+        else:
+            num_settled = sizes.block if block.num_positions == sizes.length else 0
+        end = FRAMES_PER_POSITION * num_settled
+        self._settled.append(scores[:end])
+        self.provisional = scores[end : FRAMES_PER_POSITION * block.num_positions]
+        self._frames = self._frames[end:]
+        if ends_table:
+            self._start_table()
+            return
+        if num_settled:
+            slot = self._row % sizes.past
+            block.past.caches[:, :, slot : slot + sizes.block] = new
+            block.past.num_cached = min(block.past.num_cached + sizes.block, sizes.past)
+            block.past.state = state
+            self._row += num_settled
+        else:
+            self._num_due += sizes.block
+        self._num_due = min(self._num_due, MAX_POSITIONS - self._row)
+
+    def take_settled(self) -> Floats:
+        """Return the new settled scores, (m, states); at the end those of all frames left."""
+        rows = np.concatenate([self._nothing, *self._settled])
+        self._settled = []
+        self._num_settled += len(rows)
+        if self._ended:
+            rows = rows[: len(rows) - (self._num_settled - self._num_frames)]
+            self.reset()
+        return rows
+
+
+def _cache_names(num_layers: int) -> list[str]:
+    return [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
+
+
+def _sizes_of(session: Any) -> BlockSizes:
+    """Read a network's sizes from its inputs and outputs, after checking names and shapes."""
+    shapes = {node.name: list(node.shape[1:]) for node in session.get_inputs()}
+    outputs = {node.name: list(node.shape[1:]) for node in session.get_outputs()}
+    num_layers = sum(name.startswith("keys_") for name in shapes)
+    if list(shapes) != [*_INPUTS, *_cache_names(num_layers)] or list(outputs) != _OUTPUTS:
+        raise ValueError(f"its network has the inputs {', '.join(shapes)}")
+    try:
+        length, width = shapes["positions"]
+        rings, heads, block, head_size = outputs["new"]
+        sizes = BlockSizes(
+            block=block,
+            length=length,
+            past=shapes["keys_0"][1],
+            width=width,
+            state=shapes["state"][0],
+            layers=rings // 2,
+            heads=heads,
+            head_size=head_size,
+        )
+        positive = min(astuple(sizes)) >= 1
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise ValueError(f"its network has the inputs {shapes}") from error
+    cache = [heads, sizes.past, head_size]
+    expected = [[2 * length + 3, NUM_MELS], [length, width], [], [], [sizes.state]]
+    if list(shapes.values()) != expected + [cache] * 2 * num_layers or rings != 2 * num_layers:
+        raise ValueError(f"its network has the inputs {shapes}")
+    if (
+        not positive
+        or max(length, width, sizes.state, num_layers) > _MAX_SIZE
+        or width % 2
+        or not block < length
+        or sizes.past % block
+        or 4 * rings * math.prod(cache) > _MAX_CACHE_BYTES
+    ):
+        raise ValueError(f"its network has the sizes {sizes}")
+    return sizes
+
+
+def blocks_from(archive: Archive) -> BlockModel:
+    """Build the model after checking every size; ValueError says what does not fit."""
+    topology = topology_from(archive)
+    model = BlockModel(
+        topology=topology,
+        network=archive.array("network", None).astype(np.uint8),
+        log_prior=archive.floats("log_prior", topology.num_states),
+        acoustic_scale=float(archive.floats("acoustic_scale")),
+    )
+    sizes = model.session.sizes
+    frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
+    outputs = model.session.run([Block(frames, 0, sizes.length, Past.empty(sizes))])
+    new = (1, 2 * sizes.layers, sizes.heads, sizes.block, sizes.head_size)
+    expected = [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new]
+    if [array.shape for array in outputs] != expected:
+        raise ValueError(f"its network scores {outputs[0].shape}, expected {expected[0]}")
+    if not all(np.isfinite(array).all() for array in outputs):
+        raise ValueError("its network scores with values that are not finite")
+    return model

@@ -1,0 +1,274 @@
+"""The block model: Whisper's encoder on blocks with a cached past, its file."""
+
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from services.recognizer.acoustic import blocks as blocks_module
+from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from services.recognizer.acoustic.blocks import BlockModel, Past
+from services.recognizer.acoustic.load import MODELS, load_model
+from services.recognizer.acoustic.model_file import read_archive, write_archive
+from services.recognizer.acoustic.neural import NeuralModel
+from services.recognizer.front_end.whisper_mel import WhisperMel
+from services.recognizer.recognizer import Recognizer
+from shared.audio_file import read_audio
+from shared.errors import UserError
+from training.blocks.export import onnx_of
+from training.blocks.network import BlockEncoder, BlockReadout, layout
+from training.neural.network import Shape
+
+pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+VAD = MODELS / "silero_vad.onnx"
+HELLO = read_audio(DEMO / "hello-female.wav")[0][:24_000, 0]
+FRAMES = np.resize(WhisperMel().accept_waveform(HELLO), (330, 80))  # more than a past
+FRAMES[40, 7] = FRAMES[:40].max() - 3.0  # below the floor
+SMALL = partial(Shape, look_aheads=(), width=32, heads=2, layers=4, inner=48)
+BLOCK, RIGHT = 4, 10
+LENGTH = BLOCK + RIGHT
+SCALE = np.float32(0.5)
+
+
+@cache
+def networks(num_states: int = 180) -> tuple[BlockEncoder, BlockReadout]:
+    torch.manual_seed(0)
+    encoder = BlockEncoder(SMALL(num_states=num_states)).eval()
+    with torch.no_grad():  # trained weights differ more than new ones
+        encoder.first.weight *= 6
+        encoder.second.weight *= 6
+        for name, weight in encoder.named_parameters():
+            if name.endswith("query_key_value.weight"):
+                weight.mul_(2)
+    return encoder, BlockReadout(96, num_states).eval()
+
+
+@cache
+def blocks() -> BlockModel:
+    shipped = load_model()
+    assert isinstance(shipped, NeuralModel)
+    return BlockModel(
+        topology=shipped.topology,
+        network=onnx_of(*networks(shipped.topology.num_states), BLOCK),
+        log_prior=shipped.log_prior,
+        acoustic_scale=float(SCALE),
+    )
+
+
+def scores_of(model: BlockModel, frames: np.ndarray) -> np.ndarray:
+    stream = model.stream()
+    return np.concatenate([stream.accept(frames), stream.finish()])
+
+
+def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
+    """Scores of a recording's blocks, (blocks, 2 (B + R), states)."""
+    encoder, readout = networks()
+    num_positions = (len(frames) + 1) // 2
+    laid = layout(num_positions, block_length)
+    repeated = np.repeat(frames[-1:], 2 * num_positions + 1 - len(frames), axis=0)
+    with torch.no_grad():
+        features = encoder(torch.from_numpy(np.concatenate([frames, repeated]))[None], laid)
+        rows = readout.read(features, laid)[0].numpy()
+    scores = SCALE * (rows - blocks().log_prior)
+    found: np.ndarray = scores[laid.blocks.numpy()].reshape(len(laid.blocks), -1, 180)
+    return found
+
+
+# --- scores
+
+
+def test_onnxruntime_computes_what_pytorch_does() -> None:
+    expected = torch_scores(FRAMES, BLOCK)
+    stream = blocks().stream()
+    start = 0
+    for number, scores in enumerate(expected[:-4]):  # those with a whole right context
+        end = 2 * (BLOCK * number + LENGTH) + 1
+        settled = stream.accept(FRAMES[start:end])
+        assert len(settled) == 2 * BLOCK
+        assert len(stream.provisional) == 2 * RIGHT
+        np.testing.assert_allclose(settled, scores[: 2 * BLOCK], atol=0.05)
+        np.testing.assert_allclose(stream.provisional, scores[2 * BLOCK :], atol=0.05)
+        start = end
+
+
+@pytest.mark.parametrize("num_frames", [1, 2, 5, 6, 27, 28])
+def test_the_last_run_settles_all_positions_together(num_frames: int) -> None:
+    frames = FRAMES[:num_frames]
+    (expected,) = torch_scores(frames, LENGTH)
+    found = scores_of(blocks(), frames)
+    assert len(found) == num_frames
+    np.testing.assert_allclose(found, expected[:num_frames], atol=0.05)
+
+
+def test_before_the_first_whole_block_all_scores_are_provisional() -> None:
+    stream = blocks().stream()
+    for number in range(1, 29):
+        before = stream.provisional
+        assert len(stream.accept(FRAMES[number - 1 : number])) == 0
+        num_positions = (number - 1) // 2
+        if number % 2 and num_positions % BLOCK == RIGHT % BLOCK:
+            (expected,) = torch_scores(FRAMES[:number], LENGTH)
+            expected = expected[: 2 * num_positions]
+            assert len(stream.provisional) == 2 * num_positions
+        else:
+            assert stream.provisional is before
+    assert len(stream.accept(FRAMES[28:29])) == 2 * BLOCK
+
+
+def test_scores_come_in_time() -> None:
+    stream = blocks().stream()
+    assert stream.look_ahead_frames == 2 * LENGTH
+    num_settled = 0
+    for number in range(1, 100):
+        num_settled += len(stream.accept(FRAMES[number - 1 : number]))
+        assert num_settled >= number - 2 * LENGTH
+        run = (number - 1) // 2 - ((number - 1) // 2 - RIGHT) % BLOCK  # positions at the last run
+        assert num_settled + len(stream.provisional) == max(0, 2 * run)
+    assert num_settled + len(stream.finish()) == 99
+    assert len(stream.provisional) == 0
+
+
+@pytest.mark.parametrize("num_frames", [0, 1, 2, 3, 28, 29, 30, 36, 37])
+def test_every_frame_of_a_segment_is_settled_once(num_frames: int) -> None:
+    stream = blocks().stream()
+    for _ in range(2):
+        rows = [*stream.accept(FRAMES[:num_frames]), *stream.finish()]
+        assert len(rows) == num_frames
+    assert len(stream.finish()) == 0
+
+
+def test_scores_are_the_same_in_any_chunks_and_any_company() -> None:
+    model = blocks()
+    lone = model.stream()
+    expected = {}
+    for number in range(1, len(FRAMES) + 1):
+        settled = lone.accept(FRAMES[number - 1 : number])
+        expected[number] = (settled, lone.provisional)
+    whole = scores_of(model, FRAMES)
+    rng = np.random.default_rng(0)
+    num_streams = 18  # more than share a run
+    streams = [model.stream() for _ in range(num_streams)]
+    rows: list[list[np.ndarray]] = [[] for _ in streams]
+    at = [0] * num_streams
+    while min(at) < len(FRAMES):
+        company = rng.permutation([n for n in range(num_streams) if at[n] < len(FRAMES)])
+        company = company[: rng.integers(1, num_streams + 1)]
+        ends = {n: min(at[n] + int(rng.integers(1, 40)), len(FRAMES)) for n in company}
+        work = [(streams[n], FRAMES[at[n] : ends[n]]) for n in company]
+        for n, scores in zip(company, model.score(work), strict=True):
+            rows[n].append(scores)
+            at[n] = ends[n]
+            np.testing.assert_array_equal(streams[n].provisional, expected[at[n]][1])
+    for stream, found in zip(streams, rows, strict=True):
+        np.testing.assert_array_equal(np.concatenate([*found, stream.finish()]), whole)
+
+
+def test_sessions_recognised_together_give_what_each_gives_alone() -> None:
+    model = blocks()
+    sounds = [HELLO, HELLO[8000:], np.zeros(4000, np.float32)]
+    alone = []
+    for sound in sounds:
+        recognizer = Recognizer(model, sample_rate_hz=16_000)
+        alone.append(recognizer.accept_waveform(sound) + recognizer.input_finished())
+    recognizers = [Recognizer(model, sample_rate_hz=16_000) for _ in sounds]
+    tasks = [r.process(sound) for r, sound in zip(recognizers, sounds, strict=True)]
+    together = run_scoring_tasks(model, tasks)
+    ends = run_scoring_tasks(model, [recognizer.finish() for recognizer in recognizers])
+    assert [events + end for events, end in zip(together, ends, strict=True)] == alone
+    assert alone[0]
+
+
+def test_only_the_past_counts() -> None:
+    model = blocks()
+    past, layers = model.session.sizes.past, model.session.sizes.layers
+    reach = 2 * layers * (past + LENGTH)
+    frames = np.resize(FRAMES, (reach + 60, 80))
+    frames[:4] = 0.1  # not the loudest
+    other = frames.copy()
+    other[:4] += 0.3
+    one, two = (scores_of_encoder(model, each) for each in (frames, other))
+    assert not np.array_equal(one[100], two[100])
+    np.testing.assert_array_equal(one[reach:], two[reach:])
+
+
+def scores_of_encoder(model: BlockModel, frames: np.ndarray) -> np.ndarray:
+    """Keys and values of each block: the recurrent layer remembers more than the caches."""
+    stream = model.stream()
+    kept = []
+    for start in range(0, len(frames), 8):
+        stream.accept(frames[start : start + 8])
+        kept.append(stream._past.caches.copy() if stream._past else None)
+    return np.stack([each for each in kept if each is not None])
+
+
+def test_a_segment_begins_afresh() -> None:
+    stream = blocks().stream()
+    first = np.concatenate([stream.accept(FRAMES), stream.finish()])
+    stream.accept(FRAMES[:77])
+    stream.reset()
+    assert len(stream.provisional) == 0
+    again = np.concatenate([stream.accept(FRAMES), stream.finish()])
+    np.testing.assert_array_equal(again, first)
+
+
+def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    whole = scores_of(blocks(), FRAMES)
+    monkeypatch.setattr(blocks_module, "MAX_POSITIONS", 40)
+    short = scores_of(blocks(), FRAMES)
+    assert short.shape == whole.shape
+    np.testing.assert_array_equal(short[:56], whole[:56])  # with a whole right context
+    assert not np.array_equal(short[80:160], whole[80:160])
+    later = FRAMES.copy()
+    later[:78] = later[later[:78].max(axis=1).argmax()]  # only seen before the new beginning
+    np.testing.assert_array_equal(scores_of(blocks(), later)[80:], short[80:])
+
+
+def test_a_talking_session_takes_three_megabytes() -> None:
+    sizes = blocks().session.sizes
+    assert sizes.past == 124
+    whisper = blocks_module.BlockSizes(4, 14, 124, 512, 192, layers=6, heads=8, head_size=64)
+    assert Past.empty(whisper).caches.nbytes < 3.1e6
+
+
+# --- the file
+
+
+def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
+    blocks().save(tmp_path / "blocks.npz")
+    again = load_model(tmp_path / "blocks.npz", look_ahead_ms=60.0)  # is ignored
+    assert isinstance(again, BlockModel)
+    np.testing.assert_array_equal(scores_of(again, FRAMES), scores_of(blocks(), FRAMES))
+
+
+def file_of(*, past: int = 124, block: int = BLOCK, states: int = 180) -> np.ndarray:
+    return onnx_of(*networks(states), block, past=past)
+
+
+def test_files_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "blocks.npz"
+    blocks().save(path)
+    arrays = read_archive(path).arrays
+    encoder, _ = networks()
+    broken = BlockReadout(96, 180).eval()
+    with torch.no_grad():
+        broken.output.bias[3] = float("nan")
+    changes: list[tuple[dict[str, np.ndarray], str]] = [
+        ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
+        ({"network": np.frombuffer(VAD.read_bytes(), np.uint8)}, "has the inputs"),
+        ({"network": file_of(past=122)}, "has the sizes"),  # no multiple of a block
+        ({"network": file_of(past=6000)}, "has the sizes"),  # more memory than a session has
+        ({"network": file_of(states=178)}, r"its network scores \(1, 28, 178\)"),
+        ({"network": onnx_of(encoder, broken, BLOCK)}, "are not finite"),
+        ({"log_prior": np.zeros(7, np.float32)}, "log_prior has shape"),
+        ({"acoustic_scale": np.array(np.nan, np.float32)}, "not finite"),
+    ]
+    for change, message in changes:
+        write_archive(path, {**arrays, **change})
+        with pytest.raises(UserError, match=message):
+            load_model(path)

@@ -1,0 +1,261 @@
+"""Training of the block model: its network in PyTorch, its batches, tuning, the recipe."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from corpora.feature_cache import as_floats
+from services.recognizer.acoustic.blocks import BlockModel
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, WhisperMel
+from shared.errors import UserError
+from tests.tones import tones
+from tests.unit.test_block_model import HELLO, SMALL
+from tests.unit.test_neural_training import write_corpus
+from tests.whisper_folder import encoder_arrays, write_whisper
+from training.blocks import batches, readout, trainer
+from training.blocks.batches import block_batch
+from training.blocks.labels import load_labels, save_labels
+from training.blocks.network import RIGHT_CONTEXT, BlockEncoder, BlockReadout, layout
+from training.blocks.readout import Readout, train_readout
+from training.blocks.recipe import train_blocks
+from training.blocks.trainer import BlockNetwork, train_network
+from training.blocks.window_features import encode_by
+from training.neural import teacher
+from training.neural.batches import Recording, Targets
+from training.neural.teacher import WholeEncoder
+
+pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
+
+RECORDINGS = [tones(seed) for seed in range(12)]
+
+
+def small_network() -> BlockNetwork:
+    torch.manual_seed(0)
+    return BlockNetwork(BlockEncoder(SMALL(num_states=6)), BlockReadout(96, 6)).eval()
+
+
+@torch.no_grad()
+def outputs(network: BlockNetwork, frames: np.ndarray, block_length: int) -> torch.Tensor:
+    """Log posteriors by block, (blocks, B + R, 2, states), of as many frames as are used."""
+    laid = layout((len(frames) - 1) // 2, block_length)
+    features = network.encoder(torch.from_numpy(frames)[None], laid)
+    return network.readout.read(features, laid)[0, laid.blocks]
+
+
+def whole_encoder() -> WholeEncoder:
+    torch.manual_seed(0)
+    encoder = WholeEncoder(SMALL(num_states=6)).eval()
+    with torch.no_grad():  # trained convolutions differ more than new ones
+        encoder.first.weight *= 6
+        encoder.second.weight *= 6
+    return encoder
+
+
+@pytest.mark.parametrize("num_frames", [1, 24, 25, 60])
+def test_onnxruntime_encodes_windows_as_pytorch_does(num_frames: int) -> None:
+    encoder = whole_encoder()
+    frames = WhisperMel().accept_waveform(HELLO)[:num_frames]
+    frames[0, 0] = frames.max() - 3.0  # below the floor
+    bands = np.maximum(frames, frames.max() - FLOOR_BANDS).T.copy()
+    with torch.no_grad():
+        features = encoder(torch.from_numpy(bands)[None])[0].numpy()
+    np.testing.assert_allclose(encode_by(encoder)(frames), features, atol=0.1 * features.std())
+
+
+@pytest.mark.parametrize("block_length", [4, 10])
+def test_a_block_needs_its_right_context_and_no_more(block_length: int) -> None:
+    network = small_network()
+    frames = np.random.default_rng(0).normal(0.5, 0.5, (121, 80)).astype(np.float32)
+    whole = outputs(network, frames, block_length)
+    for block in (0, 2):
+        needed = 2 * (block_length * (block + 1) + RIGHT_CONTEXT) + 1
+        live = outputs(network, frames[:needed], block_length)
+        torch.testing.assert_close(live[block], whole[block], rtol=0, atol=1e-5)
+        changed = frames.copy()
+        changed[needed - 1] = 0.0
+        assert (outputs(network, changed, block_length)[block] - whole[block]).abs().max() > 1e-4
+
+
+def test_a_block_alone_is_read_as_a_window_is() -> None:
+    network = small_network()
+    laid = layout(9, 9)
+    features = torch.randn(2, 9, 96)
+    read = network.readout.read(features, laid).flatten(1, 2)
+    torch.testing.assert_close(read, network.readout(features), rtol=0, atol=1e-5)
+
+
+def test_what_is_long_past_is_not_attended_to() -> None:
+    laid = layout(150, 10)
+    last = 149
+    assert laid.may_attend[last].nonzero()[:, 0].tolist() == list(range(140 - 124, 150))
+    of_right = laid.blocks[3, -1]  # the last of the right context of block 3
+    attended = laid.places[laid.may_attend[of_right]]
+    assert attended.tolist() == list(range(50))
+    assert not laid.may_attend[last, 150:].any(), "no copies of other blocks"
+
+
+def test_the_teacher_hears_the_same_undisturbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "_DISTURB_PROB", 0.0)
+    batch = block_batch(RECORDINGS, 0, 1)
+    again = block_batch(RECORDINGS, 0, 1)
+    torch.testing.assert_close(batch.frames, again.frames, rtol=0, atol=0)
+    num_frames = batch.frames.shape[1]
+    assert batch.states.shape[1:3] == ((num_frames - 1) // 2, 2)
+    clean = batch.clean[:, :, :num_frames].transpose(1, 2)
+    apart = batch.frames - clean  # of levels, where no floor is reached
+    loud = (clean > clean.amax(dim=(1, 2), keepdim=True) - FLOOR_BANDS / 2) & (batch.frames > 0.3)
+    for excerpt, where in zip(apart, loud, strict=True):
+        assert excerpt[where].std() < 0.02
+    monkeypatch.setattr(batches, "_DISTURB_PROB", 1.0)
+    disturbed = block_batch(RECORDINGS, 0, 1)
+    assert (disturbed.frames[0] - batch.frames[0]).abs().mean() > 0.05
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_codecs_and_clipping_keep_the_place(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "_CODEC_PROB", 1.0)
+    monkeypatch.setattr(batches, "_CLIP_PROB", 0.0 if number % 2 else 1.0)
+    sound = HELLO
+    coded = batches._distort(sound, np.random.default_rng(number))
+    assert np.abs(coded).max() > 0.3
+    shifts = range(-200, 201, 20)
+    likeness = [np.dot(sound[4000:20_000], np.roll(coded, -shift)[4000:20_000]) for shift in shifts]
+    assert shifts[int(np.argmax(likeness))] == 0
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batches, "BATCH_S", 2)
+    monkeypatch.setattr(batches, "_LENGTHS", (20, 40))
+    monkeypatch.setattr(trainer, "_KEEP_EVERY", 2)
+    monkeypatch.setattr(readout, "_INNER", 48)
+    monkeypatch.setattr(readout, "_GRU", 24)
+    monkeypatch.setattr(readout, "BATCH_S", 3)
+    monkeypatch.setattr(readout, "MAX_WINDOW_FRAMES", 80)
+    monkeypatch.setattr(readout, "_FIXED_FRAMES", 50)
+    monkeypatch.setattr(readout, "_KEEP_EVERY", 4)
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_readout_learns_which_tone_is_when_and_goes_on_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def as_it_is(recording: Recording, _rng: np.random.Generator) -> tuple[np.ndarray, Targets]:
+        return WhisperMel().accept_waveform(as_floats(recording.samples)), recording.targets
+
+    monkeypatch.setattr(readout, "augment", as_it_is)
+    encode = encode_by(whole_encoder())
+    recordings = [tones(seed) for seed in range(12)]
+    lines: list[str] = []
+
+    def train(num_steps: int, name: str) -> Readout:
+        return train_readout(
+            encode, recordings, 6,
+            seed=0, num_steps=num_steps, kept=tmp_path / name, report=lines.append,
+        )  # fmt: skip
+
+    whole = train(120, "whole")
+    unseen = tones(100)
+    frames = WhisperMel().accept_waveform(as_floats(unseen.samples))
+    with torch.no_grad():
+        found = whole(torch.from_numpy(encode(frames))[None])[0, : len(frames)]
+    assert np.mean(found.argmax(dim=-1).numpy() == unseen.targets.states[:, 0]) > 0.93
+    assert lines[-1].startswith("step 120: ")
+
+    def interrupted(line: str) -> None:
+        if line.startswith("step 8:"):
+            raise KeyboardInterrupt
+
+    first = train(12, "first").state_dict()
+    with pytest.raises(KeyboardInterrupt):
+        train_readout(
+            encode, recordings, 6, seed=0, num_steps=12, kept=tmp_path / "second",
+            report=interrupted,
+        )  # fmt: skip
+    second = train(12, "second").state_dict()
+    assert "going on after step 4" in lines
+    for name, weights in first.items():
+        torch.testing.assert_close(second[name], weights, rtol=0, atol=0)
+
+
+def test_labels_are_kept(tmp_path: Path) -> None:
+    recordings = [tones(0), tones(1)]
+    save_labels(tmp_path / "labels.npz", recordings)
+    for before, after in zip(recordings, load_labels(tmp_path / "labels.npz"), strict=True):
+        np.testing.assert_array_equal(after.samples, before.samples)
+        np.testing.assert_array_equal(after.targets.states, before.targets.states)
+        np.testing.assert_array_equal(after.targets.probs, before.targets.probs)
+        assert after.weight == before.weight
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_encoder_learns_and_goes_on_where_it_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainer, "_WARM_UP_STEPS", 5)
+    monkeypatch.setattr(trainer, "_RATE", 2e-3)
+    lines: list[str] = []
+
+    def train(num_steps: int, name: str, stop_at: str = "never") -> BlockNetwork:
+        def report(line: str) -> None:
+            lines.append(line)
+            if line.startswith(f"{stop_at}:"):
+                raise KeyboardInterrupt
+
+        network = small_network()
+        whole = WholeEncoder(SMALL(num_states=6)).eval()
+        whole.load_state_dict(network.encoder.state_dict())
+        return train_network(
+            network, whole, RECORDINGS,
+            seed=0, num_steps=num_steps, kept=tmp_path / name, report=report,
+        )  # fmt: skip
+
+    train(20, "whole")
+    first, last = (float(lines[place].split()[2]) for place in (0, -1))
+    assert last < first - 0.1
+    begun = small_network().state_dict()
+    done = train(4, "first").state_dict()
+    assert torch.equal(done["encoder.second.weight"], begun["encoder.second.weight"]), "frozen"
+    with pytest.raises(KeyboardInterrupt):
+        train(4, "second", stop_at="step 4")
+    again = train(4, "second").state_dict()
+    assert "going on after step 2" in lines
+    for name, weights in done.items():
+        torch.testing.assert_close(again[name], weights, rtol=0, atol=0)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_the_recipe_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("training.neural.initial_network.Shape", SMALL)
+    monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
+    corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
+    whisper = write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6))
+    output = tmp_path / "blocks.npz"
+    lines: list[str] = []
+    train_blocks(
+        [corpus], output, whisper=whisper, untranscribed=[corpus],
+        seed=1, num_readout_steps=4, num_steps=2, report=lines.append,
+    )  # fmt: skip
+    assert "5 of 5 recordings labelled by the teacher" in lines
+    model = load_model(output)
+    assert isinstance(model, BlockModel)
+    stream = model.stream()
+    frames = WhisperMel().accept_waveform(HELLO)
+    assert len(stream.accept(frames)) + len(stream.finish()) == len(frames)
+    np.testing.assert_array_equal(model.topology.log_stay, load_model().topology.log_stay)
+    card = output.with_suffix(".md").read_text()
+    assert "4 steps of the readout, 2 of" in card
+    assert "on 5 recordings of 0 minutes drawn from those below" in card
+    assert "CC0-1.0" in card
+    left = {path.name for path in tmp_path.iterdir() if path.is_file()}
+    assert left == {"blocks.npz", "blocks.md"}
+
+
+def test_only_a_neural_model_can_be_the_start(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="is no neural model; give one that"):
+        train_blocks([], tmp_path / "b.npz", whisper=tmp_path, start=model_path("gmm"))

@@ -1,0 +1,173 @@
+"""Batches for the block network: speech as its teacher hears it, and disturbed as it comes live.
+
+Sources as in :mod:`training.neural.augmentation`, whose disturbances are used; others' speech in
+the background, clipping and lossy coding come on top.
+
+An excerpt is cut from the recordings played one after another. Its speed is drawn; the teacher
+hears it clean, and a little beyond the end of what the network hears. A tempo is drawn for the
+frames of both. Every batch is drawn by a generator of its own, so training that goes on later
+gives the same network.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import soundfile
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from corpora.feature_cache import as_floats
+from services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
+from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
+from training.neural.augmentation import (
+    Samples,
+    change_speed,
+    change_tempo,
+    disturb,
+    scale_level,
+    source_frames,
+)
+from training.neural.batches import Recording, Targets, sampling_probs
+
+BATCH_S = 32
+_POSITIONS_PER_S = 50
+_LENGTHS = (80, 120, 160, 200)  # positions of an excerpt
+_BEYOND = 25  # positions that the teacher alone hears
+_BLOCK_LENGTHS, _BLOCK_PROBS = (5, 10, 20), (0.2, 0.4, 0.4)
+_FROM_START_PROB = 0.5  # of a recording
+_FIRST_ROW_PROB, _MAX_START = 0.7, 1200  # row of the table of positions
+_DISTURB_PROB, _TEMPO_PROB = 0.9, 0.4
+_MAX_STRETCH = 1.6  # samples needed for an excerpt, of any speed and tempo
+_TEACHER_PEAK = 0.5
+_BABBLE_PROB, _MAX_VOICES, _MIN_BABBLE_DB, _MAX_BABBLE_DB = 0.15, 3, 0.0, 20.0
+_CLIP_PROB, _MIN_CLIPPED = 0.1, 0.15  # lowest limit, of the peak
+_CODEC_PROB = 0.2
+_CODED_PEAK, _MIN_COMPRESSION, _MAX_COMPRESSION = 0.5, 0.3, 0.98
+_CODECS = (("MP3", "MPEG_LAYER_III"), ("OGG", "OPUS"))
+_TINY = 1e-9
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockBatch:
+    """Excerpts of a step."""
+
+    frames: Tensor  # (batch, 2 positions + 1, 80), as the network hears them
+    clean: Tensor  # (batch, 80, more frames), as the teacher does
+    states: Tensor  # (batch, positions, 2, k), the targets
+    probs: Tensor  # (batch, positions, 2, k)
+    block_length: int
+    start: int  # row of the first position
+
+
+def block_batch(recordings: Sequence[Recording], seed: int, number: int) -> BlockBatch:
+    """Draw the batch of a number."""
+    rng = np.random.default_rng([seed, number])
+    probs = sampling_probs(recordings)
+    length = int(rng.choice(_LENGTHS))
+    num_heard = 2 * (length + _BEYOND) + 1
+    heard, clean, states, target_probs = [], [], [], []
+    for _ in range(_POSITIONS_PER_S * BATCH_S // length):
+        samples, targets = _speech(recordings, probs, math.ceil(_MAX_STRETCH * num_heard), rng)
+        both, source = _frames(samples, len(targets), recordings, rng)
+        bands = both[:num_heard, :NUM_MELS]
+        clean.append(np.maximum(bands, bands.max() - FLOOR_BANDS).T)
+        heard.append(both[: 2 * length + 1, NUM_MELS:])
+        target = targets.of(source[: 2 * length])
+        states.append(target.states.astype(np.int64))
+        target_probs.append(target.probs.astype(np.float32))
+    shape = len(states), length, 2, -1
+    return BlockBatch(
+        frames=torch.from_numpy(np.stack(heard)),
+        clean=torch.from_numpy(np.stack(clean)),
+        states=torch.from_numpy(np.stack(states)).view(*shape),
+        probs=torch.from_numpy(np.stack(target_probs)).view(*shape),
+        block_length=int(rng.choice(_BLOCK_LENGTHS, p=_BLOCK_PROBS)),
+        start=0 if rng.random() < _FIRST_ROW_PROB else int(rng.integers(_MAX_START)),
+    )
+
+
+def _speech(
+    recordings: Sequence[Recording],
+    probs: NDArray[np.float64],
+    num_frames: int,
+    rng: np.random.Generator,
+) -> tuple[Samples, Targets]:
+    """Draw recordings until they fill the frames; the first may begin anywhere."""
+    sounds, states, target_probs = [], [], []
+    missing = num_frames
+    while missing > 0:
+        recording = recordings[int(rng.choice(len(probs), p=probs))]
+        size = len(recording.targets)
+        begin = 0
+        if missing == num_frames and size > num_frames and rng.random() >= _FROM_START_PROB:
+            begin = int(rng.integers(size - num_frames))
+        size = min(size - begin, missing)
+        sounds.append(recording.samples[HOP_SAMPLES * begin :][: HOP_SAMPLES * size])
+        target = recording.targets.of(slice(begin, begin + size))
+        states.append(target.states)
+        target_probs.append(target.probs)
+        missing -= size
+    targets = Targets(np.concatenate(states), np.concatenate(target_probs))
+    return as_floats(np.concatenate(sounds)), targets
+
+
+def _frames(
+    samples: Samples, num_source: int, recordings: Sequence[Recording], rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Compute frames, clean and disturbed side by side, (n, 160), and each one's source frame."""
+    sound, speed = change_speed(samples, rng)
+    sound = (sound * (_TEACHER_PEAK / (np.abs(sound).max() + _TINY))).astype(np.float32)
+    disturbed = sound
+    if rng.random() < _DISTURB_PROB:
+        disturbed = _distort(disturb(_with_voices(sound, recordings, rng), rng), rng)
+    frames = np.hstack(
+        [WhisperMel().accept_waveform(one) for one in (sound, scale_level(disturbed, rng))]
+    )
+    source = source_frames(len(frames), speed, num_source)
+    if rng.random() < _TEMPO_PROB:
+        frames, changed = change_tempo(frames, rng)
+        source = source[changed]
+    return frames, source
+
+
+def _with_voices(
+    sound: Samples, recordings: Sequence[Recording], rng: np.random.Generator
+) -> Samples:
+    """Add others' speech, at times."""
+    if rng.random() >= _BABBLE_PROB:
+        return sound
+    babble = np.zeros_like(sound)
+    for _ in range(int(rng.integers(1, _MAX_VOICES + 1))):
+        voice = as_floats(recordings[int(rng.integers(len(recordings)))].samples)
+        babble += np.resize(voice, len(sound)) / (np.sqrt(np.mean(voice**2)) + _TINY)
+    below_db = rng.uniform(_MIN_BABBLE_DB, _MAX_BABBLE_DB)
+    level = np.sqrt(np.mean(sound**2) / np.mean(babble**2)) * 10 ** (-below_db / 20)
+    return sound + np.float32(level) * babble
+
+
+def _distort(sound: Samples, rng: np.random.Generator) -> Samples:
+    """Clip, or code and decode, at times; the peak becomes 1/2."""
+    peak = np.abs(sound).max() + _TINY
+    if rng.random() < _CLIP_PROB:
+        peak *= np.exp(rng.uniform(np.log(_MIN_CLIPPED), 0.0))
+        sound = np.clip(sound, -peak, peak)
+    sound = (sound * (_CODED_PEAK / peak)).astype(np.float32)
+    if rng.random() >= _CODEC_PROB:
+        return sound
+    kind, codec = _CODECS[int(rng.integers(len(_CODECS)))]
+    file = io.BytesIO()
+    level = rng.uniform(_MIN_COMPRESSION, _MAX_COMPRESSION)
+    soundfile.write(
+        file, sound, SAMPLE_RATE_HZ, format=kind, subtype=codec, compression_level=level
+    )
+    file.seek(0)
+    decoded: Samples = soundfile.read(file, dtype="float32")[0]
+    return np.resize(decoded, len(sound))

@@ -1,0 +1,200 @@
+"""Write the block network as ONNX, which the recognizer runs one block at a time.
+
+The graph computes :class:`training.blocks.network.BlockEncoder` and its readout for the block and
+the right context of several sessions. All have room for ``B + R`` positions; a session has fewer
+where its speech begins and ends.
+
+=============== ================================================== =============================
+symbol          meaning                                            shape
+=============== ================================================== =============================
+frames          log-mel frames, oldest first, two before the first (sessions, 2 (B + R) + 3, 80)
+                position's
+positions       rows of the table of positions                     (sessions, B + R, width)
+num_positions   positions that there are, 1 or more                (sessions,)
+num_cached      positions in the caches                            (sessions,)
+state           state of the recurrent layer before the block      (sessions, GRU's width)
+keys_l,         of the positions before the block, for each layer  (sessions, heads, PAST, size)
+values_l
+log_posteriors  log posteriors of the states of two frames each    (sessions, 2 (B + R), states)
+new_state       state after the block                              (sessions, GRU's width)
+new             keys and values of the block, in the order of the  (sessions, 2 layers, heads,
+                inputs                                             B, size)
+=============== ================================================== =============================
+
+Products are of 8-bit integers (:mod:`training.blocks.onnx_graph`); convolutions, norms, attention
+and the recurrent layer are floats. A product with a single row may be summed in another order than
+one with more. The recurrent layer has a row for each session, so it gets the first session's once
+more.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from onnx import TensorProto, helper
+
+from services.recognizer.front_end.whisper_mel import NUM_MELS
+from training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
+from training.blocks.onnx_graph import DOMAIN, Graph, arrays_of, floats
+from training.neural.teacher import KEPT_LAYERS
+
+_KINDS = ("keys", "values")
+
+
+def onnx_of(
+    encoder: BlockEncoder,
+    readout: BlockReadout,
+    block_length: int,
+    right_context: int = RIGHT_CONTEXT,
+    past: int = PAST,
+) -> NDArray[np.uint8]:
+    """Export a network: return the bytes of an ONNX file, its inputs and outputs as above.
+
+    Parameters
+    ----------
+    encoder, readout
+        The network.
+    block_length, right_context, past
+        B, R, PAST, positions.
+    """
+    return _BlockGraph(encoder, readout, block_length, right_context, past).file_of_block()
+
+
+class _BlockGraph(Graph):
+    def __init__(
+        self,
+        encoder: BlockEncoder,
+        readout: BlockReadout,
+        block_length: int,
+        right_context: int,
+        past: int,
+    ) -> None:
+        super().__init__()
+        self._shape = encoder.shape
+        self._size = encoder.shape.width // encoder.shape.heads
+        self._encoder, self._readout = arrays_of(encoder), arrays_of(readout, "readout.")
+        self._block, self._length, self._past = block_length, block_length + right_context, past
+        self._new: list[str] = []  # keys and values of the block
+
+    def file_of_block(self) -> NDArray[np.uint8]:
+        """Write all nodes; return the file."""
+        shape, length = self._shape, self._length
+        gru = self._readout["readout.gru.weight_hh_l0"].shape[1]
+        self._log_posteriors(self._features())
+        order = [
+            self._new[layer + at] for at in range(2) for layer in range(0, 2 * shape.layers, 2)
+        ]
+        self.node("Concat", order, "new", axis=1)
+        caches = [
+            floats(f"{kind}_{layer}", "sessions", shape.heads, self._past, self._size)
+            for kind in _KINDS
+            for layer in range(shape.layers)
+        ]
+        inputs = [
+            floats("frames", "sessions", 2 * length + 3, NUM_MELS),
+            floats("positions", "sessions", length, shape.width),
+            *(
+                helper.make_tensor_value_info(name, TensorProto.INT64, ["sessions"])
+                for name in ("num_positions", "num_cached")
+            ),
+            floats("state", "sessions", gru),
+            *caches,
+        ]
+        outputs = [
+            floats("log_posteriors", "sessions", 2 * length, shape.num_states),
+            floats("new_state", "sessions", gru),
+            floats("new", "sessions", 2 * shape.layers, shape.heads, self._block, self._size),
+        ]
+        return self.file("blocks", inputs, outputs)
+
+    def _features(self) -> str:
+        """Run the encoder; the kept layers of all positions, (rows, features)."""
+        width = self._shape.width
+        bands = self.node("Transpose", ["frames"], perm=[0, 2, 1])
+        hidden = self.convolutions(bands, self._encoder, padding=0)
+        hidden = self.node("Add", [hidden, "positions"])
+        hidden = self.node("Reshape", [hidden, self.integers("rows", -1, width)])
+        mask = self._mask()
+        after = []
+        for number in range(self._shape.layers):
+            hidden = self._layer(number, hidden, mask)
+            after.append(hidden)
+        return self.node("Concat", [after[place] for place in KEPT_LAYERS], axis=-1)
+
+    def _mask(self) -> str:
+        """Return what is added to products with keys: the cached ones, then the block's."""
+        parts = []
+        for name, most in (("num_cached", self._past), ("num_positions", self._length)):
+            count = self.node("Unsqueeze", [name, self.integers("three_axes", 1, 2, 3)])
+            there = self.node("Less", [self.integers(f"{name}.places", *range(most)), count])
+            limits = [self.number("may", 0.0), self.number("may_not", -np.inf)]
+            parts.append(self.node("Where", [there, *limits]))
+        return self.node("Concat", parts, axis=-1)
+
+    def _layer(self, number: int, hidden: str, mask: str) -> str:
+        name, parameters = f"layers.{number}", self._encoder
+        normed = self.norm(hidden, parameters, f"{name}.attention_norm")
+        joint = self.product(normed, parameters, f"{name}.query_key_value")
+        seen = self._attention(number, joint, mask)
+        hidden = self.node("Add", [hidden, self.product(seen, parameters, f"{name}.attended")])
+        normed = self.norm(hidden, parameters, f"{name}.inner_norm")
+        inner = self.node("Gelu", [self.product(normed, parameters, f"{name}.inner")])
+        return self.node("Add", [hidden, self.product(inner, parameters, f"{name}.outer")])
+
+    def _attention(self, number: int, joint: str, mask: str) -> str:
+        """Attend to the cached positions and to the block's, (rows, width)."""
+        heads, size, width = self._shape.heads, self._size, self._shape.width
+        name = f"layers.{number}"
+        parts = self.split(joint, [f"{name}.{part}" for part in ("query", "key", "value")])
+        by_head = self.integers("by_head", -1, self._length, heads, size)
+        query, key, value = (
+            self.node("Transpose", [self.node("Reshape", [part, by_head])], perm=[0, 2, 1, 3])
+            for part in parts
+        )
+        ends = [self.integers("zero", 0), self.integers("block", self._block)]
+        for each in (key, value):
+            of_block = self.node("Slice", [each, *ends, self.integers("place_axis", 2)])
+            self._new.append(self.node("Unsqueeze", [of_block, self.integers("ring_axis", 1)]))
+        products = [
+            self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=size**-0.5)
+            for keys in (f"keys_{number}", key)
+        ]
+        masked = self.node("Add", [self.node("Concat", products, axis=-1), mask])
+        weights = self.node("Softmax", [masked], axis=-1)
+        names = [f"{name}.{part}_weights" for part in ("past", "own")]
+        past, own = self.split(weights, names, self._past, self._length)
+        pairs = ((past, f"values_{number}"), (own, value))
+        seen = self.node("Add", [self.node("MatMul", pair) for pair in pairs])
+        seen = self.node("Transpose", [seen], perm=[0, 2, 1, 3])
+        return self.node("Reshape", [seen, self.integers("rows", -1, width)])
+
+    def _log_posteriors(self, features: str) -> None:
+        """Run the readout on (rows, features)."""
+        parameters, length = self._readout, self._length
+        inner = self.readout_inner(features, parameters)
+        gru = parameters["readout.gru.weight_hh_l0"].shape[1]
+        by_session = self.integers("by_session", -1, length, len(parameters["readout.inner.bias"]))
+        of_sessions = self.node("Reshape", [inner, by_session])
+        in_order = self.node("Transpose", [of_sessions], perm=[1, 0, 2])
+        zero, one = self.integers("zero", 0), self.integers("one_row", 1)
+        one_more = []  # row: the first session's again
+        for each, axis in ((in_order, 1), ("num_positions", 0), ("state", 0)):
+            first = self.node("Slice", [each, zero, one, self.integers(f"axis_{axis}", axis)])
+            one_more.append(self.node("Concat", [each, first], axis=axis))
+        inputs, num_positions, state = one_more
+        counts = self.node("Cast", [num_positions], to=TensorProto.INT32)
+        nothing = self.node("Mul", [state, self.number("nothing", 0.0)])
+        directions = [self.node("Unsqueeze", [each, zero]) for each in (state, nothing)]
+        states = self.node("Concat", directions, axis=0)
+        weights = self.recurrent_weights(parameters)
+        context = self.recurrent(inputs, weights, gru, counts, states)
+        sessions = [zero, self.integers("before_last", -1), self.integers("place_axis", 2)]
+        context = self.node("Slice", [context, *sessions])
+        context = self.node("Transpose", [context], perm=[2, 0, 1, 3])  # sessions, n, directions
+        last = self.constant("last_of_block", np.array(self._block - 1))
+        state = self.node("Gather", [context, last], axis=1)
+        self.node("Gather", [state, self.constant("first", np.array(0))], "new_state", axis=1)
+        context = self.node("Reshape", [context, self.integers("both", -1, 2 * gru)])
+        by_frame = (-1, 2 * length, self._shape.num_states)
+        rows = self.readout_output(context, inner, parameters, *by_frame)
+        self.node("Identity", [rows], "log_posteriors")

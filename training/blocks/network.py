@@ -1,0 +1,168 @@
+"""The block recognizer's network, in PyTorch: Whisper's encoder in blocks, and its readout.
+
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
+encoder's layers, and the weights that training starts with); Shi et al. 2021, "Emformer: efficient
+memory transformer based acoustic model for low latency streaming speech recognition" (blocks with
+a cached past and hard copies of their right context); Zhang et al. 2016, "Highway long short-term
+memory RNNs for distant speech recognition" (a recurrent layer whose backward direction begins a
+few positions after its block); Cho et al. 2014, "Learning phrase representations using RNN
+encoder-decoder for statistical machine translation" (the GRU).
+
+A recording's positions come in blocks of ``B``. The positions of a block and ``R`` positions after
+it, its right context, attend to each other and to the ``PAST`` positions before the block, in all
+layers. Live, a block is computed at once with its right context; keys and values of its own
+positions are kept, and the right context is computed anew as a part of later blocks. For training,
+all blocks of a recording are computed together: its positions, then a copy of each block's right
+context, with a mask that lets each attend to what it may. Both compute the same. The outputs of a
+block's own positions are settled, those of its right context provisional. The network does not
+depend on ``B``, so another one can be used live than in training.
+
+    z = clip((concat(h_4, h_5, h_6) - mean) / deviation, -6, 6)
+    a = gelu(W z)
+    y = log softmax(V concat(forward GRU(a), backward GRU(a), a))
+
+======== ================================================================ =====================
+symbol   meaning                                                          shape
+======== ================================================================ =====================
+x        log-mel frames; two of zeros stand before the first              (batch, frames, 80)
+h_l      positions after layer l                                          (batch, n, width)
+R        right context, positions; a recording's last blocks have less    1
+n        positions, and copies of right contexts                          1
+a        input of the recurrent layer; it runs forwards over all blocks   (batch, n, 320)
+         and, from the block's end, over its right context; backwards
+         over the right context and then the block
+y        log posteriors of the states at the frames 2 p and 2 p + 1       (batch, n, 2, states)
+         of position p
+======== ================================================================ =====================
+
+Position ``p`` has seen the frames up to ``2 p + 2``. So a block that begins with position ``p``
+needs the frames up to ``2 (p + B + R)``. No band lies deeper than eight decades below the loudest
+one so far.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from services.recognizer.front_end.whisper_mel import FLOOR_BANDS
+from training.blocks.readout import Readout
+from training.neural.network import PADDING_FRAMES, Encoder, Shape
+from training.neural.teacher import KEPT_LAYERS
+
+RIGHT_CONTEXT = 10  # positions, 200 ms
+PAST = 124  # positions before a block that it attends to, 2.5 s
+
+_GRU_WEIGHTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The positions that are computed for a recording, and what each may attend to."""
+
+    num_positions: int  # of the recording
+    places: Tensor  # (n,) in the recording: all positions, then each block's right context
+    may_attend: Tensor  # (n, n)
+    blocks: Tensor  # (blocks, B + R), the positions of a block and its right context, of n
+    exists: Tensor  # (blocks, B + R)
+    block_length: int  # B
+
+    def in_order(self, of_blocks: Tensor) -> Tensor:
+        """Put values of the blocks, (batch, blocks, B + R, width), in order: (batch, n, width)."""
+        parts = (slice(self.block_length), slice(self.block_length, None))
+        return torch.cat([of_blocks[:, :, part][:, self.exists[:, part]] for part in parts], dim=1)
+
+
+@cache
+def layout(num_positions: int, block_length: int) -> Layout:
+    """Lay out a recording's positions and right contexts."""
+    num_blocks = math.ceil(num_positions / block_length)
+    begins = block_length * torch.arange(num_blocks)
+    places = begins[:, None] + torch.arange(block_length + RIGHT_CONTEXT)
+    exists = places < num_positions
+    copied = exists.clone()
+    copied[:, :block_length] = False
+    blocks = places.clone()
+    blocks[copied] = num_positions + torch.arange(int(copied.sum()))
+    blocks[~exists] = 0
+    positions = torch.arange(num_positions)
+    block_of = torch.cat([positions // block_length, copied.nonzero()[:, 0]])
+    begin = begins[block_of][:, None]  # of the block of the one that attends
+    may_attend = block_of == block_of[:, None]
+    may_attend[:, :num_positions] |= (positions < begin) & (positions >= begin - PAST)
+    return Layout(
+        num_positions=num_positions,
+        places=torch.cat([positions, places[copied]]),
+        may_attend=may_attend,
+        blocks=blocks,
+        exists=exists,
+        block_length=block_length,
+    )
+
+
+class BlockEncoder(Encoder):
+    """Whisper's encoder in blocks."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__(shape, dropout=0.0, padding=0)
+
+    def forward(self, frames: Tensor, laid: Layout, start: int = 0) -> Tensor:
+        """Run the layers: (batch, frames, 80) to the kept layers, (batch, n, 3 width).
+
+        There are ``2 positions + 1`` frames; ``start`` is the first position's row in the table.
+        """
+        loudest = frames.amax(dim=2, keepdim=True).cummax(dim=1).values
+        bands = pad(torch.maximum(frames, loudest - FLOOR_BANDS), (0, 0, PADDING_FRAMES, 0))
+        hidden = self.embed(bands.transpose(1, 2), start)[:, laid.places]
+        after = []
+        for layer in self.layers:
+            hidden = layer(hidden, laid.may_attend)
+            after.append(hidden)
+        return torch.cat([after[place] for place in KEPT_LAYERS], dim=-1)
+
+
+class BlockReadout(Readout):
+    """Computes the posteriors of the states; the backward direction begins anew in each block."""
+
+    def read(self, features: Tensor, laid: Layout) -> Tensor:
+        """Compute log posteriors: (batch, n, features) to (batch, n, 2, states)."""
+        inner = self.inner_of(features)
+        of_blocks = inner[:, laid.blocks]
+        forwards = self._forwards(inner[:, : laid.num_positions], of_blocks, laid)
+        context = torch.cat([forwards, self._backwards(of_blocks, laid)], dim=-1)
+        return self.log_posteriors(context, inner).view(*features.shape[:2], 2, -1)
+
+    def _forwards(self, own: Tensor, of_blocks: Tensor, laid: Layout) -> Tensor:
+        """Run over the recording, and from each block's end over its right context."""
+        own = self._run(own, own.new_zeros(len(own), self.gru.hidden_size))
+        last = laid.blocks[:, : laid.block_length].amax(dim=1)
+        right = of_blocks[:, :, laid.block_length :]
+        after = self._run(right.flatten(0, 1), own[:, last].flatten(0, 1))
+        of_right = after.view(*right.shape[:3], -1)[:, laid.exists[:, laid.block_length :]]
+        return torch.cat([own, of_right], dim=1)
+
+    def _run(self, inputs: Tensor, state: Tensor) -> Tensor:
+        weights = [getattr(self.gru, f"{kind}_l0") for kind in _GRU_WEIGHTS]
+        outputs, _ = torch.gru(
+            inputs, state[None], weights, True, 1, 0.0, self.training, False, True
+        )  # with biases, one layer, no dropout, one direction, batch first
+        return outputs
+
+    def _backwards(self, of_blocks: Tensor, laid: Layout) -> Tensor:
+        """Run over each right context and its block, from their end: (batch, n, width)."""
+        weights = [getattr(self.gru, f"{kind}_l0_reverse") for kind in _GRU_WEIGHTS]
+        state = of_blocks.new_zeros(
+            of_blocks[:, :, 0].numel() // of_blocks.shape[-1], self.gru.hidden_size
+        )
+        states = []
+        for column in reversed(range(of_blocks.shape[2])):
+            state = torch.gru_cell(of_blocks[:, :, column].flatten(0, 1), state, *weights)
+            state = state * laid.exists[:, column].repeat(len(of_blocks))[:, None]
+            states.append(state)
+        steps = torch.stack(states[::-1], dim=1)
+        return laid.in_order(steps.view(*of_blocks.shape[:3], -1))

@@ -1,0 +1,162 @@
+"""From corpora to the block model: labels, readout, tuned encoder, model card.
+
+HMMs, phone language model, the states' prior and the search's weights are those of a neural model
+made before, which also aligns the recordings with their texts. A first readout is learnt of
+Whisper's encoder as it is, on windows. Then encoder and readout are tuned in blocks.
+
+The training can be interrupted: labels, readout and network are kept beside the output, as
+``.labels.npz``, ``.readout.pt`` and ``.network.pt``, and the same command goes on from them. They
+are deleted at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from corpora.speech_corpus import RowErrors
+from services.recognizer.acoustic.blocks import BlockModel
+from services.recognizer.acoustic.load import MODEL_PATH, load_model
+from services.recognizer.acoustic.neural import NeuralModel
+from shared.errors import UserError
+from training.blocks.batches import BATCH_S
+from training.blocks.export import onnx_of
+from training.blocks.labels import Draw, label, load_labels, save_labels
+from training.blocks.network import BlockEncoder, BlockReadout
+from training.blocks.readout import train_readout
+from training.blocks.trainer import BlockNetwork, train_network
+from training.blocks.window_features import encode_by
+from training.model_card import write_card
+from training.neural.initial_network import init_encoder
+from training.neural.whisper_weights import load_whisper
+from training.progress import Report
+from training.training_set import FRAMES_PER_MINUTE, load_examples
+
+NUM_READOUT_STEPS, NUM_STEPS = 450, 450
+BLOCK_LENGTH = 4  # positions, live
+
+_DRAW = Draw(
+    kinds={"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)},
+    untranscribed_share=0.72,
+    max_untranscribed=3000,
+)
+
+
+def train_blocks(
+    corpora: Sequence[Path],
+    output: Path,
+    *,
+    whisper: Path,
+    start: Path | None = None,
+    untranscribed: Sequence[Path] = (),
+    seed: int = 0,
+    num_readout_steps: int = NUM_READOUT_STEPS,
+    num_steps: int = NUM_STEPS,
+    shipping: bool = True,
+    report: Report = print,
+) -> None:
+    """Train the block model, and write the model and its card.
+
+    Parameters
+    ----------
+    corpora
+        Folders that :func:`corpora.speech_corpus.read_corpus` reads; splits ``train`` and ``dev``.
+    output
+        The ``.npz`` file to write; the card is written beside it as ``.md``.
+    whisper
+        Folder with Whisper base, see :func:`training.neural.whisper_weights.load_whisper`.
+    start
+        A neural model: its HMMs, phone language model, prior and weights are taken over; it aligns.
+        Without it, that is the model that ships.
+    untranscribed
+        Folders of recordings in any language, which the teacher labels. Their licences are
+        unknown: name only folders that may be used.
+    seed
+        Of the draw of recordings, new weights, excerpts and disturbances.
+    num_readout_steps
+        Number of batches of 70 s that the readout of the untouched encoder learns from.
+    num_steps
+        Number of batches that encoder and readout are tuned on.
+    shipping
+        Leave out rows whose licence forbids giving the model away.
+    report
+        Receives lines of progress.
+
+    Raises
+    ------
+    UserError
+        If there is nothing to train on, ``start`` is no neural model, or a file cannot be read.
+    """
+    start = start or MODEL_PATH
+    before = load_model(start)
+    if not isinstance(before, NeuralModel):
+        raise UserError(f"{start} is no neural model; give one that 'kouxing train neural' made")
+    torch.set_num_threads(1)  # the same sums on every machine
+    torch.manual_seed(seed)
+    whole = init_encoder(whisper, before.topology.num_states).eval()
+    errors = RowErrors()
+    examples = load_examples(
+        corpora, errors, before.inventory, shipping=shipping, with_samples=True
+    )
+    labels, readout_state, network_state = kept = [
+        output.with_suffix(suffix) for suffix in (".labels.npz", ".readout.pt", ".network.pt")
+    ]
+    if not labels.exists():
+        labelled = label(
+            examples,
+            untranscribed,
+            draw=_DRAW,
+            aligner=before,
+            encoder=whole,
+            errors=errors,
+            seed=seed,
+            report=report,
+        )
+        save_labels(labels, labelled)
+    recordings = load_labels(labels)
+    first = train_readout(
+        encode_by(whole),
+        recordings,
+        before.topology.num_states,
+        seed=seed,
+        num_steps=num_readout_steps,
+        kept=readout_state,
+        report=report,
+    )
+    encoder = BlockEncoder(whole.shape)
+    load_whisper(encoder, whisper)
+    readout = BlockReadout(len(first.mean), encoder.shape.num_states)
+    readout.load_state_dict(first.state_dict())
+    network = train_network(
+        BlockNetwork(encoder, readout),
+        whole,
+        recordings,
+        seed=seed,
+        num_steps=num_steps,
+        kept=network_state,
+        report=report,
+    )
+    model = BlockModel(
+        topology=before.topology,
+        network=onnx_of(network.encoder, network.readout, BLOCK_LENGTH),
+        log_prior=before.log_prior,
+        acoustic_scale=before.acoustic_scale,
+    )
+    model.save(output)
+    minutes = sum(len(one.targets) for one in recordings) / FRAMES_PER_MINUTE
+    write_card(
+        output,
+        title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",
+        details=f"with Whisper's weights (Radford et al. 2023, MIT licence), seed {seed}, "
+        f"{num_readout_steps} steps of the readout, {num_steps} of {BATCH_S} s of sound of all, "
+        f"aligned by `{start.name}`, on {len(recordings)} recordings of {minutes:.0f} minutes "
+        "drawn from those below",
+        examples=examples,
+        errors=errors,
+        chosen=None,
+    )
+    errors.print_to(report)
+    for path in kept:
+        path.unlink()
