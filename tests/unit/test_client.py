@@ -173,7 +173,7 @@ def test_an_unknown_session_is_an_error_when_it_does_not_move(
     codes: list[str] = []
     while len(codes) < 2:
         codes += [error.code for error in stage.session.errors()]
-    assert codes == ["bad-audio", "unknown-session"]
+    assert sorted(codes) == ["bad-audio", "unknown-session"]  # in either order
 
 
 def test_skipped_audio_advances_media_time(stage: Stage) -> None:
