@@ -250,16 +250,21 @@ class _LiveOutput:
     final: list[Phone] = field(default_factory=list)
 
 
-def _decode_live(
-    model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: tuple[int, float]
-) -> _LiveOutput:
+def recognizer_with(model: AcousticModel, rule: Rule) -> Recognizer:
+    """Start a live recognizer with an output rule."""
     num_stable_frames, min_confidence = rule
-    recognizer = Recognizer(
+    return Recognizer(
         model,
         sample_rate_hz=SAMPLE_RATE_HZ,
         num_stable_frames=num_stable_frames,
         min_confidence=min_confidence,
     )
+
+
+def _decode_live(
+    model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: Rule
+) -> _LiveOutput:
+    recognizer = recognizer_with(model, rule)
     output = _LiveOutput()
     known: set[int] = set()
     for time_s, scores in scored:

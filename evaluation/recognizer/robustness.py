@@ -26,14 +26,14 @@ from evaluation.recognizer.disturbances import (
     babble,
     with_sound,
 )
-from evaluation.recognizer.error_rates import Rule, mouth_shapes
+from evaluation.recognizer.error_rates import Rule, mouth_shapes, recognizer_with
 from evaluation.recognizer.report import percent
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.alignment import spoken
 from services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from services.recognizer.offline import decode_offline
-from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
-from services.recognizer.speech_scores import ScoreEvent, score_recording
+from services.recognizer.recognizer import DEFAULT_RULE
+from services.recognizer.speech_scores import score_recording
 from shared.phones.inventory import PhoneInventory
 
 _SOUND_S = 60.0
@@ -161,7 +161,7 @@ def _outputs(
 ) -> dict[str, list[str]]:
     """Recognise a recording offline and live; return the phones of each of ``_OUTPUTS``."""
     scores = score_recording(model, samples, SAMPLE_RATE_HZ)
-    events = _decode_live(model, scores, rule)
+    events = recognizer_with(model, rule).decode(scores)
     outputs = {
         "offline": decode_offline(model, scores),
         "first_hypothesis": first_hypothesis(events, set()),
@@ -173,24 +173,15 @@ def _outputs(
     }
 
 
-def _decode_live(model: AcousticModel, scores: Sequence[ScoreEvent], rule: Rule) -> list[Emission]:
-    num_stable_frames, min_confidence = rule
-    recognizer = Recognizer(
-        model,
-        sample_rate_hz=SAMPLE_RATE_HZ,
-        num_stable_frames=num_stable_frames,
-        min_confidence=min_confidence,
-    )
-    return recognizer.decode(scores)
-
-
 def _phones_per_minute(
     model: AcousticModel, sounds: Sequence[NDArray[np.float32]], rule: Rule
 ) -> float:
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
     num_phones = 0
     for samples in sounds:
-        events = _decode_live(model, score_recording(model, samples, SAMPLE_RATE_HZ), rule)
+        events = recognizer_with(model, rule).decode(
+            score_recording(model, samples, SAMPLE_RATE_HZ)
+        )
         num_phones += len(spoken(final_hypothesis(events), model.inventory))
     return num_phones / minutes
 
