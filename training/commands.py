@@ -28,7 +28,10 @@ SyntheticWeight = Annotated[
 Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
 PhoneLm = Annotated[
     Path | None,
-    typer.Option(help="Phone language model: from `kouxing train phone-lm`, or another model's."),
+    typer.Option(
+        help="Phone language model: the shipped phone_lm.npz, one that `kouxing train phone-lm` "
+        "made, or a model's own."
+    ),
 ]
 AnyLicence = Annotated[
     bool,

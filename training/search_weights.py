@@ -55,8 +55,7 @@ def offline_error_rate(
     total = ErrorCounts()
     for rows, example in zip(scores, examples, strict=True):
         decoder.reset()
-        for row in rows:
-            decoder.accept(row)
+        decoder.advance(rows)
         decoded = [inventory.phones[segment.phone] for segment in decoder.finish()]
         recognized = [phone for phone in decoded if phone != inventory.silence]
         total += count_errors([inventory.phones[phone] for phone in example.phones], recognized)

@@ -116,7 +116,7 @@ class Recognizer:
         self._durations_s = model.topology.duration_mean_s
         self._scores = SpeechScores(model, sample_rate_hz, num_channels, lips)
         self._settled = Decoder(model.topology)  # the search over settled scores
-        self._ahead = Decoder(model.topology)  # the same, and on over the provisional ones
+        self._ahead: Decoder | None = None  # the same, and on over provisional ones, if they come
         self._rule = OutputRule(num_stable_frames, min_confidence, last_emitted=self._silence)
         self._num_final = 0
         self._start_speech(0)
@@ -199,20 +199,23 @@ class Recognizer:
         if len(scores.settled) or not np.array_equal(known, scores.provisional[: len(known)]):
             known = known[:0]  # else the search ahead goes on where it stands
         self._decoder = self._settled
-        out = [phone for row in scores.settled for phone in self._decode_frame(row)]
+        out = self._search(scores.settled)
         if len(scores.provisional):
-            self._decoder = self._ahead
+            self._ahead = self._decoder = self._ahead or Decoder(self._model.topology)
             if not len(known):
                 self._settled.forget_before(self._done)
                 self._decoder.go_on_from(self._settled)
-            new = scores.provisional[len(known) :]
-            out += [phone for row in new for phone in self._decode_frame(row)]
+            out += self._search(scores.provisional[len(known) :])
         return out
+
+    def _search(self, scores: NDArray[np.float32]) -> list[Phone]:
+        """Let the search go on over frames; the output rule hears those that it has not heard."""
+        num_heard = max(0, self._num_heard - self._decoder.num_frames)
+        self._decoder.advance(scores[:num_heard])
+        return [phone for row in scores[num_heard:] for phone in self._decode_frame(row)]
 
     def _decode_frame(self, scores: NDArray[np.float32]) -> list[Phone]:
         phone, start, confidence = self._decoder.accept(scores)
-        if self._decoder.num_frames <= self._num_heard:
-            return []
         self._num_heard = self._decoder.num_frames
         if not self._rule.accept(phone, confidence):
             return []
@@ -288,7 +291,7 @@ def warm_up(model: AcousticModel) -> None:
     silence = np.zeros(round(_WARM_UP_S * SAMPLE_RATE_HZ), dtype=np.float32)
     frames = model.front_end().accept_waveform(silence)
     scores = np.concatenate([stream.accept(frames), stream.finish()])
-    for row in (*scores, *np.zeros((_WARM_UP_ROWS, scores.shape[1]), dtype=np.float32)):
-        decoder.accept(row)
+    decoder.advance(scores)
+    decoder.advance(np.zeros((_WARM_UP_ROWS, scores.shape[1]), dtype=np.float32))
     decoder.finish()
     VoiceActivityDetector().accept_block(np.zeros(BLOCK_SAMPLES, dtype=np.float32))

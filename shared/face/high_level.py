@@ -4,9 +4,9 @@ ISO/IEC 14496-2, annex C: FAP 1 blends two of 14 visemes, FAP 2 two of six expre
 standard describes their looks in words; the values here (``high_level.tsv``) are those of Crystal
 TTVS (Tsinghua HCSI, Apache-2.0) for the expressions and for the Mandarin visemes nearest to the
 standard's English ones. Deviations: "th", "tS dZ S" and "r" are mixed from several of these; the
-tongue's tip rises in "th", "t d" and "n l", and the lower lip draws in for "f v"; brows, lids and
-cheeks move less far than there, where brows would cross and the middle of a worried brow sink; and
-disgust pulls up both sides of the lip.
+tongue's tip rises in "th", "t d" and "n l", its body in "k g" and "I", and the lower lip draws in
+for "f v"; brows, lids and cheeks move less far than there, where brows would cross and the middle
+of a worried brow sink; and disgust pulls up both sides of the lip.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def test_a_block_alone_is_read_as_a_window_is() -> None:
 def test_what_is_long_past_is_not_attended_to() -> None:
     laid = layout(150, 10)
     last = 149
-    assert laid.may_attend[last].nonzero()[:, 0].tolist() == list(range(140 - 124, 150))
+    assert laid.may_attend[last].nonzero()[:, 0].tolist() == list(range(140 - 125, 150))
     of_right = laid.blocks[3, -1]  # the last of the right context of block 3
     attended = laid.places[laid.may_attend[of_right]]
     assert attended.tolist() == list(range(50))

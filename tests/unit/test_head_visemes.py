@@ -154,8 +154,9 @@ def test_teeth_show_in_i(head: Head) -> None:
 
 @pytest.mark.parametrize("faps", [VISEMES["f"], high_level.viseme_faps(2, 0, 63)])
 def test_lower_lip_meets_the_upper_teeth_in_f(head: Head, faps: NDArray[np.float32]) -> None:
-    lower_lip, edge = place_mm(head, faps, "2.3", "9.10")
-    assert abs(lower_lip[1] - edge[1]) < 0.5
+    upper_lip, lower_lip, edge = place_mm(head, faps, "2.2", "2.3", "9.10")
+    assert -0.5 < lower_lip[1] - edge[1] < 2.0  # it covers the cutting edge,
+    assert upper_lip[1] - lower_lip[1] > 1.0  # and the teeth show above it
 
 
 @pytest.mark.parametrize("select", [4, 8], ids=["t d", "n l"])

@@ -122,7 +122,7 @@ def test_a_model_comes_back_from_its_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "array", "message"),
     [
-        ("format", np.array("neural 5"), "format 'neural 5'"),
+        ("format", np.array("neural 6"), "format 'neural 6'"),
         ("delays", np.array([0.05, 0.0], np.float32), "do not rise"),
         ("delays", np.array([0.0, 3.0], np.float32), "delays are"),
         ("delays", np.array([-3.0, 0.0], np.float32), "delays are"),

@@ -2,19 +2,37 @@
 
 import struct
 from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from services.recognizer.acoustic.load import MODEL_PATH, load_model
-from services.recognizer.acoustic.model_file import write_archive
+from services.recognizer.acoustic.gmm import GmmModel
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.acoustic.model_file import (
+    PHONE_LM_PATH,
+    read_archive,
+    shipped_phone_lm,
+    write_archive,
+)
+from services.recognizer.acoustic.neural import NeuralModel
 from services.recognizer.search.phone_lm import PhoneLanguageModel
 from shared.errors import UserError
 from shared.phones.inventory import load_inventory
-from tests.languages import MANDARIN, NUM_PHONES, SIL, START, Table, install_language, step
+from tests.languages import (
+    MANDARIN,
+    NUM_PHONES,
+    SIL,
+    START,
+    Table,
+    flat_language,
+    install_language,
+    step,
+)
 from training.commands import app
 from training.phone_lm import open_gram
 from training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
@@ -411,9 +429,38 @@ def test_files_without_a_phone_lm_are_named(tmp_path: Path) -> None:
         load_phone_lm(path, MANDARIN)
 
 
-def test_the_phone_lm_of_a_model_can_be_taken() -> None:
-    shipped = load_model().topology.phone_lm
-    np.testing.assert_array_equal(load_phone_lm(MODEL_PATH, MANDARIN).log_prob, shipped.log_prob)
+def test_the_phone_lm_of_a_model_can_be_taken(tmp_path: Path) -> None:
+    shipped, other = load_phone_lm(PHONE_LM_PATH, MANDARIN), flat_language(MANDARIN)
+    model = cast(NeuralModel, load_model())
+    np.testing.assert_array_equal(model.topology.phone_lm.log_prob, shipped.log_prob)
+    path = tmp_path / "model.npz"
+    replace(model, topology=replace(model.topology, phone_lm=other)).save(path)
+    np.testing.assert_array_equal(load_phone_lm(path, MANDARIN).phone, other.phone)
+    np.testing.assert_array_equal(load_model(path).topology.phone_lm.phone, other.phone)
+
+
+def test_a_model_with_the_shipped_phone_lm_does_not_hold_it(tmp_path: Path) -> None:
+    path = tmp_path / "model.npz"
+    cast(GmmModel, load_model(model_path("gmm"))).save(path)
+    arrays = read_archive(path).arrays
+    assert not any(name.startswith("lm_") and name != "lm_scale" for name in arrays)
+    assert load_model(path).topology.phone_lm is shipped_phone_lm()
+    with pytest.raises(UserError, match=r"no phone language model in .*model\.npz: lm_children is"):
+        load_phone_lm(path, MANDARIN)
+
+
+def test_no_phone_lm_ships_for_another_language(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install_language(tmp_path, "toy", "tests.toy_language")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    arrays = dict(read_archive(model_path("gmm")).arrays)
+    arrays["language"], arrays["phones"] = np.array("toy"), np.array(load_inventory("toy").phones)
+    path = tmp_path / "model.npz"
+    write_archive(path, arrays)
+    with pytest.raises(UserError, match="no phone language model, and none ships for toy"):
+        load_model(path)
+    load_inventory.cache_clear()
 
 
 def test_another_language_needs_no_other_code(

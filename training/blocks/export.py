@@ -13,16 +13,16 @@ positions       rows of the table of positions                     (sessions, B 
 num_positions   positions that there are, 1 or more                (sessions,)
 num_cached      positions in the caches                            (sessions,)
 state           state of the recurrent layer before the block      (sessions, GRU's width)
-keys_l,         of the positions before the block, for each layer  (sessions, heads, PAST, size)
-values_l
+keys_l,         of the positions before the block, for each layer; (sessions, heads, PAST, size)
+values_l        16-bit floats
 log_posteriors  log posteriors of the states of two frames each    (sessions, 2 (B + R), states)
 new_state       state after the block                              (sessions, GRU's width)
 new             keys and values of the block, in the order of the  (sessions, 2 layers, heads,
-                inputs                                             B, size)
+                inputs, 16-bit floats                              B, size)
 =============== ================================================== =============================
 
-Products are of 8-bit integers (:mod:`training.blocks.onnx_graph`); convolutions, norms, attention
-and the recurrent layer are floats. A product with a single row may be summed in another order than
+Products are of 8-bit integers (:mod:`training.neural.onnx_graph`); norms, attention and the
+recurrent layer are floats. A product with a single row may be summed in another order than
 one with more. The recurrent layer has a row for each session, so it gets the first session's once
 more.
 """
@@ -35,7 +35,8 @@ from onnx import TensorProto, helper
 
 from services.recognizer.front_end.whisper_mel import NUM_MELS
 from training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
-from training.blocks.onnx_graph import DOMAIN, Graph, arrays_of, floats
+from training.blocks.readout import MAX_DEVIATIONS
+from training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
 from training.neural.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")
@@ -84,9 +85,10 @@ class _BlockGraph(Graph):
         order = [
             self._new[layer + at] for at in range(2) for layer in range(0, 2 * shape.layers, 2)
         ]
-        self.node("Concat", order, "new", axis=1)
+        new = self.node("Concat", order, axis=1)
+        self.node("Cast", [new], "new", to=TensorProto.FLOAT16)
         caches = [
-            floats(f"{kind}_{layer}", "sessions", shape.heads, self._past, self._size)
+            halves(f"{kind}_{layer}", "sessions", shape.heads, self._past, self._size)
             for kind in _KINDS
             for layer in range(shape.layers)
         ]
@@ -103,17 +105,16 @@ class _BlockGraph(Graph):
         outputs = [
             floats("log_posteriors", "sessions", 2 * length, shape.num_states),
             floats("new_state", "sessions", gru),
-            floats("new", "sessions", 2 * shape.layers, shape.heads, self._block, self._size),
+            halves("new", "sessions", 2 * shape.layers, shape.heads, self._block, self._size),
         ]
         return self.file("blocks", inputs, outputs)
 
     def _features(self) -> str:
         """Run the encoder; the kept layers of all positions, (rows, features)."""
         width = self._shape.width
-        bands = self.node("Transpose", ["frames"], perm=[0, 2, 1])
-        hidden = self.convolutions(bands, self._encoder, padding=0)
-        hidden = self.node("Add", [hidden, "positions"])
-        hidden = self.node("Reshape", [hidden, self.integers("rows", -1, width)])
+        hidden = self.convolutions("frames", self._encoder, self._length)
+        rows = self.node("Reshape", ["positions", self.integers("rows", -1, width)])
+        hidden = self.node("Add", [hidden, rows])
         mask = self._mask()
         after = []
         for number in range(self._shape.layers):
@@ -155,24 +156,45 @@ class _BlockGraph(Graph):
         for each in (key, value):
             of_block = self.node("Slice", [each, *ends, self.integers("place_axis", 2)])
             self._new.append(self.node("Unsqueeze", [of_block, self.integers("ring_axis", 1)]))
+        old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in _KINDS)
         products = [
             self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=size**-0.5)
-            for keys in (f"keys_{number}", key)
+            for keys in (old_keys, key)
         ]
         masked = self.node("Add", [self.node("Concat", products, axis=-1), mask])
         weights = self.node("Softmax", [masked], axis=-1)
         names = [f"{name}.{part}_weights" for part in ("past", "own")]
         past, own = self.split(weights, names, self._past, self._length)
-        pairs = ((past, f"values_{number}"), (own, value))
+        pairs = ((past, old_values), (own, value))
         seen = self.node("Add", [self.node("MatMul", pair) for pair in pairs])
         seen = self.node("Transpose", [seen], perm=[0, 2, 1, 3])
         return self.node("Reshape", [seen, self.integers("rows", -1, width)])
 
     def _log_posteriors(self, features: str) -> None:
         """Run the readout on (rows, features)."""
+        parameters, length, states = self._readout, self._length, self._shape.num_states
+        inner = self._inner(features)
+        context = self._context(inner)
+        both = self.node("Concat", [context, inner], axis=-1)
+        logits = self.product(both, parameters, "readout.output")
+        by_frame = self.integers("by_frame", -1, 2 * length, states)
+        logits = self.node("Reshape", [logits, by_frame])
+        self.node("LogSoftmax", [logits], "log_posteriors", axis=-1)
+
+    def _inner(self, features: str) -> str:
+        """Compute the recurrent layer's input: (rows, features) to (rows, inner)."""
+        parameters = self._readout
+        mean = self.constant("readout.mean", parameters["readout.mean"])
+        inverse = self.constant("readout.inverse", 1 / parameters["readout.deviation"])
+        limits = [self.number(f"limit_{sign}", sign * MAX_DEVIATIONS) for sign in (-1, 1)]
+        standard = self.node("Mul", [self.node("Sub", [features, mean]), inverse])
+        standard = self.node("Clip", [standard, *limits])
+        return self.node("Gelu", [self.product(standard, parameters, "readout.inner")])
+
+    def _context(self, inner: str) -> str:
+        """Run the recurrent layer both ways: (rows, inner) to (rows, 2 width)."""
         parameters, length = self._readout, self._length
-        inner = self.readout_inner(features, parameters)
-        gru = parameters["readout.gru.weight_hh_l0"].shape[1]
+        width = parameters["readout.gru.weight_hh_l0"].shape[1]
         by_session = self.integers("by_session", -1, length, len(parameters["readout.inner.bias"]))
         of_sessions = self.node("Reshape", [inner, by_session])
         in_order = self.node("Transpose", [of_sessions], perm=[1, 0, 2])
@@ -186,15 +208,37 @@ class _BlockGraph(Graph):
         nothing = self.node("Mul", [state, self.number("nothing", 0.0)])
         directions = [self.node("Unsqueeze", [each, zero]) for each in (state, nothing)]
         states = self.node("Concat", directions, axis=0)
-        weights = self.recurrent_weights(parameters)
-        context = self.recurrent(inputs, weights, gru, counts, states)
+        context = self.node(
+            "GRU",
+            [inputs, *self._recurrent_weights(), counts, states],
+            hidden_size=width,
+            direction="bidirectional",
+            linear_before_reset=1,
+        )
         sessions = [zero, self.integers("before_last", -1), self.integers("place_axis", 2)]
         context = self.node("Slice", [context, *sessions])
         context = self.node("Transpose", [context], perm=[2, 0, 1, 3])  # sessions, n, directions
         last = self.constant("last_of_block", np.array(self._block - 1))
         state = self.node("Gather", [context, last], axis=1)
         self.node("Gather", [state, self.constant("first", np.array(0))], "new_state", axis=1)
-        context = self.node("Reshape", [context, self.integers("both", -1, 2 * gru)])
-        by_frame = (-1, 2 * length, self._shape.num_states)
-        rows = self.readout_output(context, inner, parameters, *by_frame)
-        self.node("Identity", [rows], "log_posteriors")
+        return self.node("Reshape", [context, self.integers("both", -1, 2 * width)])
+
+    def _recurrent_weights(self) -> list[str]:
+        """Store the recurrent layer's weights and biases."""
+
+        def gates(kind: str) -> Floats:
+            ends = ("", "_reverse")
+            return np.stack([_gates(self._readout[f"readout.gru.{kind}_l0{end}"]) for end in ends])
+
+        biases = np.hstack([gates("bias_ih"), gates("bias_hh")])
+        return [
+            self.halves("readout.input_weights", gates("weight_ih")),
+            self.halves("readout.recurrent_weights", gates("weight_hh")),
+            self.constant("readout.biases", biases),
+        ]
+
+
+def _gates(stacked: Floats) -> Floats:
+    """PyTorch's gates reset, update, new in ONNX's order: update, reset, new."""
+    reset, update, new = np.split(stacked, 3)
+    return np.concatenate([update, reset, new])

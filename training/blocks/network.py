@@ -56,7 +56,7 @@ from training.neural.network import PADDING_FRAMES, Encoder, Shape
 from training.neural.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms
-PAST = 124  # positions before a block that it attends to, 2.5 s
+PAST = 125  # positions before a block that it attends to, 2.5 s
 
 _GRU_WEIGHTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 

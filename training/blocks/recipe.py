@@ -35,7 +35,7 @@ from training.progress import Report
 from training.training_set import FRAMES_PER_MINUTE, load_examples
 
 NUM_READOUT_STEPS, NUM_STEPS = 450, 450
-BLOCK_LENGTH = 4  # positions, live
+BLOCK_LENGTH = 5  # positions, live
 
 _DRAW = Draw(
     kinds={"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)},

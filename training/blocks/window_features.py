@@ -20,8 +20,8 @@ from collections.abc import Callable, Mapping
 
 from services.recognizer.acoustic.network import open_session, position_table
 from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
-from training.blocks.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats
 from training.blocks.readout import MAX_WINDOW_FRAMES
+from training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats
 from training.neural.teacher import WholeEncoder
 
 
@@ -63,7 +63,14 @@ class _WindowGraph(Graph):
         floor = self.node("Sub", [loudest, self.number("floor", FLOOR_BANDS)])
         bands = self.node("Transpose", [self.node("Max", ["frames", floor])], perm=[1, 0])
         bands = self.node("Unsqueeze", [bands, self.integers("batch_axis", 0)])
-        hidden = self.convolutions(bands, self._parameters, padding=1)
+        for name, stride in (("first", 1), ("second", 2)):
+            names = [
+                self.halves(f"{name}.{kind}", self._parameters[f"{name}.{kind}"])
+                for kind in ("weight", "bias")
+            ]
+            convolved = self.node("Conv", [bands, *names], pads=[1, 1], strides=[stride])
+            bands = self.node("Gelu", [convolved])
+        hidden = self.node("Transpose", [bands], perm=[0, 2, 1])
         table = position_table(self._encoder.shape.width)[: MAX_WINDOW_FRAMES // 2]
         rows = self.node("Shape", [hidden], start=1, end=2)
         zero = self.integers("zero", 0)
@@ -82,7 +89,9 @@ class _WindowGraph(Graph):
         inner = self.node("Gelu", [self.product(normed, parameters, f"{name}.inner")])
         return self.node("Add", [hidden, self.product(inner, parameters, f"{name}.outer")])
 
-    def product(self, inputs: str, parameters: Mapping[str, Floats], name: str) -> str:
+    def product(
+        self, inputs: str, parameters: Mapping[str, Floats], name: str, rows: str = ""
+    ) -> str:
         """Multiply with a weight in 8 bits and add a bias; the inputs have one scale."""
         integers, scales = self.weight(parameters, name)
         bias = self.constant(f"{name}.bias", parameters[f"{name}.bias"])

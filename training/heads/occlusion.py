@@ -149,9 +149,8 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
             # ears under hair lie in its shadow, deeper than the sparse vertices tell
             ear = np.clip((np.abs(layout[:, :1]) - 0.645) / 0.04, 0, 1)
             shaded *= 1 - 0.6 * ear * np.clip(2 * under_hair[:, None] - 1, 0, 1)
-            depth = np.clip((layout[:, 2:] - 0.85) / 0.42, 0, 1)
-            lining = np.array([0.62, 0.20, 0.19]) * (0.10 + 0.90 * depth)
-            part.colors = np.where(cavity[:, None], lining * (0.7 + 0.3 * shaded), shaded)
+            lining = np.array([0.55, 0.17, 0.16]) * _into_mouth(layout[:, 2])
+            part.colors = np.where(cavity[:, None], lining * (0.5 + 0.5 * shaded), shaded)
         elif piece.name == "garment":
             part.colors = np.repeat(0.6 + 0.4 * own, 3, axis=1)
         elif piece.name.startswith("eye"):
@@ -162,4 +161,14 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
         elif piece.name.startswith("hair"):
             part.colors = np.repeat(0.45 + 0.55 * own, 3, axis=1)
         elif piece.name.startswith("teeth"):
-            part.colors = part.colors * (0.55 + 0.45 * np.clip(1.5 * own, 0, 1))
+            part.colors = part.colors * (0.70 + 0.30 * np.clip(2 * own, 0, 1))
+        elif piece.name == "tongue":
+            lit = np.clip(0.5 + 1.5 * own, 0, 1) * _into_mouth(part.vertices[:, 2] + 0.2)
+            part.colors = lit * np.array([1.0, 0.85, 0.85])
+
+
+def _into_mouth(z: Float) -> Float:
+    """Share (V, 1) of the light that comes so far behind the lips; little is left at the throat."""
+    inside = np.clip((z[:, None] - 0.75) / 0.5, 0, 1)
+    share: Float = 0.02 + 0.98 * inside**2
+    return share

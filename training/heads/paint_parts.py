@@ -53,7 +53,7 @@ def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Floa
     tooth = np.clip(np.searchsorted(bounds, place) - 1, 0, len(widths) - 1)
     within = (place - bounds[tooth]) / np.array(widths)[tooth]
     gap = np.minimum(within, 1 - within) * np.array(widths)[tooth]  # mm to the next tooth
-    ivory = np.array([0.965, 0.94, 0.885])
+    ivory = np.array([0.985, 0.965, 0.925])
     image = np.broadcast_to(ivory, (rows, columns, 3)).copy()
     image *= 1 - 0.10 * (np.clip(0.45 - v, 0, 1) / 0.45)[..., None] * np.array([0.3, 0.6, 1.0])
     image *= 1 + 0.03 * np.clip((v - 0.5) / 0.2, 0, 1)[..., None]
@@ -64,10 +64,14 @@ def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Floa
     return np.clip(image, 0, 1)
 
 
-def tongue(size: int = 64) -> Float:
-    """Paint the tongue."""
-    bumps = noise((size, size), 1.0, 9)[..., None]
-    return np.clip(np.array([0.72, 0.36, 0.36]) * (1 + 0.05 * bumps), 0, 1)
+def tongue(size: int = 128) -> Float:
+    """Paint the tongue, seen from above, its tip at the bottom: papillae, and a groove."""
+    rough = 0.05 * noise((size, size), 0.9, 9) + 0.05 * noise((size, size), 5.0, 10)
+    across = (np.arange(size) + 0.5) / size - 0.5
+    groove = 0.22 * np.exp(-((across / 0.035) ** 2))
+    image = np.array([0.80, 0.45, 0.44]) * (1 + rough - groove)[..., None]
+    paler = np.clip(1.5 * rough, 0, 1)  # the tops of the papillae
+    return np.clip(mix(image, (0.93, 0.68, 0.66), paler), 0, 1)
 
 
 def cloth(color: Color, size: int = 16) -> Float:

@@ -141,7 +141,7 @@ def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: floa
     triangles = grid_triangles(len(rows), columns)
     if up > 0:
         triangles = triangles[:, ::-1]
-    shade = np.clip(1.0 - 0.75 * np.tile(back, len(rows)) ** 1.3, 0.12, 1.0)
+    shade = np.clip(1.0 - 0.95 * np.tile(back, len(rows)) ** 1.2, 0.06, 1.0)
     by_row = np.interp(_PROFILE[:, 2], [0.0, 0.3, 0.7, 1.0], [0.45, 0.9, 1.0, 0.4])
     shade *= np.repeat(by_row, columns)
     return Part(vertices, triangles, uv, np.repeat(shade[:, None], 3, axis=1))

@@ -92,7 +92,7 @@ def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> Phone
 
 
 def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
-    """Read a file of :func:`train_phone_lm`, or the phone language model of a recognizer's model.
+    """Read a file of :func:`train_phone_lm`, or the phone language model in a recognizer's model.
 
     Raises
     ------

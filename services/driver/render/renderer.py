@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from services.driver import picture
 from services.driver.head.head import Head, Part
+from services.driver.head.mouth_light import mouth_light
 from services.driver.render import shaders
 from services.driver.render.camera import Camera
 from shared.errors import UserError
@@ -175,7 +176,7 @@ class Renderer:
         -------
         Pixels (H, W, 3), top row first; (H, W, 4) with alpha if the background is transparent.
         """
-        self._upload(*self.head.pose(faps))
+        self._upload(*self.head.pose(faps), faps)
         self._draw()
         return self._read()
 
@@ -189,7 +190,7 @@ class Renderer:
 
         posed = self.head.pose(faps)
         passed()
-        self._upload(*posed)
+        self._upload(*posed, faps)
         passed()
         self._draw()
         passed()
@@ -198,7 +199,8 @@ class Renderer:
         names = ("deform", "upload", "draw", "read back")
         return dict(zip(names, np.diff(times).tolist(), strict=True))
 
-    def _upload(self, vertices: Float32, normals: Float32) -> None:
+    def _upload(self, vertices: Float32, normals: Float32, faps: Float32) -> None:
+        self._mouth_light = mouth_light(faps)
         self._stage[:, :3], self._stage[:, 3:] = vertices, normals
         self._moving.write(self._stage)
 
@@ -220,7 +222,7 @@ class Renderer:
         screen = self._context.screen
         screen.viewport = (0, 0, *self.size)
         self._clear(screen)
-        self._upload(*self.head.pose(faps))
+        self._upload(*self.head.pose(faps), faps)
         self._paint(screen)
 
     def _clear(self, target: Any) -> None:
@@ -268,6 +270,7 @@ class Renderer:
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
             ("two_sided", float(part.double_sided)),
+            ("share", self._mouth_light if part.name in shaders.IN_MOUTH else 1.0),
         ):  # fmt: skip
             if name in program:
                 program[name] = value

@@ -20,6 +20,7 @@ uniform vec3 wrap;
 uniform float gloss;
 uniform float shine;
 uniform float two_sided;
+uniform float share;
 in vec3 in_position;
 in vec3 in_normal;
 in vec2 in_uv;
@@ -48,11 +49,11 @@ void main() {
         + KEY_COLOR * max((key + wrap) / (1.0 + wrap), 0.0) / (1.0 + wrap)
         + FILL_COLOR * max(dot(n, FILL) * 0.7 + 0.3, 0.0)
         + RIM_COLOR * max(dot(n, RIM), 0.0);
-    light *= in_color;
+    light *= share * in_color;
     float grazing = 1.0 - max(facing, 0.0);
     float fresnel = 0.04 + 0.5 * grazing * grazing * grazing * grazing;
     high = pow(max(dot(n, normalize(KEY + v)), 0.0), gloss) * max(key, 0.0) * (0.6 + fresnel);
-    high = (high + fresnel * 0.10) * shine * min(1.0, in_color.g * 1.6);
+    high = (high + fresnel * 0.10) * shine * share * min(1.0, in_color.g * 1.6);
     uv = in_uv;
     normal = in_normal;
     gl_Position = view_projection * vec4(in_position, 1.0);
@@ -110,6 +111,7 @@ void main() {
 """
 
 EYES = ("eye_left", "eye_right")
+IN_MOUTH = ("teeth_upper", "teeth_lower", "tongue")  # lit through the lips
 KEY = np.array([-0.42, 0.50, 0.80]) / np.linalg.norm([-0.42, 0.50, 0.80])  # as in the shader
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
@@ -118,9 +120,9 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "garment": ((0.25, 0.25, 0.25), 8.0, 0.05),
     "eye_left": ((0.4, 0.36, 0.36), 8.0, 0.0),
     "eye_right": ((0.4, 0.36, 0.36), 8.0, 0.0),
-    "teeth_upper": ((0.4, 0.36, 0.32), 60.0, 0.30),
-    "teeth_lower": ((0.4, 0.36, 0.32), 60.0, 0.30),
-    "tongue": ((0.5, 0.3, 0.3), 30.0, 0.20),
+    "teeth_upper": ((0.4, 0.38, 0.36), 40.0, 0.55),
+    "teeth_lower": ((0.4, 0.38, 0.36), 40.0, 0.55),
+    "tongue": ((0.5, 0.3, 0.3), 18.0, 1.0),
     "hair": ((0.3, 0.3, 0.3), 14.0, 0.05),
     "hair_tips": ((0.3, 0.3, 0.3), 14.0, 0.05),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),

@@ -3,9 +3,11 @@
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { MorphedMesh } from "./morph.js";
+import { mouthLight } from "./mouth-light.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const RADIANS_PER_UNIT = 1e-5;
+const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
 const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
 const SLOW_MS = 45; // for a picture
 const PAUSE_MS = 1000; // without a change, which is no slowness
@@ -15,6 +17,14 @@ const MIN_PIXEL_RATIO = 0.6;
 const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
+/** Let what lies in shadow, by its baked vertex colours, shine less, too. */
+function dimInShadow(shader) {
+  shader.fragmentShader = shader.fragmentShader.replace(
+    "#include <aomap_fragment>",
+    "reflectedLight.directSpecular *= min(1.0, 1.6 * vColor.g * diffuse.g);",
+  );
+}
+
 export class Head {
   frameMs = 1000 / 60; // between two pictures of the moving face, smoothed
   #renderer;
@@ -23,6 +33,7 @@ export class Head {
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
   #meshes = []; // that FAPs move
+  #inMouth = []; // materials
   #joints = []; // { node, rest, turns: [[FAP index, axis]] }
   #faps = null; // to be taken on
   #fovYDegrees = 22;
@@ -64,7 +75,8 @@ export class Head {
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
       node.frustumCulled = false; // bounds do not follow the face
-      if (node.name === "tongue") node.material.roughness = 0.9; // no lamp shines into the mouth
+      node.material.onBeforeCompile = dimInShadow;
+      if (IN_MOUTH.includes(node.name)) this.#inMouth.push(node.material);
       if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
     });
     this.#findJoints(gltf.scene, about.faps);
@@ -80,6 +92,8 @@ export class Head {
 
   #apply(faps) {
     for (const mesh of this.#meshes) mesh.pose(faps);
+    const light = mouthLight(faps);
+    for (const material of this.#inMouth) material.color.setScalar(light);
     for (const { node, rest, turns } of this.#joints) {
       node.quaternion.copy(rest);
       for (const [index, axis] of turns) {

@@ -7,6 +7,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,13 @@ from services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
 from shared.errors import UserError
 from shared.phones.inventory import PhoneInventory, load_inventory
 
+# Of the models whose files have no phone language model.
+PHONE_LM_PATH = Path(__file__).parents[1] / "models" / "phone_lm.npz"
+
 _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0
+_LANGUAGE = ("language", "phones")  # arrays
 _LOG_STEP = np.float32(0.05)  # nats; a phone language model's logs are stored in 8 bits
 
 
@@ -77,9 +82,12 @@ def write_archive(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def topology_arrays(topology: Topology) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the HMMs and of the phone language model."""
+    """Return the arrays of the HMMs and of their phone language model, unless that is shipped."""
+    arrays, shipped = (phone_lm_arrays(each) for each in (topology.phone_lm, shipped_phone_lm()))
+    if all(np.array_equal(array, shipped[name]) for name, array in arrays.items()):
+        arrays = {name: arrays[name] for name in _LANGUAGE}
     return {
-        **phone_lm_arrays(topology.phone_lm),
+        **arrays,
         "lm_scale": np.array(topology.lm_scale, np.float32),
         "phone_penalty": np.array(topology.phone_penalty, np.float32),
         "first_state": topology.first_state,
@@ -100,7 +108,7 @@ def topology_from(archive: Archive) -> Topology:
     UserError
         If the model's language is not installed.
     """
-    phone_lm = phone_lm_from(archive)
+    phone_lm = phone_lm_from(archive) if "lm_children" in archive else _shipped_for(archive)
     num_phones = len(phone_lm.inventory)
     first_state = archive.array("first_state", (num_phones + 1,)).astype(np.int64)
     if first_state[0] != 0 or (np.diff(first_state) < 1).any() or first_state[-1] > _MAX_STATES:
@@ -120,6 +128,20 @@ def topology_from(archive: Archive) -> Topology:
         duration_mean_s=archive.floats("duration_mean_s", NUM_POSITIONS, num_phones),
         duration_spread_s=archive.floats("duration_spread_s", NUM_POSITIONS, num_phones),
     )
+
+
+@cache
+def shipped_phone_lm() -> PhoneLanguageModel:
+    """Return the phone language model that ships."""
+    return phone_lm_from(read_archive(PHONE_LM_PATH))
+
+
+def _shipped_for(archive: Archive) -> PhoneLanguageModel:
+    """Return the phone language model that ships, if it is of the archive's language."""
+    language, shipped = inventory_from(archive).language, shipped_phone_lm()
+    if language != shipped.inventory.language:
+        raise ValueError(f"it has no phone language model, and none ships for {language}")
+    return shipped
 
 
 def phone_lm_arrays(phone_lm: PhoneLanguageModel) -> dict[str, NDArray[Any]]:

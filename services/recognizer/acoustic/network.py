@@ -44,14 +44,13 @@ class NetworkSizes:
 class KeyValueCache:
     """Keys and values of some sessions' earlier positions, as the network takes them.
 
-    Each is a ring of ``WINDOW`` slots. Keys are transposed, so that a product with a query runs
-    along the positions.
+    Each is a ring of ``WINDOW`` slots, in 16 bits.
     """
 
     def __init__(self, sizes: NetworkSizes, num_sessions: int) -> None:
         layers, heads, size = sizes.num_layers, sizes.num_heads, sizes.head_size
-        self.keys = np.zeros((layers, num_sessions, heads, size, WINDOW), np.float32)
-        self.values = np.zeros((layers, num_sessions, heads, WINDOW, size), np.float32)
+        self.keys = np.zeros((layers, num_sessions, heads, WINDOW, size), np.float16)
+        self.values = np.zeros_like(self.keys)
 
 
 def position_table(width: int) -> Floats:
@@ -123,7 +122,7 @@ def _sizes_of(shapes: Mapping[str, Sequence[object]]) -> NetworkSizes:
     num_layers = sum(name.startswith("keys_") for name in shapes)
     if not 1 <= num_layers <= _MAX_LAYERS or list(shapes) != input_names(num_layers):
         raise ValueError(f"its network has the inputs {', '.join(shapes)}")
-    width, heads, size = shapes["position"][-1], shapes["keys_0"][1], shapes["keys_0"][-2]
+    width, heads, size = shapes["position"][-1], shapes["keys_0"][1], shapes["keys_0"][-1]
     if (
         not (isinstance(width, int) and isinstance(heads, int) and isinstance(size, int))
         or not (_MIN_WIDTH <= width <= _MAX_WIDTH and width % 2 == 0)
@@ -131,7 +130,7 @@ def _sizes_of(shapes: Mapping[str, Sequence[object]]) -> NetworkSizes:
     ):
         raise ValueError(f"its network has the width {width}, {heads} heads of size {size}")
     expected_shapes = [(SEEN_FRAMES * NUM_INPUTS,), (width,), (), (1, 1, WINDOW)]
-    expected_shapes += [(heads, size, WINDOW)] * num_layers + [(heads, WINDOW, size)] * num_layers
+    expected_shapes += [(heads, WINDOW, size)] * 2 * num_layers
     for (name, shape), expected in zip(shapes.items(), expected_shapes, strict=True):
         if tuple(shape[1:]) != expected:
             raise ValueError(f"its network has {name} of {shape}, expected {expected} of each")

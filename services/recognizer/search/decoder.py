@@ -25,6 +25,7 @@ speech needs no endless memory.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -73,6 +74,7 @@ class Decoder:
         self._shared: list[Segment] = []  # phones that no later frame can change
         self._last_shared = _NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
+        self._confidence = 0.0  # in the phone
         self._records = np.empty((_RECORD_CAPACITY, 3), dtype=np.int32)
         self._num_records = 0
         self._context = np.zeros(_MAX_TOKENS, dtype=np.int32)  # of each token
@@ -86,13 +88,14 @@ class Decoder:
         """Take over where another search of the same topology stands."""
         self.num_frames, self._best = other.num_frames, other._best
         self._shared, self._last_shared = list(other._shared), other._last_shared
-        self._num_records, self._num_tokens = other._num_records, other._num_tokens
         if len(self._records) != len(other._records):
             self._records = np.empty_like(other._records)
-        self._records[: self._num_records] = other._records[: self._num_records]
-        self._token_of[:] = other._token_of
+        self._records[: other._num_records] = other._records[: other._num_records]
+        self._token_of[self._context[: self._num_tokens]] = _NO_TOKEN
+        self._num_records, self._num_tokens = other._num_records, other._num_tokens
         for name in ("_context", "_top", "_score", "_link"):
             getattr(self, name)[: self._num_tokens] = getattr(other, name)[: self._num_tokens]
+        self._token_of[self._context[: self._num_tokens]] = np.arange(self._num_tokens)
 
     def accept(self, scores: NDArray[np.float32]) -> tuple[int, int, float]:
         """Take the state scores of one frame, shape (states,).
@@ -104,38 +107,46 @@ class Decoder:
             0 to 1: among the best paths of all contexts, the share of those in which the phone is
             the last or the last but one.
         """
-        if self._num_records + _MAX_TOKENS > len(self._records):
-            self._drop_records()
+        self.advance(scores[None])
+        token, state = self._best
+        phone = int(self._graph.last_phone[self._context[token]])
+        return phone, self._end(self._link[token, state]), self._confidence
+
+    def advance(self, scores: NDArray[np.float32]) -> None:
+        """Take the state scores of frames that nobody asks about, shape (frames, states)."""
         topology, graph = self._topology, self._graph
-        self._num_tokens, self._num_records, token, state, confidence = _step(
-            self.num_frames,
-            scores,
-            self._num_tokens,
-            self._context,
-            self._token_of,
-            self._top,
-            self._score,
-            self._link,
-            self._records,
-            self._num_records,
-            self._silence,
-            topology.first_state,
-            topology.log_stay,
-            topology.log_leave,
-            np.float32(topology.lm_scale),
-            np.float32(topology.phone_penalty),
-            graph.first_arc,
-            graph.arc_phone,
-            graph.arc_log_prob,
-            graph.arc_context,
-            graph.backoff_state,
-            graph.log_backoff,
-            graph.last_phone,
-        )
-        self.num_frames += 1
-        self._best = (token, state)
-        phone = int(graph.last_phone[self._context[token]])
-        return phone, self._end(self._link[token, state]), confidence
+        num_taken = 0
+        while num_taken < len(scores):
+            if self._num_records + _MAX_TOKENS > len(self._records):
+                self._drop_records()
+            num_new, self._num_tokens, self._num_records, token, state, self._confidence = _steps(
+                self.num_frames,
+                scores[num_taken:],
+                self._num_tokens,
+                self._context,
+                self._token_of,
+                self._top,
+                self._score,
+                self._link,
+                self._records,
+                self._num_records,
+                self._silence,
+                topology.first_state,
+                topology.log_stay,
+                topology.log_leave,
+                np.float32(topology.lm_scale),
+                np.float32(topology.phone_penalty),
+                graph.first_arc,
+                graph.arc_phone,
+                graph.arc_log_prob,
+                graph.arc_context,
+                graph.backoff_state,
+                graph.log_backoff,
+                graph.last_phone,
+            )
+            self._best = (token, state)
+            self.num_frames += num_new
+            num_taken += num_new
 
     def path_since(self, frame: int) -> list[Segment]:
         """Phones of the best string so far after a frame, without its last phone.
@@ -206,6 +217,47 @@ def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
         for segment in segments
         if segment.end - frame > max(frame - segment.start, 0)
     ]
+
+
+@numba.njit(cache=True, nogil=True)
+def _steps(
+    frame: int,
+    observed: NDArray[np.float32],
+    num_tokens: int,
+    context: NDArray[np.int32],
+    token_of: NDArray[np.int16],
+    top: NDArray[np.float32],
+    score: NDArray[np.float32],
+    link: NDArray[np.int32],
+    records: NDArray[np.int32],
+    num_records: int,
+    *constants: Any,
+) -> tuple[int, int, int, int, int, float]:
+    """Advance all paths by the observed frames, or as many as there is room for their records.
+
+    Returns
+    -------
+    tuple
+        Number of frames; numbers of tokens and of records; the best token and its best state; the
+        confidence.
+    """
+    num_done, token, state, confidence = 0, 0, 0, 0.0
+    while num_done < len(observed) and num_records + len(context) <= len(records):
+        num_tokens, num_records, token, state, confidence = _step(
+            frame + num_done,
+            observed[num_done],
+            num_tokens,
+            context,
+            token_of,
+            top,
+            score,
+            link,
+            records,
+            num_records,
+            *constants,
+        )
+        num_done += 1
+    return num_done, num_tokens, num_records, token, state, confidence
 
 
 @numba.njit(cache=True, nogil=True)

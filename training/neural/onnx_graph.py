@@ -1,4 +1,4 @@
-"""What the exports of Whisper's encoder and its readout to ONNX share.
+"""What the exports of networks to ONNX share.
 
 Products with weights are of 8-bit integers. A weight ``W`` has a scale ``s`` for each output, its
 input ``x`` a scale ``r`` for each row:
@@ -6,13 +6,14 @@ input ``x`` a scale ``r`` for each row:
     y[i, j] = r[i] s[j] sum_k round(x[i, k] / r[i]) round(W[k, j] / s[j]) + b[j]
     r[i] = max_k |x[i, k]| / 127,   s[j] = max_k |W[k, j]| / 127
 
-So a row's values do not depend on the other rows of a product. Large weights that are no integers
-are stored as 16-bit floats, and widened when the file is opened.
+So a row's values do not depend on the other rows of a product. Convolutions are products too: a row
+has the inputs of all places. Large weights that are no integers are stored as 16-bit floats, and
+widened when the file is opened.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from training.blocks.readout import MAX_DEVIATIONS
+from services.recognizer.front_end.whisper_mel import NUM_MELS
 
 DOMAIN = "com.microsoft"  # of onnxruntime's own operators
 _OPERATORS = 20  # version of the ONNX operator set
@@ -39,7 +40,9 @@ class Graph:
 
     def __init__(self) -> None:
         self._nodes: list[onnx.NodeProto] = []
+        self._num_nodes = 0  # those of branches too
         self._tensors: dict[str, onnx.TensorProto] = {}
+        self._zero_points: dict[str, str] = {}  # by what the rows of a product are
 
     def file(
         self,
@@ -58,19 +61,30 @@ class Graph:
 
     def node(self, kind: str, inputs: Sequence[str], output: str = "", **settings: Any) -> str:
         """Add a node with one output, and return the output's name."""
-        output = output or f"{kind}_{len(self._nodes)}"
+        self._num_nodes += 1
+        output = output or f"{kind}_{self._num_nodes}"
         self._nodes.append(helper.make_node(kind, inputs, [output], **settings))
         return output
 
-    def split(self, inputs: str, names: Sequence[str], *sizes: int) -> Sequence[str]:
-        """Split the last axis into equal parts, or into parts of these sizes; return the names."""
+    def split(
+        self, inputs: str, names: Sequence[str], *sizes: int, axis: int = -1
+    ) -> Sequence[str]:
+        """Split an axis into equal parts, or into parts of these sizes; return the names."""
         if sizes:
             lengths = self.integers(f"{names[0]}.lengths", *sizes)
-            node = helper.make_node("Split", [inputs, lengths], names, axis=-1)
+            node = helper.make_node("Split", [inputs, lengths], names, axis=axis)
         else:
-            node = helper.make_node("Split", [inputs], names, axis=-1, num_outputs=len(names))
+            node = helper.make_node("Split", [inputs], names, axis=axis, num_outputs=len(names))
         self._nodes.append(node)
         return names
+
+    def branch(self, name: str, write: Callable[[], str], *shape: int | str) -> onnx.GraphProto:
+        """Write nodes as a graph of their own; its constants stay in the outer graph."""
+        outside, self._nodes = self._nodes, []
+        output = write()
+        graph = helper.make_graph(self._nodes, name, [], [floats(output, *shape)])
+        self._nodes = outside
+        return graph
 
     def constant(self, name: str, array: NDArray[Any] | np.generic | float) -> str:
         """Store a constant once, and return its name."""
@@ -88,8 +102,11 @@ class Graph:
 
     def halves(self, name: str, array: Floats) -> str:
         """Store 16-bit floats; onnxruntime widens them once, when it opens the file."""
-        stored = self.constant(f"{name}.halves", array.astype(np.float16))
-        return self.node("Cast", [stored], to=TensorProto.FLOAT)
+        return self.floats_of(self.constant(f"{name}.halves", array.astype(np.float16)))
+
+    def floats_of(self, halves: str) -> str:
+        """Widen 16-bit floats."""
+        return self.node("Cast", [halves], to=TensorProto.FLOAT)
 
     def norm(self, inputs: str, parameters: Mapping[str, Floats], name: str) -> str:
         """Normalise rows."""
@@ -99,16 +116,22 @@ class Graph:
         ]
         return self.node("LayerNormalization", [inputs, *names], epsilon=_EPSILON)
 
-    def product(self, inputs: str, parameters: Mapping[str, Floats], name: str) -> str:
-        """Multiply rows, (rows, inputs), with a weight in 8 bits and add a bias."""
+    def product(
+        self, inputs: str, parameters: Mapping[str, Floats], name: str, rows: str = "positions"
+    ) -> str:
+        """Multiply rows, (rows, inputs), with a weight in 8 bits and add a bias.
+
+        ``rows`` names what they are; there are always as many of a name.
+        """
         last = self.integers("last_axis", -1)
         highest = self.node("ReduceMax", [self.node("Abs", [inputs]), last], keepdims=0)
         scale = self.node("Mul", [highest, self.number("step", 1 / _MAX_INTEGER)])
         scale = self.node("Max", [scale, self.number("min_scale", _MIN_SCALE)])
-        if "zero_points" not in {node.output[0] for node in self._nodes}:  # one for each row
+        if rows not in self._zero_points:  # one for each row
             value = numpy_helper.from_array(np.array([_ZERO_POINT], np.uint8))
-            self.node("ConstantOfShape", [self.node("Shape", [scale])], "zero_points", value=value)
-        rounded = self.node("QuantizeLinear", [inputs, scale, "zero_points"], axis=0)
+            shape = self.node("Shape", [scale])
+            self._zero_points[rows] = self.node("ConstantOfShape", [shape], value=value)
+        rounded = self.node("QuantizeLinear", [inputs, scale, self._zero_points[rows]], axis=0)
         integers, scales = self.weight(parameters, name)
         one = self.number("one", 1.0)
         zero_point = self.constant("zero_point", np.array(_ZERO_POINT, np.uint8))
@@ -120,7 +143,7 @@ class Graph:
 
     def weight(self, parameters: Mapping[str, Floats], name: str) -> tuple[str, str]:
         """Store a weight: integers, (inputs, outputs), and the scales of its outputs."""
-        weight = parameters[f"{name}.weight"]
+        weight = in_rows(parameters[f"{name}.weight"])
         scale = np.maximum(np.abs(weight).max(axis=1) / _MAX_INTEGER, _MIN_SCALE)
         integers = np.rint(weight / scale[:, None]).astype(np.int8).T
         return (
@@ -128,64 +151,27 @@ class Graph:
             self.constant(f"{name}.scales", scale.astype(np.float32)),
         )
 
-    def convolutions(self, bands: str, parameters: Mapping[str, Floats], padding: int) -> str:
-        """Run both: (batch, 80, frames) to (batch, positions, width)."""
-        hidden = bands
-        for name, stride in (("first", 1), ("second", 2)):
-            names = [
-                self.halves(f"{name}.{kind}", parameters[f"{name}.{kind}"])
-                for kind in ("weight", "bias")
+    def convolutions(self, frames: str, parameters: Mapping[str, Floats], length: int) -> str:
+        """Run both: (batch, 2 length + 3, 80) to (batch * length, width)."""
+        places = self._places(frames, 2 * length + 1, 1, NUM_MELS)
+        hidden = self.node("Gelu", [self.product(places, parameters, "first", "frames")])
+        width = len(parameters["first.bias"])
+        by_frame = self.integers("by_frame_of_batch", -1, 2 * length + 1, width)
+        places = self._places(self.node("Reshape", [hidden, by_frame]), length, 2, width)
+        return self.node("Gelu", [self.product(places, parameters, "second")])
+
+    def _places(self, inputs: str, number: int, stride: int, size: int) -> str:
+        """Join three neighbours each: (batch, n, size) to (batch * number, 3 size)."""
+        one, step = self.integers("axis_1", 1), self.integers(f"stride_{stride}", stride)
+        pieces = []
+        for place in range(3):
+            ends = [
+                self.integers(f"from_{start}", start)
+                for start in (place, place + stride * (number - 1) + 1)
             ]
-            convolved = self.node(
-                "Conv", [hidden, *names], pads=[padding, padding], strides=[stride]
-            )
-            hidden = self.node("Gelu", [convolved])
-        return self.node("Transpose", [hidden], perm=[0, 2, 1])
-
-    def readout_inner(self, features: str, parameters: Mapping[str, Floats]) -> str:
-        """Compute the recurrent layer's input: (rows, features) to (rows, inner)."""
-        mean = self.constant("readout.mean", parameters["readout.mean"])
-        inverse = self.constant("readout.inverse", 1 / parameters["readout.deviation"])
-        limits = [self.number(f"limit_{sign}", sign * MAX_DEVIATIONS) for sign in (-1, 1)]
-        standard = self.node("Mul", [self.node("Sub", [features, mean]), inverse])
-        standard = self.node("Clip", [standard, *limits])
-        return self.node("Gelu", [self.product(standard, parameters, "readout.inner")])
-
-    def recurrent_weights(self, parameters: Mapping[str, Floats]) -> list[str]:
-        """Store the recurrent layer's weights and biases."""
-
-        def gates(kind: str) -> Floats:
-            ends = ("", "_reverse")
-            return np.stack([_gates(parameters[f"readout.gru.{kind}_l0{end}"]) for end in ends])
-
-        biases = np.hstack([gates("bias_ih"), gates("bias_hh")])
-        return [
-            self.halves("readout.input_weights", gates("weight_ih")),
-            self.halves("readout.recurrent_weights", gates("weight_hh")),
-            self.constant("readout.biases", biases),
-        ]
-
-    def recurrent(self, inner: str, weights: Sequence[str], width: int, *states: str) -> str:
-        """Run the recurrent layer: (n, batch, inner) to (n, directions, batch, width).
-
-        ``states`` are the numbers of rows, (batch,), and first states, (directions, batch, width).
-        """
-        return self.node(
-            "GRU",
-            [inner, *weights, *states],
-            hidden_size=width,
-            direction="bidirectional",
-            linear_before_reset=1,
-        )
-
-    def readout_output(
-        self, context: str, inner: str, parameters: Mapping[str, Floats], *shape: int
-    ) -> str:
-        """Compute log posteriors of rows, in a shape whose last axis are the states."""
-        both = self.node("Concat", [context, inner], axis=-1)
-        logits = self.product(both, parameters, "readout.output")
-        by_frame = self.integers("by_frame", *shape)
-        return self.node("LogSoftmax", [self.node("Reshape", [logits, by_frame])], axis=-1)
+            pieces.append(self.node("Slice", [inputs, *ends, one, step]))
+        joined = self.node("Concat", pieces, axis=-1)
+        return self.node("Reshape", [joined, self.integers(f"three_{size}", -1, 3 * size)])
 
 
 def arrays_of(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
@@ -193,12 +179,44 @@ def arrays_of(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
     return {prefix + name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}
 
 
+def in_rows(weight: Floats) -> Floats:
+    """Return a weight as (outputs, inputs); the inputs of a convolution are place by place."""
+    if weight.ndim == 3:
+        weight = weight.transpose(0, 2, 1)
+    return weight.reshape(len(weight), -1)
+
+
+def tensors_in(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    """Return the constants of an ONNX file."""
+    graph = onnx.load_model_from_string(file.tobytes()).graph
+    return {constant.name: numpy_helper.to_array(constant) for constant in graph.initializer}
+
+
+def weight_in(stored: Mapping[str, NDArray[Any]], name: str, shape: Sequence[int]) -> Floats:
+    """Read a parameter of a given shape from the constants of a file.
+
+    Raises
+    ------
+    KeyError
+        If the file does not have it.
+    """
+    if name in stored:
+        return np.asarray(stored[name], dtype=np.float32)
+    product = name.removesuffix(".weight")
+    if f"{product}.turned" in stored:
+        rows = stored[f"{product}.turned"].T
+    else:
+        rows = (stored[f"{product}.integers"] * stored[f"{product}.scales"]).T
+    if len(shape) == 3:
+        rows = rows.reshape(shape[0], shape[2], shape[1]).transpose(0, 2, 1)
+    return np.asarray(rows, dtype=np.float32)
+
+
 def floats(name: str, *shape: int | str) -> onnx.ValueInfoProto:
     """Describe an input or output."""
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
 
 
-def _gates(stacked: Floats) -> Floats:
-    """PyTorch's gates reset, update, new in ONNX's order: update, reset, new."""
-    reset, update, new = np.split(stacked, 3)
-    return np.concatenate([update, reset, new])
+def halves(name: str, *shape: int | str) -> onnx.ValueInfoProto:
+    """Describe an input or output of 16-bit floats."""
+    return helper.make_tensor_value_info(name, TensorProto.FLOAT16, shape)

@@ -1,0 +1,17 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { mouthLight } from "../mouth-light.js";
+
+// as in tests/unit/test_mouth_light.py
+for (const [upper, lower, pushed, light] of [
+  [0, 0, 0, 0.08],
+  [0, -120, 0, 0.4868],
+  [-20, -120, 260, 0.3372],
+  [-280, -600, 70, 0.8746],
+]) {
+  test(`lips at ${upper} and ${lower}, pushed ${pushed}`, () => {
+    const faps = new Float32Array(68);
+    [faps[3], faps[4], faps[15], faps[16]] = [upper, lower, pushed, pushed];
+    assert.ok(Math.abs(mouthLight(faps) - light) < 1e-4);
+  });
+}

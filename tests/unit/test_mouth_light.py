@@ -1,0 +1,23 @@
+"""The light on teeth and tongue."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.driver.head.mouth_light import mouth_light
+
+pytestmark = pytest.mark.unit
+
+
+# the page does the same: services/gateway/page/tests/mouth-light.test.js
+@pytest.mark.parametrize(
+    ("upper", "lower", "pushed", "light"),
+    [(0, 0, 0, 0.08), (0, -120, 0, 0.4868), (-20, -120, 260, 0.3372), (-280, -600, 70, 0.8746)],
+)
+def test_little_light_comes_through_a_small_mouth_or_pushed_lips(
+    upper: float, lower: float, pushed: float, light: float
+) -> None:
+    faps = np.zeros(68, np.float32)
+    faps[[3, 4, 15, 16]] = upper, lower, pushed, pushed
+    assert mouth_light(faps) == pytest.approx(light, abs=1e-4)
