@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
+from shared.phones.inventory import PhoneInventory, Syllable
 
 # Licences that allow a model trained on the data to be given away.
 _FREE_LICENCE = re.compile(
@@ -51,6 +51,12 @@ class Utterance:
     seconds: float
     phones: tuple[int, ...]  # indices into the inventory's phones
     syllables: tuple[int, ...]  # number of phones in each syllable
+
+
+def syllables_of(utterance: Utterance, inventory: PhoneInventory) -> list[Syllable]:
+    """Return the syllables of a recording's text, each with its phones."""
+    symbols = iter([inventory.phones[index] for index in utterance.phones])
+    return [tuple(next(symbols) for _ in range(length)) for length in utterance.syllables]
 
 
 @dataclass(slots=True)

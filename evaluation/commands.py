@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +33,14 @@ LookAhead = Annotated[
     list[float] | None,
     typer.Option("--look-ahead-ms", help="Look-ahead of models that have one; repeatable."),
 ]
+
+
+class Part(StrEnum):
+    """What clips are for."""
+
+    CHOICE = "choice"  # choosing settings
+    HELD = "held"  # scoring
+
 
 SENTENCE = Path(__file__).parents[1] / "shared" / "demo" / "hello-female.wav"
 
@@ -172,6 +181,48 @@ def rivals(
 
 
 @app.command()
+def ferguson(
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    part: Annotated[Part, typer.Option(help="Which clips.")] = Part.HELD,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the accuracy over the rate (.png).")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare lips with real ones at several speaking rates, as Zhang et al. 2021 do."""
+    from corpora.figures import save_figure
+    from evaluation.lips.contour_accuracy import print_rates, rates_figure, score_rates
+
+    check_output(picture, json_file)
+    scores = score_rates(clips, part)
+    print_rates(scores, Console())
+    if picture is not None:
+        save_figure(rates_figure(scores), picture)
+    write_json(json_file, [asdict(score) for score in scores])
+
+
+@app.command()
+def contour(
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of contours and curvatures (.png).")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Check the shapes of the Ferguson lips: gap, outline, bends and dents at every opening."""
+    import numpy as np
+
+    from corpora.figures import save_figure
+    from evaluation.lips.contour_shapes import check_shapes, print_shapes, shapes_figure
+
+    check_output(picture, json_file)
+    figures = check_shapes(np.linspace(0.0, 5.0, 501))
+    print_shapes(figures, Console())
+    if picture is not None:
+        save_figure(shapes_figure(), picture)
+    write_json(json_file, {name: values.tolist() for name, values in asdict(figures).items()})
+
+
+@app.command()
 def closures(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     json_file: JsonFile = None,
@@ -222,6 +273,35 @@ def visemes(
 
     check_output(picture, json_file)
     write_json(json_file, main(clips, parameters, picture))
+
+
+@app.command()
+def endpoints(
+    manifest: Manifest,
+    audio: Audio = None,
+    split: Split = "dev",
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the pieces over a waveform (.png).")
+    ] = None,
+    recording: Annotated[
+        str | None, typer.Option(help="The recording to draw; else the first one.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare syllables found by energy and zero crossings with forced alignment."""
+    from corpora.figures import save_figure
+    from evaluation.lips.segmentation import figure, print_score, score_segmentation
+    from shared.errors import UserError
+
+    check_output(picture, json_file)
+    score, recordings = score_segmentation(manifest, split, audio)
+    print_score(score, Console())
+    write_json(json_file, asdict(score))
+    if picture is not None:
+        chosen = [one for one in recordings if recording in (None, one.name)]
+        if not chosen:
+            raise UserError(f"there is no recording {recording!r} in split {split!r}")
+        save_figure(figure(chosen[0]), picture)
 
 
 @bench_app.command()

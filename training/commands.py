@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from services.cli.terminal import check_output
+from services.cli.terminal import check_output, print_message
 from shared.errors import UserError
 from shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from training import SYNTHETIC_WEIGHT
@@ -272,3 +272,17 @@ def lips(
         seed=seed,
         any_licence=any_licence,
     )
+
+
+@app.command()
+def ferguson(
+    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    corpus: Corpora,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
+    any_licence: AnyLicence = False,
+) -> None:
+    """Learn the table of the ferguson lips: openings, usual lengths, influence factors."""
+    from training.ferguson.recipe import train_ferguson
+
+    check_output(output)
+    train_ferguson(clips, corpus, output, print_message, any_licence=any_licence)

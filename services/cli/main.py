@@ -57,7 +57,7 @@ for kind in KINDS.values():
     app.command(kind.name, help=kind.summary)(service_command(kind))
 for command in (
     run.run, clients.speak, clients.listen, clients.status, configuration.config,
-    offline.render, offline.phones, offline.align,
+    offline.render, offline.phones, offline.align, offline.lips,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(head_app, name="head")

@@ -11,6 +11,7 @@ import typer
 from services.cli.heads import DEFAULT_HEAD, HeadName
 from services.cli.terminal import CONSOLE, VoiceFile, print_message, write_output
 from services.driver.config import Framing
+from shared.errors import UserError
 from shared.face.lip_models import LipModelName
 
 Audio = Annotated[Path, typer.Argument(help="Audio file.")]
@@ -24,6 +25,13 @@ class PhoneFormat(StrEnum):
     CSV = "csv"
     JSON = "json"
     TEXTGRID = "textgrid"
+
+
+class Timing(StrEnum):
+    """What tells when the phones of a text are spoken."""
+
+    ENDPOINTS = "endpoints"  # energy and zero crossings
+    ALIGN = "align"  # the acoustic model
 
 
 Form = Annotated[
@@ -111,6 +119,48 @@ def align(
     aligned = align_text(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ, text)
     duration_s = len(samples) / MEDIA_RATE_HZ
     write_output(format_phones(aligned, _form(form, output), duration_s), output)
+
+
+def lips(
+    audio: Audio,
+    text_and_output: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[TEXT] OUTPUT",
+            help="What is said, in Chinese characters or pinyin (else phones are recognised); then"
+            " the file: .svg or .png (the mouth at every key frame), .mp4, or .csv (the contour).",
+        ),
+    ],
+    timing: Annotated[
+        Timing | None,
+        typer.Option(help="What times a text: energy and zero crossings, or forced alignment."),
+    ] = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Smooth between key frames, not linear.")
+    ] = False,
+    points: Annotated[
+        int, typer.Option(min=2, max=1000, help="Points of each of the four lines (.csv).")
+    ] = 21,
+    speech_to_text: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a sherpa-onnx model, which tells what is said."),
+    ] = None,
+) -> None:
+    """Draw the mouth alone, in two dimensions: for cartoons, teaching and papers."""
+    from services.cli.mouth_drawing import draw_mouth
+
+    *text, output = text_and_output
+    if len(text) > 1:
+        raise UserError("give one text and one output; put a text with spaces in quotes")
+    draw_mouth(
+        audio,
+        text[0] if text else None,
+        Path(output),
+        timing=timing,
+        smooth=smooth,
+        num_points=points,
+        speech_to_text=speech_to_text,
+    )
 
 
 def _form(form: PhoneFormat | None, output: Path | None) -> str:

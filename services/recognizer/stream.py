@@ -20,7 +20,7 @@ from services.recognizer.acoustic.acoustic_model import (
     ScoringTask,
     run_scoring_tasks,
 )
-from services.recognizer.front_end.pcm import SLICE, level_db, slices
+from services.recognizer.front_end.pcm import SLICE, progress_at, slices
 from services.recognizer.front_end.resample import Resampler
 from services.recognizer.lip_source import LipsFromSound, delay_for
 from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
@@ -223,7 +223,7 @@ class _Segment:
         """End the sound."""
         outputs = yield from self._process_mono(self._resampler.finish())
         outputs += self._placed((yield from self._recognizer.finish()))
-        return [*outputs, self._progress(SILENT_DB)]
+        return [*outputs, Progress(time_s=to_seconds(self.media_time), level_db=SILENT_DB)]
 
     def _process_mono(self, samples: NDArray[np.float32]) -> ScoringTask[list[StreamOutput]]:
         outputs: list[StreamOutput] = [
@@ -234,12 +234,9 @@ class _Segment:
             self._slice.append(piece)
             outputs += self._placed((yield from self._recognizer.process(piece)))
             if self._num_samples % SLICE == 0:
-                outputs.append(self._progress(level_db(np.concatenate(self._slice))))
+                outputs.append(progress_at(self.media_time, np.concatenate(self._slice)))
                 self._slice.clear()
         return outputs
-
-    def _progress(self, level: float) -> Progress:
-        return Progress(time_s=to_seconds(self.media_time), level_db=level)
 
     def _placed(self, results: Sequence[Emission]) -> list[Emission]:
         """Count results' times from the session's first sample, in whole samples.

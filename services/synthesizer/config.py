@@ -10,7 +10,11 @@ from shared.config import BoundEndpoint, ServiceConfig
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 
 # Default delay of each lip model.
-DELAYS_MS: dict[str, float] = {LipModelName.LEARNT: 60.0, LipModelName.DYNAMIC_VISEMES: 160.0}
+DELAYS_MS: dict[str, float] = {
+    LipModelName.LEARNT: 60.0,
+    LipModelName.DYNAMIC_VISEMES: 160.0,
+    LipModelName.FERGUSON: 160.0,
+}
 
 
 class SynthesizerConfig(ServiceConfig):
@@ -23,10 +27,11 @@ class SynthesizerConfig(ServiceConfig):
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
     """FAP frames per second."""
     delay_ms: Annotated[float, Field(ge=0, le=300)] = DELAYS_MS[DEFAULT_LIP_MODEL]
-    """How much later than its sound a frame is made, in steps of 20 ms; 160 with dynamic-visemes,
-    unless another value is given."""
+    """How much later than its sound a frame is made, in steps of 20 ms; 160 with dynamic-visemes
+    and ferguson, unless another value is given."""
     lips: LipModelName = DEFAULT_LIP_MODEL
-    """Lip model: of recognised phones (dynamic-visemes), or of the sound itself (learnt)."""
+    """Lip model: of recognised phones (dynamic-visemes), of the sound itself (learnt), or of one
+    opening (ferguson)."""
     idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
     """Seed of blinks, gaze and head motion; with 0 the mouth alone moves."""
 

@@ -12,6 +12,7 @@ class LipModelName(StrEnum):
 
     DYNAMIC_VISEMES = "dynamic-visemes"  # the recognised phones
     LEARNT = "learnt"  # the sound itself
+    FERGUSON = "ferguson"  # one opening, by the phones and the sound's energy
 
 
 DEFAULT_LIP_MODEL = LipModelName.LEARNT

@@ -2,9 +2,10 @@
 
 A language is a Python package with ``phones.tsv`` and a function ``pronounce``. A pattern
 ``READABLE`` may say which stretches of a line of text to pronounce; without it, words between
-spaces. ``CODE`` may be the language's two letters in ISO 639-1, by which recordings name it. The
-languages that come with kouxing are listed in ``BUILT_IN``; any installed distribution adds one by
-an entry point of the group ``kouxing.languages`` (its name is the language's, its value the
+spaces. A function ``spell`` may write a syllable's phones as its readers do; without it, the
+symbols in a row. ``CODE`` may be the language's two letters in ISO 639-1, by which recordings name
+it. The languages that come with kouxing are listed in ``BUILT_IN``; any installed distribution adds
+one by an entry point of the group ``kouxing.languages`` (its name is the language's, its value the
 package).
 
 ``phones.tsv`` has one phone a row, in the order of the acoustic models' outputs:
@@ -64,6 +65,7 @@ class PhoneInventory:
     before_rounded: dict[str, str]  # viseme of a phone before a rounded one, where it has another
     pronounce: Callable[[str], list[Syllable]]  # text to syllables of phones; the lexicon
     readable: re.Pattern[str] = _WORDS  # finds the stretches of a line that may be pronounced
+    spell: Callable[[Syllable], str] = "".join  # the phones of a syllable to its spelling
     code: str = ""  # ISO 639-1, "zh"; empty: recordings are never in this language
 
     def __post_init__(self) -> None:
@@ -149,6 +151,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
             },
             pronounce=lexicon.pronounce,
             readable=getattr(lexicon, "READABLE", _WORDS),
+            spell=getattr(lexicon, "spell", "".join),
             code=getattr(lexicon, "CODE", ""),
         )
     except (OSError, ImportError, KeyError, ValueError, TypeError, AttributeError) as error:

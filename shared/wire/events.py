@@ -38,7 +38,11 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
         case events.SpeechChange():
             return Speech(media_time=to_samples(event.time_s), active=event.active)
         case events.Progress():
-            return Progress(media_time=to_samples(event.time_s), level_db=event.level_db)
+            return Progress(
+                media_time=to_samples(event.time_s),
+                level_db=event.level_db,
+                zero_crossing_rate=event.zero_crossing_rate,
+            )
         case events.EndOfSound():
             return EndOfPhones(media_time=to_samples(event.time_s))
 
@@ -67,6 +71,10 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
         case Speech():
             return events.SpeechChange(active=message.active, time_s=time_s)
         case Progress():
-            return events.Progress(time_s=time_s, level_db=message.level_db)
+            return events.Progress(
+                time_s=time_s,
+                level_db=message.level_db,
+                zero_crossing_rate=message.zero_crossing_rate,
+            )
         case EndOfPhones():
             return events.EndOfSound(time_s=time_s)

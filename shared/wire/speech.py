@@ -51,6 +51,8 @@ class Progress(Message):
     """The sound is processed up to media_time."""
 
     level_db: Annotated[float, Meta(ge=-200, le=20)]  # RMS of the newest 20 ms, full scale = 0
+    # sign changes a sample in the newest 20 ms
+    zero_crossing_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

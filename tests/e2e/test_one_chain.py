@@ -183,7 +183,7 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
         with Client(running.control) as client:
             session = client.open_session(encoding="f32le", sample_rate_hz=16000, paced=False)
             with pytest.raises(Refused):
-                session.choose_lips("ferguson")
+                session.choose_lips("muscles")
             session.choose_lips("learnt")
             sent = stream_into(session, samples, chunk=320)
             session.close()

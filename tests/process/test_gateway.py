@@ -507,7 +507,7 @@ def test_microphone_and_sample_may_choose_their_lips(
             await until(lambda: len(system.chosen) == 2)
             assert (await receive_json(viewer, "lips"))["lips"] == "learnt"
             assert (await receive_json(viewer, "lips"))["lips"] == "dynamic-visemes"
-            await viewer.send_json({"play": "sample", "lips": "ferguson"})
+            await viewer.send_json({"play": "sample", "lips": "muscles"})
             assert "lips must be one of" in (await receive_json(viewer, "error"))["text"]
             await viewer.send_json({"lips": "learnt"})
             assert "only for the sample" in (await receive_json(viewer, "error"))["text"]

@@ -38,8 +38,9 @@ def test_the_tracked_face_is_the_last_one(tmp_path: Path) -> None:
     with av.open(str(tmp_path / "one.mp4")) as video:
         image = next(video.decode(video=0)).to_ndarray(format="rgb24").astype(int)
         assert len(video.streams.audio) == 1
-    learnt, visemes, tracked = np.split(image[:300], 3, axis=1)
+    visemes, learnt, ferguson, tracked = np.split(image[:300], 4, axis=1)
     assert np.abs(learnt - visemes).max() < 60, "both are silent"
+    assert np.abs(learnt - ferguson).max() < 60, "both are silent"
     assert np.abs(learnt - tracked).max() > 120
     with pytest.raises(UserError, match="there is no clip two"):
         film_clip(tmp_path, "two", tmp_path / "two.mp4")

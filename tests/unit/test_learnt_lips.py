@@ -449,5 +449,5 @@ def test_another_lip_model_goes_on_from_where_the_mouth_is(to_learnt: bool) -> N
 
 
 def test_an_unknown_lip_model_is_refused_by_name() -> None:
-    with pytest.raises(UserError, match="no lip model 'ferguson'; choose one of"):
-        load_lip_model(name="ferguson")
+    with pytest.raises(UserError, match="no lip model 'muscles'; choose one of"):
+        load_lip_model(name="muscles")

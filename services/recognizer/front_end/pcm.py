@@ -8,6 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from shared.clock import to_seconds
+from shared.phones.events import Progress
+
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 FULL_SCALE = 32768.0
 SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
@@ -72,3 +75,30 @@ def level_db(samples: NDArray[np.float32]) -> float:
     exact = samples.astype(np.float64)
     power = float(exact @ exact) / len(exact)
     return max(-120.0, 10.0 * math.log10(power + 1e-12))
+
+
+def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
+    """Return how often the samples change their sign, for each of them: 0 to 1.
+
+    Source: Zhang et al. 2021, eq. 2, divided by the number of samples; 0 counts as positive.
+    """
+    if len(samples) == 0:
+        return 0.0
+    return float(np.count_nonzero(np.diff(np.signbit(samples)))) / len(samples)
+
+
+def progress_at(media_time: int, newest: NDArray[np.float32]) -> Progress:
+    """Tell of the sound up to ``media_time`` by its newest samples, shape (n,)."""
+    return Progress(
+        time_s=to_seconds(media_time),
+        level_db=level_db(newest),
+        zero_crossing_rate=zero_crossing_rate(newest),
+    )
+
+
+def progress_of(samples: NDArray[np.float32]) -> list[Progress]:
+    """Return what a live recognizer tells of a whole sound, 16 kHz mono, every 20 ms."""
+    return [
+        progress_at(end, samples[end - SLICE : end])
+        for end in range(SLICE, len(samples) + 1, SLICE)
+    ]

@@ -7,6 +7,8 @@ from functools import lru_cache
 
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from services.synthesizer.lips.ferguson.model import FergusonLips
+from services.synthesizer.lips.ferguson.table import load_table
 from services.synthesizer.lips.learnt.model import LearntLips
 from services.synthesizer.lips.lip_model import LipModel
 from shared.errors import UserError
@@ -16,6 +18,7 @@ from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inven
 LIP_MODELS: dict[str, Callable[[PhoneInventory], LipModel]] = {
     LipModelName.DYNAMIC_VISEMES: lambda inventory: DynamicVisemes(load_parameters(), inventory),
     LipModelName.LEARNT: lambda inventory: LearntLips(DynamicVisemes(load_parameters(), inventory)),
+    LipModelName.FERGUSON: lambda inventory: FergusonLips(load_table(inventory), inventory),
 }
 
 

@@ -51,6 +51,16 @@ _WITHOUT_INITIAL = {
     **{"m": ("m",), "n": ("n",), "ng": ("n",), "hm": ("h", "m"), "hng": ("h", "n")},
 }
 
+# How finals are written: alone (the first spelling above), after an initial, and after j q x.
+_SPELLED_ALONE = {
+    phones[0]: spelling
+    for spelling, phones in reversed(_WITHOUT_INITIAL.items())
+    if len(phones) == 1 and phones[0] not in _INITIALS_BY_LENGTH
+}
+_SPELLED_AFTER = {"ii": "i", "iii": "i", "iou": "iu", "uei": "ui", "uen": "un"}
+_SPELLED_AFTER |= {phone: "ü" + phone[1:] for phone in _V_ROW.values()}
+_SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
+
 _PINYIN_LETTERS = "üāáǎàēéěèīíǐìōóǒòūúǔùǖǘǚǜ"
 _TONE_MARKS = "\u0300\u0301\u0304\u030c"
 
@@ -106,6 +116,24 @@ def pronounce(text: str) -> list[tuple[str, ...]]:
     is_pinyin = text.isascii() or any(letter in text for letter in _PINYIN_LETTERS)
     syllables = text.split() if is_pinyin else pinyin_of_text("".join(text.split()))
     return [phones_of_syllable(syllable) for syllable in syllables]
+
+
+def spell(phones: tuple[str, ...]) -> str:
+    """Return the pinyin of a syllable's phones, without its tone; of an initial alone, the initial.
+
+    Examples
+    --------
+    >>> spell(("sh", "iii"))
+    'shi'
+    >>> spell(("van",))
+    'yuan'
+    """
+    *initial, final = phones
+    if not initial:
+        return _SPELLED_ALONE.get(final) or _SPELLED_AFTER.get(final, final)
+    if initial[0] in _J_INITIALS:
+        final = _SPELLED_AFTER_J.get(final, final)
+    return initial[0] + _SPELLED_AFTER.get(final, final)
 
 
 def pinyin_of_text(text: str) -> tuple[str, ...]:

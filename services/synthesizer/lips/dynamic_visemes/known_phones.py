@@ -85,6 +85,10 @@ class KnownPhones:
         self._speech_ends_s = [end_s for end_s in self._speech_ends_s if end_s >= time_s]
         return forgotten
 
+    def in_order(self) -> list[Phone]:
+        """Return all known phones by their onsets."""
+        return sorted(self._phones.values(), key=lambda phone: (phone.onset_s, phone.index))
+
     def timeline(self) -> Timeline:
         """Place the visemes of all known phones on the time axis."""
         phones = tuple(self._phones.values())

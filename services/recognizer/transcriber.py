@@ -1,0 +1,82 @@
+"""Speech to text: the words of a sound, where nobody gives them.
+
+What a lip model is told with its text, it can have from any speech recogniser behind
+``Transcriber``. The one here is sherpa-onnx, with a model that the user names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.clock import MEDIA_RATE_HZ
+from shared.errors import UserError
+
+
+class Transcriber(Protocol):
+    """Any speech recogniser."""
+
+    def transcribe(self, samples: NDArray[np.float32]) -> str:
+        """Return what is said in a sound, 16 kHz mono, shape (n,); empty if nothing is."""
+
+
+class SherpaTranscriber:
+    """A Mandarin model in sherpa-onnx.
+
+    Parameters
+    ----------
+    folder
+        As sherpa-onnx gives models away: ``tokens.txt``, and either an encoder, a decoder and a
+        joiner (a transducer), or one model, of the kind that the folder's name tells:
+        ``paraformer`` or ``sense-voice``. Of several files the smallest is taken, which is the one
+        with 8-bit weights.
+
+    Raises
+    ------
+    UserError
+        If sherpa-onnx is not installed, or the folder holds no such model.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._recognizer = _recognizer_in(folder)
+
+    def transcribe(self, samples: NDArray[np.float32]) -> str:
+        """Return what is said in a sound, 16 kHz mono, shape (n,); empty if nothing is."""
+        stream = self._recognizer.create_stream()
+        stream.accept_waveform(MEDIA_RATE_HZ, samples)
+        self._recognizer.decode_stream(stream)
+        return str(stream.result.text).strip()
+
+
+def _recognizer_in(folder: Path) -> Any:
+    try:
+        from sherpa_onnx import OfflineRecognizer  # noqa: PLC0415 (optional)
+    except ImportError:
+        raise UserError(
+            "speech to text needs sherpa-onnx: pip install 'kouxing[speech-to-text]'"
+        ) from None
+    tokens = folder / "tokens.txt"
+    parts = {name: _model_in(folder, name) for name in ("encoder", "decoder", "joiner", "model")}
+    if not tokens.is_file():
+        raise UserError(f"{folder} holds no tokens.txt; name the folder of a sherpa-onnx model")
+    given = {"tokens": str(tokens), "num_threads": 1}
+    if parts["encoder"] and parts["decoder"] and parts["joiner"]:
+        names = ("encoder", "decoder", "joiner")
+        return OfflineRecognizer.from_transducer(**given, **{name: parts[name] for name in names})
+    if parts["model"] and "paraformer" in folder.name:
+        return OfflineRecognizer.from_paraformer(**given, paraformer=parts["model"])
+    if parts["model"] and "sense-voice" in folder.name:
+        return OfflineRecognizer.from_sense_voice(**given, model=parts["model"], language="zh")
+    raise UserError(
+        f"{folder} holds no model of a known kind; name the folder of a sherpa-onnx transducer, "
+        "or one whose name has 'paraformer' or 'sense-voice' in it"
+    )
+
+
+def _model_in(folder: Path, name: str) -> str | None:
+    """Return the smallest file of a name, which may go on after it."""
+    found = sorted(folder.glob(f"{name}*.onnx"), key=lambda path: path.stat().st_size)
+    return str(found[0]) if found else None

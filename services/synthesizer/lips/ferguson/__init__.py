@@ -1,0 +1,1 @@
+"""Lips of one opening R over time, drawn as Ferguson curves: Zhang et al. 2021."""

@@ -1,0 +1,196 @@
+"""The lips' contour at any opening R, and the FAPs that belong to it.
+
+Source: Zhang et al. 2021, section 3. Four lines of five MPEG-4 feature points each, whose corners
+are shared, make 16 points. How far a point travels up was measured once. A Ferguson curve, cubic
+pieces joined with two continuous derivatives, goes through a line's points ``(x_j, dy_j)``: it
+tells the travel at any ``x``, so a contour may have any number of points:
+
+    l(x) = y(x) + R dy(x)                                                          (eq. 4)
+
+======  ============================================  ============  ======================
+symbol  meaning                                       unit          shape
+======  ============================================  ============  ======================
+x       along the mouth, 0 and 1 at the corners       mouth widths  (num_points,)
+y       height of the closed lip                      mouth widths  (num_points,)
+dy      travel up for R = 1                           mouth widths  (num_points,)
+R       opening, 0 (closed) to 5 (widest)             1             (num_frames,)
+======  ============================================  ============  ======================
+
+``lip_points.tsv`` has the points and says how they were measured.
+
+Deviations: the closed lip is a Ferguson curve, too, and its upper edge goes through the two peaks
+of Cupid's bow besides. The curve's ends are free (natural splines). As in the paper, lips move
+vertically only: corners neither come together nor come forward, so /u/ is a small opening.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+from services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
+
+Array = NDArray[np.float64]
+
+# feature points from the subject's right to the left, as a viewer reads them
+LINES = {
+    "outer upper": ("8.4", "8.6", "8.1", "8.5", "8.3"),
+    "inner upper": ("2.5", "2.7", "2.2", "2.6", "2.4"),
+    "inner lower": ("2.5", "2.9", "2.3", "2.8", "2.4"),
+    "outer lower": ("8.4", "8.8", "8.2", "8.7", "8.3"),
+}
+_ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without a travel
+_MOUTH_WIDTHS_PER_MNS = 0.39  # of the head "woman"
+_FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
+
+
+@dataclass(frozen=True, slots=True)
+class LipPoint:
+    """A feature point of the closed mouth, and how far it travels."""
+
+    x: float  # mouth widths
+    y: float
+    fap: int | None  # that moves it vertically
+    travel: float  # FAP units at R = 5
+
+
+@dataclass(frozen=True, slots=True)
+class LipLine:
+    """One line of the contour."""
+
+    closed: CubicSpline  # x -> y
+    travel: CubicSpline  # x -> dy
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The x of both corners, mouth widths."""
+        return float(self.travel.x[0]), float(self.travel.x[-1])
+
+    def heights(self, x: ArrayLike, openings: ArrayLike) -> Array:
+        """Return the heights l (num_frames, num_points) at x (num_points,) for R (num_frames,)."""
+        opening = np.asarray(openings, dtype=np.float64)[:, None]
+        heights: Array = self.closed(x) + opening * self.travel(x)  # Zhang 2021, eq. 4
+        return heights
+
+
+@lru_cache
+def lip_points() -> dict[str, LipPoint]:
+    """Return the points of ``lip_points.tsv`` by their names."""
+    file = resources.files(__package__) / "lip_points.tsv"
+    lines = [line for line in file.read_text("utf-8").splitlines() if not line.startswith("#")]
+    return {
+        row["point"]: LipPoint(
+            float(row["x"]),
+            float(row["y"]),
+            int(row["fap"]) if row["fap"] else None,
+            float(row["travel"] or 0.0),
+        )
+        for row in csv.DictReader(lines, delimiter="\t")
+    }
+
+
+@lru_cache
+def lip_lines() -> dict[str, LipLine]:
+    """Return the four lines by their names."""
+    return {name: _line(name) for name in LINES}
+
+
+def _line(name: str) -> LipLine:
+    points = lip_points()
+    moving = [points[point] for point in LINES[name]]
+    all_points = (*LINES[name], *_ONLY_CLOSED.get(name, ()))
+    closed = sorted((points[point] for point in all_points), key=lambda point: point.x)
+    return LipLine(
+        _ferguson([point.x for point in closed], [point.y for point in closed]),
+        _ferguson([point.x for point in moving], [_rise(point) for point in moving]),
+    )
+
+
+def _ferguson(x: list[float], y: list[float]) -> CubicSpline:
+    return CubicSpline(x, y, bc_type="natural")
+
+
+def _rise(point: LipPoint) -> float:
+    """Travel up for R = 1, mouth widths."""
+    assert point.fap is not None  # noqa: S101 - all points of LINES have one
+    sign = 1.0 if FAPS[point.fap - 1].direction == "up" else -1.0
+    return sign * point.travel * _FAP_UNIT / MAX_OPENING
+
+
+def contour(openings: ArrayLike, num_points: int = 41) -> Array:
+    """Return the lips' contour.
+
+    Parameters
+    ----------
+    openings
+        R (num_frames,), 0 to 5.
+    num_points
+        Of each line, evenly spaced along x; at least 2.
+
+    Returns
+    -------
+    Array
+        Points x, y in mouth widths, shape (num_frames, 4, num_points, 2), lines as ``LINES``.
+
+    Raises
+    ------
+    ValueError
+        If an opening is out of range, or there are too few points.
+
+    Examples
+    --------
+    >>> contour([0.0, 5.0], num_points=9).shape
+    (2, 4, 9, 2)
+    """
+    opening = _checked(openings)
+    if num_points < 2:
+        raise ValueError(f"a line has at least 2 points, got {num_points}")
+    points = np.empty((len(opening), len(LINES), num_points, 2))
+    for row, line in enumerate(lip_lines().values()):
+        x = np.linspace(*line.ends, num_points)
+        points[:, row, :, 0] = x
+        points[:, row, :, 1] = line.heights(x, opening)
+    return points
+
+
+def faps_of(openings: ArrayLike) -> Array:
+    """Return the mouth's FAPs for openings.
+
+    Jaw and lips' feature points travel as measured; the head's lips follow between them. FAPs that
+    do not move the mouth vertically are 0.
+
+    Parameters
+    ----------
+    openings
+        R (num_frames,), 0 to 5.
+
+    Returns
+    -------
+    Array
+        FAP units, shape (num_frames, num_mouth_faps), in the order of ``MOUTH_FAPS``.
+
+    Raises
+    ------
+    ValueError
+        If an opening is out of range.
+    """
+    travels = {point.fap: point.travel for point in lip_points().values()}
+    whole = np.array([travels.get(fap, 0.0) for fap in MOUTH_FAPS])
+    faps: Array = _checked(openings)[:, None] / MAX_OPENING * whole
+    return faps
+
+
+def _checked(openings: ArrayLike) -> Array:
+    opening = np.asarray(openings, dtype=np.float64)
+    if opening.ndim != 1:
+        raise ValueError(f"expected openings of shape (num_frames,), got {opening.shape}")
+    if not ((opening >= 0.0) & (opening <= MAX_OPENING)).all():
+        raise ValueError(f"an opening is between 0 and {MAX_OPENING:g}")
+    return opening

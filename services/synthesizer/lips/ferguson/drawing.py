@@ -1,0 +1,238 @@
+"""Draw the mouth in two dimensions: SVG text, or pictures.
+
+A drawing is a list of filled outlines and of labels, in pixels, y downwards. ``svg`` and
+``rasterize`` turn it into a file's text and into a picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from services.synthesizer.lips.ferguson.contour import contour
+
+Array = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+_POINTS_OF_LINE = 61
+_UPPER_LIP, _LOWER_LIP, _SHINE = "#b5505a", "#c9626b", "#da8288"
+_INSIDE, _TEETH, _TONGUE = "#3a1418", "#f6f1e7", "#a84a52"
+_INK, _FAINT_INK, PAPER = "#222222", "#777777", "#ffffff"
+# mouth widths, from the inner corners: where the upper teeth end, the tongue at rest begins
+_TEETH_EDGE, _TEETH_HALF_WIDTH, _TEETH_ROUNDNESS = -0.085, 0.30, 0.05
+_TONGUE_BELOW_TEETH, _TONGUE_HALF_WIDTH = 0.045, 0.27
+_LINE_PX_PER_WIDTH = 0.006
+# the box around a mouth at any opening, mouth widths
+WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
+_ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # as Pillow calls them
+_FINER = 3  # pictures are drawn so much larger, then averaged
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """A filled polygon, or an open line if it has no fill."""
+
+    points: Array  # (num_points, 2), pixels
+    color: str  # "#rrggbb"
+    line_px: float | None = None  # None: filled
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A line of text."""
+
+    text: str
+    x: float  # pixels
+    y: float  # of its base line
+    size_px: float
+    color: str = _INK
+    anchor: Literal["start", "middle", "end"] = "middle"  # what of the text is at x
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """Outlines, in the order in which they cover each other, and labels."""
+
+    width_px: int
+    height_px: int
+    outlines: list[Outline] = field(default_factory=list)
+    labels: list[Label] = field(default_factory=list)
+
+
+def mouth(opening: float, center_px: tuple[float, float], width_px: float) -> list[Outline]:
+    """Draw a mouth.
+
+    Parameters
+    ----------
+    opening
+        R, 0 to 5.
+    center_px
+        Where the middle of the closed mouth is.
+    width_px
+        From corner to corner.
+    """
+    outer_upper, inner_upper, inner_lower, outer_lower = contour([opening], _POINTS_OF_LINE)[0]
+    x, top, bottom = inner_upper[:, 0], inner_upper[:, 1], inner_lower[:, 1]
+    # upper teeth hang from the skull: the lips uncover them
+    edge = _TEETH_EDGE + _TEETH_ROUNDNESS * ((x - 0.5) / _TEETH_HALF_WIDTH) ** 2
+    teeth = np.clip(edge, bottom, top)
+    # the tongue lies behind the lower lip
+    bow = 1.0 - ((x - 0.5) / _TONGUE_HALF_WIDTH) ** 2
+    highest = max(0.0, _TEETH_EDGE - _TONGUE_BELOW_TEETH - float(bottom.min()))
+    tongue = np.clip(bottom + 0.8 * highest * bow, bottom, top)
+    near_teeth = np.abs(x - 0.5) < _TEETH_HALF_WIDTH + 0.03
+    near_tongue = np.abs(x - 0.5) < _TONGUE_HALF_WIDTH
+    # light falls on the middle of the lower lip
+    of_lower = np.interp(x, outer_lower[:, 0], outer_lower[:, 1])
+    share = 0.5 + 0.16 * (1.0 - ((x - 0.5) / 0.25) ** 2)
+    on_lip = np.abs(x - 0.5) < 0.25
+    shine_low, shine_high = (
+        bottom + (of_lower - bottom) * height for height in (share, 1.0 - share)
+    )
+
+    def between(above: Array, below: Array, where: NDArray[np.bool_]) -> Array:
+        upper, lower = (np.stack([x, line], axis=1)[where] for line in (above, below))
+        return np.concatenate([upper, lower[::-1]])
+
+    everywhere = np.ones(len(x), dtype=bool)
+    line_px = _LINE_PX_PER_WIDTH * width_px
+    lips = np.concatenate([outer_upper, outer_lower[::-1]])
+    parts = [
+        Outline(lips, _LOWER_LIP),
+        Outline(np.concatenate([outer_upper, inner_upper[::-1]]), _UPPER_LIP),
+        Outline(between(shine_high, shine_low, on_lip), _SHINE),
+        Outline(between(top, bottom, everywhere), _INSIDE),
+        Outline(between(tongue, bottom, near_tongue), _TONGUE),
+        Outline(between(top, teeth, near_teeth), _TEETH),
+        Outline(inner_upper, _INSIDE, line_px),
+        Outline(inner_lower, _INSIDE, line_px),
+    ]
+
+    def placed(points: Array) -> Array:
+        return np.array(center_px) + (points - [0.5, 0.0]) * [width_px, -width_px]
+
+    return [Outline(placed(part.points), part.color, part.line_px) for part in parts]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A mouth to draw, with what is said."""
+
+    time_s: float
+    opening: float  # R
+    phone: str
+    syllable: str = ""  # that begins here
+
+
+def strip(moments: Sequence[Moment], mouths_a_row: int, mouth_px: float) -> Drawing:
+    """Draw mouths in rows, each with its phone and its time, below the syllables.
+
+    Parameters
+    ----------
+    moments
+        In order of time.
+    mouths_a_row
+        At most.
+    mouth_px
+        Width of a mouth.
+    """
+    columns = max(1, min(mouths_a_row, len(moments)))
+    rows = -(-len(moments) // columns)
+    cell_px = WIDTH * mouth_px
+    text_px = 0.115 * mouth_px
+    mouth_height_px = (HIGHEST - LOWEST) * mouth_px
+    row_px = mouth_height_px + 5.0 * text_px
+    drawing = Drawing(round(columns * cell_px), round(rows * row_px + text_px))
+    for number, moment in enumerate(moments):
+        left, top = number % columns * cell_px, number // columns * row_px
+        middle = left + 0.5 * cell_px
+        lips_top = top + 1.9 * text_px
+        if moment.syllable:
+            label = Label(moment.syllable, middle, top + 1.4 * text_px, 1.2 * text_px)
+            drawing.labels.append(label)
+        center = (middle, lips_top + HIGHEST * mouth_px)
+        drawing.outlines.extend(mouth(moment.opening, center, mouth_px))
+        below = lips_top + mouth_height_px
+        drawing.labels.append(Label(moment.phone, middle, below + 1.1 * text_px, text_px))
+        time = f"{moment.time_s:.2f} s"
+        drawing.labels.append(
+            Label(time, middle, below + 2.3 * text_px, 0.85 * text_px, _FAINT_INK)
+        )
+    return drawing
+
+
+def image(moment: Moment, width_px: int, height_px: int) -> Drawing:
+    """Draw one mouth that fills a picture, with its time and what is said."""
+    drawing = Drawing(width_px, height_px)
+    text_px = 0.06 * height_px
+    mouth_px = min(width_px / WIDTH, (height_px - 3.0 * text_px) / (HIGHEST - LOWEST))
+    center = (0.5 * width_px, 0.5 * text_px + HIGHEST * mouth_px)
+    drawing.outlines.extend(mouth(moment.opening, center, mouth_px))
+    below = height_px - text_px
+    drawing.labels.append(
+        Label(f"{moment.time_s:.2f} s", text_px, below, text_px, _FAINT_INK, "start")
+    )
+    drawing.labels.append(Label(moment.syllable, 0.5 * width_px, below, 1.4 * text_px))
+    drawing.labels.append(
+        Label(moment.phone, width_px - text_px, below, text_px, _FAINT_INK, "end")
+    )
+    return drawing
+
+
+def svg(drawing: Drawing) -> str:
+    """Return a drawing as the text of an SVG file."""
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{drawing.width_px}"'
+        f' height="{drawing.height_px}" viewBox="0 0 {drawing.width_px} {drawing.height_px}">',
+        f'<rect width="100%" height="100%" fill="{PAPER}"/>',
+    ]
+    for outline in drawing.outlines:
+        if len(outline.points) < 2:
+            continue
+        path = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in outline.points)
+        if outline.line_px is None:
+            lines.append(f'<path d="{path}Z" fill="{outline.color}"/>')
+        else:
+            lines.append(
+                f'<path d="{path}" fill="none" stroke="{outline.color}"'
+                f' stroke-width="{outline.line_px:.1f}" stroke-linecap="round"/>'
+            )
+    lines += [
+        f'<text x="{label.x:.1f}" y="{label.y:.1f}" font-size="{label.size_px:.1f}"'
+        f' text-anchor="{label.anchor}" fill="{label.color}" font-family="sans-serif">'
+        f"{escape(label.text)}</text>"
+        for label in drawing.labels
+    ]
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def rasterize(drawing: Drawing) -> UInt8:
+    """Return a drawing as a picture (height_px, width_px, 3), sRGB."""
+    fine = Image.new("RGB", (drawing.width_px * _FINER, drawing.height_px * _FINER), PAPER)
+    pen = ImageDraw.Draw(fine)
+    for outline in drawing.outlines:
+        points = [(x * _FINER, y * _FINER) for x, y in outline.points.tolist()]
+        if len(points) < 2:
+            continue
+        if outline.line_px is None:
+            pen.polygon(points, fill=outline.color)
+        else:
+            width = max(1, round(outline.line_px * _FINER))
+            pen.line(points, fill=outline.color, width=width, joint="curve")
+    for label in drawing.labels:
+        font = ImageFont.load_default(max(label.size_px * _FINER, 1.0))
+        pen.text(
+            (label.x * _FINER, label.y * _FINER),
+            label.text,
+            label.color,
+            font,
+            _ANCHORS[label.anchor],
+        )
+    picture = fine.resize((drawing.width_px, drawing.height_px), Image.Resampling.BOX)
+    return np.asarray(picture)

@@ -1,0 +1,134 @@
+"""Ferguson lips live: shapes of the phones, times of the sound, and no jerk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.live_chain import LiveChain
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.front_end.resample import to_16_khz
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.face import Face
+from services.synthesizer.lips.ferguson.contour import faps_of
+from services.synthesizer.lips.ferguson.table import load_table
+from services.synthesizer.lips.load import load_lip_model
+from shared.audio_file import read_audio
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.face.lip_models import LipModelName
+from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from shared.phones.inventory import load_inventory
+from tests.system import DEMO
+
+pytestmark = pytest.mark.unit
+
+LIPS = load_lip_model(name=LipModelName.FERGUSON)
+TABLE = load_table(load_inventory())
+LOWER_LIP = 4  # column of FAP 5
+WIDEST = float(faps_of([5.0])[0, MOUTH_FAPS.index(5)])
+DELAY_S = 0.16
+
+
+def phone(index: int, symbol: str, onset_s: float, duration_s: float = 0.15) -> Phone:
+    return Phone(
+        index=index,
+        symbol=symbol,
+        onset_s=onset_s,
+        duration_s=duration_s,
+        confidence=1.0,
+        final=True,
+    )
+
+
+def progress(start_s: float, end_s: float, *, loud: bool) -> list[SoundEvent]:
+    return [
+        Progress(time_s=round(number * 0.02, 2), level_db=-20.0 if loud else -70.0)
+        for number in range(round(start_s / 0.02) + 1, round(end_s / 0.02) + 1)
+    ]
+
+
+def openings(events: Sequence[SoundEvent], face: Face | None = None) -> NDArray[np.float64]:
+    """R of each frame, at 50 Hz."""
+    face = face or Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    frames = [faps for event in events for _, faps in face.accept(event)]
+    return 5.0 * np.array(frames, dtype=np.float64)[:, LOWER_LIP] / WIDEST
+
+
+SAID: list[SoundEvent] = [
+    *progress(0.0, 0.5, loud=False),
+    SpeechChange(active=True, time_s=0.5),
+    *progress(0.5, 0.6, loud=True),
+    phone(0, "m", 0.5, 0.1),
+    *progress(0.6, 0.7, loud=True),
+    phone(1, "a", 0.6, 0.4),
+    *progress(0.7, 1.0, loud=True),
+    *progress(1.0, 2.0, loud=False),
+]
+
+
+def test_the_mouth_has_the_phones_openings_and_rests_in_silence() -> None:
+    made = openings(SAID)
+    assert made[:15].max() == 0.0
+    assert made[25] == pytest.approx(TABLE.opening["m"], abs=0.7)
+    assert made[31] == pytest.approx(TABLE.opening["a"], abs=0.7)
+    assert np.argmax(made) < 36
+    assert made[60:].max() < 0.05  # the energy tells the end, long before voice activity does
+
+
+def test_the_energy_moves_the_mouth_before_a_phone_is_known() -> None:
+    no_phones = [event for event in SAID if not isinstance(event, Phone)]
+    made = openings(no_phones)
+    assert made[26] > 0.5
+    assert made[50:].max() < 0.05  # and what no phone explains is no speech
+
+
+def test_revisions_and_interruptions_leave_no_jump() -> None:
+    revised: list[SoundEvent] = [
+        replace(event, symbol="u") if isinstance(event, Phone) and event.index else event
+        for event in SAID
+    ]
+    made = openings([*SAID[:-60], *(event for event in revised if isinstance(event, Phone))])
+    assert np.abs(np.diff(made)).max() < 2.0
+    face = Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    before = openings(SAID[:42], face)
+    assert before[-1] > 2.0
+    face.flush()
+    after = openings(progress(0.74, 1.2, loud=False), face)
+    assert np.abs(np.diff([before[-1], *after])).max() < 2.0
+    assert after[8:].max() < 0.05
+
+
+def test_lips_at_rest_while_no_sound_comes() -> None:
+    face = Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    openings(SAID[:42], face)
+    frames = np.array([faps for _, faps in face.relax(12)])
+    assert np.abs(frames[-1]).max() < 1e-6
+
+
+def test_speech_moves_all_lips_within_their_travel_whatever_the_chunks() -> None:
+    samples, rate_hz = read_audio(DEMO / "hello-female.wav")
+    samples = to_16_khz(samples, rate_hz)[:32_000]
+    settings = SynthesizerConfig(lips=LipModelName.FERGUSON, idle_motion_seed=0)
+    assert settings.delay_ms == 160.0
+    made = []
+    for chunk in (32_000, 333):
+        chain = LiveChain(load_model(), LIPS, synthesizer=settings)
+        frames = []
+        for begin in range(0, len(samples), chunk):
+            frames += chain.accept_waveform(samples[begin : begin + chunk])
+        made.append(np.array([faps for _, faps in frames + chain.input_finished()]))
+    np.testing.assert_array_equal(made[0], made[1])
+    opening = 5.0 * made[0][:, LOWER_LIP] / WIDEST
+    assert opening.max() > 2.5
+    assert opening.min() >= 0.0
+    assert opening.max() <= 5.0
+
+
+def test_a_language_without_a_table_is_named() -> None:
+    with pytest.raises(UserError, match="no table for other"):
+        load_table(replace(load_inventory(), language="other"))

@@ -1,0 +1,181 @@
+"""Endpoints, and when the phones of a known text are spoken."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.front_end.pcm import progress_of, zero_crossing_rate
+from services.recognizer.stream import SpeechStream
+from services.synthesizer.lips.ferguson.endpoints import SyllableCutter, pieces_of
+from services.synthesizer.lips.ferguson.motion import KeyFrames
+from services.synthesizer.lips.ferguson.openings import key_frames_of
+from services.synthesizer.lips.ferguson.table import format_table, load_table, parse_table
+from services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
+from shared.audio_file import read_audio
+from shared.errors import UserError
+from shared.phones.events import Phone, Progress
+from shared.phones.inventory import load_inventory
+from tests.system import DEMO
+
+pytestmark = pytest.mark.unit
+
+INVENTORY = load_inventory()
+TABLE = load_table(INVENTORY)
+RATE_HZ = 16_000
+
+
+def speech(parts: Sequence[tuple[str, float]]) -> NDArray[np.float32]:
+    """Make a sound of vowels (v), hissing consonants (s), weak nasals (n) and silence (-)."""
+    rng = np.random.default_rng(0)
+    made = []
+    for kind, length_s in parts:
+        time_s = np.arange(round(length_s * RATE_HZ)) / RATE_HZ
+        noise = rng.standard_normal(len(time_s))
+        made.append(
+            {
+                "v": 0.2 * np.sin(2 * np.pi * 200.0 * time_s),
+                "s": 0.05 * noise,
+                "n": 0.03 * np.sin(2 * np.pi * 200.0 * time_s),
+                "-": 1e-4 * noise,
+            }[kind]
+        )
+    return np.concatenate(made).astype(np.float32)
+
+
+def test_zero_crossings_of_a_tone_are_twice_its_frequency() -> None:
+    tone = np.sin(2 * np.pi * 1000.0 * (np.arange(RATE_HZ) + 0.5) / RATE_HZ).astype(np.float32)
+    assert zero_crossing_rate(tone) == pytest.approx(2 * 1000.0 / RATE_HZ, abs=1e-3)
+    assert zero_crossing_rate(tone[:0]) == 0.0
+
+
+def test_pieces_end_at_pauses_at_dips_and_before_hisses() -> None:
+    parts = [("-", 0.4), ("v", 0.2), ("-", 0.2), ("v", 0.2), ("n", 0.08), ("v", 0.2)]
+    pieces = pieces_of(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
+    starts = [piece.start_s for piece in pieces]
+    np.testing.assert_allclose(starts, [0.4, 0.8, 1.0, 1.28], atol=0.045)
+    assert pieces[0].end_s == pytest.approx(0.6, abs=0.045)
+    assert pieces[1].end_s == pieces[2].start_s
+    assert pieces[-1].end_s == pytest.approx(1.58, abs=0.045)
+
+
+def test_the_thresholds_follow_the_noise() -> None:
+    parts = [("-", 1.0), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 0.5)]
+    noise = 0.01 * np.random.default_rng(1).standard_normal(round(2.2 * RATE_HZ))
+    quiet, noisy = (
+        pieces_of(progress_of(sound.astype(np.float32)))
+        for sound in (0.1 * speech(parts), speech(parts) + noise)
+    )
+    assert len(quiet) == len(noisy) == 2
+    for one, other in zip(quiet, noisy, strict=True):
+        assert one.start_s == pytest.approx(other.start_s, abs=0.045)
+
+
+@pytest.mark.parametrize("chunk", [113, 4000])
+def test_pieces_of_a_stream_are_those_of_the_whole(chunk: int) -> None:
+    samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]
+    stream = SpeechStream(load_model())
+    cutter = SyllableCutter()
+    pieces = []
+    for begin in range(0, len(samples), chunk):
+        for output in stream.accept_waveform(samples[begin : begin + chunk]):
+            if isinstance(output, Progress):
+                pieces += cutter.accept(output)
+    pieces += cutter.finish()
+    assert pieces == pieces_of(progress_of(samples))
+    assert len(pieces) > 3
+
+
+def test_a_hole_in_time_ends_a_piece() -> None:
+    cutter = SyllableCutter()
+    slices = progress_of(speech([("-", 0.3), ("v", 0.3)]))
+    assert not [piece for one in slices for piece in cutter.accept(one)]
+    later = Progress(time_s=5.0, level_db=-20.0)
+    assert [piece.end_s for piece in cutter.accept(later)] == [0.6]
+
+
+def test_syllables_begin_with_their_pieces_and_finals_by_the_influence_factor() -> None:
+    sound = speech([("-", 0.4), ("n", 0.06), ("v", 0.2), ("s", 0.12), ("v", 0.2), ("-", 0.4)])
+    phones = time_text(progress_of(sound), [("m", "a"), ("s", "an")], TABLE)
+    assert [phone.symbol for phone in phones] == ["m", "a", "s", "an"]
+    m, a, s, an = phones
+    assert m.onset_s == pytest.approx(0.4, abs=0.05)
+    assert s.onset_s == pytest.approx(0.66, abs=0.05)
+    length_s = an.onset_s + an.duration_s - s.onset_s
+    assert an.onset_s == pytest.approx(s.onset_s + TABLE.influence["an"] * length_s)
+    assert a.onset_s + a.duration_s == pytest.approx(s.onset_s)
+
+
+def test_more_and_fewer_pieces_than_syllables() -> None:
+    slices = progress_of(speech([("-", 0.4), ("v", 0.6), ("-", 0.4)]))
+    three = time_text(slices, [("a",), ("m", "a"), ("er",)], TABLE)
+    onsets = [phone.onset_s for phone in three]
+    assert onsets == sorted(onsets)
+    assert onsets[0] == pytest.approx(0.4, abs=0.05)
+    assert three[-1].onset_s + three[-1].duration_s == pytest.approx(1.0, abs=0.05)
+    parts = [("-", 0.4), ("v", 0.1), ("n", 0.06), ("v", 0.1), ("-", 0.4)]
+    (one,) = time_text(progress_of(speech(parts)), [("a",)], TABLE)
+    assert one.duration_s == pytest.approx(0.26, abs=0.05)
+
+
+def test_what_cannot_be_timed_is_refused() -> None:
+    silent = progress_of(speech([("-", 1.0)]))
+    with pytest.raises(UserError, match="no speech was found"):
+        time_text(silent, [("a",)], TABLE)
+    with pytest.raises(UserError, match="the text is empty"):
+        time_text(silent, [], TABLE)
+    with pytest.raises(UserError, match=f"at most {MAX_SYLLABLES}"):
+        time_text(silent, [("a",)] * (MAX_SYLLABLES + 1), TABLE)
+
+
+def test_key_frames_are_linear_or_smooth_and_never_overshoot() -> None:
+    frames = KeyFrames(np.array([0.0, 1.0, 2.0]), np.array([0.0, 4.0, 4.0]))
+    np.testing.assert_allclose(frames.openings_at([-1.0, 0.25, 1.5, 9.0]), [0.0, 1.0, 4.0, 4.0])
+    time_s = np.linspace(-1.0, 3.0, 401)
+    smooth = frames.openings_at(time_s, smooth=True)
+    assert smooth.max() <= 4.0
+    assert (np.diff(smooth) >= -1e-12).all()
+    np.testing.assert_allclose(frames.openings_at([0.0, 1.0, 2.0], smooth=True), [0.0, 4.0, 4.0])
+
+
+@pytest.mark.parametrize(
+    ("times", "openings"), [([0.0, 0.0], [1.0, 1.0]), ([0.0], [5.1]), ([], []), ([0.0], [1.0, 2.0])]
+)
+def test_wrong_key_frames_are_refused(times: list[float], openings: list[float]) -> None:
+    with pytest.raises(ValueError, match=r"times_s|opening"):
+        KeyFrames(np.array(times), np.array(openings))
+
+
+def test_the_mouth_has_a_phones_opening_when_it_begins_and_closes_in_pauses() -> None:
+    def phone(symbol: str, onset_s: float) -> Phone:
+        return Phone(
+            index=0, symbol=symbol, onset_s=onset_s, duration_s=0.1, confidence=1.0, final=True
+        )
+
+    said = [phone("m", 1.0), phone("a", 1.1), phone("sil", 1.2), phone("i", 2.0)]
+    frames = key_frames_of(said, TABLE, INVENTORY.silence)
+    of = TABLE.opening
+    np.testing.assert_allclose(
+        frames.openings_at([0.5, 1.0, 1.1, 1.2, 1.5, 2.0, 2.1]),
+        [0.0, of["m"], of["a"], 0.0, 0.0, of["i"], 0.0],
+        atol=1e-9,
+    )
+    assert key_frames_of([], TABLE, INVENTORY.silence).openings_at([1.0]) == [0.0]
+
+
+def test_the_table_that_ships_is_plausible_and_read_back() -> None:
+    assert set(TABLE.opening) == set(INVENTORY.phones)
+    closed = max(TABLE.opening[phone] for phone in "bpm")
+    assert closed < 1.0 < TABLE.opening["i"] < TABLE.opening["a"]
+    factors = {TABLE.level[vowel]: TABLE.influence[vowel] for vowel in INVENTORY.vowels}
+    assert sorted(factors) == [1, 2, 3, 4]
+    assert sorted(factors, key=lambda level: -factors[level]) == [1, 2, 3, 4]
+    text = format_table(TABLE, INVENTORY, ["about"])
+    assert parse_table(text, INVENTORY) == TABLE
+    for damaged in (text.replace("\na\t", "\nA\t"), text.replace("\na\t4", "\na\t9")):
+        with pytest.raises(UserError, match="damaged"):
+            parse_table(damaged, INVENTORY)

@@ -1,0 +1,129 @@
+"""Learning the table of the ferguson lips, and scoring a segmentation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.lips.segmentation import SegmentedRecording, figure, pair, score
+from services.recognizer.alignment import spoken
+from services.synthesizer.lips.ferguson.contour import faps_of
+from services.synthesizer.lips.ferguson.endpoints import Piece
+from services.synthesizer.lips.ferguson.openings import key_frames_of
+from services.synthesizer.lips.ferguson.table import load_table
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.events import Phone, Progress
+from shared.phones.inventory import load_inventory
+from tests.lips import clip_of, utterance
+from training.ferguson.lengths import AlignedSpeech, influence_levels, usual_times
+from training.ferguson.openings import fit_openings, relative_openings, travel_of
+from training.ferguson.recipe import train_ferguson
+
+pytestmark = pytest.mark.unit
+
+INVENTORY = load_inventory()
+TABLE = load_table(INVENTORY)
+
+
+def test_openings_are_found_again() -> None:
+    phones = utterance(0, 200)
+    time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
+    true = replace(TABLE, opening={**TABLE.opening, "a": 5.0, "i": 1.5, "d": 2.5})
+    opening = key_frames_of(phones, true, INVENTORY.silence).openings_at(time_s)
+    clip = clip_of(time_s, faps_of(opening))
+    relative = relative_openings([clip])[0]
+    scale = 5.0 / np.percentile(opening, 98)  # what is wide for this speaker is 5
+    np.testing.assert_allclose(relative, np.minimum(scale * opening, 5.0), atol=0.01)
+    found = fit_openings([clip], [phones], INVENTORY)
+    for phone in ("a", "i", "u", "d", "b", "sh"):
+        expected = min(scale * true.opening[phone], 5.0)
+        assert found[phone] == pytest.approx(expected, abs=0.3)
+    assert found["sil"] == 0.0
+    # what is not heard is like what has its visemes
+    assert found["ang"] == pytest.approx(found["a"], abs=0.3)
+    travel = faps_of([5.0])[0] / scale
+    np.testing.assert_allclose(travel_of([clip]), travel, rtol=0.05, atol=1e-9)
+    assert len(travel_of([clip])) == len(MOUTH_FAPS)
+
+
+def aligned(lengths_s: list[tuple[str, float]]) -> list[Phone]:
+    phones, onset_s = [], 0.0
+    for index, (symbol, length_s) in enumerate(lengths_s):
+        phones.append(
+            Phone(
+                index=index,
+                symbol=symbol,
+                onset_s=onset_s,
+                duration_s=length_s,
+                confidence=1.0,
+                final=True,
+            )
+        )
+        onset_s += length_s
+    return phones
+
+
+def test_lengths_hisses_and_influence_are_counted() -> None:
+    phones = aligned([("s", 0.1), ("a", 0.1), ("m", 0.04), ("i", 0.16)] * 30)
+    slices = [
+        Progress(
+            time_s=0.02 * number, level_db=-20.0, zero_crossing_rate=0.8 * ((number - 1) % 20 < 5)
+        )
+        for number in range(1, 601)
+    ]
+    speech = AlignedSpeech(slices, [("s", "a"), ("m", "i")] * 30, phones)
+    usual = usual_times([speech], INVENTORY)
+    assert usual.duration_s["s"] == pytest.approx(0.1, abs=0.01)
+    assert usual.duration_s["m"] == pytest.approx(0.04, abs=0.01)
+    assert usual.crossings["s"] > usual.crossings["m"]
+    assert usual.influence["a"] > usual.influence["ei"] > usual.influence["i"]
+    assert usual.level["a"] == 1
+
+
+def test_levels_group_finals_of_like_shares() -> None:
+    share = {"a": 0.6, "o": 0.58, "e": 0.4, "i": 0.3, "u": 0.29, "v": 0.1}
+    level, influence = influence_levels(share, dict.fromkeys(share, 1.0))
+    assert level == {"a": 1, "o": 1, "e": 2, "i": 3, "u": 3, "v": 4}
+    assert influence["u"] == pytest.approx(0.295)
+
+
+def test_boundaries_are_paired_in_order() -> None:
+    real, found = np.array([0.0, 0.3, 0.6, 0.9]), np.array([0.02, 0.28, 0.33, 0.75, 0.95])
+    assert pair(real, found) == [(0, 0), (1, 1), (3, 4)]
+    assert pair(real, np.zeros(0)) == []
+
+
+def test_a_segmentation_is_scored_and_drawn(tmp_path: Path) -> None:
+    slices = [
+        Progress(time_s=0.02 * number, level_db=-20.0 if 20 < number <= 50 else -70.0)
+        for number in range(1, 71)
+    ]
+    phones = [
+        replace(phone, onset_s=0.4 + phone.onset_s)
+        for phone in aligned([("m", 0.1), ("a", 0.2), ("m", 0.1), ("a", 0.2), ("sil", 0.2)])
+    ]
+    recording = SegmentedRecording(
+        name="made-up",
+        samples=np.zeros(22_400, np.float32),
+        slices=slices,
+        pieces=[Piece(0.42, 1.0)],
+        syllables=[("m", "a"), ("m", "a")],
+        aligned=spoken(phones, INVENTORY),
+    )
+    found = score([recording], TABLE)
+    assert (found.num_syllables, found.num_pieces, found.mean_count_error) == (2, 1, 0.5)
+    assert (found.recall, found.precision) == (0.5, 1.0)
+    assert found.mean_boundary_error_ms == pytest.approx(20.0)
+    assert found.by_text.mean_ms < 30.0
+    assert found.by_text.within_50_ms == 1.0
+    figure(recording).savefig(tmp_path / "pieces.png")
+    assert (tmp_path / "pieces.png").stat().st_size > 5000
+
+
+def test_a_folder_without_clips_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no Mandarin clips"):
+        train_ferguson(tmp_path, [tmp_path], tmp_path / "table.tsv", print)

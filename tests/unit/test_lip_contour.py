@@ -1,0 +1,91 @@
+"""The Ferguson contour: its points, its FAPs, its drawings."""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from services.synthesizer.lips.ferguson import drawing
+from services.synthesizer.lips.ferguson.contour import (
+    LINES,
+    contour,
+    faps_of,
+    lip_lines,
+    lip_points,
+)
+from shared.face.faps import FAPS, MOUTH_FAPS
+
+pytestmark = pytest.mark.unit
+
+
+def test_four_lines_share_their_corners_and_have_16_points() -> None:
+    assert len({point for line in LINES.values() for point in line}) == 16
+    for upper, lower in (("outer upper", "outer lower"), ("inner upper", "inner lower")):
+        assert LINES[upper][0] == LINES[lower][0]
+        assert LINES[upper][-1] == LINES[lower][-1]
+
+
+@pytest.mark.parametrize("opening", [0.0, 1.7, 5.0])
+def test_feature_points_travel_as_measured(opening: float) -> None:
+    lines, points = lip_lines(), lip_points()
+    faps = dict(zip(MOUTH_FAPS, faps_of([opening])[0], strict=True))
+    for name, members in LINES.items():
+        for member in members:
+            point = points[member]
+            assert point.fap is not None
+            assert member in FAPS[point.fap - 1].feature_points
+            sign = 1.0 if FAPS[point.fap - 1].direction == "up" else -1.0
+            rise = sign * faps[point.fap] * 0.39 / 1024.0  # mouth widths
+            assert lines[name].heights([point.x], [opening])[0, 0] == pytest.approx(point.y + rise)
+
+
+def test_curves_have_two_continuous_derivatives() -> None:
+    for line in lip_lines().values():
+        for curve in (line.closed, line.travel):
+            for knot in curve.x[1:-1]:
+                for order in range(3):
+                    before, after = curve([knot - 1e-9, knot + 1e-9], order)
+                    assert before == pytest.approx(after, abs=1e-4)
+
+
+def test_closed_lips_meet_and_open_lips_part() -> None:
+    closed, widest = contour([0.0, 5.0], num_points=101)
+    assert np.abs(closed[1] - closed[2]).max() < 1e-9
+    gap = widest[1, :, 1] - widest[2, :, 1]
+    assert gap.argmax() == 50
+    assert 0.15 < gap.max() < 0.3
+
+
+def test_jaw_falls_with_the_lower_lip() -> None:
+    faps = dict(zip(MOUTH_FAPS, faps_of([5.0])[0], strict=True))
+    assert faps[3] > 100.0
+    assert faps[5] < -300.0
+    assert not faps_of([0.0]).any()
+    # the paper moves lips vertically only
+    assert all(value == 0.0 for fap, value in faps.items() if FAPS[fap - 1].fapu == "MW")
+
+
+@pytest.mark.parametrize("opening", [-0.1, 5.1, float("nan")])
+def test_openings_out_of_range_are_refused(opening: float) -> None:
+    with pytest.raises(ValueError, match="between 0 and 5"):
+        contour([opening])
+    with pytest.raises(ValueError, match="between 0 and 5"):
+        faps_of([opening])
+
+
+def test_drawing_is_the_same_in_svg_and_picture() -> None:
+    moments = [drawing.Moment(0.1 * number, 2.5 * number, "a<", "ba") for number in range(3)]
+    strip = drawing.strip(moments, mouths_a_row=2, mouth_px=60.0)
+    root = ElementTree.fromstring(drawing.svg(strip))  # noqa: S314 - our own
+    assert [element.text for element in root if element.tag.endswith("text")].count("a<") == 3
+    picture = drawing.rasterize(strip)
+    assert picture.shape == (strip.height_px, strip.width_px, 3)
+
+    def dark_rows(moment: drawing.Moment) -> int:
+        """Rows of the middle column that show the inside of the mouth."""
+        column = drawing.rasterize(drawing.image(moment, 320, 240))[:200, 160].astype(int)
+        return int((column.sum(axis=1) < 200).sum())
+
+    assert dark_rows(moments[0]) <= 2 < dark_rows(moments[2])

@@ -1,0 +1,78 @@
+"""``kouxing lips``: the 2-D mouth of a sound."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from xml.etree import ElementTree
+
+import av
+import numpy as np
+import pytest
+
+from services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
+from services.cli.offline import Timing
+from services.driver import picture
+from services.synthesizer.lips.ferguson.contour import LINES, contour
+from shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+SOUND = Path(__file__).parents[2] / "shared" / "demo" / "fast-female.wav"
+NUM_FRAMES = 124  # of 4.925 s
+TEXT = "四是四，十是十，十四是十四，四十是四十。"
+
+
+def test_table_holds_the_contour_of_every_frame(tmp_path: Path) -> None:
+    output = tmp_path / "mouth.csv"
+    draw_mouth(SOUND, TEXT, output, num_points=5)
+    with output.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == CSV_COLUMNS
+    assert len(rows) == NUM_FRAMES * len(LINES) * 5
+    last = rows[-1]
+    assert (last["line"], last["point"]) == ("outer lower", "4")
+    widest = max(rows, key=lambda row: float(row["opening"]))
+    first = next(row for row in rows if row["time_s"] == widest["time_s"])
+    at = rows.index(first)
+    heights = [float(row["y"]) for row in rows[at : at + 20]]
+    expected = contour([float(widest["opening"])], 5)[0, :, :, 1].ravel()
+    np.testing.assert_allclose(heights, expected, atol=1e-4)
+
+
+def test_picture_and_svg_show_every_key_frame(tmp_path: Path) -> None:
+    draw_mouth(SOUND, TEXT, tmp_path / "mouth.svg")
+    draw_mouth(SOUND, TEXT, tmp_path / "mouth.png")
+    root = ElementTree.parse(tmp_path / "mouth.svg").getroot()  # noqa: S314 - our own
+    texts = [element.text for element in root if element.tag.endswith("text")]
+    assert texts.count("si") + texts.count("shi") == 16
+    assert texts.count("iii") + texts.count("ii") == 16
+    pixels = picture.decode((tmp_path / "mouth.png").read_bytes(), "mouth.png")
+    assert pixels.shape[:2] == (int(root.attrib["height"]), int(root.attrib["width"]))
+
+
+def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
+    draw_mouth(SOUND.with_name("vowels-male.wav"), "a1 o1 e2 yi1 wu1 yu1", tmp_path / "mouth.mp4")
+    with av.open(str(tmp_path / "mouth.mp4")) as container:
+        assert container.streams.audio
+        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    assert len(images) == 57  # of 2.275 s
+    gap = [int((image[:, 320].sum(axis=1) < 200).sum()) for image in images]  # dark rows
+    assert gap[0] < 10
+    assert max(gap) > 20
+
+
+@pytest.mark.parametrize(
+    ("text", "output", "timing", "message"),
+    [
+        (TEXT, "mouth.gif", None, "ends in .svg, .png, .mp4, .csv"),
+        (None, "mouth.svg", Timing.ALIGN, "--timing is for a text"),
+        ("", "mouth.svg", None, "text is empty"),
+    ],
+)
+def test_mistakes_are_named(
+    tmp_path: Path, text: str | None, output: str, timing: Timing | None, message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        draw_mouth(SOUND, text, tmp_path / output, timing=timing)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,1 @@
+"""Learns the table of the ferguson lips, and how far each FAP travels."""

@@ -1,0 +1,113 @@
+"""From clips of real lips and a corpus of speech to the table of the ferguson lips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from corpora.feature_cache import read_audio
+from corpora.lip_clips import label_clip, read_clips
+from corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
+from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.alignment import align_phones, spoken
+from services.recognizer.front_end.pcm import progress_of
+from services.synthesizer.lips.ferguson.table import PhoneTable, format_table
+from shared.clock import MEDIA_RATE_HZ
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS
+from shared.phones.inventory import PhoneInventory
+from training.ferguson.lengths import AlignedSpeech, usual_times
+from training.ferguson.openings import fit_openings, travel_of
+from training.progress import Report
+
+_MIN_SYLLABLES = 3  # words alone are spoken slower than speech
+_MAX_OF_SPEAKER = 60  # recordings, so that nobody counts too much
+
+
+def train_ferguson(
+    clips: Path,
+    corpora: Sequence[Path],
+    output: Path,
+    report: Report,
+    *,
+    any_licence: bool = False,
+) -> None:
+    """Learn the table from the clips and the recordings that are for training.
+
+    Raises
+    ------
+    UserError
+        If nothing may be used, or the file cannot be written.
+    """
+    model = load_model()
+    inventory = model.inventory
+    used = [clip for clip in read_clips(clips, any_licence=any_licence) if clip.part == "train"]
+    if not used:
+        raise UserError(
+            f"no clip in {clips} may be used; give clips with a free licence, or --any-licence"
+        )
+    openings = fit_openings(used, [label_clip(model, clip) for clip in used], inventory)
+    errors = RowErrors()
+    rows = training_rows(corpora, inventory, errors, any_licence=any_licence)
+    times = usual_times(aligned_speech(model, rows, errors), inventory)
+    errors.print_to(report)
+    for fap, travel in zip(MOUTH_FAPS, travel_of(used), strict=True):
+        report(f"FAP {fap} travels {travel:.1f} FAP units to the widest mouth (lip_points.tsv)")
+    licences = sorted({clip.licence for clip in used} | {row.licence for row in rows})
+    table = PhoneTable(
+        opening=openings,
+        duration_s=times.duration_s,
+        crossings=times.crossings,
+        level=times.level,
+        influence=times.influence,
+    )
+    about = [
+        "Made by `kouxing train ferguson`; least squares, no seed.",
+        f"Openings from the clips {', '.join(clip.name for clip in used)}; "
+        f"the rest from {len(rows)} recordings.",
+        f"Under: {'; '.join(licences)}",
+    ]
+    try:
+        output.write_text(format_table(table, inventory, about), encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{output}: cannot be written: {error.strerror}") from None
+
+
+def training_rows(
+    corpora: Sequence[Path], inventory: PhoneInventory, errors: RowErrors, *, any_licence: bool
+) -> list[Utterance]:
+    """Read sentences of the training split, some of each speaker.
+
+    Raises
+    ------
+    UserError
+        If there are none.
+    """
+    chosen: list[Utterance] = []
+    of_speaker: dict[str, int] = {}
+    for corpus in corpora:
+        for row in read_corpus(corpus, errors, inventory, split="train"):
+            number = of_speaker.get(row.speaker, 0)
+            is_free = any_licence or may_ship(row.licence)
+            if is_free and len(row.syllables) >= _MIN_SYLLABLES and number < _MAX_OF_SPEAKER:
+                of_speaker[row.speaker] = number + 1
+                chosen.append(row)
+    if not chosen:
+        raise errors.nothing_left(f"in {', '.join(map(str, corpora))}")
+    return chosen
+
+
+def aligned_speech(
+    model: AcousticModel, rows: Sequence[Utterance], errors: RowErrors
+) -> Iterator[AlignedSpeech]:
+    """Align recordings with their texts; those that do not fit are reported."""
+    for row in rows:
+        syllables = syllables_of(row, model.inventory)
+        try:
+            samples = read_audio(row.path)
+            phones = align_phones(model, samples, MEDIA_RATE_HZ, syllables)
+        except (UserError, OSError, ValueError) as error:
+            errors.add(row.utterance_id, str(error))
+            continue
+        yield AlignedSpeech(progress_of(samples), syllables, spoken(phones, model.inventory))
