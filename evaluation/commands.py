@@ -341,6 +341,17 @@ def plot_visemes(
         print_message(f"wrote {path}")
 
 
+@plot_app.command(name="mouths")
+def plot_mouths(
+    folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/mouths"),
+) -> None:
+    """Draw the mouths of the visemes on every head, and with more or less expressiveness."""
+    from evaluation.lips.mouth_sheets import draw_mouth_sheets
+
+    for path in draw_mouth_sheets(folder):
+        print_message(f"wrote {path}")
+
+
 @plot_app.command(name="clip")
 def plot_clip(
     name: Annotated[str, typer.Argument(help="Name of the clip.")],

@@ -89,6 +89,7 @@ class LiveChain:
             frame_rate_hz=synthesizer.frame_rate_hz,
             delay_s=synthesizer.delay_ms / 1e3,
             idle_motion_seed=synthesizer.idle_motion_seed,
+            expressiveness=synthesizer.expressiveness,
         )
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:

@@ -72,6 +72,10 @@ def render(
     sound: Annotated[Path | None, typer.Option(help="Sound for a .fap file.")] = None,
     at: Annotated[float | None, typer.Option(help="When one picture is taken, s.")] = None,
     voice: VoiceFile = None,
+    expressiveness: Annotated[
+        float | None,
+        typer.Option(min=0.5, max=2, help="How large the mouth's movements are for a sound."),
+    ] = None,
 ) -> None:
     """Make a video or pictures of an audio or FAP file."""
     from services.cli.rendering import Shot, render_file
@@ -79,7 +83,10 @@ def render(
     shot = Shot(
         head=head, size=size, background=background, camera=camera, yaw_deg=yaw, pitch_deg=pitch
     )
-    render_file(source, output, shot, lips=lips, rate_hz=rate, sound=sound, at_s=at, voice=voice)
+    render_file(
+        source, output, shot, lips=lips, rate_hz=rate, sound=sound, at_s=at, voice=voice,
+        expressiveness=expressiveness,
+    )  # fmt: skip
 
 
 def phones(

@@ -67,6 +67,7 @@ def render_file(
     sound: Path | None = None,
     at_s: float | None = None,
     voice: Path | None = None,
+    expressiveness: float | None = None,
 ) -> None:
     """Make a video, one picture or a picture for every image.
 
@@ -86,6 +87,8 @@ def render_file(
         Time of the one picture.
     voice
         The voice of who speaks in a sound, for learnt lips.
+    expressiveness
+        How large the mouth's movements are for a sound, 0.5 to 2; None: the default.
 
     Raises
     ------
@@ -101,6 +104,8 @@ def render_file(
         raise UserError(f"--lips is for a sound; {source} holds the motion of its lips")
     if voice is not None and _is_fap(source):
         raise UserError(f"--voice is for a sound; {source} holds the motion of its lips")
+    if expressiveness is not None and _is_fap(source):
+        raise UserError(f"--expressiveness is for a sound; {source} holds the motion of its lips")
     if not is_picture:
         check_name(output)
     lips = lips or [DEFAULT_LIP_MODEL]
@@ -109,7 +114,7 @@ def render_file(
         if _is_fap(source):
             animation = _read_animation(source, sound)
         else:
-            animation = _animate(source, lips, voice, progress)
+            animation = _animate(source, lips, voice, expressiveness, progress)
         if not animation.frames:
             raise UserError(f"{source}: it has no frames")
         if is_picture:
@@ -162,7 +167,11 @@ def _read_animation(source: Path, sound: Path | None) -> _Animation:
 
 
 def _animate(
-    source: Path, lips: Sequence[LipModelName], voice: Path | None, progress: Progress
+    source: Path,
+    lips: Sequence[LipModelName],
+    voice: Path | None,
+    expressiveness: float | None,
+    progress: Progress,
 ) -> _Animation:
     """Make the frames that the services, by their defaults, would make of a sound."""
     samples = read_mono_16k(source)
@@ -171,10 +180,13 @@ def _animate(
     lips_from_sound = _lips_of(model, voice)
     faces: list[list[film.Frame]] = []
     for name in lips:
+        settings = SynthesizerConfig(lips=name)
+        if expressiveness is not None:
+            settings = settings.model_copy(update={"expressiveness": expressiveness})
         chain = LiveChain(
             model,
             load_lip_model(name=name),
-            synthesizer=SynthesizerConfig(lips=name),
+            synthesizer=settings,
             lips_from_sound=lips_from_sound,
         )
         frames: list[film.Frame] = []

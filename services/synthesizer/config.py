@@ -35,6 +35,9 @@ class SynthesizerConfig(ServiceConfig):
     idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
     """Seed of blinks, gaze and head motion; with 0 the mouth alone moves."""
 
+    expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
+    """How large the mouth's movements are; 1 for those of the lip model. Closures stay closed."""
+
     @model_validator(mode="before")
     @classmethod
     def _delay_of_the_lips(cls, values: dict[str, object]) -> dict[str, object]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from services.synthesizer.lips.dynamic_visemes.trajectory import NO_TRANSITION, Motion, Transition
 from services.synthesizer.lips.lip_model import LipModel, MouthFrame
 from services.synthesizer.modifiers.amplitude import Amplitude
+from services.synthesizer.modifiers.expressiveness import Expressiveness
 from services.synthesizer.modifiers.idle_motion import IdleMotion
 from services.synthesizer.modifiers.modifier import Modifier, Moment
 from shared.errors import UserError
@@ -50,6 +51,8 @@ class Face:
         0 to 0.3: how much later than its sound a frame is made.
     idle_motion_seed
         Seed of blinks, gaze and head motion; with 0 the mouth alone moves.
+    expressiveness
+        0.5 to 2: how large the mouth's movements are; 1 for those of the lip model.
 
     Raises
     ------
@@ -58,7 +61,13 @@ class Face:
     """
 
     def __init__(
-        self, lips: LipModel, *, frame_rate_hz: float, delay_s: float, idle_motion_seed: int = 0
+        self,
+        lips: LipModel,
+        *,
+        frame_rate_hz: float,
+        delay_s: float,
+        idle_motion_seed: int = 0,
+        expressiveness: float = 1.0,
     ) -> None:
         if not 0.0 <= delay_s <= MAX_DELAY_S:
             raise UserError(f"delay_s is {delay_s:g}; give 0 to {MAX_DELAY_S:g} seconds")
@@ -68,6 +77,7 @@ class Face:
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s
         self._idle_motion_seed = idle_motion_seed
+        self._expressiveness = expressiveness
         self._event_s = 0.0  # of the last event
         self._begin(0.0)
 
@@ -85,6 +95,8 @@ class Face:
             self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s
         )
         self._modifiers: list[Modifier] = [Amplitude()]  # applied in this order
+        if self._expressiveness != 1.0:
+            self._modifiers.append(Expressiveness(self._expressiveness))
         if self._idle_motion_seed:
             self._modifiers.append(IdleMotion(self._idle_motion_seed))
 

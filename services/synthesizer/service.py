@@ -90,6 +90,7 @@ class SynthesizerService(Service):
             frame_rate_hz=self.frame_rate_hz,
             delay_s=self._config.delay_ms / 1e3,
             idle_motion_seed=self._config.idle_motion_seed,
+            expressiveness=self._config.expressiveness,
         )
 
     def stop_session(self, session: str) -> None:

@@ -194,7 +194,7 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     samples = samples_of_file(DEMO / "vowels-male.wav")
-    chain = LiveChain(load_model(), LIPS)
+    chain = LiveChain(load_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
     frames = chain.accept_waveform(samples) + chain.input_finished()
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
     scored = live_scheme("lips", LIPS, DEFAULT_DELAY_S).frames(hear(load_model(), clip, None))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.driver.head.head import Head
+from services.driver.head.head import Head, neutral_faps
 from shared.face import high_level
 from shared.face.faps import NUM_FAPS
 from tests import heads
@@ -150,6 +150,25 @@ def test_teeth_show_in_i(head: Head) -> None:
     upper_lip, lower_lip, edge = place_mm(head, VISEMES["i"], "2.2", "2.3", "9.10")
     assert upper_lip[1] - edge[1] > 2
     assert edge[1] > lower_lip[1]
+
+
+def test_edge_of_the_upper_teeth_lies_a_little_below_the_lips_at_rest(head: Head) -> None:
+    upper_lip, edge = place_mm(head, VISEMES["NA"], "2.2", "9.10")  # between the middle teeth,
+    assert 0.2 < upper_lip[1] - edge[1] < 1.5  # which reach 0.8 to 1 mm lower
+
+
+def test_lower_teeth_show_once_the_jaw_drops(head: Head) -> None:
+    dropped = neutral_faps(open_jaw=300, raise_b_midlip=-580)  # as in a
+    for faps, shows in ((VISEMES["NA"], False), (VISEMES["v"], False), (dropped, True)):
+        lower_lip, edge = place_mm(head, faps, "2.3", "9.11")
+        assert (edge[1] > lower_lip[1]) == shows
+
+
+def test_body_of_the_tongue_rises_for_k_g_and_lies_low_for_a(head: Head) -> None:
+    raised, rest, low = (
+        place_mm(head, high_level.viseme_faps(select, 0, 63), "6.2")[0, 1] for select in (5, 0, 10)
+    )
+    assert low + 4 < rest < raised - 3
 
 
 @pytest.mark.parametrize("faps", [VISEMES["f"], high_level.viseme_faps(2, 0, 63)])

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.unit
 # the page does the same: services/gateway/page/tests/mouth-light.test.js
 @pytest.mark.parametrize(
     ("upper", "lower", "pushed", "light"),
-    [(0, 0, 0, 0.08), (0, -120, 0, 0.4868), (-20, -120, 260, 0.3372), (-280, -600, 70, 0.8746)],
+    [(0, 0, 0, 0.08), (0, -120, 0, 0.5698), (-20, -120, 260, 0.4065), (-280, -600, 70, 0.9242)],
 )
 def test_little_light_comes_through_a_small_mouth_or_pushed_lips(
     upper: float, lower: float, pushed: float, light: float

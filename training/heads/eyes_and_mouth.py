@@ -34,8 +34,8 @@ def teeth_pieces(fapu: dict[str, float]) -> list[Piece]:
     """Make the upper and the lower teeth; the lower ones move with the jaw."""
     pieces = []
     for name, widths, edge, front, up in (
-        ("teeth_upper", parts.UPPER_TEETH, 5.142, 1.222, 1.0),
-        ("teeth_lower", parts.LOWER_TEETH, 5.148, 1.188, -1.0),
+        ("teeth_upper", parts.UPPER_TEETH, 5.144, 1.238, 1.0),
+        ("teeth_lower", parts.LOWER_TEETH, 5.146, 1.206, -1.0),
     ):
         part = parts.tooth_row(widths, edge, front, up)
         still = np.ones(len(part.vertices))
@@ -50,7 +50,7 @@ def tongue_piece(tongue: Skin, fapu: dict[str, float]) -> Piece:
     top = np.clip((y - 5.15) / 0.05, 0, 1)
     to_tip = np.clip((z - 0.56) / 0.59, 0, 1)
     groove = 0.014 * np.exp(-((x / 0.045) ** 2)) * top * np.clip(3 * (1 - to_tip), 0, 1)
-    sunk = 0.078 - 0.020 * to_tip**2 + groove + 0.02 * np.abs(x) / 0.19
+    sunk = 0.110 - 0.052 * to_tip**2 + groove + 0.02 * np.abs(x) / 0.19
     points = np.stack([1.28 * x, y - sunk, z - 0.03], axis=1)
     uv = np.clip(points[:, [0, 2]] * [1.8, 1.4] + [0.5, -0.65], 0, 1)
     part = parts.Part(points, surface.triangles_of(tongue.quads), uv, np.ones_like(points))

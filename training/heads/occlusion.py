@@ -161,9 +161,9 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
         elif piece.name.startswith("hair"):
             part.colors = np.repeat(0.45 + 0.55 * own, 3, axis=1)
         elif piece.name.startswith("teeth"):
-            part.colors = part.colors * (0.70 + 0.30 * np.clip(2 * own, 0, 1))
+            part.colors = part.colors * (0.80 + 0.20 * np.clip(2 * own, 0, 1))
         elif piece.name == "tongue":
-            lit = np.clip(0.5 + 1.5 * own, 0, 1) * _into_mouth(part.vertices[:, 2] + 0.2)
+            lit = np.clip(0.5 + 1.5 * own, 0, 1) * _into_mouth(part.vertices[:, 2] + 0.22)
             part.colors = lit * np.array([1.0, 0.85, 0.85])
 
 

@@ -66,7 +66,7 @@ def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Floa
 
 def tongue(size: int = 128) -> Float:
     """Paint the tongue, seen from above, its tip at the bottom: papillae, and a groove."""
-    rough = 0.05 * noise((size, size), 0.9, 9) + 0.05 * noise((size, size), 5.0, 10)
+    rough = 0.06 * noise((size, size), 0.8, 9) + 0.02 * noise((size, size), 4.0, 10)
     across = (np.arange(size) + 0.5) / size - 0.5
     groove = 0.22 * np.exp(-((across / 0.035) ** 2))
     image = np.array([0.80, 0.45, 0.44]) * (1 + rough - groove)[..., None]

@@ -75,6 +75,7 @@ def pupil_growth(part: Part, centre: Float) -> Float:
 UPPER_TEETH = (8.4, 6.6, 7.4, 6.8, 6.6, 9.5, 9.0)
 LOWER_TEETH = (5.4, 5.8, 6.6, 6.9, 7.0, 10.0, 9.5)
 _TOOTH_COLUMNS = 6
+_ARCH_HALF_WIDTH, _ARCH_DEPTH = 0.300, 0.44  # of half an ellipse
 # profile of a tooth row from the gum in front over the cutting edge to the back:
 # (outwards, away from the edge, texture row)
 _PROFILE = np.array(
@@ -115,12 +116,14 @@ def tooth_row(widths: tuple[float, ...], edge_y: float, front_z: float, up: floa
 
     # the arch: half an ellipse, walked by its length
     angle = np.linspace(-np.pi / 2, np.pi / 2, 2001)
-    arch = np.stack([0.275 * np.sin(angle), 0.44 * np.cos(angle)], axis=1)
+    arch = np.stack([_ARCH_HALF_WIDTH * np.sin(angle), _ARCH_DEPTH * np.cos(angle)], axis=1)
     walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(arch, axis=0), axis=1))])
     walked -= walked[-1] / 2
     at = np.interp(place, walked, angle)
-    x, z = 0.275 * np.sin(at), front_z - 0.44 + 0.44 * np.cos(at)
-    outward = np.stack([np.sin(at) / 0.275, np.zeros_like(at), np.cos(at) / 0.44], axis=1)
+    x, z = _ARCH_HALF_WIDTH * np.sin(at), front_z - _ARCH_DEPTH + _ARCH_DEPTH * np.cos(at)
+    outward = np.stack(
+        [np.sin(at) / _ARCH_HALF_WIDTH, np.zeros_like(at), np.cos(at) / _ARCH_DEPTH], axis=1
+    )
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
 
     back = np.abs(place) / half[-1]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _DEPTH = 500.0  # of the teeth behind the lips at rest, FAP units (MNS / 1024)
-_SPREAD = 0.35
+_SPREAD = 0.25
 _FLOOR = 0.08
 
 

@@ -1,7 +1,7 @@
 // How much light falls on teeth and tongue: as services/driver/head/mouth_light.py.
 
 const DEPTH = 500; // of the teeth behind the lips at rest, FAP units (MNS / 1024)
-const SPREAD = 0.35;
+const SPREAD = 0.25;
 const FLOOR = 0.08;
 
 /** Share of the light, 0 to 1, for 68 FAPs. */

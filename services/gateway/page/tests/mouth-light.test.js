@@ -5,9 +5,9 @@ import { mouthLight } from "../mouth-light.js";
 // as in tests/unit/test_mouth_light.py
 for (const [upper, lower, pushed, light] of [
   [0, 0, 0, 0.08],
-  [0, -120, 0, 0.4868],
-  [-20, -120, 260, 0.3372],
-  [-280, -600, 70, 0.8746],
+  [0, -120, 0, 0.5698],
+  [-20, -120, 260, 0.4065],
+  [-280, -600, 70, 0.9242],
 ]) {
   test(`lips at ${upper} and ${lower}, pushed ${pushed}`, () => {
     const faps = new Float32Array(68);

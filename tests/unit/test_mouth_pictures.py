@@ -1,0 +1,66 @@
+"""Mouths are told apart on mute pictures at viewing distance."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.driver.config import Framing
+from services.driver.head.head import Head
+from services.driver.render.camera import Camera
+from services.driver.render.renderer import Renderer
+from services.driver.render.scene import camera
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from services.synthesizer.modifiers.expressiveness import Expressiveness
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from tests import heads
+from tests.lips import LIPS
+
+pytestmark = pytest.mark.unit
+
+VISEMES = "a i u o e v f b".split()
+SIZE_PX = (640, 480)
+MIN_PIXELS = 300  # that differ between two mouths,
+MIN_CHANGE = 30  # each by so much of 255
+
+
+def spoken(viseme: str) -> NDArray[np.float32]:
+    """FAPs (68,) of a viseme's target as the services send it by default."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[np.array(MOUTH_FAPS) - 1] = LIPS.parameters.target[VISEME_INDEX[viseme]]
+    Expressiveness(SynthesizerConfig().expressiveness).scale(faps)
+    return faps
+
+
+@pytest.fixture(scope="module", params=heads.NAMES)
+def head(request: pytest.FixtureRequest) -> Head:
+    name: str = request.param
+    return heads.load(name, "coarse")
+
+
+def draw(head: Head, visemes: list[str], view: Camera) -> list[NDArray[np.int32]]:
+    renderer = Renderer(head, *SIZE_PX, samples=0, camera=view)
+    pictures = [renderer.draw(spoken(viseme)).astype(np.int32) for viseme in visemes]
+    renderer.close()
+    return pictures
+
+
+def test_each_two_mouths_differ(head: Head) -> None:
+    pictures = dict(zip(VISEMES, draw(head, VISEMES, camera(head)), strict=True))
+    for one, other in combinations(VISEMES, 2):
+        mouth = np.abs(pictures[one] - pictures[other])[240:420, 220:420]
+        assert (mouth.max(axis=2) > MIN_CHANGE).sum() > MIN_PIXELS, (one, other)
+
+
+def test_rounded_lips_stand_out_in_profile(head: Head) -> None:
+    """The lips' outline in u and in ü is further to the front (left) than in i."""
+    fronts = []
+    for picture in draw(head, ["u", "v", "i"], camera(head, Framing.MOUTH, 90.0)):
+        background = picture[:, :20].mean(axis=1, keepdims=True)
+        is_face = np.abs(picture - background).max(axis=2) > 40
+        fronts.append(np.argmax(is_face[200:300], axis=1).min())  # rows of the lips
+    assert max(fronts[:2]) < fronts[2] - 8
