@@ -1,6 +1,21 @@
-"""Runs the command line as ``python -m services``."""
+"""Runs the command line, as ``kouxing`` or ``python -m services``.
 
-from services.cli.main import main
+Ctrl-C ends a command that still imports what it needs, without a traceback.
+"""
+
+from __future__ import annotations
+
+import signal
+
+
+def main() -> None:
+    """Run the command line."""
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from services.cli.main import main as run_command_line
+
+    signal.signal(signal.SIGINT, interrupt)
+    run_command_line()
+
 
 if __name__ == "__main__":
     main()

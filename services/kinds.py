@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import pkgutil
 import socket
 from collections.abc import Collection, Mapping
@@ -10,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from shared.config import COMMON, Bound, ServiceConfig, Settings, bound_keys, variable
+from shared.endpoints import WILDCARDS
+from shared.errors import UserError
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,15 +68,18 @@ KINDS = {
 }
 
 
-def read_settings(file: Path | None = None) -> Settings:
-    """Return what a file and the environment say about all services.
+def read_settings(
+    file: Path | None = None, assignments: Mapping[str, str] | None = None
+) -> Settings:
+    """Return what a file, the environment and a command line say about all services.
 
     Raises
     ------
     UserError
         As ``shared.config.Settings``.
     """
-    return Settings({kind.name: kind.config_type for kind in KINDS.values()}, file=file)
+    types = {kind.name: kind.config_type for kind in KINDS.values()}
+    return Settings(types, file=file, assignments=assignments)
 
 
 def free_addresses(
@@ -103,3 +109,42 @@ def free_addresses(
     if "control" in names:
         environment[variable(COMMON, "control")] = environment[variable("control", "commands")]
     return environment
+
+
+def available_addresses(settings: Settings) -> dict[str, str]:
+    """Return an environment in which services bind free ports where default ones are taken.
+
+    Raises
+    ------
+    UserError
+        If a port that was chosen is taken.
+    """
+    free = free_addresses()
+    environment = {}
+    for kind in KINDS.values():
+        values = {each.key: each for each in settings.describe(kind.config_type)}
+        bound = bound_keys(kind.config_type)
+        host = next((str(values[key].value) for key in bound if bound[key] is Bound.HOST), "")
+        for key in (key for key in bound if bound[key] is not Bound.HOST):
+            setting = values[key]
+            endpoint_host, _, port = str(setting.value).removeprefix("tcp://").rpartition(":")
+            if port not in ("0", "*"):
+                if not _is_taken(endpoint_host or host, int(port)):
+                    continue
+                if setting.origin != "default":
+                    raise UserError(
+                        f"{kind.name}.{key}: another program has port {port}; choose another, or"
+                        " none to get a free one"
+                    )
+            environment[variable(kind.name, key)] = free[variable(kind.name, key)]
+    return environment
+
+
+def _is_taken(host: str, port: int) -> bool:
+    host = "" if host in WILDCARDS else host.strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host, port), family=family):
+            return False
+    except OSError as error:
+        return error.errno == errno.EADDRINUSE

@@ -1,4 +1,7 @@
-"""A service as a process: read the configuration, run, and say how it ended."""
+"""A service as a process: read the configuration, run, and say how it ended.
+
+What takes long to import is imported once Ctrl-C gives no traceback any more.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,10 @@ import signal
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from services.kinds import KINDS, read_settings
-from shared.config import parse_assignments
-from shared.errors import UserError
-from shared.service import Service, run_service
+if TYPE_CHECKING:
+    from shared.service import Service
 
 
 def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
@@ -33,6 +35,10 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
         If the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while it starts is no error
+    from services.kinds import KINDS, read_settings
+    from shared.config import parse_assignments
+    from shared.service import run_service
+
     kind = KINDS[name]
     config = read_settings(file).load(kind.config_type, parse_assignments(assignments))
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # peers come and go
@@ -46,6 +52,10 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
 
 def run_module(name: str) -> None:
     """Run ``python -m services.<name>``: a service without the command line's other commands."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from services.kinds import KINDS
+    from shared.errors import UserError
+
     parser = argparse.ArgumentParser(
         prog=f"python -m services.{name}", description=KINDS[name].summary
     )

@@ -138,7 +138,7 @@ class Client:
                     if isinstance(answer, Message):
                         return answer
         raise UserError(
-            f"control at {self._control} does not answer; is 'kouxing run' running there?"
+            f"control at {self._control} does not answer; is it running? to start it: kouxing run"
         )
 
 

@@ -129,6 +129,8 @@ class Settings:
         A TOML file, if there is one.
     environment
         Defaults to the process's own.
+    assignments
+        Values from the command line, by ``service.key``.
 
     Raises
     ------
@@ -142,11 +144,13 @@ class Settings:
         *,
         file: Path | None = None,
         environment: Mapping[str, str] | None = None,
+        assignments: Mapping[str, str] | None = None,
     ) -> None:
         self._tables: dict[str, type[ServiceConfig]] = {COMMON: ServiceConfig, **types}
         self._layers = (
             {} if file is None else _read_file(file, self._tables),
             _read_environment(os.environ if environment is None else environment, self._tables),
+            _read_assignments(assignments or {}, self._tables),
         )
 
     def load(self, config_type: type[Config], overrides: Mapping[str, str] | None = None) -> Config:
@@ -299,6 +303,19 @@ def _read_environment(
             layer.setdefault(table, {})[key] = Given(text, f"${name}")
         elif name.startswith(PREFIX):
             raise UserError(f"${name}: unknown variable; {_nearest(name, known)}")
+    return layer
+
+
+def _read_assignments(
+    assignments: Mapping[str, str], tables: Mapping[str, type[ServiceConfig]]
+) -> Layer:
+    known = [f"{table}.{key}" for table, each in tables.items() for key in each.model_fields]
+    layer: Layer = {}
+    for name, text in assignments.items():
+        if name not in known:
+            raise UserError(f"--set {name}: there is no such key; {_nearest(name, known)}")
+        table, _, key = name.partition(".")
+        layer.setdefault(table, {})[key] = Given(text, "--set")
     return layer
 
 

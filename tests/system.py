@@ -34,7 +34,8 @@ def free_port(host: str = "127.0.0.1") -> int:
 
 def own_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which all services run on ports of their own, driver headless."""
-    return {**os.environ, **ONE_THREAD, **headless(folder), **free_addresses()}
+    own = {"XDG_RUNTIME_DIR": str(folder)}  # where its user's commands would find it
+    return {**os.environ, **ONE_THREAD, **headless(folder), **free_addresses(), **own}
 
 
 def headless(folder: Path) -> dict[str, str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -24,6 +25,7 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
     for name, figures in results.items():
         console.rule(name)
         console.print(_outputs(figures))
+        console.print(_live_outputs(figures))
         console.print(_speakers(figures))
         console.print(_labials(figures))
         cost = figures["cpu_per_audio_second"]
@@ -39,10 +41,10 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
 
 
 def _outputs(figures: Figures) -> Table:
-    columns = ("output", "phone error %", "95 %", "ins / del / sub %", "viseme error %", "95 %")
+    columns = ("output", "phone error %", "95 %", "ins/del/sub %", "viseme error %", "95 %")
     table = _table(
         f"{figures['split']}: {figures['recordings']} recordings, {figures['speakers']} speakers",
-        (*columns, "final, phones / visemes", "delay p50 / p95 ms"),
+        columns,
     )
     for score in figures["scores"]:
         table.add_row(
@@ -52,15 +54,22 @@ def _outputs(figures: Figures) -> Table:
             _kinds(score["phone_errors"]),
             percent(score["viseme_error_rate"]),
             _interval(score["viseme_interval_95"]),
-            _rates(score, "final_"),
-            _delay(score),
         )
+    return table
+
+
+def _live_outputs(figures: Figures) -> Table:
+    columns = ("output", "final phone / viseme error %", "delay p50 / p95 ms")
+    table = _table("live", columns)
+    for score in figures["scores"]:
+        if _delay(score):
+            table.add_row(score["output"], _rates(score, "final_"), _delay(score))
     return table
 
 
 def _speakers(figures: Figures) -> Table:
     full, live = figures["scores"][0], figures["scores"][-1]
-    columns = ("speaker", "phones", "phone error %", "ins / del / sub %", "viseme error %")
+    columns = ("speaker", "phones", "phone error %", "ins/del/sub %", "viseme error %")
     outputs = (f"phone error %, {live['output']}", "final phone error %")
     table = _table(f"by speaker, {full['output']}", (*columns, *outputs))
     for speaker, errors in full["phone_errors_by_speaker"].items():
@@ -95,7 +104,7 @@ def _side_by_side(results: Mapping[str, Figures]) -> Table:
 
 
 def _table(title: str, columns: Iterable[str]) -> Table:
-    table = Table(title=title)
+    table = Table(title=title, box=box.SIMPLE, padding=(0, 1, 0, 0), title_justify="left")
     for number, column in enumerate(columns):
         table.add_column(column, justify="right" if number else "left")
     return table
@@ -114,12 +123,12 @@ def _rates(score: Figures, hypothesis: str = "") -> str:
 
 
 def _interval(bounds: tuple[float, float] | None) -> str:
-    return "-" if bounds is None else f"{percent(bounds[0])} - {percent(bounds[1])}"
+    return "-" if bounds is None else f"{percent(bounds[0])}-{percent(bounds[1])}"
 
 
 def _kinds(errors: Mapping[str, int]) -> str:
     kinds = ("insertions", "deletions", "substitutions")
-    return " / ".join(percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
+    return "/".join(percent(errors[kind] / max(1, errors["reference"])) for kind in kinds)
 
 
 def _delay(score: Figures) -> str:

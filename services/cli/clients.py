@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from services.cli.running_system import find_control
 from services.cli.terminal import CONSOLE, JsonFile, VoiceFile, print_message, write_json
 from services.kinds import read_settings
 from shared.config import ServiceConfig
+from shared.errors import UserError
 
 SHOWN_FIGURES = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
 Control = Annotated[
-    str, typer.Option(help="Where control takes commands; else $KOUXING_CONTROL, else this host.")
+    str,
+    typer.Option(help="Address of control; else $KOUXING_CONTROL, else the system you run here."),
 ]
+
+
+class Shown(StrEnum):
+    """What ``kouxing listen`` prints."""
+
+    FAPS = "faps"
+    SYLLABLES = "syllables"
+    PHONES = "phones"
 
 
 def speak(
@@ -53,9 +67,9 @@ def speak(
         audio = open_audio(Path(source))
     summary = stream(
         audio,
-        _control_address(control),
+        control_address(control),
         CONSOLE,
-        session=session,
+        session=_session_name(session),
         record=record,
         paced=not fast,
         voice=profile,
@@ -68,59 +82,81 @@ def speak(
 
 
 def listen(
-    session: Annotated[str, typer.Argument(help="Name of the session; it may open later.")],
+    session: Annotated[
+        str,
+        typer.Argument(help="Name of the session, which may open later; without it, the newest."),
+    ] = "",
+    show: Annotated[
+        Shown, typer.Option(help="What to print; syllables and phones once they are final.")
+    ] = Shown.FAPS,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Record to a .fap or .jsonl file.")
+        Path | None,
+        typer.Option("--output", "-o", help="Record the FAP frames to a .fap or .jsonl file."),
     ] = None,
     control: Control = "",
 ) -> None:
-    """Print or record the FAP stream of a session until it ends."""
+    """Print or record what a session shows, until it ends."""
     from services.cli.follow import follow
 
-    follow(session, output, _control_address(control), CONSOLE)
+    follow(_session_name(session), output, show, control_address(control))
 
 
 def status(control: Control = "", json_file: JsonFile = None) -> None:
     """Show services, sessions, rates and latencies."""
     from shared.client import Client
 
-    with Client(_control_address(control), deadline_s=3.0) as client:
+    with Client(control_address(control), deadline_s=3.0) as client:
         report = client.status()
     out = Console()
-    table = Table("service", "instance", "role", "state", "heartbeat s ago", "clock ms", "figures")
+    services = Table("service", "state", "answered", "figures", box=box.SIMPLE)
     for service in report.services:
         figures = ", ".join(
             f"{name} {value:.4g}"
             for name, value in sorted(service.metrics.items())
             if name.endswith(("_p50", "_p95")) or name in SHOWN_FIGURES or _is_drop(name)
         )
-        table.add_row(
-            escape(service.service),
-            escape(service.instance),
-            service.role,
-            service.state,
-            f"{service.age_s:.1f}",
-            f"{service.clock_offset_ms:.1f}",
-            escape(figures),
+        services.add_row(
+            escape(service.instance), service.state, f"{service.age_s:.1f} s ago", escape(figures)
         )
-    out.print(table)
-    sessions = Table("session", "state", "open s", "speaking", "workers")
-    for each in report.sessions:
-        speaking = "yes" if each.speaking else "no"
-        sessions.add_row(
-            each.session,
-            each.state,
-            f"{each.age_s:.0f}",
-            speaking,
-            escape(", ".join(sorted({*each.workers.values()}))),
-        )
-    out.print(sessions)
+    out.print(services)
+    if not report.sessions:
+        out.print("no session is open")
+    else:
+        sessions = Table("session", "state", "open for", "speaking", "workers", box=box.SIMPLE)
+        for each in report.sessions:
+            sessions.add_row(
+                each.session,
+                each.state,
+                f"{each.age_s:.0f} s",
+                "yes" if each.speaking else "no",
+                escape(", ".join(sorted({*each.workers.values()}))),
+            )
+        out.print(sessions)
     write_json(json_file, asdict(report))
+
+
+def _session_name(name: str) -> str:
+    """Return a name that a session can have, or an empty one.
+
+    Raises
+    ------
+    UserError
+        If no session can have it.
+    """
+    if not re.fullmatch("[A-Za-z0-9_-]{0,64}", name):
+        raise UserError(
+            f"no session can be called {name!r}; use up to 64 letters, digits, '-' and '_'"
+        )
+    return name
 
 
 def _is_drop(name: str) -> bool:
     return name.startswith("dropped_") and not name.endswith("_per_s")
 
 
-def _control_address(given: str) -> str:
-    return read_settings().load(ServiceConfig, {"control": given} if given else {}).control
+def control_address(given: str) -> str:
+    """Return where control is: as told, else the user's newest system, else the default."""
+    settings = read_settings().describe(ServiceConfig, {"control": given} if given else {})
+    control = next(each for each in settings if each.key == "control")
+    found = find_control() if control.origin == "default" else ""
+    return found or str(control.value)

@@ -28,7 +28,7 @@ A value comes from, weakest first:
 1. the default below,
 2. a TOML file (`--config FILE`) with one table per service, such as `[recognizer]`,
 3. the environment, as `KOUXING_<SERVICE>_<KEY>`, such as `KOUXING_RECOGNIZER_MIN_CONFIDENCE`,
-4. the command line of a service, as `--set KEY=VALUE`.
+4. the command line: `--set KEY=VALUE` of a service, `--set SERVICE.KEY=VALUE` of `kouxing run`.
 
 Every service also has the keys of `[common]`. They can be set for all services, in the table
 `[common]` or as `KOUXING_<KEY>`, and for one service, which counts more. A key, table or variable
@@ -52,15 +52,14 @@ def config(
     """Print all keys: meaning, range, default, present value and where it came from."""
     if service and service not in TABLES:
         raise UserError(f"there is no service {service!r}; write one of {', '.join(TABLES)}")
-    if assignments and not service:
-        raise UserError("--set is for one service; name it, as in: kouxing config driver --set ...")
+    values = parse_assignments(assignments or [])
     if markdown:
         text = markdown_page()
     elif service:
-        values = parse_assignments(assignments or [])
         text = _toml_table(service, read_settings(config).describe(TABLES[service], values))
     else:
-        text = "\n".join(_toml_table(*each) for each in _all_settings(read_settings(config)))
+        settings = read_settings(config, values)
+        text = "\n".join(_toml_table(*each) for each in _all_settings(settings))
     sys.stdout.write(text)
 
 

@@ -1,4 +1,4 @@
-"""Prints or records the FAP stream of a session."""
+"""Prints or records what a session shows: FAP frames, syllables or phones."""
 
 from __future__ import annotations
 
@@ -6,29 +6,48 @@ import json
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
+from services.cli.clients import Shown
+from services.cli.terminal import check_output, print_message
 from shared.client import Client
 from shared.clock import to_seconds
 from shared.errors import UserError
 from shared.face.fap_file import FapAnimation, write_fap
 from shared.face.faps import FAPS, NUM_FAPS
 from shared.follower import PollingLoop, SessionFollower
+from shared.phones import events
+from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
+from shared.phones.syllables import SyllableTrack
+from shared.wire.control import SessionState
+from shared.wire.events import phone_of
 from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.speech import Phone
 
 OPEN_POLL_S = 0.2
-SILENT_S = 2.0  # without frames, control is asked where the session is
+SILENT_S = 2.0  # without messages, control is asked where the session is
 SHOWN_FAPS = (3, 4, 5, 6, 16, 17)  # of a printed frame: jaw, lips, corner, protrusion
+LEGEND = "the columns: " + ", ".join(f"FAP {n} {FAPS[n - 1].name}" for n in SHOWN_FAPS)
+
+Followed = TypeVar("Followed", bound=Message)
+Line = TypeVar("Line")
 
 
-def follow(session: str, output: Path | None, control: str, console: Console) -> None:
+def follow(session: str, output: Path | None, shown: Shown, control: str) -> None:
     """Follow a session from now on to its end.
+
+    Parameters
+    ----------
+    session
+        Its name; empty: the newest that is open, or else the next.
+    output
+        File for the FAP frames; None: print what ``shown`` says.
 
     Raises
     ------
@@ -36,67 +55,105 @@ def follow(session: str, output: Path | None, control: str, console: Console) ->
         If control does not answer or the file cannot be written.
     """
     if output is not None and output.suffix not in (".fap", ".jsonl"):
-        raise UserError(f"{output}: write to a .fap or .jsonl file")
+        raise UserError(f"{output}: unknown kind of file; write to .fap or .jsonl")
+    if output is not None and shown is not Shown.FAPS:
+        raise UserError(f"--show {shown} is for the terminal; a file takes FAP frames")
+    check_output(output)
     with Client(control) as client:
-        with console.status(f"waiting for session {session}"):
-            while (endpoints := _endpoints(session, client)) is None:
-                time.sleep(OPEN_POLL_S)
-        frames = _frames(session, endpoints, client, console)
+        state = _wait_for_session(session, client)
+        session = state.session
         try:
-            if output is None:
-                num_frames = _print(frames, sys.stdout, _as_row)
+            if shown is not Shown.FAPS:
+                inventory = load_inventory(state.language or DEFAULT_LANGUAGE)
+                rows = _phone_rows(_messages(Phone, state, client), shown, inventory)
+                num_lines = _print(rows, sys.stdout, str)
+            elif output is None:
+                print_message(LEGEND)
+                num_lines = _print(_messages(FapFrame, state, client), sys.stdout, _as_row)
             elif output.suffix == ".jsonl":
                 with output.open("w", encoding="utf-8") as file:
-                    num_frames = _print(frames, file, _as_json)
+                    num_lines = _print(_messages(FapFrame, state, client), file, _as_json)
             else:
-                num_frames = _write_fap(output, session, list(frames))
+                frames = list(_messages(FapFrame, state, client))
+                num_lines = _write_fap(output, session, frames)
         except OSError as error:
             raise UserError(f"{output}: cannot be written: {error.strerror}") from None
-    console.print(f"session {session} ended: {num_frames} FAP frames", highlight=False)
+    unit = "FAP frames" if shown is Shown.FAPS else shown.value
+    print_message(f"session {session} ended: {num_lines} {unit}")
+    if output is not None:
+        print_message(f"wrote {output}")
 
 
-def _endpoints(session: str, client: Client) -> dict[str, str] | None:
-    """Return where a session is published; None if it is not open."""
-    for state in client.status().sessions:
-        if state.session == session and "faps" in state.endpoints:
-            return state.endpoints
-    return None
+def _wait_for_session(name: str, client: Client) -> SessionState:
+    """Return an open session of that name (empty: the newest), once there is one."""
+    found = _find_session(name, client)
+    if found is None:
+        wanted = f"session {name}" if name else "a session"
+        opener = f"speak my.wav --session {name}" if name else "speak my.wav"
+        print_message(f"waiting for {wanted} to open, as with kouxing {opener}; Ctrl-C ends")
+    while found is None:
+        time.sleep(OPEN_POLL_S)
+        found = _find_session(name, client)
+    return found
 
 
-def _frames(
-    session: str, endpoints: dict[str, str], client: Client, console: Console
-) -> Iterator[FapFrame]:
-    """Yield frames, wherever the session moves, until it ends or the user interrupts."""
-    frames: deque[FapFrame] = deque()
+def _find_session(name: str, client: Client) -> SessionState | None:
+    """Return an open session that is published; None if there is none."""
+    published = [
+        state
+        for state in client.status().sessions
+        if name in ("", state.session) and "faps" in state.endpoints
+    ]
+    return min(published, key=lambda state: state.age_s, default=None)
+
+
+def _messages(kind: type[Followed], state: SessionState, client: Client) -> Iterator[Followed]:
+    """Yield messages, wherever the session moves, until it ends or the user interrupts."""
+    messages: deque[Followed] = deque()
     loop = PollingLoop(client.bus)
     follower = SessionFollower(
         loop,
-        session,
-        {FapFrame: frames.append, EndOfFaps: lambda _end: None},
-        on_complete=lambda: console.print(f"following session {session}", highlight=False),
+        state.session,
+        {kind: messages.append, EndOfFaps: lambda _end: None},
+        on_complete=lambda: print_message(f"following session {state.session}"),
     )
+    endpoints = state.endpoints
     follower.start(0, endpoints)
     try:
         while not follower.has_ended:
             if not loop.step(SILENT_S):
-                found = _endpoints(session, client)
+                found = _find_session(state.session, client)
                 if found is None:
                     return
-                if found != endpoints:
-                    endpoints = found
+                if found.endpoints != endpoints:
+                    endpoints = found.endpoints
                     follower.start(0, endpoints)
-            while frames:
-                yield frames.popleft()
+            while messages:
+                yield messages.popleft()
     except KeyboardInterrupt:
         return
 
 
-def _print(frames: Iterator[FapFrame], out: IO[str], form: Callable[[FapFrame], str]) -> int:
-    num_frames = 0
-    for num_frames, frame in enumerate(frames, start=1):  # noqa: B007 - the count is the answer
-        out.write(form(frame) + "\n")
+def _phone_rows(
+    messages: Iterable[Phone], shown: Shown, inventory: PhoneInventory
+) -> Iterator[str]:
+    """Yield a line for each phone or syllable once it is final; pauses have none."""
+    track = SyllableTrack(inventory)
+    for message in messages:
+        phone = phone_of(message)
+        changed = track.accept(phone) if shown is Shown.SYLLABLES else [phone]
+        for each in changed:
+            text = each.symbol if isinstance(each, events.Phone) else each.text
+            if each.final and each.duration_s > 0 and text != inventory.silence:
+                yield f"{each.onset_s:9.3f} s  {each.duration_s:6.3f} s  {text}"
+
+
+def _print(lines: Iterable[Line], out: IO[str], form: Callable[[Line], str]) -> int:
+    num_lines = 0
+    for num_lines, line in enumerate(lines, start=1):  # noqa: B007 - the count is the answer
+        out.write(form(line) + "\n")
         out.flush()
-    return num_frames
+    return num_lines
 
 
 def _values(frame: FapFrame) -> NDArray[np.float32]:
@@ -111,7 +168,7 @@ def _as_json(frame: FapFrame) -> str:
 
 def _as_row(frame: FapFrame) -> str:
     values = _values(frame)
-    shown = "  ".join(f"{FAPS[n - 1].name} {values[n - 1]:5.0f}" for n in SHOWN_FAPS)
+    shown = "  ".join(f"{values[n - 1]:6.0f}" for n in SHOWN_FAPS)
     return f"{to_seconds(frame.media_time):9.3f} s  {shown}"
 
 

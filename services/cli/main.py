@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import signal
 import sys
-from importlib.metadata import entry_points
+from importlib.metadata import entry_points, version
 from io import TextIOWrapper
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -51,8 +51,28 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Live Mandarin speech in, a talking 3-D face out.",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"kouxing {version('kouxing')}")
+        raise typer.Exit
+
+
+@app.callback()
+def kouxing(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Live Mandarin speech in, a talking 3-D face out."""
+
+
 for kind in KINDS.values():
     app.command(kind.name, help=kind.summary)(service_command(kind))
 for command in (
@@ -69,7 +89,7 @@ def main() -> None:
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file, too
     try:
-        app()
+        app(prog_name="kouxing")
     except UserError as error:
         CONSOLE.print(f"kouxing: {error}", style="red", markup=False, soft_wrap=True)
         sys.exit(2)

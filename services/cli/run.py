@@ -6,18 +6,25 @@ import os
 import signal
 import sys
 import webbrowser
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from services.cli.running_system import announce, find_control
 from services.cli.services import ConfigFile
-from services.cli.terminal import CONSOLE, print_message
+from services.cli.terminal import CONSOLE, command_name, print_message
 from services.control.config import ControlConfig
 from services.driver.config import DriverConfig
 from services.gateway.config import GatewayConfig
-from services.kinds import KINDS, read_settings
+from services.kinds import KINDS, available_addresses, read_settings
+from shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
+from shared.endpoints import WILDCARDS, split_endpoint
 from shared.errors import UserError
+
+if TYPE_CHECKING:
+    from shared.audio_file import AudioSource
 
 
 def run(
@@ -32,39 +39,65 @@ def run(
         str, typer.Option(help="woman, man, elder, child, an .npz, or a .glb with morphs.")
     ] = "",
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Port of the page, instead of 8080.")
+    ] = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="SERVICE.KEY=VALUE", help="Set one key of a service; repeatable."
+        ),
+    ] = None,
 ) -> None:
     """Run all services on this machine and restart those that crash."""
     from services.cli.supervisor import Supervisor
+    from shared.audio_file import open_audio
 
-    settings = read_settings(config)
-    control, gateway = settings.load(ControlConfig), settings.load(GatewayConfig)
-    driver = settings.load(DriverConfig)
+    given = parse_assignments(assignments or [])
+    if port is not None:
+        given["gateway.port"] = str(port)
+    settings = read_settings(config, given)
     for kind in KINDS.values():
         settings.load(kind.config_type)  # nothing starts where any key is wrong
+    sample = None if play is None else open_audio(play)
+    driver = settings.load(DriverConfig)
     arguments = ["--config", str(config)] if config else []
     out = Path(driver.out)
-    environment = head_environment(head or driver.head, out)
+    addresses = available_addresses(settings)
+    control = _control_address(settings, addresses)
+    environment = {
+        **_assigned_environment(given),
+        **head_environment(head or driver.head, out),
+        **addresses,
+        variable(COMMON, "control"): control,
+    }
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
-    page = f"http://{gateway.host}:{gateway.port}"
+    gateway = settings.load(GatewayConfig)
+    page_port = addresses.get(variable("gateway", "port"), gateway.port)
+    page = f"http://{gateway.host}:{page_port}"
+    for remark in _remarks_on_ports(settings, addresses, control):
+        print_message(remark)
     try:
         with CONSOLE.status(f"starting {', '.join(KINDS)}"):
             supervisor.start()
-            supervisor.wait_ready(control.commands)
+            supervisor.wait_ready(control)
         supervisor.watch()
-        print_message(f"the face is at {page}")
-        has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-        if browser and not stop_after and (has_display or sys.platform == "darwin"):
-            webbrowser.open(page)
-        if play is not None:
-            _play_sample(play, control.commands)
-        if stop_after:
-            return
-        print_message(
-            "ready: use the microphone on the page, or 'kouxing speak my.wav'; Ctrl-C ends"
-        )
-        supervisor.wait()
+        with announce(control):
+            print_message(f"the face is at {page}")
+            has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+            if browser and not stop_after and (has_display or sys.platform == "darwin"):
+                webbrowser.open(page)
+            if sample is not None:
+                _play_sample(sample, control)
+            if stop_after:
+                return
+            print_message(
+                "ready: use the microphone on the page, or, in another terminal,"
+                f" {command_name()} speak my.wav; Ctrl-C ends"
+            )
+            supervisor.wait()
     except KeyboardInterrupt:
         print_message("stopping")
     finally:
@@ -101,12 +134,48 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
     return environment | {"KOUXING_GATEWAY_HEAD": str(page_head)}
 
 
-def _play_sample(path: Path, control: str) -> None:
-    from services.cli.streaming import stream
-    from shared.audio_file import open_audio
+def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
+    """Return the environment that gives services what ``--set`` says, whatever else does."""
+    environment = {}
+    for name, value in assignments.items():
+        table, _, key = name.partition(".")
+        for each in (COMMON, *KINDS) if table == COMMON else (table,):
+            environment[variable(each, key)] = value
+    return environment
 
-    summary = stream(open_audio(path), control, CONSOLE, session="demo", record=True)
-    print_message(f"spoke {path.name}: {summary.num_phones} phones in {summary.duration_s:.1f} s")
+
+def _control_address(settings: Settings, moved: Mapping[str, str]) -> str:
+    """Return where services and clients of this machine find control."""
+    control = next(each for each in settings.describe(ServiceConfig) if each.key == "control")
+    commands = variable("control", "commands")
+    if commands not in moved and control.origin != "default":
+        return str(control.value)
+    address = moved.get(commands, settings.load(ControlConfig).commands)
+    host, port = split_endpoint(address, "control.commands")
+    return f"tcp://127.0.0.1:{port}" if host in WILDCARDS else address
+
+
+def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str) -> Iterator[str]:
+    """Yield what a user is told of default ports that are taken."""
+    taken = [
+        str(each.value)
+        for kind in KINDS.values()
+        for each in settings.describe(kind.config_type)
+        if each.origin == "default" and variable(kind.name, each.key) in moved
+    ]
+    if taken:
+        yield f"taken by other programs: {', '.join(taken)}; free ports are used instead"
+    if variable("control", "commands") in moved:
+        if running := find_control():
+            yield f"kouxing runs already, with control at {running}; this is one more"
+        yield f"your kouxing commands find this one; other programs: KOUXING_CONTROL={control}"
+
+
+def _play_sample(sample: AudioSource, control: str) -> None:
+    from services.cli.streaming import stream
+
+    summary = stream(sample, control, CONSOLE, session="demo", record=True)
+    print_message(f"spoke {sample.name}: {summary.num_phones} phones in {summary.duration_s:.1f} s")
     if not summary.video:
         raise UserError("no video was written; see the messages above")
     print_message(f"wrote {summary.video}")

@@ -15,15 +15,16 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from shared.audio_file import AudioSource, clipping_remarks, num_clipped
 from shared.bus import Socket
 from shared.client import Client, Session, Subscription
+from shared.clock import to_seconds
 from shared.errors import UserError
 from shared.phones.inventory import load_inventory
 from shared.wire.control import Event
-from shared.wire.face import EndOfFaps
+from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.speech import Phone
 
 QUEUE_WAIT_S = 0.005
 END_LIMIT_S = 30.0  # for the last frames after the last sample
-VIDEO_LIMIT_S = 3600.0
+STATUS_S = 1.0  # between questions to control
 QUIET_PEAK = 1e-3  # below this (-60 dBFS) a file is called silent
 
 
@@ -66,19 +67,26 @@ def stream(
             paced=paced,
             voice=voice,
         )
-        output = opened.subscribe(EndOfFaps)
+        output = opened.subscribe(EndOfFaps, FapFrame)
         phones = opened.subscribe(Phone)
         events = client.bus.connect_subscriber(opened.opened.events)
         events.subscribe(Event, opened.name)
+        drawn_before_s = _drawn_s(client) if record else 0.0
         try:
-            duration_s, clipped, peak = _send_all(source, opened, events, console, paced=paced)
-            _send_with_retry(opened.finish)
-            _wait_for_end(output, opened, events, console)
+            with _progress(console) as progress:
+                face = _Face(output, progress, f"speaking {source.name}", source.duration_s)
+                duration_s, clipped, peak = _send_all(
+                    source, opened, face, events, console, paced=paced
+                )
+                _send_with_retry(opened.finish)
+                _wait_for_end(face, opened, events, console, client)
             num_phones = _count_phones(phones, load_inventory(opened.opened.language).silence)
         finally:
             with contextlib.suppress(UserError):  # closed already, or control is gone
                 opened.close()
-        video = _wait_for_video(events, console) if record else ""
+        video = ""
+        if record:
+            video = _wait_for_video(events, console, client, drawn_before_s, duration_s)
     if num_phones == 0:
         reason = "it is silent" if peak < QUIET_PEAK else "is there a voice in it?"
         _warn(console, f"{source.name}: no speech was found; {reason}")
@@ -87,29 +95,60 @@ def stream(
     return StreamSummary(opened.name, duration_s, num_phones, video)
 
 
+class _Face:
+    """The FAP frames that come back, and a bar of how far they are."""
+
+    def __init__(
+        self, output: Subscription, progress: Progress, title: str, duration_s: float | None
+    ) -> None:
+        self.has_ended = False
+        self._output = output
+        self._progress = progress
+        self._task = progress.add_task(title, total=duration_s)
+
+    def update(self, timeout_s: float) -> None:
+        """Take what comes, waiting up to the timeout for the first of it."""
+        if not self._output.wait(timeout_s):
+            return
+        for received in self._output.receive():
+            if isinstance(received.message, EndOfFaps):
+                self.has_ended = True
+            elif isinstance(received.message, FapFrame):
+                time_s = to_seconds(received.message.media_time)
+                self._progress.update(self._task, completed=time_s)
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True)
+
+
 def _send_all(
-    source: AudioSource, session: Session, events: Socket, console: Console, *, paced: bool
+    source: AudioSource,
+    session: Session,
+    face: _Face,
+    events: Socket,
+    console: Console,
+    *,
+    paced: bool,
 ) -> tuple[float, float, float]:
     """Send everything; return seconds sent, the share of clipped samples and the peak."""
     num_sent = clipped = 0
     peak = 0.0
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task(f"speaking {source.name}", total=source.duration_s)
-        begin_s = time.monotonic()
-        try:
-            for block in source.blocks:
-                _send_with_retry(functools.partial(session.send, block))
-                num_sent += len(block)
-                clipped += num_clipped(block)
-                peak = max(peak, float(np.abs(block).max()))
+    begin_s = time.monotonic()
+    try:
+        for block in source.blocks:
+            _send_with_retry(functools.partial(session.send, block))
+            num_sent += len(block)
+            clipped += num_clipped(block)
+            peak = max(peak, float(np.abs(block).max()))
+            face.update(0.0)
+            _check_errors(session, events, console)
+            if paced and source.duration_s is not None:
                 sent_s = num_sent / source.sample_rate_hz
-                progress.update(task, completed=sent_s)
-                _check_errors(session, events, console)
-                if paced and source.duration_s is not None:
-                    time.sleep(max(0.0, begin_s + sent_s - time.monotonic()))
-        except KeyboardInterrupt:
-            console.print("stopping")
+                time.sleep(max(0.0, begin_s + sent_s - time.monotonic()))
+    except KeyboardInterrupt:
+        console.print("stopping")
     duration_s = num_sent / source.sample_rate_hz
     return duration_s, clipped / max(1, num_sent * source.num_channels), peak
 
@@ -131,12 +170,23 @@ def _send_with_retry(send: Callable[[], bool]) -> None:
         time.sleep(QUEUE_WAIT_S)
 
 
-def _wait_for_end(output: Subscription, session: Session, events: Socket, console: Console) -> None:
-    """Wait for the last frame; with much audio queued that may take a while."""
-    while True:
-        if output.wait(0.2) and any(isinstance(r.message, EndOfFaps) for r in output.receive()):
-            return
+def _wait_for_end(
+    face: _Face, session: Session, events: Socket, console: Console, client: Client
+) -> None:
+    """Wait for the last frame; with much audio queued that may take a while.
+
+    Raises
+    ------
+    UserError
+        If the session is lost, or the system is gone.
+    """
+    ask_s = time.monotonic() + STATUS_S
+    while not face.has_ended:
+        face.update(0.2)
         _check_errors(session, events, console)
+        if time.monotonic() > ask_s:
+            client.status()
+            ask_s = time.monotonic() + STATUS_S
 
 
 def _check_errors(session: Session, events: Socket, console: Console) -> None:
@@ -169,11 +219,26 @@ def _count_phones(phones: Subscription, silence: str) -> int:
     return len(indices)
 
 
-def _wait_for_video(events: Socket, console: Console) -> str:
-    end_s = time.monotonic() + VIDEO_LIMIT_S
-    with console.status("writing the video"):
-        while time.monotonic() < end_s:
-            if not events.wait(0.2):
+def _wait_for_video(
+    events: Socket, console: Console, client: Client, drawn_before_s: float, duration_s: float
+) -> str:
+    """Wait for the driver's video, of so many seconds; return its path, empty if there is none.
+
+    Raises
+    ------
+    UserError
+        If the system is gone.
+    """
+    with _progress(console) as progress:
+        task = progress.add_task("writing the video", total=duration_s)
+        newest_s = drawn_before_s
+        while True:
+            drawn_s = _drawn_s(client)
+            if drawn_s < newest_s:
+                raise UserError("the driver was started again, so there is no video; speak again")
+            newest_s = drawn_s
+            progress.update(task, completed=drawn_s - drawn_before_s)
+            if not events.wait(STATUS_S):
                 continue
             for received in events.receive():
                 event = received.message
@@ -182,7 +247,20 @@ def _wait_for_video(events: Socket, console: Console) -> str:
                 if isinstance(event, Event) and event.detail.startswith("no-video"):
                     _warn(console, event.detail)
                     return ""
-    raise UserError("the driver wrote no video; see 'kouxing status'")
+
+
+def _drawn_s(client: Client) -> float:
+    """Return how many seconds of video the driver has drawn since it started.
+
+    Raises
+    ------
+    UserError
+        If no driver runs.
+    """
+    drivers = [each for each in client.status().services if each.service == "driver"]
+    if not drivers:
+        raise UserError("no driver runs, so there is no video; start one: kouxing driver")
+    return max(each.metrics.get("video_ms", 0.0) for each in drivers) / 1000
 
 
 def _warn(console: Console, text: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -22,6 +23,14 @@ VoiceFile = Annotated[
 def print_message(text: str) -> None:
     """Print a line for the user on standard error, apart from a command's results."""
     CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def command_name() -> str:
+    """Return what a user types for this command here: kouxing, or where it is."""
+    called = Path(sys.argv[0])
+    if shutil.which("kouxing") or called.name != "kouxing":
+        return "kouxing"
+    return str(called.relative_to(Path.cwd()) if called.is_relative_to(Path.cwd()) else called)
 
 
 def write_output(text: str, output: Path | None) -> None:
@@ -51,17 +60,16 @@ def check_output(*paths: Path | None) -> None:
             continue
         is_new = not path.exists()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("a"):
                 pass
             if is_new:
                 path.unlink()
         except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+            raise _not_written(path, error) from None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file and the folders it lies in.
+    """Write a file into a folder that exists.
 
     Raises
     ------
@@ -69,10 +77,15 @@ def write_text(path: Path, text: str) -> None:
         If it cannot be written.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+        raise _not_written(path, error) from None
+
+
+def _not_written(path: Path, error: OSError) -> UserError:
+    if isinstance(error, FileNotFoundError):
+        return UserError(f"{path}: cannot be written: first type: mkdir -p {path.parent}")
+    return UserError(f"{path}: cannot be written: {error.strerror}")
 
 
 def _plain(value: object) -> object:

@@ -203,6 +203,7 @@ class Sessions:
             speaking=record.speaking,
             endpoints=record.endpoints,
             workers=record.workers,
+            language=record.language,
         )
 
     # --- inside --------------------------------------------------------------------------------

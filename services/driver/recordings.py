@@ -25,6 +25,8 @@ class Recordings:
         Called with the session and its finished video.
     on_failed
         Called with the session and the reason why it gets no video.
+    on_image
+        Called after each image that was drawn.
     """
 
     def __init__(
@@ -33,10 +35,12 @@ class Recordings:
         *,
         on_written: Callable[[str, Recording], None],
         on_failed: Callable[[str, str], None],
+        on_image: Callable[[], None] = lambda: None,
     ) -> None:
         self._make = make
         self._on_written = on_written
         self._on_failed = on_failed
+        self._on_image = on_image
         self._open: dict[str, Recording] = {}
         self._ending: list[tuple[str, Recording]] = []  # all frames are in; some are to be drawn
 
@@ -96,15 +100,19 @@ class Recordings:
 
     def _draw_image(self, session: str) -> bool:
         try:
-            return self._open[session].step()
+            has_drawn = self._open[session].step()
         except UserError as error:
             self._fail(session, self._open.pop(session), error)
             return False
+        if has_drawn:
+            self._on_image()
+        return has_drawn
 
     def _finish_first(self) -> None:
         session, recording = self._ending[0]
         try:
             if recording.step():
+                self._on_image()
                 return
         except UserError as error:
             self._fail(session, recording, error)

@@ -58,7 +58,10 @@ class DriverService(Service):
         self.poses = Poses(config.session)
         self.view = View(config, self.poses.switch)
         self._recordings = Recordings(
-            self._make_recording, on_written=self._report_written, on_failed=self._report_failure
+            self._make_recording,
+            on_written=self._report_written,
+            on_failed=self._report_failure,
+            on_image=lambda: self.metrics.count("video_ms", round(1000 / config.frame_rate_hz)),
         )
 
     def start_session(self, start: StartSession) -> bool:

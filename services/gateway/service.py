@@ -22,12 +22,16 @@ from services.gateway.microphone import Microphones, OwnSessions, Sample, error_
 from services.gateway.outbox import Kind
 from services.gateway.viewers import Viewers
 from shared.bus import Socket
+from shared.clock import to_samples
 from shared.endpoints import is_loopback
 from shared.errors import UserError
 from shared.follower import SessionFollower
+from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
+from shared.phones.syllables import SyllableTrack
 from shared.service import Handler, Service
 from shared.wire.audio import Sound
 from shared.wire.control import SessionInput, StartSession, StatusReport, StatusRequest
+from shared.wire.events import phone_of
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
 from shared.wire.session import Error
@@ -43,6 +47,7 @@ class _Session:
 
     start: StartSession
     follower: SessionFollower
+    syllables: SyllableTrack
 
 
 class GatewayService(Service):
@@ -212,12 +217,22 @@ class GatewayService(Service):
                 Speech: self._on_speech,
             },
             on_complete=lambda: self.session_started(session.start),
-            on_restart=lambda: self._viewers.add_session(
-                start.session, follower.epoch, session.start.lips
-            ),
+            on_restart=lambda: self._restart(session),
         )
-        session = _Session(start, follower)
+        session = _Session(start, follower, SyllableTrack(self._inventory(start.language)))
         return session
+
+    def _inventory(self, language: str) -> PhoneInventory:
+        try:
+            return load_inventory(language or DEFAULT_LANGUAGE)
+        except UserError as error:  # it is only about captions
+            self.warn("language", str(error))
+            return load_inventory()
+
+    def _restart(self, session: _Session) -> None:
+        """Begin a session anew for its viewers: it goes on in another epoch."""
+        session.syllables.reset()
+        self._viewers.add_session(session.start.session, session.follower.epoch, session.start.lips)
 
     def _on_frame(self, frame: FapFrame) -> None:
         message = wire.binary(wire.FAP_TYPE, frame.epoch, frame.media_time, frame.values)
@@ -238,6 +253,16 @@ class GatewayService(Service):
             final=phone.final,
         )
         self._viewers.forward(phone.session, Kind.TEXT, message)
+        for syllable in self._sessions[phone.session].syllables.accept(phone_of(phone)):
+            message = wire.text(
+                "syllable",
+                index=syllable.index,
+                symbol=syllable.text,
+                media_time=to_samples(syllable.onset_s),
+                duration=to_samples(syllable.duration_s),
+                final=syllable.final,
+            )
+            self._viewers.forward(phone.session, Kind.TEXT, message)
 
     def _on_speech(self, speech: Speech) -> None:
         message = wire.text("speech", active=speech.active, media_time=speech.media_time)

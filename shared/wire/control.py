@@ -79,6 +79,7 @@ class SessionState:
     speaking: bool
     endpoints: EndpointMap  # of the session's workers: audio, phones, faps, ...
     workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
+    language: LanguageName = ""  # of the phones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

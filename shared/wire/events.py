@@ -47,19 +47,24 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
             return EndOfPhones(media_time=to_samples(event.time_s))
 
 
+def phone_of(message: Phone) -> events.Phone:
+    """Return the phone that a message carries."""
+    return events.Phone(
+        index=message.index,
+        symbol=message.symbol,
+        onset_s=to_seconds(message.media_time),
+        duration_s=to_seconds(message.duration),
+        confidence=message.confidence,
+        final=message.final,
+    )
+
+
 def event_of(message: SpeechMessage) -> events.SoundEvent:
     """Return the event that a message carries."""
     time_s = to_seconds(message.media_time)
     match message:
         case Phone():
-            return events.Phone(
-                index=message.index,
-                symbol=message.symbol,
-                onset_s=time_s,
-                duration_s=to_seconds(message.duration),
-                confidence=message.confidence,
-                final=message.final,
-            )
+            return phone_of(message)
         case Lips():
             return events.LipFrame(
                 time_s=time_s,

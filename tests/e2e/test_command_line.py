@@ -194,34 +194,73 @@ def test_render_into_a_missing_folder_is_named(tmp_path: Path) -> None:
     assert "nowhere" in result.stderr
 
 
-def test_listen_records_a_session(system: System, tmp_path: Path) -> None:
-    recorded = tmp_path / "face.fap"
-    samples = samples_of_file(SENTENCE)
+def listening(control: str, *arguments: object) -> subprocess.Popen[str]:
+    """Start ``kouxing listen`` and return once it says that it waits."""
     listener = subprocess.Popen(
-        [sys.executable, "-m", "services", "listen", "heard", "--output", recorded],
-        env={**os.environ, "KOUXING_CONTROL": system.control},
+        [sys.executable, "-m", "services", "listen", *map(str, arguments)],
+        env={**os.environ, "KOUXING_CONTROL": control},
         cwd=ROOT,
+        stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
     assert listener.stderr is not None
+    assert "waiting for" in listener.stderr.readline()
+    return listener
+
+
+def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: Path) -> None:
+    recorded = tmp_path / "face.fap"
+    samples = samples_of_file(SENTENCE)
+    recorder = listening(system.control, "heard", "--output", recorded)
+    printer = listening(system.control, "--show", "syllables")  # of the newest session
     with Client(system.control) as client:
         session = client.open_session(session="heard", encoding="f32le", paced=False)
-        assert listener.stderr.readline() == "following session heard\n"
+        for listener in (recorder, printer):
+            assert listener.stderr is not None
+            assert listener.stderr.readline() == "following session heard\n"
         sent = stream_into(session, samples, chunk=320)
         session.close()
-    _, log = listener.communicate(timeout=100)
-    assert listener.returncode == 0, log
+    _, log = recorder.communicate(timeout=100)
+    assert recorder.returncode == 0, log
     animation = read_fap(recorded)
     assert animation.frame_rate_hz == 50
     np.testing.assert_allclose(animation.faps, sent.faps, atol=0.5)
+    printed, log = printer.communicate(timeout=100)
+    assert printer.returncode == 0, log
+    spoken = [line.split()[-1] for line in printed.splitlines()]
+    assert "sil" not in spoken
+    assert set(spoken) & {"a", "e", "yi", "wu", "yu"}, printed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["listen", "two words"], "letters, digits"),
+        (["listen", "heard", "-o", "face.txt"], ".jsonl"),
+        (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
+        (["speak", SENTENCE, "--session", "two words"], "letters, digits"),
+        (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
+    ],
+)
+def test_a_running_system_is_not_asked_for_what_cannot_be(
+    system: System, arguments: list[str], word: str
+) -> None:
+    result = kouxing(*arguments, control=system.control)
+    assert result.returncode == 2
+    assert word in result.stderr
 
 
 def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -> None:
     figures = tmp_path / "status.json"
-    result = kouxing("status", "--json", figures, control=system.control)
+    result = kouxing(
+        "status", "--json", figures, control=system.control, environment={"COLUMNS": "80"}
+    )
     assert result.returncode == 0, result.stderr
-    assert "recognizer" in result.stdout
+    instances = [line.split()[0] for line in result.stdout.splitlines() if " ready " in line]
+    assert {name.partition("-")[0] for name in instances} >= {"recognizer", "synthesizer"}
+    assert "…" not in result.stdout
+    assert max(map(len, result.stdout.splitlines())) <= 80
     services = json.loads(figures.read_text(encoding="utf-8"))["services"]
     assert {service["service"] for service in services} == {
         "control",
@@ -236,7 +275,7 @@ def test_lines_reach_a_log_file_at_once() -> None:
     code = """
 import os, signal
 from services.cli import main as command_line
-command_line.app = lambda: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
+command_line.app = lambda **_: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
 command_line.main()
 """
     done = subprocess.run(

@@ -113,7 +113,8 @@ def test_the_mouth_on_the_screen_follows_the_faps(
     browser.evaluate(
         "for (const name of ['header', 'footer']) document.querySelector(name).style.opacity = 0"
     )
-    show = "Math.abs(window.kouxing.state.faps[2] - {}) < 1 && window.kouxing.state.phone === '{}'"
+    state = "window.kouxing.state"
+    show = f"Math.abs({state}.faps[2] - {{}}) < 1 && {state}.caption === '{{}}'"
 
     browser.wait_for(show.format(0, "b"))
     closed = browser.steady_image()
@@ -141,6 +142,16 @@ def test_the_mouth_on_the_screen_follows_the_faps(
     assert teeth(closed_again)[mouth].mean() < 0.02
     wrong = ('"level": "error"', "exceptionDetails")
     assert not [text for text in browser.complaints if any(mark in text for mark in wrong)]
+
+
+def test_the_caption_shows_syllables_and_phones_on_request(
+    system: System, session: Session, browser: Browser, gateway: Gateway
+) -> None:
+    system.talk(session.name, A_FACE, "iao")
+    browser.command("Page.navigate", url=gateway.page)
+    for caption in ("yao", "iao"):
+        browser.wait_for(f"window.kouxing?.state.caption === '{caption}'")
+        browser.evaluate("document.getElementById('show-phones').click()")
 
 
 def simulate(browser: Browser, script: str) -> Any:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
 import signal
+import socket
 import subprocess
 import sys
 import urllib.request
@@ -11,7 +15,7 @@ from pathlib import Path
 import av
 import pytest
 
-from tests.system import DEMO, ROOT, kouxing, own_environment
+from tests.system import DEMO, ONE_THREAD, ROOT, kouxing, own_environment
 
 pytestmark = pytest.mark.e2e
 SENTENCE = DEMO / "vowels-male.wav"
@@ -28,34 +32,55 @@ def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:
         assert sum(1 for _ in film.decode(video=0)) >= 2.2 * 25
 
 
-def test_it_runs_until_it_is_interrupted(tmp_path: Path) -> None:
-    environment = own_environment(tmp_path)
-    running = subprocess.Popen(
-        [sys.executable, "-m", "services", "run", "--no-browser"],
-        env=environment,
-        cwd=ROOT,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
+def test_it_runs_until_it_is_interrupted_and_is_found_whatever_its_ports(tmp_path: Path) -> None:
+    environment = {**os.environ, **ONE_THREAD, "XDG_RUNTIME_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "services", "run"]
+    for setting in ("driver.view=none", f"driver.out={tmp_path}"):
+        command += ["--set", setting]
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # another program has it, which is as good
+            stack.enter_context(socket.create_server(("127.0.0.1", 5550)))
+        running = subprocess.Popen(
+            [*command, "--no-browser", "--port", "0"],
+            env=environment,
+            cwd=ROOT,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        stack.callback(running.communicate)
+        stack.callback(running.kill)
         begun = ""
         while "ready:" not in begun:
             line = running.stderr.readline() if running.stderr else ""
             assert line, f"it ended: {begun}"
             begun += line
-        page = f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/"
-        assert page.rstrip("/") in begun
-        with urllib.request.urlopen(page) as answer:
+        assert "tcp://127.0.0.1:5550" in begun.splitlines()[0]  # is taken
+        port = re.findall(r"the face is at http://127.0.0.1:(\d+)\n", begun)[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert "kouxing" in answer.read().decode()
         spoken = kouxing("speak", SENTENCE, environment=environment)
         assert spoken.returncode == 0, spoken.stderr
         running.send_signal(signal.SIGINT)
         _, log = running.communicate(timeout=60)
-    finally:
-        running.kill()
-        running.communicate()
     assert running.returncode == 0, log
     assert "Traceback" not in log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--play", "nowhere.wav"], "no such file"),
+        (["--set", "recognizer.acustic=gmm"], "recognizer.acoustic"),
+        (["--set", "synthesizer.delay_ms=5000"], "300"),
+    ],
+)
+def test_what_cannot_be_run_is_named_before_anything_starts(
+    tmp_path: Path, arguments: list[str], word: str
+) -> None:
+    result = kouxing("run", *arguments, environment=own_environment(tmp_path))
+    assert result.returncode == 2
+    assert result.stderr.startswith("kouxing: ")
+    assert word in result.stderr
 
 
 def test_a_wrong_configuration_ends_it_with_the_key(tmp_path: Path) -> None:

@@ -66,6 +66,17 @@ def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
 
 
 @pytest.mark.parametrize(
+    ("module", "slow_import"), [("services.recognizer", "pydantic"), ("services", "typer")]
+)
+def test_ctrl_c_amid_the_imports_is_no_error(tmp_path: Path, module: str, slow_import: str) -> None:
+    ctrl_c = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
+    (tmp_path / f"{slow_import}.py").write_text(ctrl_c)
+    result = ended(module, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}")
+    assert result.returncode == -signal.SIGINT
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize(
     ("service", "key"),
     [("control", "commands"), ("recognizer", "audio"), ("synthesizer", "phone_input")],
 )

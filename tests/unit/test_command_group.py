@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, version
 
 import pytest
 import typer
@@ -55,6 +55,18 @@ def test_a_misspelt_added_command_is_suggested(added: list[str]) -> None:
 def test_a_command_of_this_package_starts_without_the_added_ones(added: list[str]) -> None:
     assert CliRunner().invoke(command_line.app, ["phones", "--help"]).exit_code == 0
     assert added == []
+
+
+@pytest.mark.parametrize("command", [[], ["speak"], ["head", "export"], ["wave"]])
+def test_h_asks_for_help(added: list[str], command: list[str]) -> None:
+    result = CliRunner().invoke(command_line.app, [*command, "-h"])
+    assert result.exit_code == 0
+    assert "Usage:" in result.output
+
+
+def test_the_version_is_told() -> None:
+    result = CliRunner().invoke(command_line.app, ["--version"])
+    assert result.output == f"kouxing {version('kouxing')}\n"
 
 
 def test_the_command_line_imports_neither_training_nor_evaluation_nor_services() -> None:

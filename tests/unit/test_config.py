@@ -62,6 +62,17 @@ def test_file_is_weaker_than_environment_is_weaker_than_command_line(tmp_path: P
     assert all_three.num_stable_frames == 5
 
 
+def test_assignments_are_stronger_than_the_environment() -> None:
+    types = {kind.name: kind.config_type for kind in KINDS.values()}
+    environment = {"KOUXING_RECOGNIZER_NUM_STABLE_FRAMES": "4", "KOUXING_GATEWAY_PORT": "1"}
+    given = {"recognizer.num_stable_frames": "5", "common.log_level": "error"}
+    both = Settings(types, environment=environment, assignments=given)
+    assert both.load(RecognizerConfig).num_stable_frames == 5
+    assert (both.load(GatewayConfig).port, both.load(GatewayConfig).log_level) == (1, "error")
+    with pytest.raises(UserError, match=r"--set recognizer.acustic: .* recognizer.acoustic;"):
+        Settings(types, environment={}, assignments={"recognizer.acustic": "gmm"})
+
+
 def test_one_service_is_stronger_than_all_services(tmp_path: Path) -> None:
     file = written(tmp_path, "[recognizer]\nlog_level = 'debug'\n[common]\nlog_level = 'error'\n")
     assert settings(file).load(RecognizerConfig).log_level == "debug"

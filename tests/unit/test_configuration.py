@@ -52,5 +52,12 @@ def test_one_service_is_printed_with_what_the_command_line_sets(
 def test_what_cannot_be_printed_is_named() -> None:
     with pytest.raises(UserError, match="one of common, control"):
         config("listener")
-    with pytest.raises(UserError, match="--set is for one service"):
+    with pytest.raises(UserError, match=r"--set port: .* nearest is gateway.port"):
         config(assignments=["port=1"])
+
+
+def test_all_services_are_printed_with_what_the_command_line_sets(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    config(assignments=["gateway.port=1"])
+    assert "port = 1  # --set" in capsys.readouterr().out

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import pkgutil
+import socket
 
 import pytest
 
-from services.kinds import KINDS, ServiceKind
+from services.gateway.config import GatewayConfig
+from services.kinds import KINDS, ServiceKind, available_addresses, read_settings
 from shared.config import ServiceConfig
+from shared.errors import UserError
 from shared.service import Service
 
 pytestmark = pytest.mark.unit
@@ -21,6 +25,38 @@ def test_an_entry_leads_to_its_classes_and_its_module(kind: ServiceKind) -> None
     assert service.name == kind.name
     assert issubclass(kind.config_type, ServiceConfig)
     assert importlib.util.find_spec(f"services.{kind.name}.__main__")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "*"])
+def test_only_default_addresses_give_way_to_other_programs(host: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        chosen = read_settings(assignments={"gateway.port": str(port)})
+        with pytest.raises(UserError, match=f"gateway.port: another program has port {port}"):
+            available_addresses(chosen)
+        chosen = read_settings(
+            assignments={
+                "control.events": f"tcp://{host}:{port}",
+                "control.advertise": "here",
+                "control.insecure": "true",
+            }
+        )
+        with pytest.raises(UserError, match=r"control\.events"):
+            available_addresses(chosen)
+
+
+def test_a_taken_default_is_replaced_by_a_free_port() -> None:
+    taken = GatewayConfig().port
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # another program has it, which is as good
+            stack.enter_context(socket.create_server(("127.0.0.1", taken)))
+        moved = available_addresses(read_settings())
+    assert int(moved["KOUXING_GATEWAY_PORT"]) != taken
+
+
+def test_port_0_is_a_free_port() -> None:
+    moved = available_addresses(read_settings(assignments={"gateway.port": "0"}))
+    assert int(moved["KOUXING_GATEWAY_PORT"]) > 0
 
 
 def test_control_starts_first() -> None:

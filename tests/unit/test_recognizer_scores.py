@@ -166,7 +166,7 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     )
     for part in ("full traceback", "by speaker", "p, b, m and f", "CPU seconds", *reasons):
         assert part in text, part
-    assert "first hypothesis ┃ final hypothesis" in text  # side by side
+    assert "first hypothesis  final hypothesis" in text  # side by side
     assert text.count("lying") == 1  # once, not once a model
     with pytest.raises(UserError, match="'nothing'"):
         evaluate_recognizer(load_model(), tmp_path, "nothing")

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.terminal import check_output
+from services.cli.terminal import check_output, write_text
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 
 
 def test_outputs_are_checked_before_the_work_and_left_as_they_are(tmp_path: Path) -> None:
-    old, new = tmp_path / "old.json", tmp_path / "folder" / "new.json"
+    old, new = tmp_path / "old.json", tmp_path / "new.json"
     old.write_text("kept")
     check_output(None, old, new)
     assert old.read_text() == "kept"
@@ -19,3 +19,11 @@ def test_outputs_are_checked_before_the_work_and_left_as_they_are(tmp_path: Path
     for wrong in (tmp_path, old / "below.json"):
         with pytest.raises(UserError, match="cannot be written"):
             check_output(None, new, wrong)
+
+
+def test_no_folder_is_made_for_an_output(tmp_path: Path) -> None:
+    missing = tmp_path / "folder"
+    for write in (check_output, lambda path: write_text(path, "text")):
+        with pytest.raises(UserError, match=f"mkdir -p {missing}"):
+            write(missing / "new.json")
+    assert not missing.exists()

@@ -15,13 +15,15 @@ import { VoiceStore } from "./voice.js";
 
 const LABEL_EVERY_MS = 250;
 const ERROR_MS = 8000; // for which an error stays to be read
+const SHOW_PHONES = "kouxing.show-phones"; // where the browser keeps that choice
 const OTHER_MODEL =
   "What was learnt of your mouth does not fit this version: press Learn my mouth. 口型模型已更新，请重新学习。";
 
 const element = (id) => document.getElementById(id);
 const playout = new Playout();
 const track = new FapTrack();
-const phones = new PhoneTrack();
+const syllables = new PhoneTrack();
+const phones = new PhoneTrack(); // shown instead of the syllables, on request
 const meter = new LevelMeter();
 const presence = new Presence();
 const sound = new Sound(onSoundState);
@@ -59,7 +61,7 @@ window.kouxing = {
       soundMinusPictureMs: heardMs === null ? null : heardMs - playout.offsetMs,
       microphone: element("microphone").getAttribute("aria-pressed") === "true",
       lips,
-      phone: element("phone").value,
+      caption: element("spoken").value,
       voice: voices.voice?.profile ?? "",
       lesson: lesson.step,
     };
@@ -71,6 +73,7 @@ window.kouxing = {
 function forget() {
   playout.reset();
   track.reset();
+  syllables.reset();
   phones.reset();
   meter.reset();
 }
@@ -119,6 +122,9 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
         missing = message.missing;
         showState();
         break;
+      case "syllable":
+        syllables.accept(message);
+        break;
       case "phone":
         phones.accept(message);
         break;
@@ -148,7 +154,7 @@ function draw(nowMs) {
   head?.draw(nowMs);
 
   showLevel(mediaTime);
-  if (mediaTime !== null) showPhones(mediaTime);
+  if (mediaTime !== null) showCaption(mediaTime);
   if (nowMs - labelledMs > LABEL_EVERY_MS) {
     labelledMs = nowMs;
     showState();
@@ -204,9 +210,9 @@ function showLips() {
   element("lips").setAttribute("aria-pressed", lips === "learnt");
 }
 
-function showPhones(mediaTime) {
-  const { current, past } = phones.at(mediaTime);
-  setText(element("phone"), current);
+function showCaption(mediaTime) {
+  const { current, past } = (arePhonesShown() ? phones : syllables).at(mediaTime);
+  setText(element("spoken"), current);
   const key = past.join(" ");
   if (element("past").dataset.key !== key) {
     element("past").dataset.key = key;
@@ -299,6 +305,16 @@ element("lips").onclick = () => {
   chosenLips = lips === "learnt" ? "dynamic-visemes" : "learnt";
   if (isSample) link.chooseLips(chosenLips);
   else microphone.chooseLips(chosenLips);
+};
+
+function arePhonesShown() {
+  return element("show-phones").getAttribute("aria-pressed") === "true";
+}
+
+element("show-phones").setAttribute("aria-pressed", storage()?.getItem(SHOW_PHONES) === "true");
+element("show-phones").onclick = () => {
+  element("show-phones").setAttribute("aria-pressed", !arePhonesShown());
+  storage()?.setItem(SHOW_PHONES, arePhonesShown());
 };
 
 element("microphone").onclick = () => {

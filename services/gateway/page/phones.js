@@ -1,4 +1,4 @@
-// The phones of a session. Pure code: nothing is drawn.
+// The phones of a session, or its syllables. Pure code: nothing is drawn.
 
 const MAX_PHONES = 100;
 const MAX_SHOWN = 8; // beside the current one
@@ -6,7 +6,7 @@ const SHOWN_AFTER_END = 8 * 16000; // samples for which the last phone is still 
 const SILENCE = "sil";
 const SILENCE_SIGN = "·";
 
-/** Phones as they come and are revised, and which of them are shown at a media time. */
+/** Phones, or syllables, as they come and are revised, and which of them are shown at a media time. */
 export class PhoneTrack {
   #phones = []; // { index, symbol, begin, end }, by index
 

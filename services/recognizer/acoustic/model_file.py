@@ -66,7 +66,9 @@ def read_archive(path: Path) -> Archive:
     try:
         content = io.BytesIO(path.read_bytes())
     except OSError as error:
-        raise UserError(f"no acoustic model at {path}; train one or reinstall") from error
+        raise UserError(
+            f"no acoustic model at {path}; write neural, blocks, gmm, or a model file's name"
+        ) from error
     try:
         with np.lib.npyio.NpzFile(content, allow_pickle=False) as archive:
             return Archive({name: archive[name] for name in archive.files})

@@ -1,0 +1,72 @@
+"""How commands find the system that their user runs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from services.cli.clients import control_address
+from services.cli.running_system import announce, find_control
+from tests.system import ROOT
+
+pytestmark = pytest.mark.unit
+ANNOUNCE = """
+import sys
+from services.cli.running_system import announce
+with announce(sys.argv[1]):
+    print("announced", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("KOUXING_CONTROL", raising=False)
+
+
+def announcing(control: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", ANNOUNCE, control],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "announced\n"
+    return process
+
+
+def test_the_newest_running_system_is_found_however_others_ended() -> None:
+    assert find_control() == ""
+    first, second, third = (announcing(f"tcp://127.0.0.1:{port}") for port in (1, 2, 3))
+    assert find_control() == "tcp://127.0.0.1:3"
+    third.kill()  # leaves its file behind
+    third.communicate()
+    assert find_control() == "tcp://127.0.0.1:2"
+    second.communicate()  # the end of its input
+    assert control_address("") == "tcp://127.0.0.1:1"
+    first.communicate()
+    assert find_control() == ""
+
+
+def test_an_address_that_is_told_counts_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    default = control_address("")
+    with announce("tcp://127.0.0.1:1"):
+        assert control_address("") == "tcp://127.0.0.1:1"
+        assert control_address("tcp://127.0.0.1:4") == "tcp://127.0.0.1:4"
+        monkeypatch.setenv("KOUXING_CONTROL", "tcp://127.0.0.1:5")
+        assert control_address("") == "tcp://127.0.0.1:5"
+    monkeypatch.delenv("KOUXING_CONTROL")
+    assert control_address("") == default
+
+
+def test_a_folder_that_others_can_write_to_is_not_believed(tmp_path: Path) -> None:
+    with announce("tcp://127.0.0.1:1"):
+        (folder,) = tmp_path.iterdir()
+        folder.chmod(0o777)
+        assert find_control() == ""

@@ -1,0 +1,94 @@
+"""Captions: phones become pinyin syllables as they come and are revised."""
+
+from __future__ import annotations
+
+import pytest
+
+from shared.errors import UserError
+from shared.phones.events import Phone
+from shared.phones.inventory import load_inventory
+from shared.phones.mandarin.pinyin import phones_of_syllable, spell
+from shared.phones.syllables import MAX_PHONES, SyllableTrack
+
+pytestmark = pytest.mark.unit
+MANDARIN = load_inventory("mandarin")
+
+
+def phone(index: int, symbol: str, *, final: bool = True, duration_s: float = 0.1) -> Phone:
+    return Phone(
+        index=index,
+        symbol=symbol,
+        onset_s=0.1 * index,
+        duration_s=duration_s,
+        confidence=1.0,
+        final=final,
+    )
+
+
+def test_every_syllable_of_mandarin_is_spelled_as_it_is_read() -> None:
+    num_spelled = 0
+    for initial in ["", *sorted(MANDARIN.initials)]:
+        for final in sorted(MANDARIN.vowels):
+            phones = (initial, final) if initial else (final,)
+            try:
+                read = phones_of_syllable(spell(phones))
+            except UserError:  # no syllable of Mandarin
+                continue
+            if final not in ("ii", "iii") or initial:
+                num_spelled += read == phones
+    assert num_spelled > 400
+
+
+@pytest.mark.parametrize(
+    ("phones", "spelling"),
+    [
+        (("sh", "iii"), "shi"),
+        (("z", "ii"), "zi"),
+        (("l", "v"), "lü"),
+        (("x", "van"), "xuan"),
+        (("l", "iou"), "liu"),
+        (("g", "uei"), "gui"),
+        (("uen",), "wen"),
+        (("iou",), "you"),
+        (("v",), "yu"),
+        (("er",), "er"),
+        (("zh",), "zh"),
+        (("sil",), "sil"),
+    ],
+)
+def test_spelling(phones: tuple[str, ...], spelling: str) -> None:
+    assert spell(phones) == spelling
+
+
+def test_an_initial_is_shown_at_once_and_completed_by_its_vowel() -> None:
+    track = SyllableTrack(MANDARIN)
+    (first,) = track.accept(phone(0, "sh", final=False))
+    assert (first.index, first.text, first.final) == (0, "sh", False)
+    (second,) = track.accept(phone(1, "iii", final=False))
+    assert (second.index, second.text, second.onset_s) == (0, "shi", 0.0)
+    assert second.duration_s == pytest.approx(0.2)
+    assert track.accept(phone(1, "iii", final=False)) == []
+    track.accept(phone(0, "sh"))
+    (final,) = track.accept(phone(1, "iii"))
+    assert final.final
+
+
+def test_what_proves_to_be_one_syllable_is_withdrawn_as_two() -> None:
+    track = SyllableTrack(MANDARIN)
+    for index, symbol in enumerate(("a", "ou", "sil")):
+        track.accept(phone(index, symbol, final=False))
+    withdrawn, joined = track.accept(phone(0, "m", final=False))
+    assert (withdrawn.index, withdrawn.duration_s, withdrawn.final) == (1, 0.0, True)
+    assert joined.text == "mou"
+    (alone,) = track.accept(phone(1, "sil", duration_s=0.0))  # the vowel was none
+    assert alone.text == "m"
+
+
+def test_a_long_stream_keeps_its_syllables() -> None:
+    track = SyllableTrack(MANDARIN)
+    texts: dict[int, str] = {}
+    for index in range(4 * MAX_PHONES):
+        for syllable in track.accept(phone(index, ("b", "a", "sil")[index % 3])):
+            texts[syllable.index] = syllable.text
+            assert syllable.duration_s > 0.0
+    assert list(texts.values()) == ["ba", "sil"] * (4 * MAX_PHONES // 3) + ["b"]
