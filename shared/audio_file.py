@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 import soundfile
@@ -15,6 +15,9 @@ import soxr
 from numpy.typing import NDArray
 
 from shared.errors import UserError
+
+if TYPE_CHECKING:
+    from shared.media_file import MediaSound
 
 LOWEST_RATE_HZ = 8_000
 HIGHEST_RATE_HZ = 48_000  # what the wire carries; files above are resampled to it
@@ -39,9 +42,10 @@ class AudioSource:
 
 
 def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
-    """Open an audio file (wav, flac, ogg, mp3, ...) for reading block by block.
+    """Open an audio file, or the sound of a video, for reading block by block.
 
-    Files above 48 kHz are resampled to 48 kHz, and channels beyond the second are left out.
+    libsndfile reads wav, flac, ogg and mp3, FFmpeg all others (m4a, mp4, webm, ...). Files above
+    48 kHz are resampled to 48 kHz, and channels beyond the second are left out or mixed in.
 
     Raises
     ------
@@ -58,15 +62,12 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
             raise UserError(f"{path}: this is a folder; give an audio file") from None
         if path.stat().st_size == 0:
             raise UserError(f"{path}: the file is empty") from None
-        raise UserError(
-            f"{path}: this is no audio that can be read ({error}); give wav, flac, ogg or mp3"
-        ) from None
+        if isinstance(error, OSError):
+            raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+        return _open_media(path, block_s)
     if file.frames == 0:
         raise UserError(f"{path}: the file holds no samples; was the recording cut off?")
-    if file.samplerate < LOWEST_RATE_HZ:
-        raise UserError(
-            f"{path}: {file.samplerate} Hz is too low for speech; give {LOWEST_RATE_HZ} Hz or more"
-        )
+    _check_rate(path, file.samplerate)
     rate_hz = min(file.samplerate, HIGHEST_RATE_HZ)
     remarks: list[str] = []
     return AudioSource(
@@ -77,6 +78,55 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
         blocks=_file_blocks(file, path, rate_hz, block_s, remarks),
         remarks=remarks,
     )
+
+
+def _check_rate(path: Path, rate_hz: int) -> None:
+    if rate_hz < LOWEST_RATE_HZ:
+        raise UserError(
+            f"{path}: {rate_hz} Hz is too low for speech; give {LOWEST_RATE_HZ} Hz or more"
+        )
+
+
+def _open_media(path: Path, block_s: float) -> AudioSource:
+    """Open what libsndfile does not read."""
+    from shared.media_file import open_media  # noqa: PLC0415 - 0.1 s; few files need it
+
+    sound = open_media(path, HIGHEST_RATE_HZ, 2)
+    remarks: list[str] = []
+    _check_rate(path, sound.sample_rate_hz)
+    return AudioSource(
+        name=path.name,
+        sample_rate_hz=sound.sample_rate_hz,
+        num_channels=sound.num_channels,
+        duration_s=sound.duration_s,
+        blocks=_media_blocks(path, sound, round(block_s * sound.sample_rate_hz), remarks),
+        remarks=remarks,
+    )
+
+
+def _media_blocks(
+    path: Path, sound: MediaSound, size: int, remarks: list[str]
+) -> Iterator[Samples]:
+    """Cut the sound anew into blocks of a size; the last one is shorter."""
+    rest: list[Samples] = []
+    num_waiting = num_read = 0
+    for piece in sound.blocks:
+        if not np.isfinite(piece).all():
+            raise UserError(f"{path}: NaN or infinite samples; export the file again")
+        rest.append(np.clip(piece, -1.0, 1.0))
+        num_waiting += len(piece)
+        num_read += len(piece)
+        if num_waiting >= size:
+            samples = np.concatenate(rest)
+            whole = num_waiting - num_waiting % size
+            yield from np.split(samples[:whole], whole // size)
+            rest, num_waiting = [samples[whole:]], num_waiting - whole
+    if num_waiting:
+        yield np.concatenate(rest)
+    if num_read == 0:
+        raise UserError(f"{path}: the file holds no samples; was the recording cut off?")
+    if sound.duration_s is not None:
+        remarks += _missing(path, num_read / sound.sample_rate_hz, sound.duration_s)
 
 
 def read_audio(path: Path) -> tuple[Samples, int]:
@@ -194,7 +244,10 @@ def _cut_off(file: soundfile.SoundFile, path: Path, num_read: int) -> list[str]:
     num_stated = file.frames
     if (match := _MISSING.search(file.extra_info)) and int(match[1]) < _NO_LENGTH:
         num_stated = int(match[1]) * num_read // int(match[2])
-    read_s, stated_s = num_read / file.samplerate, num_stated / file.samplerate
+    return _missing(path, num_read / file.samplerate, num_stated / file.samplerate)
+
+
+def _missing(path: Path, read_s: float, stated_s: float) -> list[str]:
     if stated_s < read_s + LEAST_MISSING_S:
         return []
     return [f"{path}: the file is cut off: {read_s:.1f} s of {stated_s:.1f} s are there"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections import deque
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.cli.clients import Shown
+from services.cli.curves import json_line
 from services.cli.terminal import check_output, print_message
 from shared.client import Client
 from shared.clock import to_seconds
@@ -161,9 +161,7 @@ def _values(frame: FapFrame) -> NDArray[np.float32]:
 
 
 def _as_json(frame: FapFrame) -> str:
-    faps = [round(float(value), 2) for value in _values(frame)]
-    time_s = to_seconds(frame.media_time)
-    return json.dumps({"time_s": time_s, "sequence": frame.sequence, "faps": faps})
+    return json_line(to_seconds(frame.media_time), frame.sequence, _values(frame))
 
 
 def _as_row(frame: FapFrame) -> str:

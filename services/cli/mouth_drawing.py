@@ -15,6 +15,7 @@ from rich.progress import Progress
 
 from services.cli.offline import Timing
 from services.cli.sound_file import read_mono_16k
+from services.cli.spoken_text import text_of
 from services.cli.terminal import CONSOLE, check_output, print_message, write_text
 from services.driver.video.writer import VideoWriter, write_picture
 from services.recognizer.acoustic.load import load_model
@@ -89,6 +90,8 @@ def draw_mouth(
     if speech_to_text is not None:
         text = SherpaTranscriber(speech_to_text).transcribe(samples)
         print_message(f"{source}: {text or 'no words were recognised'}")
+    elif text is not None:
+        text = text_of(text)
     inventory = load_inventory()
     with CONSOLE.status(f"timing {len(samples) / MEDIA_RATE_HZ:.0f} s"):
         phones = timed_phones(samples, text, timing or Timing.ENDPOINTS)

@@ -12,9 +12,9 @@ from services.cli.heads import DEFAULT_HEAD, HeadName
 from services.cli.terminal import CONSOLE, VoiceFile, print_message, write_output
 from services.driver.config import Framing
 from shared.errors import UserError
-from shared.face.lip_models import LipModelName
+from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 
-Audio = Annotated[Path, typer.Argument(help="Audio file.")]
+Audio = Annotated[Path, typer.Argument(help="Audio or video file.")]
 Acoustic = Annotated[str, typer.Option(help="Model: neural, blocks, gmm, or a file.")]
 
 
@@ -25,6 +25,14 @@ class PhoneFormat(StrEnum):
     CSV = "csv"
     JSON = "json"
     TEXTGRID = "textgrid"
+
+
+class CurveForm(StrEnum):
+    """What the values of a curve file are."""
+
+    FAPS = "faps"
+    ARKIT = "arkit"
+    OCULUS = "oculus"
 
 
 class Timing(StrEnum):
@@ -39,22 +47,38 @@ Form = Annotated[
     typer.Option("--format", help="If not given, the file's suffix tells, else a table."),
 ]
 Output = Annotated[Path | None, typer.Option("--output", "-o", help="File to write.")]
-_FORM_OF_SUFFIX = {f".{form.value}": form for form in PhoneFormat}
+_FORM_OF_SUFFIX = {
+    ".txt": PhoneFormat.TABLE,
+    ".csv": PhoneFormat.CSV,
+    ".json": PhoneFormat.JSON,
+    ".textgrid": PhoneFormat.TEXTGRID,
+}
 
 
 def render(
-    source: Annotated[Path, typer.Argument(metavar="SOUND|FAP", help="Audio or .fap file.")],
+    source: Annotated[Path, typer.Argument(metavar="SOUND|FAP", help="Audio, video or .fap file.")],
     output: Annotated[
         Path,
         typer.Argument(
-            help="Video (.mp4, .mov, .webm, silent .webp), one picture (.png), or a picture for"
-            " every image (a folder, or a name with a number: face%05d.png)."
+            help="Video (.mp4, .mov, .webm, silent .webp), one picture (.png), a picture for"
+            " every image (a folder, or a name with a number: face%05d.png), or the face's curves"
+            " (.fap, .csv, .jsonl, or .glb: the head, animated)."
         ),
     ],
     lips: Annotated[
         list[LipModelName] | None,
         typer.Option(help="Lip model for a sound; repeated: faces side by side, with captions."),
     ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="As a viewer of the stream would have seen it.")
+    ] = False,
+    text: Annotated[
+        str | None,
+        typer.Option(help="What is said (characters, pinyin, or a file with them): better lips."),
+    ] = None,
+    form: Annotated[
+        CurveForm, typer.Option("--as", help="Values of a curve file.")
+    ] = CurveForm.FAPS,
     head: HeadName = DEFAULT_HEAD,
     size: Annotated[str, typer.Option(help="WIDTHxHEIGHT in pixels.")] = "1280x720",
     background: Annotated[
@@ -77,20 +101,81 @@ def render(
         typer.Option(min=0.5, max=2, help="How large the mouth's movements are for a sound."),
     ] = None,
 ) -> None:
-    """Make a video or pictures of an audio or FAP file."""
-    from services.cli.rendering import Shot, render_file
+    """Make a video, pictures or curves of an audio or FAP file."""
+    from rich.progress import Progress
 
-    shot = Shot(
-        head=head, size=size, background=background, camera=camera, yaw_deg=yaw, pitch_deg=pitch
-    )
-    render_file(
-        source, output, shot, lips=lips, rate_hz=rate, sound=sound, at_s=at, voice=voice,
-        expressiveness=expressiveness,
+    from services.cli import curves
+    from services.cli.motion import is_fap, motion_of_sound, read_motion
+    from services.cli.rendering import Shot, check_pictures, draw, make_renderer
+
+    faces = lips or [DEFAULT_LIP_MODEL]
+    _check_source(
+        source, lips=bool(lips), live=live, text=text is not None, voice=voice is not None,
+        expressiveness=expressiveness is not None, sound=sound is not None,
     )  # fmt: skip
+    shot = Shot(
+        head=head, size=size, background=background, camera=camera, yaw_deg=yaw, pitch_deg=pitch,
+        rate_hz=rate, at_s=at,
+    )  # fmt: skip
+    renderer = None
+    if curves.is_curves(output):
+        curves.check_curves(output, form)
+        if len(faces) > 1:
+            raise UserError("curves are of one face; give --lips once")
+    else:
+        if form is not CurveForm.FAPS:
+            raise UserError(f"--as {form} is for curves; write .csv, .jsonl or .glb")
+        check_pictures(output, shot)
+        renderer = make_renderer(shot, output, faces)
+    with Progress(console=CONSOLE, transient=True) as progress:
+        motion = (
+            read_motion(source, sound)
+            if is_fap(source)
+            else motion_of_sound(
+                source,
+                faces,
+                progress,
+                live=live,
+                text=text,
+                voice=voice,
+                expressiveness=expressiveness,
+            )
+        )
+        if not motion.frames:
+            raise UserError(f"{source}: it has no frames")
+        if renderer is None:
+            curves.write_curves(motion, output, form, head)
+            made = _number(len(motion.frames), "frame")
+        else:
+            made = _number(draw(motion, renderer, output, shot, progress), "image")
+            renderer.close()
+    if motion.num_phones == 0:
+        print_message(f"{source}: no speech was found; the mouth stays closed")
+    phones = "" if motion.num_phones is None else f", {_number(motion.num_phones, 'phone')}"
+    print_message(f"wrote {output}: {made}{phones}")
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _check_source(source: Path, *, sound: bool, **of_sounds: bool) -> None:
+    """Refuse options that do not fit a source."""
+    from services.cli.motion import is_fap
+
+    if of_sounds["live"] and of_sounds["text"]:
+        raise UserError("--live knows no text beforehand; leave --live or --text out")
+    if not is_fap(source):
+        if sound:
+            raise UserError(f"--sound is for a .fap file; {source} brings its own")
+        return
+    given = [name for name, is_given in of_sounds.items() if is_given]
+    if given:
+        raise UserError(f"--{given[0]} is for a sound; {source} holds the motion of its lips")
 
 
 def phones(
-    audio: Audio, acoustic: Acoustic = "neural", form: Form = None, output: Output = None
+    audio: Audio, acoustic: Acoustic = "blocks", form: Form = None, output: Output = None
 ) -> None:
     """Recognise an audio file: phones with their times."""
     from services.cli.sound_file import read_mono_16k
@@ -99,33 +184,44 @@ def phones(
     from shared.clock import MEDIA_RATE_HZ
     from shared.phones.phone_files import format_phones
 
+    style = _form(form, output)
     samples = read_mono_16k(audio)
     duration_s = len(samples) / MEDIA_RATE_HZ
     with CONSOLE.status(f"recognising {duration_s:.0f} s"):
         found = recognize(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ)
     if not found:
         print_message(f"{audio}: no speech was found")
-    write_output(format_phones(found, _form(form, output), duration_s), output)
+    write_output(format_phones(found, style, duration_s), output)
 
 
 def align(
     audio: Audio,
-    text: Annotated[str, typer.Argument(help="What is said: Chinese characters, or pinyin.")],
-    acoustic: Acoustic = "neural",
+    text: Annotated[
+        str, typer.Argument(help="What is said: Chinese characters or pinyin, or a file of them.")
+    ],
+    acoustic: Acoustic = "blocks",
     form: Form = None,
     output: Output = None,
 ) -> None:
-    """Find the times of the phones of a known text."""
+    """Find the times of the phones of a known text; status 1 if it does not fit the sound."""
     from services.cli.sound_file import read_mono_16k
+    from services.cli.spoken_text import does_not_fit, read_text
     from services.recognizer.acoustic.load import load_model, model_path
-    from services.recognizer.alignment import align_text
+    from services.recognizer.alignment import align_syllables, timed_syllables
     from shared.clock import MEDIA_RATE_HZ
     from shared.phones.phone_files import format_phones
 
+    style = _form(form, output)
     samples = read_mono_16k(audio)
-    aligned = align_text(load_model(model_path(acoustic)), samples, MEDIA_RATE_HZ, text)
+    model = load_model(model_path(acoustic))
+    transcript = read_text(text, model.inventory)
+    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
     duration_s = len(samples) / MEDIA_RATE_HZ
-    write_output(format_phones(aligned, _form(form, output), duration_s), output)
+    syllables = timed_syllables(alignment.phones, transcript, model.inventory)
+    write_output(format_phones(alignment.phones, style, duration_s, syllables), output)
+    if not alignment.fits:
+        print_message(does_not_fit(audio, alignment))
+        raise typer.Exit(1)
 
 
 def lips(
@@ -173,4 +269,6 @@ def lips(
 def _form(form: PhoneFormat | None, output: Path | None) -> str:
     if form is None and output is not None:
         form = _FORM_OF_SUFFIX.get(output.suffix.lower())
+        if form is None:
+            raise UserError(f"{output}: give a name that ends in {', '.join(_FORM_OF_SUFFIX)}")
     return (form or PhoneFormat.TABLE).value

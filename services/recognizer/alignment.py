@@ -2,11 +2,16 @@
 
 The best path of the recognizer's own model through the text's phones, with optional pauses at
 syllable boundaries (Li et al. 2011, section 3.2, scheme 1, used HTK for this).
+
+The path is found for any text. How well the text fits, its *fit*, tells whether it is what was
+said: what the path loses against the best phone of every frame, of what an average phone loses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +19,34 @@ from numpy.typing import NDArray
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.front_end.features import HOP_S
 from services.recognizer.front_end.resample import to_16_khz
-from services.recognizer.search.forced_path import segments_of_path, utterance_graph, viterbi_path
+from services.recognizer.search.forced_path import (
+    UtteranceGraph,
+    segments_of_path,
+    utterance_graph,
+    viterbi_path,
+)
 from services.recognizer.speech_scores import frame_time_s
 from shared.errors import UserError
 from shared.phones.events import Phone
 from shared.phones.inventory import PhoneInventory, Syllable
+from shared.phones.transcript import TimedSyllable, Transcript
+
+# Calibrated with the block model on the corpus' dev sentences and conversation: see
+# docs/recognition.md.
+MIN_FIT = 0.85
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """A text in a recording."""
+
+    phones: list[Phone]  # all phones and the pauses, in order, from the beginning to the end
+    fit: float  # 1: the phones are the best ones everywhere; 0: any others fit as well
+
+    @property
+    def fits(self) -> bool:
+        """Whether the text is likely what was said."""
+        return self.fit >= MIN_FIT
 
 
 def align_text(
@@ -60,15 +88,26 @@ def align_phones(
     syllables: Sequence[Syllable],
 ) -> list[Phone]:
     """Like :func:`align_text`, for the phones of known syllables."""
+    return align_syllables(model, samples, sample_rate_hz, syllables).phones
+
+
+def align_syllables(
+    model: AcousticModel,
+    samples: NDArray[np.float32],
+    sample_rate_hz: int,
+    syllables: Sequence[Syllable],
+) -> Alignment:
+    """Like :func:`align_phones`, with how well they fit."""
     inventory, topology = model.inventory, model.topology
     stream = model.stream()
     frames = model.front_end().accept_waveform(to_16_khz(samples, sample_rate_hz))
     scores = np.concatenate([stream.accept(frames), stream.finish()])
+    silence = inventory.index[inventory.silence]
     graph = utterance_graph(
         [inventory.index[symbol] for syllable in syllables for symbol in syllable],
         [len(syllable) for syllable in syllables],
         topology.first_state,
-        silence=inventory.index[inventory.silence],
+        silence=silence,
     )
     path = np.empty(0, dtype=np.int64)
     if len(scores):
@@ -96,9 +135,45 @@ def align_phones(
                 final=True,
             )
         )
-    return phones
+    return Alignment(phones, _fit(path, graph, scores, best_of_phones, silence))
+
+
+def _fit(
+    path: NDArray[np.int64],
+    graph: UtteranceGraph,
+    scores: NDArray[np.float32],
+    best_of_phones: NDArray[np.float32],
+    silence: int,
+) -> float:
+    """Compare a path's states with the best phone of each frame, (frames, phones).
+
+    Frames that are silent by path and sound are left out, so that pauses hide nothing.
+    """
+    lost = best_of_phones.max(axis=1) - scores[np.arange(len(path)), graph.states[path]]
+    lost_on_average = best_of_phones.max(axis=1) - best_of_phones.mean(axis=1)
+    is_silent = (graph.phones[graph.phone_number[path]] == silence) & (
+        best_of_phones.argmax(axis=1) == silence
+    )
+    if is_silent.all():
+        return 0.0
+    return 1.0 - float(lost[~is_silent].sum() / lost_on_average[~is_silent].sum())
 
 
 def spoken(phones: Sequence[Phone], inventory: PhoneInventory) -> list[Phone]:
     """Return the phones without the pauses."""
     return [phone for phone in phones if phone.symbol != inventory.silence]
+
+
+def timed_syllables(
+    phones: Sequence[Phone], transcript: Transcript, inventory: PhoneInventory
+) -> list[TimedSyllable]:
+    """Return the syllables of a text at the times of its aligned phones."""
+    rest = iter(spoken(phones, inventory))
+    timed = []
+    for syllable in transcript.syllables:
+        own = list(islice(rest, len(syllable.phones)))
+        end_s = own[-1].onset_s + own[-1].duration_s
+        timed.append(
+            TimedSyllable(syllable.text, syllable.spelling, own[0].onset_s, end_s - own[0].onset_s)
+        )
+    return timed

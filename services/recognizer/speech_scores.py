@@ -198,11 +198,14 @@ class SpeechScores:
 
 
 def score_recording(
-    model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int
+    model: AcousticModel,
+    samples: NDArray[np.float32],
+    sample_rate_hz: int,
+    lips: LipFrameStream | None = None,
 ) -> list[ScoreEvent]:
     """Score a whole recording, shape (n,) or (n, channels)."""
     num_channels = 1 if samples.ndim == 1 else samples.shape[1]
-    scores = SpeechScores(model, sample_rate_hz, num_channels)
+    scores = SpeechScores(model, sample_rate_hz, num_channels, lips)
     return (
         run_scoring_tasks(model, [scores.process(samples)])[0]
         + run_scoring_tasks(model, [scores.finish()])[0]

@@ -27,7 +27,7 @@ from shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, Speech
 
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
-MAX_DELAY_S = 0.3
+MAX_DELAY_S = 1.5  # live at most 0.3; further ahead a viseme weighs less than a face can show
 MAX_GAP_S = 10.0  # of media time that is filled with frames
 REST_S = 0.3  # frames that lead to rest after the end of the sound
 _RECENT_S = 2.0  # of events that a new lip model is told
@@ -48,7 +48,8 @@ class Face:
     frame_rate_hz
         10 to 240; frame ``k`` is at media time ``k / frame_rate_hz``.
     delay_s
-        0 to 0.3: how much later than its sound a frame is made.
+        0 to 1.5: how much later than its sound a frame is made; with 1.5 a recording's visemes are
+        blended as if all were known.
     idle_motion_seed
         Seed of blinks, gaze and head motion; with 0 the mouth alone moves.
     expressiveness
@@ -86,7 +87,8 @@ class Face:
         self._next_frame = math.ceil(start_s * self._frame_rate_hz - _ROUNDING)
         self._time_s = self._next_frame / self._frame_rate_hz  # of the last frame
         self._num_frames = 0  # made so far, while media time stood still too
-        self._is_speaking = False
+        self._is_speaking = False  # at the last frame
+        self._changes: deque[SpeechChange] = deque()  # of frames to come
         self._levels: list[tuple[float, float]] = []  # since the last frame
         self._recent: deque[SoundEvent] = deque()  # those a new lip model is told
         self._mouth = self._mouth_before = np.zeros(len(MOUTH_FAPS))  # of the last two frames
@@ -128,6 +130,7 @@ class Face:
         where it is then.
         """
         step_s = 1.0 / self._frame_rate_hz
+        self._follow_speech(math.inf)
         return [self._frame(self._lips.relax(step_s)) for _ in range(num_frames)]
 
     def flush(self) -> None:
@@ -160,7 +163,7 @@ class Face:
         while _time_of(self._recent[0]) < self._event_s - _RECENT_S:
             self._recent.popleft()
         if isinstance(event, SpeechChange):
-            self._is_speaking = event.active
+            self._changes.append(event)
         elif isinstance(event, Progress):
             self._levels.append((event.time_s, event.level_db))
 
@@ -170,9 +173,14 @@ class Face:
         last = math.floor((time_s - self._delay_s) * self._frame_rate_hz + _ROUNDING)
         for number in range(self._next_frame, last + 1):
             self._time_s = number / self._frame_rate_hz
+            self._follow_speech(self._time_s)
             frames.append(self._frame(self._lips.frame_at(self._time_s)))
         self._next_frame = max(self._next_frame, last + 1)
         return frames
+
+    def _follow_speech(self, time_s: float) -> None:
+        while self._changes and self._changes[0].time_s <= time_s:
+            self._is_speaking = self._changes.popleft().active
 
     def _frame(self, mouth: MouthFrame) -> Frame:
         self._change_s += 1.0 / self._frame_rate_hz

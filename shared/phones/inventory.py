@@ -1,12 +1,13 @@
 """The phones of a language: one value, made from the tables in the language's own folder.
 
-A language is a Python package with ``phones.tsv`` and a function ``pronounce``. A pattern
-``READABLE`` may say which stretches of a line of text to pronounce; without it, words between
-spaces. A function ``spell`` may write a syllable's phones as its readers do; without it, the
-symbols in a row. ``CODE`` may be the language's two letters in ISO 639-1, by which recordings name
-it. The languages that come with kouxing are listed in ``BUILT_IN``; any installed distribution adds
-one by an entry point of the group ``kouxing.languages`` (its name is the language's, its value the
-package).
+A language is a Python package with ``phones.tsv`` and a function ``pronounce``. A function
+``transcribe`` may tell more: a text's syllables with their spelling, and what it cannot read. A
+pattern ``READABLE`` may say which stretches of a line of text to pronounce; without it, words
+between spaces. A function ``spell`` may write a syllable's phones as its readers do; without it,
+the symbols in a row. ``CODE`` may be the language's two letters in ISO 639-1, by which recordings
+name it. The languages that come with kouxing are listed in ``BUILT_IN``; any installed distribution
+adds one by an entry point of the group ``kouxing.languages`` (its name is the language's, its value
+the package).
 
 ``phones.tsv`` has one phone a row, in the order of the acoustic models' outputs:
 
@@ -35,6 +36,7 @@ from importlib import resources
 from importlib.metadata import entry_points
 
 from shared.errors import UserError
+from shared.phones.transcript import SpokenSyllable, Transcript
 
 BUILT_IN = {"mandarin": "shared.phones.mandarin"}
 DEFAULT_LANGUAGE = "mandarin"
@@ -64,6 +66,7 @@ class PhoneInventory:
     visemes: dict[str, VisemeShares]  # by phone
     before_rounded: dict[str, str]  # viseme of a phone before a rounded one, where it has another
     pronounce: Callable[[str], list[Syllable]]  # text to syllables of phones; the lexicon
+    transcribe: Callable[[str], Transcript] | None = None  # as pronounce, with the spelling
     readable: re.Pattern[str] = _WORDS  # finds the stretches of a line that may be pronounced
     spell: Callable[[Syllable], str] = "".join  # the phones of a syllable to its spelling
     code: str = ""  # ISO 639-1, "zh"; empty: recordings are never in this language
@@ -109,6 +112,22 @@ class PhoneInventory:
         """Vowels, each with what follows it in its syllable."""
         return self._of_kind("vowel")
 
+    def read(self, text: str) -> Transcript:
+        """Return a text's syllables with their spelling, and what cannot be read.
+
+        Raises
+        ------
+        UserError
+            If the text cannot be read at all.
+        """
+        if self.transcribe is not None:
+            return self.transcribe(text)
+        syllables = (
+            SpokenSyllable(self.spell(phones), self.spell(phones), phones)
+            for phones in self.pronounce(text)
+        )
+        return Transcript(tuple(syllables))
+
     def _of_kind(self, wanted: str) -> frozenset[str]:
         return frozenset(
             phone for phone, kind in zip(self.phones, self.kinds, strict=True) if kind == wanted
@@ -150,6 +169,7 @@ def load_inventory(language: str = DEFAULT_LANGUAGE) -> PhoneInventory:
                 row["phone"]: row["before_rounded"] for row in rows if row["before_rounded"]
             },
             pronounce=lexicon.pronounce,
+            transcribe=getattr(lexicon, "transcribe", None),
             readable=getattr(lexicon, "READABLE", _WORDS),
             spell=getattr(lexicon, "spell", "".join),
             code=getattr(lexicon, "CODE", ""),

@@ -10,14 +10,22 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import TypeAlias
 
 from shared.errors import UserError
 from shared.phones.events import Phone
+from shared.phones.transcript import TimedSyllable
 
 _COLUMNS = ("index", "phone", "onset_s", "duration_s", "confidence")
 
 
-def format_phones(phones: Sequence[Phone], style: str, total_s: float) -> str:
+def format_phones(
+    phones: Sequence[Phone],
+    style: str,
+    total_s: float,
+    syllables: Sequence[TimedSyllable] = (),
+) -> str:
     """Write phones as text.
 
     Parameters
@@ -28,6 +36,8 @@ def format_phones(phones: Sequence[Phone], style: str, total_s: float) -> str:
         ``table``, ``csv``, ``json`` or ``textgrid``.
     total_s
         Length of the recording, seconds.
+    syllables
+        Those of a known text: further tiers of a TextGrid, a further list in JSON.
 
     Returns
     -------
@@ -41,7 +51,7 @@ def format_phones(phones: Sequence[Phone], style: str, total_s: float) -> str:
     """
     if style not in _STYLES:
         raise UserError(f"unknown format {style!r}; choose {', '.join(_STYLES)}")
-    return _STYLES[style](phones, total_s)
+    return _STYLES[style](phones, total_s, syllables)
 
 
 def _cells(phone: Phone) -> tuple[int, str, float, float, float]:
@@ -54,8 +64,7 @@ def _cells(phone: Phone) -> tuple[int, str, float, float, float]:
     )
 
 
-def _table(phones: Sequence[Phone], total_s: float) -> str:
-    del total_s
+def _table(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
     lines = ["  onset_s  duration_s  phone  confidence"]
     for phone in phones:
         times = f"{phone.onset_s:9.3f}  {phone.duration_s:10.3f}"
@@ -63,8 +72,7 @@ def _table(phones: Sequence[Phone], total_s: float) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _csv(phones: Sequence[Phone], total_s: float) -> str:
-    del total_s
+def _csv(phones: Sequence[Phone], _total_s: float, _: Sequence[TimedSyllable]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
@@ -72,13 +80,34 @@ def _csv(phones: Sequence[Phone], total_s: float) -> str:
     return text.getvalue()
 
 
-def _json(phones: Sequence[Phone], total_s: float) -> str:
+def _json(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]) -> str:
     rows = [dict(zip(_COLUMNS, _cells(phone), strict=True)) for phone in phones]
-    return json.dumps({"total_s": round(total_s, 4), "phones": rows}, indent=1) + "\n"
+    found: dict[str, object] = {"total_s": round(total_s, 4), "phones": rows}
+    if syllables:
+        found["syllables"] = [
+            asdict(syllable)
+            | {"onset_s": round(syllable.onset_s, 4), "duration_s": round(syllable.duration_s, 4)}
+            for syllable in syllables
+        ]
+    return json.dumps(found, indent=1, ensure_ascii=False) + "\n"
 
 
-def _textgrid(phones: Sequence[Phone], total_s: float) -> str:
-    intervals = _without_gaps(phones, total_s)
+_Interval: TypeAlias = tuple[float, float, str]  # start and end in seconds, text
+
+
+def _textgrid(phones: Sequence[Phone], total_s: float, syllables: Sequence[TimedSyllable]) -> str:
+    tiers = {
+        "phones": [(p.onset_s, p.onset_s + p.duration_s, p.symbol) for p in phones],
+    }
+    if syllables:
+        ends_s = [syllable.onset_s + syllable.duration_s for syllable in syllables]
+        tiers = {
+            name: [
+                (syllable.onset_s, end_s, getattr(syllable, of))
+                for syllable, end_s in zip(syllables, ends_s, strict=True)
+            ]
+            for name, of in (("characters", "text"), ("syllables", "spelling"))
+        } | tiers
     lines = [
         'File type = "ooTextFile"',
         'Object class = "TextGrid"',
@@ -86,47 +115,56 @@ def _textgrid(phones: Sequence[Phone], total_s: float) -> str:
         "xmin = 0",
         f"xmax = {total_s:.4f}",
         "tiers? <exists>",
-        "size = 1",
+        f"size = {len(tiers)}",
         "item []:",
-        "    item [1]:",
+    ]
+    for number, (name, intervals) in enumerate(tiers.items(), start=1):
+        lines += _tier(number, name, _without_gaps(intervals, total_s), total_s)
+    return "\n".join(lines) + "\n"
+
+
+def _tier(number: int, name: str, intervals: list[_Interval], total_s: float) -> list[str]:
+    lines = [
+        f"    item [{number}]:",
         '        class = "IntervalTier"',
-        '        name = "phones"',
+        f'        name = "{name}"',
         "        xmin = 0",
         f"        xmax = {total_s:.4f}",
         f"        intervals: size = {len(intervals)}",
     ]
-    for number, (start_s, end_s, symbol) in enumerate(intervals, start=1):
+    for position, (start_s, end_s, text) in enumerate(intervals, start=1):
+        quoted = text.replace('"', '""')
         lines += [
-            f"        intervals [{number}]:",
+            f"        intervals [{position}]:",
             f"            xmin = {start_s:.4f}",
             f"            xmax = {end_s:.4f}",
-            f'            text = "{symbol}"',
+            f'            text = "{quoted}"',
         ]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
-def _without_gaps(phones: Sequence[Phone], total_s: float) -> list[tuple[float, float, str]]:
+def _without_gaps(given: Sequence[_Interval], total_s: float) -> list[_Interval]:
     """Return intervals that cover the whole time: gaps become empty ones, overlaps are cut."""
-    intervals: list[tuple[float, float, str]] = []
+    intervals: list[_Interval] = []
     now_s = 0.0
-    for number, phone in enumerate(phones):
-        next_s = phones[number + 1].onset_s if number + 1 < len(phones) else total_s
-        start_s = max(now_s, phone.onset_s)
-        end_s = min(phone.onset_s + phone.duration_s, next_s, total_s)
+    for number, (onset_s, offset_s, text) in enumerate(given):
+        next_s = given[number + 1][0] if number + 1 < len(given) else total_s
+        start_s = max(now_s, onset_s)
+        end_s = min(offset_s, next_s, total_s)
         if round(end_s, 4) <= round(start_s, 4):
             continue
         if round(start_s, 4) > round(now_s, 4):
             intervals.append((now_s, start_s, ""))
         else:
             start_s = now_s
-        intervals.append((start_s, end_s, phone.symbol))
+        intervals.append((start_s, end_s, text))
         now_s = end_s
     if round(total_s, 4) > round(now_s, 4):
         intervals.append((now_s, total_s, ""))
     return intervals
 
 
-_STYLES: dict[str, Callable[[Sequence[Phone], float], str]] = {
+_STYLES: dict[str, Callable[[Sequence[Phone], float, Sequence[TimedSyllable]], str]] = {
     "table": _table,
     "csv": _csv,
     "json": _json,

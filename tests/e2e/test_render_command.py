@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -16,16 +17,20 @@ import pytest
 from PIL import Image
 
 from services.cli.heads import import_mesh
-from services.cli.offline import render
+from services.cli.offline import CurveForm, render
 from services.cli.run import head_environment
 from services.driver.config import DriverConfig, Framing
 from services.driver.head.glb_export import export_glb
 from services.driver.head.head import Head
 from services.driver.video.film import frames_of
+from services.live_chain import LiveChain
+from services.recognizer.acoustic.load import load_model
 from services.recognizer.lips import load_lips
 from services.recognizer.voice import Voice
+from services.synthesizer.lips.load import load_lip_model
+from shared.audio_file import read_audio
 from shared.errors import UserError
-from shared.face.fap_file import FapAnimation, write_fap
+from shared.face.fap_file import FapAnimation, read_fap, write_fap
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from tests.glb_writer import write_glb
 from tests.meshes import meshes
@@ -103,6 +108,12 @@ def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
         ("a.mp4", {"lips": ["learnt"]}, "--lips is for a sound"),
         ("a.mp4", {"voice": Path("me.voice")}, "--voice is for a sound"),
+        ("a.mp4", {"live": True}, "--live is for a sound"),
+        ("a.csv", {"text": "你好"}, "--text is for a sound"),
+        ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit is for curves"),
+        ("a.fap", {"form": CurveForm.ARKIT}, "such a file holds faps"),
+        ("a.glb", {"form": CurveForm.OCULUS}, "such a file holds faps or arkit"),
+        ("no/a.csv", {}, "cannot be written"),
         ("no/a.mp4", {}, "cannot be written"),
         ("no/a.png", {"size": "64x48"}, "cannot be written"),
     ],
@@ -112,6 +123,35 @@ def test_what_does_not_fit_is_named(
 ) -> None:
     with pytest.raises(UserError, match=said):
         render(face, tmp_path / output, **options)
+
+
+def test_a_sound_becomes_curves(tmp_path: Path) -> None:
+    paths = {suffix: tmp_path / f"a{suffix}" for suffix in (".fap", ".csv", ".jsonl")}
+    render(SENTENCE, paths[".fap"])
+    faps = read_fap(paths[".fap"])
+    assert faps.frame_rate_hz == 50
+    assert np.ptp(faps.faps[:, 2]) > 100
+    render(paths[".fap"], paths[".csv"])
+    table = np.genfromtxt(paths[".csv"], delimiter=",", names=True)
+    np.testing.assert_allclose(table["open_jaw"], faps.faps[:, 2], rtol=1e-3, atol=0.01)
+    np.testing.assert_allclose(table["time_s"], np.arange(len(faps.faps)) / 50)
+    render(paths[".fap"], paths[".jsonl"], form=CurveForm.ARKIT)
+    lines = [json.loads(line) for line in paths[".jsonl"].read_text().splitlines()]
+    jaw = [line["arkit"]["jawOpen"] for line in lines]
+    assert np.corrcoef(jaw, faps.faps[:, 2])[0, 1] > 0.8
+    with pytest.raises(UserError, match="curves are of one face"):
+        render(SENTENCE, paths[".csv"], lips=list(LipModelName)[:2])
+    with pytest.raises(UserError, match="--live knows no text"):
+        render(SENTENCE, paths[".csv"], live=True, text="啊")
+
+
+def test_live_shows_what_the_stream_would_have(tmp_path: Path) -> None:
+    render(SENTENCE, tmp_path / "live.fap", live=True)
+    chain = LiveChain(load_model(), load_lip_model())
+    samples = read_audio(SENTENCE)[0][:, 0]
+    frames = chain.accept_waveform(samples) + chain.input_finished()
+    written = read_fap(tmp_path / "live.fap").faps[:, 2:]
+    np.testing.assert_allclose(written, [faps[2:] for _, faps in frames], rtol=1e-6, atol=1e-6)
 
 
 def test_lip_models_side_by_side(tmp_path: Path) -> None:

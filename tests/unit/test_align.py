@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from services.cli.offline import PhoneFormat, align
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.alignment import align_text, spoken
+from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.alignment import align_syllables, align_text, spoken, timed_syllables
 from shared.audio_file import read_audio
 from shared.errors import UserError
 from shared.phones.events import Phone
@@ -110,6 +111,65 @@ def test_the_suffix_tells_the_form(
 ) -> None:
     align(DEMO / "vowels-male.wav", "啊喔鹅衣乌迂", form=form, output=tmp_path / name)
     assert (tmp_path / name).read_text().startswith(beginning)
+
+
+def test_a_text_that_does_not_fit_is_told_and_fails(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "wrong.txt").write_text("今天是2024年10月1日，Mike走了", encoding="utf-8")
+    output = tmp_path / "said.csv"
+    with pytest.raises(typer.Exit) as ended:
+        align(DEMO / "hello-female.wav", str(tmp_path / "wrong.txt"), output=output)
+    assert ended.value.exit_code == 1
+    told = capsys.readouterr().err
+    assert "left out of the text: 'Mike'" in told
+    assert "does not fit" in told
+    assert output.is_file()
+
+
+@pytest.mark.parametrize(
+    ("text", "fits"),
+    [
+        ("你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。", True),
+        ("你好，欢迎来到口型。你听到的每一个字，", False),
+        ("你好，欢迎来到口型。今天天气不错，我们一起去公园散步吧。", False),
+        ("ni3 hao3 huan1 ying2 lai2 dao4 kou3 xing2 nǐ tīng dào de měi yí gè zì dōu yóu wǒ de"
+         " liǎn shí shí shuō chū lái", True),
+    ],
+)  # fmt: skip
+def test_the_fit_tells_whether_the_text_was_said(text: str, *, fits: bool) -> None:
+    model = load_model(model_path("blocks"))
+    samples, rate_hz = read_audio(DEMO / "hello-female.wav")
+    syllables = model.inventory.pronounce(text)
+    assert align_syllables(model, samples, rate_hz, syllables).fits is fits
+    padded = np.concatenate([np.zeros((3 * rate_hz, 1), np.float32), samples])
+    assert align_syllables(model, padded, rate_hz, syllables).fits is fits, "whatever the pauses"
+
+
+def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
+    transcript = load_inventory().read("你好")
+    aligned = [
+        Phone(index=i, symbol=symbol, onset_s=0.1 * i, duration_s=0.1, confidence=1.0, final=True)
+        for i, symbol in enumerate(["sil", "n", "i", "sil", "h", "ao"])
+    ]
+    syllables = timed_syllables(aligned, transcript, load_inventory())
+    lines = format_phones(aligned, "textgrid", 0.7, syllables).splitlines()
+    assert "size = 3" in lines
+    names = [line.split('"')[1] for line in lines if "name =" in line]
+    assert names == ["characters", "syllables", "phones"]
+    texts = [line.split('"')[1] for line in lines if "text =" in line]
+    assert texts == [
+        "", "你", "", "好", "", "", "ni3", "", "hao3", "", "sil", "n", "i", "sil", "h", "ao", "",
+    ]  # fmt: skip
+    read = json.loads(format_phones(aligned, "json", 0.7, syllables))
+    assert read["syllables"][1] == {
+        "text": "好", "spelling": "hao3", "onset_s": 0.4, "duration_s": 0.2,
+    }  # fmt: skip
+
+
+def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"ends in \.txt, \.csv, \.json, \.textgrid"):
+        align(DEMO / "vowels-male.wav", "啊", output=tmp_path / "said.xml")
 
 
 def test_unknown_style() -> None:

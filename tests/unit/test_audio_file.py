@@ -4,6 +4,7 @@ import io
 import tracemalloc
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import soundfile
@@ -101,3 +102,60 @@ def test_raw_sound_may_come_in_odd_pieces() -> None:
     source = raw_audio(io.BytesIO(values.tobytes() + b"\x01"), 16000, 2)
     read = np.concatenate(list(source.blocks))
     np.testing.assert_allclose(read.ravel() * 32768, values)
+
+
+def _write_media(path: Path, codec: str, samples: np.ndarray, rate_hz: int) -> None:
+    with av.open(path, "w") as container:
+        stream = container.add_stream(codec, rate=rate_hz, layout="mono")
+        assert isinstance(stream, av.AudioStream)
+        resampler = av.AudioResampler(stream.format.name, "mono", rate_hz, frame_size=960)
+        frame = av.AudioFrame.from_ndarray(samples[None], format="fltp", layout="mono")
+        frame.sample_rate = rate_hz
+        for part in [*resampler.resample(frame), *resampler.resample(None)]:
+            container.mux(stream.encode(part))
+        container.mux(stream.encode(None))
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "rate_hz"),
+    [("a.m4a", "aac", 44100), ("a.webm", "libopus", 48000), ("a.mkv", "pcm_s16le", 22050)],
+)
+def test_what_a_telephone_records_is_read(
+    tmp_path: Path, name: str, codec: str, rate_hz: int
+) -> None:
+    sine = (0.5 * np.sin(2 * np.pi * 440 * np.arange(rate_hz) / rate_hz)).astype(np.float32)
+    _write_media(tmp_path / name, codec, sine, rate_hz)
+    source = open_audio(tmp_path / name)
+    blocks = list(source.blocks)
+    samples = np.concatenate(blocks)[:, 0]
+    assert (source.sample_rate_hz, source.num_channels) == (rate_hz, 1)
+    assert source.duration_s == pytest.approx(1.0, abs=0.1)
+    assert {len(block) for block in blocks[:-1]} == {round(0.02 * rate_hz)}
+    assert len(samples) / rate_hz == pytest.approx(1.0, abs=0.1)
+    spectrum = np.abs(np.fft.rfft(samples[:rate_hz]))
+    assert np.argmax(spectrum) == pytest.approx(440, abs=10)
+    assert np.abs(samples[rate_hz // 4 : rate_hz // 2]).max() == pytest.approx(0.5, abs=0.05)
+    assert source.remarks == []
+
+
+def test_media_that_are_cut_off_or_silent_films_are_named(tmp_path: Path) -> None:
+    sine = (0.5 * np.sin(np.arange(96000) / 17)).astype(np.float32)
+    _write_media(tmp_path / "a.mkv", "pcm_s16le", sine, 48000)
+    data = (tmp_path / "a.mkv").read_bytes()
+    (tmp_path / "a.mkv").write_bytes(data[: len(data) // 2])
+    source = open_audio(tmp_path / "a.mkv")
+    assert sum(len(block) for block in source.blocks) > 0
+    assert "cut off" in source.remarks[0]
+    with av.open(tmp_path / "mute.mp4", "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.width = stream.height = 32
+        stream.pix_fmt = "yuv420p"
+        picture = av.VideoFrame.from_ndarray(np.zeros((32, 32, 3), np.uint8), format="rgb24")
+        container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    with pytest.raises(UserError, match="no sound in it"):
+        open_audio(tmp_path / "mute.mp4")
+    (tmp_path / "list.m3u8").write_text(f"#EXTM3U\n#EXTINF:5,\n{tmp_path / 'a.mkv'}\n")
+    with pytest.raises(UserError, match="no audio that can be read"):
+        open_audio(tmp_path / "list.m3u8")

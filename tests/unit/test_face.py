@@ -276,7 +276,7 @@ def test_the_end_of_the_sound_brings_the_frames_owed_and_leads_to_rest() -> None
 
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(UserError, match="delay_s"):
-        make_face(delay_s=0.4)
+        make_face(delay_s=1.6)
     with pytest.raises(UserError, match="frame_rate_hz"):
         make_face(frame_rate_hz=5.0)
 

@@ -396,7 +396,7 @@ def test_lips_do_not_pass_through_each_other() -> None:
 
 
 def test_phones_are_no_evidence_against_a_closure() -> None:
-    phones = ClosingPhones(LIPS.inventory, "b", 3.0)
+    phones = ClosingPhones(LIPS.inventory, "b", ClosureRule(phone=3.0))
     log_odds = [phones.log_odds(0.5)]
     phones.accept(phone("t", 0.46), 0.4)
     log_odds.append(phones.log_odds(0.5))
@@ -404,6 +404,16 @@ def test_phones_are_no_evidence_against_a_closure() -> None:
     phones.accept(phone("p", 0.46, index=1), 0.4)
     assert phones.log_odds(0.5) > 2.0
     assert [shut_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
+
+
+def test_of_recordings_other_phones_are_evidence_against_a_closure() -> None:
+    phones = ClosingPhones(LIPS.inventory, "b", ClosureRule(phone=3.0, other=2.0))
+    phones.accept(phone("t", 0.46), 0.0)
+    phones.accept(phone("sil", 0.7, index=1), 0.0)
+    assert phones.log_odds(0.5) == -2.0
+    assert phones.log_odds(0.72) == 0.0
+    phones.accept(phone("p", 0.48, index=2), 0.0)
+    assert phones.log_odds(0.5) > 2.0
 
 
 @pytest.mark.parametrize("doubtful", [{4: -100.0, 5: -100.0}, {6: -100.0, 7: -100.0}])

@@ -1,7 +1,7 @@
 import pytest
 
 from shared.errors import UserError
-from shared.phones.mandarin.pinyin import phones_of_syllable, pinyin_of_text
+from shared.phones.mandarin.pinyin import phones_of_syllable, transcribe
 from tests.languages import MANDARIN
 
 pytestmark = pytest.mark.unit
@@ -133,10 +133,39 @@ def test_unknown_syllables_are_named(wrong: str) -> None:
 
 
 def test_text() -> None:
-    assert pinyin_of_text("你好，世界！") == ("ni3", "hao3", "shi4", "jie4")
+    assert MANDARIN.pronounce("你好，世界！") == [
+        ("n", "i"),
+        ("h", "ao"),
+        ("sh", "iii"),
+        ("j", "ie"),
+    ]
     assert MANDARIN.pronounce("ni3 hao3") == [("n", "i"), ("h", "ao")]
-    assert pinyin_of_text("绿") == ("lv4",)
+    assert MANDARIN.pronounce("绿") == [("l", "v")]
     with pytest.raises(UserError, match="'abc'"):
-        pinyin_of_text("你abc")
-    with pytest.raises(UserError, match="'42'"):
-        pinyin_of_text("42度")
+        MANDARIN.pronounce("你abc，x")
+
+
+@pytest.mark.parametrize(
+    ("text", "read"),
+    [
+        ("2024年10月1日", "二零二四年十月一日"),
+        ("下午3:30", "下午三点三十分"),
+        ("3.5%", "百分之三点五"),
+        ("第2个，2个", "第二个两个"),
+        ("-5℃", "负五摄氏度"),
+    ],
+)
+def test_numbers_are_read(text: str, read: str) -> None:
+    assert "".join(syllable.text for syllable in transcribe(text).syllables) == read
+
+
+def test_a_transcript_has_characters_tones_and_what_was_dropped() -> None:
+    transcript = transcribe("银行 的花儿，A股 ☃。女")
+    assert [syllable.text for syllable in transcript.syllables] == list("银行的花儿股女")
+    spelling = [syllable.spelling for syllable in transcript.syllables]
+    assert spelling == ["yin2", "hang2", "de5", "hua1", "er2", "gu3", "nü3"]
+    assert transcript.dropped == ("A", "☃")
+    assert [s.spelling for s in transcribe("Nǐ hǎo, lü4 ma!").syllables] == [
+        "Ni3", "hao3", "lü4", "ma",
+    ]  # fmt: skip
+    assert transcribe("，。").syllables == ()

@@ -150,3 +150,49 @@ def test_unwritable_path(tmp_path: Path) -> None:
         export_glb(heads.load("woman", "coarse"), tmp_path / "no" / "head.glb")
     with pytest.raises(UserError, match=r"ends in \.glb"):
         export_glb(heads.load("woman", "coarse"), tmp_path / "head.png")
+
+
+def read(document: dict[str, Any], binary: bytes, accessor: int) -> np.ndarray:
+    """Return the floats of an accessor, flat."""
+    view = document["bufferViews"][document["accessors"][accessor]["bufferView"]]
+    return np.frombuffer(binary, np.float32, view["byteLength"] // 4, view["byteOffset"])
+
+
+@pytest.mark.parametrize("as_arkit", [False, True])
+def test_an_animation_moves_the_head_as_its_faps_do(tmp_path: Path, *, as_arkit: bool) -> None:
+    head = heads.load("woman", "coarse")
+    faps = np.zeros((3, 68), np.float32)
+    faps[1] = 0.5 * ARKIT[ARKIT_NAMES.index("jawOpen")]
+    faps[2, 48] = 0.1 / 1e-5  # the head turns by 0.1 rad
+    path = tmp_path / "speaks.glb"
+    export_glb(head, path, [(0.02 * k, row) for k, row in enumerate(faps)], as_arkit=as_arkit)
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    (animation,) = document["animations"]
+    curves = {}
+    for channel in animation["channels"]:
+        sampler = animation["samplers"][channel["sampler"]]
+        target = channel["target"]
+        name = document["nodes"][target["node"]]["name"]
+        curves[name, target["path"]] = read(document, data[28 + size :], sampler["output"])
+        times_s = read(document, data[28 + size :], sampler["input"])
+        np.testing.assert_allclose(times_s, [0.0, 0.02, 0.04])
+    np.testing.assert_allclose(
+        curves["head", "rotation"].reshape(3, 4)[2], [0, np.sin(0.05), 0, np.cos(0.05)], atol=1e-6
+    )
+    (skin,) = (part for part in head.parts if part.name == "skin")
+    targets = next(m for m in document["meshes"] if m["name"] == "skin")["extras"]["targetNames"]
+    weights = curves["skin", "weights"].reshape(3, len(targets))
+    assert not weights[0].any()
+    moved = np.zeros((skin.vertices.stop - skin.vertices.start, 3))
+    fields = head.basis[3 * skin.vertices.start : 3 * skin.vertices.stop].T.toarray()
+    for name, weight in zip(targets, weights[1], strict=True):
+        if weight and as_arkit:
+            moved += weight * (ARKIT[ARKIT_NAMES.index(name)] @ fields).reshape(-1, 3)
+        elif weight:
+            fap = next(fap for fap in FAPS if fap.name == name)
+            moved += 1024 * weight * fields[fap.number - 1].reshape(-1, 3)
+    expected = (faps[1] @ fields).reshape(-1, 3)
+    error_m = np.abs(moved - expected).max()
+    assert error_m < (0.1 if as_arkit else 0.01) * np.abs(expected).max()

@@ -13,25 +13,32 @@ Nodes: ``kouxing`` > ``body`` (joint), ``garment``; ``body`` > ``head`` (joint) 
 ``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``;
 and ``skin``, a mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face
 looks along z.
+
+With a motion there is an animation ``speech`` of the weights of every mesh and of the nodes that
+turn; between its frames it is linear.
 """
 
 from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from services.driver.head.head import ASSETS, Head, Part
 from services.driver.render.renderer import BACKGROUND
 from services.driver.render.scene import camera
 from shared.errors import UserError
-from shared.face.blendshapes import ARKIT, ARKIT_NAMES
+from shared.face.blendshapes import ARKIT, ARKIT_NAMES, arkit_weights
 from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
+
+Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
 _COMPONENT = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
@@ -60,7 +67,7 @@ class _Document:
             key: []
             for key in (
                 "nodes", "meshes", "materials", "textures", "images", "samplers", "skins",
-                "accessors", "bufferViews",
+                "accessors", "bufferViews", "animations",
             )
         }  # fmt: skip
         self.binary = bytearray()
@@ -88,7 +95,7 @@ class _Document:
         array: NDArray[Any],
         kind: str,
         *,
-        target: int = _ARRAY_BUFFER,
+        target: int | None = _ARRAY_BUFFER,
         normalized: bool = False,
         bounds: bool = False,
     ) -> int:
@@ -102,7 +109,11 @@ class _Document:
         if normalized:
             item["normalized"] = True
         if bounds:
-            item["min"], item["max"] = array.min(axis=0).tolist(), array.max(axis=0).tolist()
+            lowest, highest = array.min(axis=0), array.max(axis=0)
+            item["min"], item["max"] = (
+                np.atleast_1d(lowest).tolist(),
+                np.atleast_1d(highest).tolist(),
+            )
         return self.add("accessors", item)
 
     def sparse_vectors(
@@ -132,7 +143,8 @@ class _Document:
 
     def save(self, path: Path, **rest: Any) -> None:
         """Write the two chunks."""
-        document = {"asset": {"version": "2.0", "generator": "kouxing"}, **self.json, **rest}
+        lists = {kind: items for kind, items in self.json.items() if items}  # none may be empty
+        document = {"asset": {"version": "2.0", "generator": "kouxing"}, **lists, **rest}
         document["buffers"] = [{"byteLength": len(self.binary)}]
         text = json.dumps(document, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
@@ -149,7 +161,9 @@ class _Document:
             ) from error
 
 
-def export_glb(head: Head, path: str | Path) -> None:
+def export_glb(
+    head: Head, path: str | Path, motion: Sequence[Frame] = (), *, as_arkit: bool = False
+) -> None:
     """Write a head as GLB.
 
     Parameters
@@ -158,6 +172,10 @@ def export_glb(head: Head, path: str | Path) -> None:
         The head; a fine one has more triangles.
     path
         File to write.
+    motion
+        Frames of an animation: media time in seconds, FAPs (68,).
+    as_arkit
+        Move the targets of ARKit's shapes, not those of the FAPs.
 
     Raises
     ------
@@ -193,18 +211,63 @@ def export_glb(head: Head, path: str | Path) -> None:
         "nodes", _parent("kouxing", [nodes["body"], *on_body]) | {"extras": extras}
     )
     identity = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)).reshape(2, 16)
-    matrices = document.accessor(identity, "MAT4")
-    del document.json["bufferViews"][-1]["target"]  # matrices are no vertex attribute
+    matrices = document.accessor(identity, "MAT4", target=None)
     joints = [nodes["body"], nodes["head"]]
     document.add(
         "skins",
         {"joints": joints, "skeleton": nodes["body"], "inverseBindMatrices": matrices},
     )
+    if len(motion):
+        _add_animation(document, nodes, motion, as_arkit=as_arkit)
     document.save(
         Path(path),
         scene=0,
         scenes=[{"name": head.name, "nodes": [nodes["kouxing"], *skinned], "extras": extras}],
     )
+
+
+def _add_animation(
+    document: _Document, nodes: dict[str, int], motion: Sequence[Frame], *, as_arkit: bool
+) -> None:
+    """Add an animation of all weights and rotations."""
+    times_s = np.array([time_s for time_s, _ in motion], np.float32)
+    faps = np.array([faps for _, faps in motion], np.float32)  # (num_frames, 68)
+    weights = {
+        fap.name: faps[:, fap.number - 1] / np.float32(_units_per_weight(fap.fapu)) for fap in FAPS
+    }
+    turned = {node for node, _ in _ROTATION_OF.values() if node in nodes}
+    if as_arkit:
+        shapes = np.array([arkit_weights(row) for row in faps]).T
+        weights = dict(zip(ARKIT_NAMES, shapes, strict=True))
+        turned &= {"head"}  # ARKit's own shapes turn the eyes
+    curves = {(node, "rotation"): _rotation(node, faps) for node in sorted(turned)}
+    for name, node in nodes.items():
+        if (mesh := document.json["nodes"][node].get("mesh")) is None:
+            continue
+        names = document.json["meshes"][mesh].get("extras", {}).get("targetNames", ())
+        if names:
+            still = np.zeros(len(faps), np.float32)
+            curves[name, "weights"] = np.stack([weights.get(each, still) for each in names], axis=1)
+    times = document.accessor(times_s, "SCALAR", target=None, bounds=True)
+    samplers: list[dict[str, Any]] = []
+    channels: list[dict[str, Any]] = []
+    for (name, path), values in curves.items():
+        kind = "VEC4" if path == "rotation" else "SCALAR"
+        flat = values if path == "rotation" else values.ravel()
+        output = document.accessor(flat.astype(np.float32), kind, target=None)
+        channels.append({"sampler": len(samplers), "target": {"node": nodes[name], "path": path}})
+        samplers.append({"input": times, "output": output, "interpolation": "LINEAR"})
+    document.add("animations", {"name": "speech", "samplers": samplers, "channels": channels})
+
+
+def _rotation(node: str, faps: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the quaternions (num_frames, 4) of a node that FAPs turn: yaw, pitch, roll."""
+    angles = np.zeros((len(faps), 3))
+    for fap, (turned, axis) in _ROTATION_OF.items():
+        if turned == node:
+            angles[:, axis.index(1)] = faps[:, fap - 1] * RADIANS_PER_ANGLE_UNIT
+    quaternions: NDArray[np.float64] = Rotation.from_euler("YXZ", angles[:, [1, 0, 2]]).as_quat()
+    return quaternions
 
 
 def _carrier(head: Head, part: Part) -> str:

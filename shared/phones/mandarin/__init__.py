@@ -10,9 +10,9 @@ Crystal has {ei, en, eng}; the vowels ``ii`` and ``iii`` keep the shape of the i
 
 import re
 
-from shared.phones.mandarin.pinyin import pronounce, spell
+from shared.phones.mandarin.pinyin import pronounce, spell, transcribe
 
-__all__ = ["CODE", "READABLE", "pronounce", "spell"]
+__all__ = ["CODE", "READABLE", "pronounce", "spell", "transcribe"]
 
 CODE = "zh"
 READABLE = re.compile(r"[\u3007\u4e00-\u9fff]+")

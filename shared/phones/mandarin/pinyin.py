@@ -23,6 +23,7 @@ import unicodedata
 from functools import lru_cache
 
 from shared.errors import UserError
+from shared.phones.transcript import SpokenSyllable, Transcript
 
 # Longest first, so that zh is not read as z + h.
 _INITIALS_BY_LENGTH = tuple("zh ch sh b p m f d t n l g k h j q x r z c s".split())
@@ -62,7 +63,8 @@ _SPELLED_AFTER |= {phone: "ü" + phone[1:] for phone in _V_ROW.values()}
 _SPELLED_AFTER_J = {phone: "u" + phone[1:] for phone in _V_ROW.values()}
 
 _PINYIN_LETTERS = "üāáǎàēéěèīíǐìōóǒòūúǔùǖǘǚǜ"
-_TONE_MARKS = "\u0300\u0301\u0304\u030c"
+_TONES = {"\u0304": 1, "\u0301": 2, "\u030c": 3, "\u0300": 4}  # combining marks
+_PUNCTUATION = ',.;!?"()“”，。！？、；：…—'
 
 
 def phones_of_syllable(syllable: str) -> tuple[str, ...]:
@@ -106,16 +108,17 @@ def phones_of_syllable(syllable: str) -> tuple[str, ...]:
 def pronounce(text: str) -> list[tuple[str, ...]]:
     """Return the phones of each syllable of a text, in Chinese characters or in pinyin.
 
-    Spaces between Chinese characters, as in segmented texts, mean nothing.
-
     Raises
     ------
     UserError
-        If the text cannot be read.
+        If the text cannot be read, as a whole.
     """
-    is_pinyin = text.isascii() or any(letter in text for letter in _PINYIN_LETTERS)
-    syllables = text.split() if is_pinyin else pinyin_of_text("".join(text.split()))
-    return [phones_of_syllable(syllable) for syllable in syllables]
+    transcript = transcribe(text)
+    if transcript.dropped:
+        raise UserError(
+            f"cannot read {transcript.dropped[0]!r} as Mandarin; write it out in Chinese characters"
+        )
+    return transcript.phones
 
 
 def spell(phones: tuple[str, ...]) -> str:
@@ -136,40 +139,86 @@ def spell(phones: tuple[str, ...]) -> str:
     return initial[0] + _SPELLED_AFTER.get(final, final)
 
 
-def pinyin_of_text(text: str) -> tuple[str, ...]:
-    """Convert Chinese text to numbered pinyin syllables; punctuation is left out.
+def transcribe(text: str) -> Transcript:
+    """Read a text aloud: characters or pinyin, numbers and dates.
+
+    Spaces between Chinese characters, as in segmented texts, and punctuation mean nothing. Letters
+    and symbols among the characters are dropped.
 
     Raises
     ------
     UserError
-        If the text contains letters or digits, whose reading is unknown.
+        If a syllable of pinyin is unknown.
 
     Examples
     --------
-    >>> pinyin_of_text("你好！")
-    ('ni3', 'hao3')
+    >>> [syllable.spelling for syllable in transcribe("10月1日").syllables]
+    ['shi2', 'yue4', 'yi1', 'ri4']
     """
-    foreign = re.search(r"[^\W\u3007\u3400-\u9fff\U00020000-\U0003ffff]+", text)
-    if foreign:
-        raise UserError(
-            f"cannot read {foreign.group()!r} as Mandarin; write it out in Chinese characters"
+    has_letters = any(letter.isalpha() for letter in text)
+    if has_letters and (text.isascii() or any(mark in text.lower() for mark in _PINYIN_LETTERS)):
+        written = [word.strip(_PUNCTUATION) for word in text.split()]
+        return Transcript(
+            tuple(
+                SpokenSyllable(word, _with_tone_digit(word), phones_of_syllable(word))
+                for word in written
+                if word
+            )
         )
+    characters = _read_numbers("".join(text.split()))
+    syllables = tuple(
+        SpokenSyllable(character, spelling.replace("v", "ü"), phones_of_syllable(spelling))
+        for character, spelling in zip(characters, _pinyin_of(characters), strict=True)
+        if spelling
+    )
+    readable = {syllable.text for syllable in syllables}
+    dropped = "".join(
+        letter if letter not in readable and _is_spoken(letter) else " " for letter in characters
+    )
+    return Transcript(syllables, tuple(dropped.split()))
+
+
+def _pinyin_of(characters: str) -> list[str]:
+    """Return the pinyin of each character of a text, "" where it has none."""
     from pypinyin import Style, lazy_pinyin  # noqa: PLC0415 (0.3 s; not all that know phones read)
 
-    syllables = lazy_pinyin(
-        text,
+    found: list[str] = lazy_pinyin(
+        characters,
         style=Style.TONE3,
-        errors="ignore",
+        errors=lambda unknown: [""] * len(unknown),  # type: ignore[arg-type,return-value]
         neutral_tone_with_five=True,
         v_to_u=False,
     )
-    return tuple(syllables)
+    return found
+
+
+def _read_numbers(text: str) -> str:
+    """Write numbers, dates, times and units as they are read: 3.5% -> 百分之三点五."""
+    if not re.search(r"\d", text):
+        return text
+    from wetext import Normalizer  # noqa: PLC0415 (0.3 s)
+
+    read: str = Normalizer(lang="zh", operator="tn").normalize(text)
+    return read.replace("第两", "第二")  # ordinals: wetext 0.1 reads every 2 before a measure as 两
+
+
+def _is_spoken(letter: str) -> bool:
+    """Whether a character is no punctuation."""
+    return unicodedata.category(letter)[0] not in "PZC"
+
+
+def _with_tone_digit(syllable: str) -> str:
+    """Write a tone mark as a digit: pǎo -> pao3."""
+    decomposed = unicodedata.normalize("NFD", syllable)
+    digits = [str(_TONES[mark]) for mark in decomposed if mark in _TONES]
+    letters = "".join(mark for mark in decomposed if mark not in _TONES)
+    return unicodedata.normalize("NFC", letters) + "".join(digits[:1])
 
 
 def _plain(syllable: str) -> str:
     """Return a syllable in lower case, with v for ü, without its tone."""
     decomposed = unicodedata.normalize("NFD", syllable.strip().lower())
-    toneless = "".join(mark for mark in decomposed if mark not in _TONE_MARKS)
+    toneless = "".join(mark for mark in decomposed if mark not in _TONES)
     composed = unicodedata.normalize("NFC", toneless)
     return re.sub(r"[0-5]$", "", composed).replace("u:", "v").replace("ü", "v")
 

@@ -44,6 +44,7 @@ class ClosureRule:
 
     sound: float = 2.0  # added to the sound's log odds: it rather misses a closure than invents one
     phone: float = 2.2  # log odds that a phone adds at most
+    other: float = 0.0  # log odds that a phone which closes nothing takes away at most
     doubt: float = 0.8  # log odds around 0 within which lips are led part of the way
     # log odds lost, unless a phone tells the closure, for each FAP unit
     parted: float = 0.02  # of an opening above 100, up to 300
@@ -82,12 +83,13 @@ class ClosingPhones:
         The language.
     viseme
         First viseme of the phones: "b" or "f".
-    most
-        Log odds that a phone adds at most.
+    rule
+        How much phones count.
     """
 
-    def __init__(self, inventory: PhoneInventory, viseme: str, most: float) -> None:
-        self._most = most
+    def __init__(self, inventory: PhoneInventory, viseme: str, rule: ClosureRule) -> None:
+        self._rule = rule
+        self._silence = inventory.silence
         self._symbols = {
             symbol for symbol, shares in inventory.visemes.items() if shares[0][0] == viseme
         }
@@ -98,7 +100,10 @@ class ClosingPhones:
         known, known_s = self._phones.pop(phone.index, (None, now_s))
         if known is not None and known.final and not phone.final:
             phone = known
-        if phone.symbol in self._symbols and math.isfinite(phone.onset_s + phone.duration_s):
+        counts = phone.symbol in self._symbols or (
+            self._rule.other > 0.0 and phone.symbol != self._silence
+        )
+        if counts and math.isfinite(phone.onset_s + phone.duration_s):
             self._phones[phone.index] = (phone, known_s)
 
     def forget_before(self, time_s: float) -> None:
@@ -111,10 +116,22 @@ class ClosingPhones:
 
     def log_odds(self, time_s: float) -> float:
         """Return what the phones add to the log odds of a closure at a time."""
-        return max((self._of(*each, time_s) for each in self._phones.values()), default=0.0)
+        closing = [each for each in self._phones.values() if each[0].symbol in self._symbols]
+        added = max((self._of(*each, time_s) for each in closing), default=0.0)
+        if added > 0.0 or self._rule.other == 0.0:
+            return added
+        return -max(
+            (
+                min(log_odds_of(max(phone.confidence, 0.5)), self._rule.other)
+                for phone, _ in self._phones.values()
+                if phone.symbol not in self._symbols
+                and phone.onset_s <= time_s < phone.onset_s + phone.duration_s
+            ),
+            default=0.0,
+        )
 
     def _of(self, phone: Phone, known_s: float, time_s: float) -> float:
-        most = min(log_odds_of(max(phone.confidence, 0.5)), self._most)
+        most = min(log_odds_of(max(phone.confidence, 0.5)), self._rule.phone)
         end_s = phone.onset_s + min(phone.duration_s, _HELD_S)
         if known_s < phone.onset_s + _LATEST_S:
             end_s = max(end_s, known_s + _DECIDED_S)

@@ -99,7 +99,7 @@ class LearntStream:
         self._delay_s = delay_s
         self._neutral = visemes.parameters.neutral
         self._bilabials, self._labiodentals = (
-            ClosingPhones(visemes.inventory, viseme, rule.phone) for viseme in ("b", "f")
+            ClosingPhones(visemes.inventory, viseme, rule) for viseme in ("b", "f")
         )
         self._waiting: deque[LipFrame] = deque()  # not yet due
         self._newest_s = -np.inf  # time of the newest lip frame

@@ -1,0 +1,37 @@
+"""A text as it is spoken: syllables with their spelling, and what could not be read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class SpokenSyllable:
+    """A syllable of a text."""
+
+    text: str  # what is written: a character, or the syllable itself
+    spelling: str  # with its tone, such as "ni3"
+    phones: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Transcript:
+    """A text, syllable by syllable."""
+
+    syllables: tuple[SpokenSyllable, ...]
+    dropped: tuple[str, ...] = ()  # stretches of the text whose reading is unknown
+
+    @property
+    def phones(self) -> list[tuple[str, ...]]:
+        """The phones of each syllable."""
+        return [syllable.phones for syllable in self.syllables]
+
+
+@dataclass(frozen=True, slots=True)
+class TimedSyllable:
+    """A syllable of a text where it is spoken."""
+
+    text: str
+    spelling: str
+    onset_s: float
+    duration_s: float

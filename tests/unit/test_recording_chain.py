@@ -1,0 +1,100 @@
+"""Recordings: everything is known before the first frame is made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from corpora.lip_clips import level_track
+from services.recognizer.acoustic.load import load_model
+from services.recognizer.alignment import align_text
+from services.recognizer.lips import lips_for
+from services.recording_chain import HeardRecording, animate, hear_recording
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from services.synthesizer.lips.load import load_lip_model
+from services.synthesizer.offline import synthesize
+from shared.audio_file import read_audio
+from shared.phones.events import Phone, SpeechChange
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+STILL = SynthesizerConfig(idle_motion_seed=0, expressiveness=1.0)
+TEXT = "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。"
+
+
+@lru_cache
+def bilabials(*, is_text_known: bool) -> HeardRecording:
+    samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
+    model = load_model()
+    aligned = align_text(model, samples, rate_hz, TEXT) if is_text_known else None
+    return hear_recording(model, samples[:, 0], lips_for(model), aligned)
+
+
+def openings(heard: HeardRecording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return times and the opening of the inner lips, learnt, FAP units."""
+    frames = animate(heard, load_lip_model(name="learnt"), STILL)
+    return (
+        np.array([time_s for time_s, _ in frames]),
+        np.array([-faps[3] - faps[4] for _, faps in frames]),
+    )
+
+
+def test_dynamic_visemes_are_the_full_model() -> None:
+    samples = read_audio(DEMO / "vowels-male.wav")[0][:, 0]
+    heard = hear_recording(load_model(), samples)
+    lips = load_lip_model(name="dynamic-visemes")
+    assert isinstance(lips, DynamicVisemes)
+    made = np.array([faps for _, faps in animate(heard, lips, STILL)])
+    num_frames = int(heard.duration_s * 50) + 1
+    full = synthesize(lips, heard.phones, num_frames, 50.0, level_track(samples))
+    assert np.ptp(full[:, 2]) > 100
+    np.testing.assert_allclose(made[:num_frames], full, atol=1e-3)
+    assert len(made) == num_frames + 15, "and the way to rest"
+
+
+def test_of_a_known_text_every_closing_lip_shuts_and_vowels_are_open() -> None:
+    heard = bilabials(is_text_known=True)
+    times_s, opening = openings(heard)
+    closing = [phone for phone in heard.phones if phone.symbol in ("b", "p", "m")]
+    assert len(closing) == 16
+    for phone in closing:
+        assert opening[np.abs(times_s - phone.onset_s - 0.04) < 0.021].min() < 10, phone
+    opens = [phone for phone in heard.phones if phone.symbol in ("a", "ai", "ao", "an", "ing")]
+    for phone in opens:
+        during = (times_s >= phone.onset_s) & (times_s < phone.onset_s + phone.duration_s)
+        assert opening[during].max() > 100, phone
+
+
+def test_recognised_phones_err_where_the_text_does_not() -> None:
+    known, recognised = (bilabials(is_text_known=is_known) for is_known in (True, False))
+    times_s, opening = openings(recognised)
+    missed = [
+        phone
+        for phone in known.phones
+        if phone.symbol in ("b", "p", "m")
+        and opening[np.abs(times_s - phone.onset_s - 0.04) < 0.041].min() > 100
+    ]
+    assert missed
+
+
+def test_the_face_knows_of_speech_when_it_is_due() -> None:
+    speech = [
+        SpeechChange(active=True, time_s=2.0),
+        SpeechChange(active=False, time_s=4.0),
+    ]
+    heard = bilabials(is_text_known=False)
+    quiet = [each for each in heard.events if not isinstance(each, Phone | SpeechChange)]
+    config = SynthesizerConfig(lips="dynamic-visemes")  # type: ignore[arg-type]
+    lips = load_lip_model(name="dynamic-visemes")
+    silent, spoken = (
+        animate(replace(heard, events=[*quiet, *changes]), lips, config) for changes in ([], speech)
+    )
+    moved = [s for (s, one), (_, other) in zip(silent, spoken, strict=True) if (one != other).any()]
+    assert moved[0] == pytest.approx(2.0, abs=0.041)
