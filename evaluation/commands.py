@@ -341,6 +341,19 @@ def plot_visemes(
         print_message(f"wrote {path}")
 
 
+@plot_app.command(name="lip-line")
+def plot_lip_line(
+    output: Annotated[Path, typer.Argument(help="Picture to write (.png).")],
+) -> None:
+    """Draw the head's lips beside lips that plain zones of influence move."""
+    from corpora.figures import save_figure
+    from evaluation.lips.lip_line import lip_line_figure
+
+    check_output(output)
+    save_figure(lip_line_figure(), output)
+    print_message(f"wrote {output}")
+
+
 @plot_app.command(name="mouths")
 def plot_mouths(
     folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/mouths"),

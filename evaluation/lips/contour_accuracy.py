@@ -6,9 +6,10 @@ displacements ``V`` of the lips' feature points from the closed mouth,
     accuracy = 1 - sum |V_made - V_real| / sum |V_real|
 
 over all vertical displacements of lip points and all frames. Two deviations: the paper divides by
-the mean of several speakers; here each speaker's displacements are scaled so that the widest
-opening (98th percentile) is that of R = 5. And other rates are the same recording, time-scaled with
-its pitch kept, so that the real lips are known: they move as much faster.
+the mean of several speakers; here each speaker's displacements, and those of each method, are
+scaled so that the widest opening (98th percentile) is that of R = 5. And other rates are the same
+recording, time-scaled with its pitch kept, so that the real lips are known: they move as much
+faster.
 
 Where a clip's words are not known, its recognised syllables are the text, as in the paper.
 """
@@ -38,7 +39,7 @@ from services.recognizer.front_end.pcm import progress_of
 from services.recognizer.lips import lips_for
 from services.recognizer.offline import recognize
 from services.synthesizer.lips.ferguson.contour import faps_of
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from services.synthesizer.lips.ferguson.motion import MAX_OPENING, KeyFrames
 from services.synthesizer.lips.ferguson.openings import key_frames_of
 from services.synthesizer.lips.ferguson.table import load_table
 from services.synthesizer.lips.ferguson.timing import time_text
@@ -64,22 +65,6 @@ _MIDDLES = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
 BEST_OPENING, STILL = "best R of each frame", "still mouth"
 
 
-@dataclass(frozen=True, slots=True)
-class Error:
-    """Sums of |V_made - V_real| and of |V_real|, FAP units."""
-
-    difference: float = 0.0
-    size: float = 0.0
-
-    def __add__(self, other: Error) -> Error:
-        return Error(self.difference + other.difference, self.size + other.size)
-
-    @property
-    def accuracy(self) -> float:
-        """1 - |V_made - V_real| / |V_real|; below 0 for lips further off than closed ones."""
-        return 1.0 - self.difference / self.size
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RateScore:
     """What every method scores at one speaking rate."""
@@ -89,10 +74,11 @@ class RateScore:
     accuracy: dict[str, float]
 
 
-def error_of(made: Array, real: Array) -> Error:
-    """Compare displacements, (num_frames, num_points) each; NaN where not measured."""
+def accuracy_of(made: Array, real: Array) -> float:
+    """Compare mouth FAPs, (num_frames, num_mouth_faps) each; NaN where not measured."""
+    made, real = made[:, _LIP_COLUMNS], real[:, _LIP_COLUMNS]
     difference, size = np.abs(made - real), np.abs(real)
-    return Error(float(np.nansum(difference)), float(np.nansum(size[np.isfinite(difference)])))
+    return 1.0 - float(np.nansum(difference) / np.sum(size[np.isfinite(difference)]))
 
 
 def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list[RateScore]:
@@ -106,44 +92,47 @@ def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list
     clips = [clip for clip in read_clips(folder) if clip.part == part and clip.is_in_sync]
     if not clips:
         raise UserError(f"{folder} has no {part} clips in sync")
-    real = _scaled(clips)
+    real = scaled([clip.speaker for clip in clips], [clip.faps for clip in clips])
     model = load_model()
     scores = []
     for rate in rates:
-        errors: dict[str, Error] = {}
+        made: dict[str, list[Array]] = {}
         num_syllables, seconds = 0, 0.0
-        for clip, faps in track(
-            list(zip(clips, real, strict=True)), description=f"{rate:g} times the rate"
-        ):
+        for clip in track(clips, description=f"{rate:g} times the rate"):
             samples = clip.samples if rate == 1.0 else faster(clip.samples, rate)
             syllables, phones = _text(model, clip, samples)
             num_syllables += len(syllables)
             seconds += sum(phone.duration_s for phone in phones)
             for name, curves in _methods(model, samples, syllables, phones):
-                made = curves(clip.time_s / rate)[:, _LIP_COLUMNS]
-                errors[name] = errors.get(name, Error()) + error_of(made, faps[:, _LIP_COLUMNS])
-        errors |= _limits(real)
+                made.setdefault(name, []).append(curves(clip.time_s / rate))
+        accuracy = {
+            name: accuracy_of(
+                np.concatenate(scaled([name] * len(clips), mouths)), np.concatenate(real)
+            )
+            for name, mouths in made.items()
+        }
+        accuracy |= limits(np.concatenate(real))
         scores.append(
             RateScore(
                 rate=rate,
                 syllables_per_s=num_syllables / max(seconds, 1e-9),
-                accuracy={name: error.accuracy for name, error in errors.items()},
+                accuracy=accuracy,
             )
         )
     return scores
 
 
-def _scaled(clips: Sequence[LipClip]) -> list[Array]:
-    """Return the FAPs of clips, scaled so that each speaker's widest opening is that of R = 5."""
+def scaled(mouths_of: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
+    """Scale FAPs (num_frames, num_mouth_faps): the widest opening of everyone is that of R = 5."""
     whole = -float(faps_of([MAX_OPENING])[0, _MIDDLES].sum())
-    by_speaker: dict[str, list[Array]] = {}
-    for clip in clips:
-        by_speaker.setdefault(clip.speaker, []).append(-clip.faps[:, _MIDDLES].sum(axis=1))
+    openings: dict[str, list[Array]] = {}
+    for owner, faps in zip(mouths_of, mouths, strict=True):
+        openings.setdefault(owner, []).append(-faps[:, _MIDDLES].sum(axis=1))
     widest = {
-        speaker: float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE))
-        for speaker, group in by_speaker.items()
+        owner: max(float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE)), 1.0)
+        for owner, group in openings.items()
     }
-    return [clip.faps * whole / max(widest[clip.speaker], 1.0) for clip in clips]
+    return [faps * whole / widest[owner] for owner, faps in zip(mouths_of, mouths, strict=True)]
 
 
 def _text(
@@ -167,43 +156,48 @@ def _methods(
     table = load_table(inventory)
     by_endpoints = time_text(progress_of(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
-        motion = key_frames_of(timed, table, inventory.silence)
-        yield name, lambda times_s, motion=motion: faps_of(motion.openings_at(times_s))
+        yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
     events = live_events(model, samples, lips_for(model), [DEFAULT_DELAY_S])[DEFAULT_DELAY_S]
     for name in LIP_MODELS:
         lips = load_lip_model(inventory.language, name)
         frames = live_frames(lips, events, DEFAULT_DELAY_S, FRAME_RATE_HZ)
-        mouth = frames[:, np.array(MOUTH_FAPS) - 1]
-        frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
-        yield (
-            f"{name}, live",
-            lambda times_s, frame_s=frame_s, mouth=mouth: np.stack(
-                [np.interp(times_s, frame_s, column) for column in mouth.T], axis=1
-            ),
-        )
+        yield f"{name}, live", _between(frames[:, np.array(MOUTH_FAPS) - 1])
 
 
-def _limits(real: Sequence[Array]) -> dict[str, Error]:
+def _curves_of(motion: KeyFrames) -> Curves:
+    return lambda times_s: faps_of(motion.openings_at(times_s))
+
+
+def _between(mouth: Array) -> Curves:
+    """Interpolate between frames (num_frames, num_mouth_faps)."""
+    frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
+    return lambda times_s: np.stack(
+        [np.interp(times_s, frame_s, column) for column in mouth.T], axis=1
+    )
+
+
+def limits(real: Array) -> dict[str, float]:
     """Score the best that one opening a frame can do, and a mouth that stands still."""
-    faps = np.concatenate(real)[:, _LIP_COLUMNS]
-    faps = faps[np.isfinite(faps).any(axis=1)]
-    candidates = faps_of(np.linspace(0.0, MAX_OPENING, 101))[:, _LIP_COLUMNS]
-    away = np.nansum(np.abs(faps[:, None] - candidates), axis=2)
-    best = candidates[away.argmin(axis=1)]
-    still = np.broadcast_to(np.nanmedian(faps, axis=0), faps.shape)
-    return {BEST_OPENING: error_of(best, faps), STILL: error_of(still, faps)}
+    candidates = faps_of(np.linspace(0.0, MAX_OPENING, 51))
+    away = np.stack(
+        [np.nansum(np.abs(real - mouth)[:, _LIP_COLUMNS], axis=1) for mouth in candidates]
+    )
+    still = np.zeros_like(real)
+    for column in _LIP_COLUMNS:
+        measured = real[np.isfinite(real[:, column]), column]
+        still[:, column] = np.median(measured) if len(measured) else 0.0
+    return {
+        BEST_OPENING: accuracy_of(candidates[away.argmin(axis=0)], real),
+        STILL: accuracy_of(still, real),
+    }
 
 
 def print_rates(scores: Sequence[RateScore], console: Console) -> None:
-    """Print accuracies in the shape of the paper's table 3, a column for each method."""
-    names = list(scores[0].accuracy)
-    table = Table("rate", "syllables/s", *names)
-    for score in scores:
-        table.add_row(
-            f"{score.rate:g}",
-            f"{score.syllables_per_s:.1f}",
-            *(f"{100 * score.accuracy[name]:.1f} %" for name in names),
-        )
+    """Print accuracies by speaking rate as the paper's table 3, a row for each method."""
+    table = Table("accuracy at the rate", *(f"{score.rate:g}" for score in scores))
+    table.add_row("syllables a second", *(f"{score.syllables_per_s:.1f}" for score in scores))
+    for name in scores[0].accuracy:
+        table.add_row(name, *(f"{100 * score.accuracy[name]:.0f} %" for score in scores))
     console.print(table)
 
 

@@ -24,6 +24,7 @@ from shared.errors import UserError
 from shared.logs import LOG
 
 SAMPLE = Path(str(resources.files("shared") / "demo" / "hello-female.wav"))
+SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
 MAX_MICROPHONES = 16
 HELLO_LIMIT_S = 10.0
 LAST_FRAME_LIMIT_S = 1.5  # for the last frames, when a microphone ends

@@ -18,7 +18,13 @@ from aiohttp import web
 from services.gateway import http, wire
 from services.gateway.config import GatewayConfig
 from services.gateway.learn_mouth import MouthLearner
-from services.gateway.microphone import Microphones, OwnSessions, Sample, error_text
+from services.gateway.microphone import (
+    SAMPLE_TEXT,
+    Microphones,
+    OwnSessions,
+    Sample,
+    error_text,
+)
 from services.gateway.outbox import Kind
 from services.gateway.viewers import Viewers
 from shared.bus import Socket
@@ -27,6 +33,7 @@ from shared.endpoints import is_loopback
 from shared.errors import UserError
 from shared.follower import SessionFollower
 from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
+from shared.phones.known_text import Characters, characters_of
 from shared.phones.syllables import SyllableTrack
 from shared.service import Handler, Service
 from shared.wire.audio import Sound
@@ -88,6 +95,7 @@ class GatewayService(Service):
         )
         self._tasks: set[asyncio.Task[None]] = set()
         self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is spoken
+        self._sample_characters: Characters = ()  # once they are needed
         self._closing: asyncio.Task[None] | None = None
         self._report_s = 0.0
         self._request_s = 0.0
@@ -219,7 +227,10 @@ class GatewayService(Service):
             on_complete=lambda: self.session_started(session.start),
             on_restart=lambda: self._restart(session),
         )
-        session = _Session(start, follower, SyllableTrack(self._inventory(start.language)))
+        is_sample = self._sample is not None and self._sample[0].session == start.session
+        characters = self._sample_characters if is_sample else ()
+        track = SyllableTrack(self._inventory(start.language), characters)
+        session = _Session(start, follower, track)
         return session
 
     def _inventory(self, language: str) -> PhoneInventory:
@@ -289,6 +300,10 @@ class GatewayService(Service):
     async def _speak(self, sample: Sample) -> None:
         error = ""
         try:
+            if not self._sample_characters:  # takes 0.3 s
+                self._sample_characters = await asyncio.to_thread(
+                    characters_of, SAMPLE_TEXT, load_inventory()
+                )
             await sample.speak()
         except UserError as refusal:
             error = error_text(refusal)

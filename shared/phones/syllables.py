@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from shared.phones.events import Phone
 from shared.phones.inventory import PhoneInventory
+from shared.phones.known_text import Characters, place_in_text
 
 MAX_PHONES = 40  # that may still be revised; older ones are taken for granted
 
@@ -15,7 +16,7 @@ class Syllable:
     """One syllable, or a pause. The same ``index`` again revises it, as with phones."""
 
     index: int  # of its first phone
-    text: str  # "shi"; of a pause, the inventory's silence
+    text: str  # "shi", or its character; of a pause, the inventory's silence
     onset_s: float  # seconds from the session's first sample
     duration_s: float  # seconds; 0 if it is final: there was no such syllable after all
     final: bool
@@ -28,10 +29,14 @@ class SyllableTrack:
     ----------
     inventory
         The language; its ``spell`` writes the syllables.
+    characters
+        What is spoken, if it is known: syllables become characters where they fit.
     """
 
-    def __init__(self, inventory: PhoneInventory) -> None:
+    def __init__(self, inventory: PhoneInventory, characters: Characters = ()) -> None:
         self._inventory = inventory
+        self._characters = characters
+        self._num_said = 0  # characters before those of the phones that are kept
         self._phones: dict[int, Phone] = {}
         self._syllables: dict[int, Syllable] = {}
 
@@ -39,6 +44,7 @@ class SyllableTrack:
         """Forget all phones, as when a session begins anew."""
         self._phones.clear()
         self._syllables.clear()
+        self._num_said = 0
 
     def accept(self, phone: Phone) -> list[Syllable]:
         """Take a phone, or a revision of one; return the syllables that it changes."""
@@ -47,12 +53,17 @@ class SyllableTrack:
         else:
             self._phones[phone.index] = phone
         groups = self._groups()
+        places = self._places(groups)
         if len(self._phones) > MAX_PHONES:
-            oldest = groups.pop(0)
+            oldest, place = groups.pop(0), places.pop(0)
+            self._num_said = self._num_said if place is None else place + 1
             self._syllables.pop(oldest[0].index, None)
             for each in oldest:
                 del self._phones[each.index]
-        syllables = {group[0].index: self._syllable(group) for group in groups}
+        syllables = {
+            group[0].index: self._syllable(group, place)
+            for group, place in zip(groups, places, strict=True)
+        }
         withdrawn = [
             Syllable(index=index, text=old.text, onset_s=old.onset_s, duration_s=0.0, final=True)
             for index, old in self._syllables.items()
@@ -77,11 +88,21 @@ class SyllableTrack:
                 groups.append([phone])
         return groups
 
-    def _syllable(self, phones: list[Phone]) -> Syllable:
+    def _places(self, groups: list[list[Phone]]) -> list[int | None]:
+        """Return the position of each syllable among the characters; None: at none."""
+        heard = [tuple(phone.symbol for phone in group) for group in groups]
+        spoken = [each for each in heard if each != (self._inventory.silence,)]
+        left = [phones for _, phones in self._characters[self._num_said :]]
+        found = iter(place_in_text(spoken, left) if left else [None] * len(spoken))
+        places = (None if each == (self._inventory.silence,) else next(found) for each in heard)
+        return [None if place is None else place + self._num_said for place in places]
+
+    def _syllable(self, phones: list[Phone], place: int | None) -> Syllable:
         first, last = phones[0], phones[-1]
+        spelling = self._inventory.spell(tuple(phone.symbol for phone in phones))
         return Syllable(
             index=first.index,
-            text=self._inventory.spell(tuple(phone.symbol for phone in phones)),
+            text=spelling if place is None else self._characters[place][0],
             onset_s=first.onset_s,
             duration_s=max(0.0, last.onset_s + last.duration_s - first.onset_s),
             final=all(phone.final for phone in phones),

@@ -213,7 +213,7 @@ def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: P
     recorded = tmp_path / "face.fap"
     samples = samples_of_file(SENTENCE)
     recorder = listening(system.control, "heard", "--output", recorded)
-    printer = listening(system.control, "--show", "syllables")  # of the newest session
+    printer = listening(system.control, "heard", "--show", "syllables")
     with Client(system.control) as client:
         session = client.open_session(session="heard", encoding="f32le", paced=False)
         for listener in (recorder, printer):

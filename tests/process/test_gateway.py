@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import csv
 import json
 import os
 import queue
@@ -22,6 +23,7 @@ from urllib.parse import urlsplit
 import aiohttp
 import pytest
 
+from services.gateway.microphone import SAMPLE, SAMPLE_TEXT
 from shared.bus import AUDIO_QUEUE_LENGTH, Bus
 from shared.clock import now_ns
 from shared.face.faps import MASK_BYTES, NUM_FAPS
@@ -48,7 +50,7 @@ from shared.wire.session import (
     SessionOpened,
 )
 from shared.wire.speech import Phone, Speech
-from tests.system import free_port
+from tests.system import DEMO, free_port
 
 pytestmark = pytest.mark.process
 
@@ -482,10 +484,29 @@ def test_the_sample_sentence_is_streamed_once_for_whoever_asks(
                 names.add(name)
             await until(lambda: len(system.audio_messages) > 10)
             assert names == set(system.started)
+            phone = Phone(
+                session=names.pop(),
+                epoch=EPOCH,
+                media_time=320,
+                index=0,
+                symbol="n",
+                duration=1600,
+                confidence=0.5,
+                final=False,
+            )
+            system.do(lambda: system.phones.send(phone))
+            assert (await receive_json(browser, "syllable"))["symbol"] == "你"
 
     asyncio.run(ask())
     assert gateway.stop() == 0
     assert system.closed == system.started
+
+
+def test_the_text_of_the_sample_is_its_transcript() -> None:
+    with (DEMO / "transcripts.tsv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file, delimiter="\t"))
+    texts = [row["text"] for row in rows if row["file"] == SAMPLE.name]
+    assert texts == [SAMPLE_TEXT]
 
 
 def test_microphone_and_sample_may_choose_their_lips(

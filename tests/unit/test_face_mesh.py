@@ -22,7 +22,7 @@ MEDIAPIPE = {
 
 
 def picture(name: str) -> NDArray[np.uint8]:
-    return np.asarray(Image.open(PICTURES / f"render_{name}.png").convert("RGB"))
+    return np.asarray(Image.open(PICTURES / f"face_{name}.png").convert("RGB"))
 
 
 @pytest.mark.parametrize("name", MEDIAPIPE)

@@ -113,7 +113,7 @@ def test_lips_at_rest_while_no_sound_comes() -> None:
 def test_speech_moves_all_lips_within_their_travel_whatever_the_chunks() -> None:
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     samples = to_16_khz(samples, rate_hz)[:32_000]
-    settings = SynthesizerConfig(lips=LipModelName.FERGUSON, idle_motion_seed=0)
+    settings = SynthesizerConfig(lips=LipModelName.FERGUSON, idle_motion_seed=0, expressiveness=1.0)
     assert settings.delay_ms == 160.0
     made = []
     for chunk in (32_000, 333):

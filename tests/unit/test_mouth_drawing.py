@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
-from services.cli.offline import Timing
+from services.cli.offline import Timing, lips
 from services.driver import picture
 from services.synthesizer.lips.ferguson.contour import LINES, contour
 from shared.errors import UserError
@@ -76,3 +76,8 @@ def test_mistakes_are_named(
     with pytest.raises(UserError, match=message):
         draw_mouth(SOUND, text, tmp_path / output, timing=timing)
     assert not list(tmp_path.iterdir())
+
+
+def test_words_without_quotes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="in quotes"):
+        lips(SOUND, ["si4", "shi4", str(tmp_path / "mouth.svg")])

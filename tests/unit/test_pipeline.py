@@ -215,5 +215,5 @@ def test_warm_up_leaves_nothing_behind(hello: np.ndarray) -> None:
 
 def test_warming_up_leaves_nothing_to_compile() -> None:
     warm_up(load_model())
-    assert decoder._step.signatures
+    assert decoder._steps.signatures
     assert decoder._paths_through.signatures

@@ -7,6 +7,7 @@ import pytest
 from shared.errors import UserError
 from shared.phones.events import Phone
 from shared.phones.inventory import load_inventory
+from shared.phones.known_text import characters_of, place_in_text
 from shared.phones.mandarin.pinyin import phones_of_syllable, spell
 from shared.phones.syllables import MAX_PHONES, SyllableTrack
 
@@ -92,3 +93,38 @@ def test_a_long_stream_keeps_its_syllables() -> None:
             texts[syllable.index] = syllable.text
             assert syllable.duration_s > 0.0
     assert list(texts.values()) == ["ba", "sil"] * (4 * MAX_PHONES // 3) + ["b"]
+
+
+def test_the_characters_of_a_known_text_are_shown_though_phones_are_wrong() -> None:
+    text = characters_of("四是四，十是十。十四是十四，四十是四十！" * 4, MANDARIN)
+    track = SyllableTrack(MANDARIN, text)
+    texts: dict[int, str] = {}
+    index = 0
+    for number, (_, phones) in enumerate(text):
+        symbols = ("sil", *phones) if number % 10 == 3 else phones
+        if number % 10 == 5:
+            symbols = ("c", "ii")  # heard wrongly
+        if number % 10 == 7:
+            continue  # missed
+        for symbol in symbols:
+            for syllable in track.accept(phone(index, symbol)):
+                texts[syllable.index] = syllable.text
+            index += 1
+    shown = [each for each in texts.values() if each != "sil"]
+    expected = [each for number, (each, _) in enumerate(text) if number % 10 != 7]
+    right = sum(a == b for a, b in zip(shown, expected, strict=True))
+    assert right >= 0.9 * len(expected), shown
+
+
+def test_what_is_not_in_the_text_is_spelled() -> None:
+    assert place_in_text([("n", "i"), ("h", "ao"), ("f", "a")], [("h", "ao"), ("m", "a")]) == [
+        None,
+        0,
+        1,
+    ]
+    assert place_in_text([], [("h", "ao")]) == []
+    track = SyllableTrack(MANDARIN, characters_of("好。", MANDARIN))
+    texts: dict[int, str] = {}
+    for index, symbol in enumerate(("n", "i", "h", "ao")):
+        texts |= {each.index: each.text for each in track.accept(phone(index, symbol))}
+    assert texts == {0: "ni", 2: "好"}

@@ -3,7 +3,7 @@
 Source: Zhang et al. 2021, section 4, measured each opening on photographs. Here the tracked opening
 is R(t) itself: between key frames it is linear in the openings of the two phones (eq. 6), so these
 are a linear least-squares problem with bounds. A phone that is seldom heard is held near what its
-visemes have in other phones.
+visemes have in other phones. Silence and the bilabials are closed: R is 0.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from scipy.optimize import lsq_linear
 
 from corpora.lip_clips import LipClip
 from services.synthesizer.lips.dynamic_visemes.parameters import columns
+from services.synthesizer.lips.dynamic_visemes.visemes import REST
 from services.synthesizer.lips.ferguson.motion import MAX_OPENING
 from services.synthesizer.lips.ferguson.openings import anchors_of
 from shared.face.faps import MOUTH_FAPS
@@ -27,6 +28,7 @@ Array = NDArray[np.float64]
 
 _FULL_PERCENTILE = 98.0  # of a speaker's opening: R is 5 there
 _RIDGE = 10.0  # weight of what a phone's visemes tell, video frames
+_CLOSED = (REST, "b")  # visemes whose lips touch
 _MIDDLING = 2.0  # opening of a viseme that was never seen
 
 
@@ -52,7 +54,7 @@ def relative_openings(clips: Sequence[LipClip]) -> list[Array]:
 def fit_openings(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> dict[str, float]:
-    """Estimate the opening of each phone; that of silence is 0.
+    """Estimate the opening of each phone; that of silence and of bilabials is 0.
 
     Parameters
     ----------
@@ -63,17 +65,19 @@ def fit_openings(
     inventory
         Their language.
     """
+    is_open = np.array(
+        [inventory.visemes[phone][0][0] not in _CLOSED for phone in inventory.phones]
+    )
     parts, heights = [], []
     for clip, phones, opening in zip(clips, labels, relative_openings(clips), strict=True):
         is_measured = np.isfinite(opening)
-        parts.append(_weights(clip.time_s[is_measured], phones, inventory))
+        parts.append(_weights(clip.time_s[is_measured], phones, inventory) * is_open)
         heights.append(opening[is_measured])
     weights, height = np.concatenate(parts), np.concatenate(heights)
-    shares = _viseme_shares(inventory)
+    shares = _viseme_shares(inventory) * is_open[:, None]
     of_visemes = _least_squares(weights @ shares, height, np.full(shares.shape[1], _MIDDLING))
     fitted = _least_squares(weights, height, shares @ of_visemes)
-    openings = dict(zip(inventory.phones, fitted.tolist(), strict=True))
-    return openings | {inventory.silence: 0.0}
+    return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
 
 
 def travel_of(clips: Sequence[LipClip]) -> Array:
@@ -102,7 +106,6 @@ def _weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory)
         tent = np.zeros(len(anchors))
         tent[number] = 1.0
         weights[:, inventory.index[symbol]] += np.interp(times_s, anchors_s, tent)
-    weights[:, inventory.index[inventory.silence]] = 0.0  # where R is 0
     return weights
 
 

@@ -1,0 +1,59 @@
+"""Accuracy of made lips against real ones (Zhang et al. 2021, section 6)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evaluation.lips.contour_accuracy import BEST_OPENING, STILL, accuracy_of, limits, scaled
+from evaluation.lips.contour_shapes import check_shapes
+from services.synthesizer.lips.ferguson.contour import faps_of
+from shared.face.faps import MOUTH_FAPS
+
+pytestmark = pytest.mark.unit
+
+OPENINGS = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0])
+
+
+def test_accuracy_is_one_less_the_share_of_the_error() -> None:
+    real = faps_of(OPENINGS)
+    assert accuracy_of(real, real) == pytest.approx(1.0)
+    assert accuracy_of(0.75 * real, real) == pytest.approx(0.75)
+    assert accuracy_of(np.zeros_like(real), real) == pytest.approx(0.0)
+    assert accuracy_of(-real, real) == pytest.approx(-1.0)
+
+
+def test_unmeasured_points_and_other_faps_do_not_count() -> None:
+    real = faps_of(OPENINGS)
+    made = 0.5 * real
+    real[2] = np.nan
+    real[:, MOUTH_FAPS.index(52)] = np.nan
+    made[:, MOUTH_FAPS.index(3)] = 1e4  # the jaw is no lip
+    made[:, MOUTH_FAPS.index(6)] = 1e4  # the paper moves lips vertically
+    assert accuracy_of(made, real) == pytest.approx(0.5)
+
+
+def test_everyone_opens_as_wide() -> None:
+    real = faps_of(OPENINGS)
+    of_two = scaled(["a", "b", "a"], [3.0 * real, 0.2 * real, 1.5 * real])
+    assert np.nanmax(of_two[0][:, MOUTH_FAPS.index(52)]) == pytest.approx(0.0)
+    np.testing.assert_allclose(of_two[0], 2.0 * of_two[2])
+    assert of_two[1][4] == pytest.approx(real[4], rel=0.1)
+
+
+def test_limits_of_one_opening_and_of_none() -> None:
+    real = faps_of(OPENINGS)
+    found = limits(real)
+    assert found[BEST_OPENING] == pytest.approx(1.0)
+    assert found[STILL] < 0.6
+
+
+def test_shapes_of_the_shipped_contour_are_sound() -> None:
+    figures = check_shapes(np.linspace(0.0, 5.0, 11))
+    assert not len(figures.faults)
+    assert figures.gap[0] == pytest.approx(0.0, abs=1e-9)
+    assert (np.diff(figures.gap) > 0.0).all()
+
+
+def test_crossed_lips_are_a_fault() -> None:
+    assert list(check_shapes([-1.0, 2.0]).faults) == [0]
