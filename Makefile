@@ -7,6 +7,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
 RIVALS := evaluation/lips/rivals
+CLIENT := proto/node
 SAMPLE := shared/demo/hello-female.wav
 LOCK := requirements.lock
 TORCH := torch==2.13.0
@@ -26,7 +27,7 @@ demo: setup
 setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(PAGE)/head.glb
 
 # Two processes: one for the tests that start services, both for the others.
-test: .venv/installed-dev setup $(RIVALS)/node_modules/.package-lock.json
+test: .venv/installed-dev setup $(RIVALS)/node_modules/.package-lock.json $(CLIENT)/node_modules/.package-lock.json
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --no-loadscope-reorder
 	$(NPM) $(PAGE) test
 
@@ -50,7 +51,7 @@ lock: .venv/installed
 		--no-annotate --custom-compile-command 'make lock' --output-file $(LOCK) pyproject.toml -
 
 clean:
-	rm -rf .venv $(PAGE)/node_modules $(RIVALS)/node_modules $(PAGE)/head.glb out
+	rm -rf .venv $(PAGE)/node_modules $(RIVALS)/node_modules $(CLIENT)/node_modules $(PAGE)/head.glb out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
@@ -72,8 +73,9 @@ $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
 	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
 
-$(RIVALS)/node_modules/.package-lock.json: $(RIVALS)/package-lock.json | .venv/installed
-	$(NPM) $(RIVALS) ci
+$(RIVALS)/node_modules/.package-lock.json $(CLIENT)/node_modules/.package-lock.json: \
+		%/node_modules/.package-lock.json: %/package-lock.json | .venv/installed
+	$(NPM) $* ci
 	touch $@
 
 $(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py | .venv/installed

@@ -6,14 +6,19 @@ import dataclasses
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
 
 from services.control.registry import CLIENT_NEEDS
-from shared.face.faps import MOUTH_FAPS
+from services.control.service import Request
+from services.synthesizer.service import LOW_LEVEL_FAPS
+from shared.face.faps import FAPS, MOUTH_FAPS
+from shared.phones.inventory import load_inventory
+from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.control import EventName, ServiceState, SessionInput, SessionState
+from shared.wire.events import SPEECH_MESSAGES
 from shared.wire.kinds import MESSAGES, PUBLISHER_OF
 from shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
 from shared.wire.schema import schema
@@ -42,10 +47,11 @@ def section(heading: str) -> str:
     return found[1]
 
 
-def table(text: str) -> list[list[str]]:
-    """Return the cells of the table in a text, without its header; no rows if there is none."""
-    rows = [line.strip("|\n") for line in text.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in row.split(" | ")] for row in rows[2:]]
+def table(text: str, number: int = 0) -> list[list[str]]:
+    """Return the cells of a table in a text, without its header; no rows if there is none."""
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    rows = tables[number].splitlines() if tables else []
+    return [[cell.strip() for cell in row.strip("|").split(" |")] for row in rows[2:]]
 
 
 def type_text(kind: msgspec.inspect.Type) -> str:
@@ -151,6 +157,54 @@ def test_the_document_describes_no_message_that_does_not_exist() -> None:
 
 def test_every_error_code_is_in_the_document() -> None:
     assert {row[0].strip("`") for row in table(section("Errors"))} == {*ErrorCode}
+
+
+def test_every_answer_is_in_the_document() -> None:
+    rows = [
+        [set(re.findall(r"`([a-z-]+)`", cell)) for cell in row] for row in table(section("Answers"))
+    ]
+    asked, answers, errors = (set().union(*column) for column in zip(*rows, strict=True))
+    from_clients = {cls.kind for cls in (*get_args(Request), AudioChunk, EndOfAudio)}
+    assert asked - {"joined", "request"} == from_clients | {
+        "heartbeat",
+        "start-session",
+        *(cls.kind for cls in SPEECH_MESSAGES),
+    }
+    assert answers < set(MESSAGES)
+    assert errors - {"request"} == {*ErrorCode}
+
+
+def test_every_fap_is_in_the_document() -> None:
+    assert table(section("FAPs"), -1) == [
+        [
+            str(fap.number),
+            f"`{fap.name}`",
+            fap.fapu,
+            fap.direction.replace("_", " "),
+            ", ".join(fap.feature_points),
+        ]
+        for fap in FAPS
+    ]
+    assert list(LOW_LEVEL_FAPS) == list(range(2, 68)), "FAP 1 and 2 are never set"
+
+
+def test_every_unit_of_faps_is_in_the_document() -> None:
+    assert {row[0] for row in table(section("FAPs"))} == {fap.fapu for fap in FAPS if fap.fapu}
+
+
+def test_every_phone_is_in_the_document_and_its_example_has_it() -> None:
+    inventory = load_inventory()
+    rows = table(section("Phones"))
+    assert [[row[0], row[1], row[4]] for row in rows] == [
+        [f"`{phone}`", kind, ", ".join(viseme for viseme, _ in inventory.visemes[phone])]
+        for phone, kind in zip(inventory.phones, inventory.kinds, strict=True)
+    ]
+    for symbol, kind, _, example, _ in rows:
+        if kind != "silence":
+            character, pinyin = example.split()
+            ((syllable),) = inventory.pronounce(character)
+            assert inventory.pronounce(pinyin) == [syllable]
+            assert symbol.strip("`") in syllable
 
 
 def test_every_event_is_in_the_document() -> None:

@@ -22,6 +22,7 @@ from tests.system import DEMO, ROOT, System
 
 pytestmark = pytest.mark.e2e
 DOCUMENT = ROOT / "proto" / "PROTOCOL.md"
+NODE = str(Path(sys.executable).with_name("node"))
 HOSTS = {
     "control": "127.0.0.11",
     "recognizer": "127.0.0.12",
@@ -195,13 +196,18 @@ def test_a_client_of_version_1_is_told_in_version_1_what_to_do(spread: System) -
     stranger.close()
 
 
-def test_the_example_in_the_document_runs(spread: System) -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
+@pytest.mark.parametrize(("language", "program"), [("python", sys.executable), ("js", NODE)])
+def test_the_examples_in_the_document_run(
+    language: str, program: str, spread: System, tmp_path: Path
+) -> None:
+    (example,) = re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
     address = "tcp://127.0.0.1:5550"
     assert address in example
+    script = tmp_path / "client.mjs"  # a name that Python takes, too
+    script.write_text(example.replace(address, spread.control), encoding="utf-8")
+    (tmp_path / "node_modules").symlink_to(DOCUMENT.parent / "node" / "node_modules")
     result = subprocess.run(
-        [sys.executable, "-", str(DEMO / "vowels-male.wav")],
-        input=example.replace(address, spread.control),
+        [program, script, DEMO / "vowels-male.wav"],
         capture_output=True,
         text=True,
         timeout=60,
