@@ -115,20 +115,14 @@ def _models(
 
     Yields title, name, model, and the output rule that suits it.
     """
-    from services.recognizer.acoustic.load import (
-        DEFAULT_MODEL,
-        load_model,
-        model_path,
-        with_early_network,
-    )
+    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
     from services.recognizer.config import RecognizerConfig
 
     for name in names or [DEFAULT_MODEL]:
         suited = RecognizerConfig(acoustic=name)
         rule = suited.num_stable_frames, suited.min_confidence
         for look_ahead_ms in look_aheads_ms or [suited.look_ahead_ms]:
-            model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
-            model = with_early_network(model, look_ahead_ms=look_ahead_ms)
+            model = load_live_model(name, look_ahead_ms=look_ahead_ms)
             title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_aheads_ms else name
             yield title, name, model, rule
 

@@ -58,7 +58,7 @@ class LiveChain:
 
     Examples
     --------
-    >>> chain = LiveChain(load_model(), load_lip_model())
+    >>> chain = LiveChain(load_live_model(), load_lip_model())
     >>> frames = chain.accept_waveform(samples) + chain.input_finished()
     """
 

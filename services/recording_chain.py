@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model, model_path, with_early_network
 from services.recognizer.front_end.pcm import progress_of
 from services.recognizer.lip_source import LipsFromSound
 from services.recognizer.offline import decode_offline
@@ -31,7 +30,6 @@ from services.synthesizer.lips.lip_model import LipModel
 from shared.clock import MEDIA_RATE_HZ
 from shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent, SpeechChange
 
-_ACOUSTIC = "blocks"  # has the fewest errors; nobody waits for it
 # Chosen on clips for choices, as those of the live chain.
 _RECOGNISED = ClosureRule(other=1.0)
 _CERTAIN = ClosureRule(phone=6.0, other=6.0)  # of a known text: its phones decide
@@ -49,11 +47,6 @@ class HeardRecording:
     def phones(self) -> list[Phone]:
         """Its phones with their times, silence included."""
         return [event for event in self.events if isinstance(event, Phone)]
-
-
-def load_recording_model() -> AcousticModel:
-    """Load the acoustic model for recordings; the lips from sound fit it."""
-    return with_early_network(load_model(model_path(_ACOUSTIC)))
 
 
 def hear_recording(

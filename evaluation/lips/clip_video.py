@@ -16,7 +16,7 @@ from services.driver.render.side_by_side import SideBySide
 from services.driver.video import film
 from services.driver.video.writer import check_name
 from services.live_chain import sound_events
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.lips import lips_for
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.lips.load import load_lip_model
@@ -41,7 +41,7 @@ def film_clip(folder: Path, name: str, output: Path) -> None:
     clip = next((clip for clip in read_clips(folder, language=None) if clip.name == name), None)
     if clip is None:
         raise UserError(f"there is no clip {name} in {folder}")
-    model = load_model()
+    model = load_live_model()
     faces = []
     for lips in LipModelName:
         delay_s = SynthesizerConfig(lips=lips).delay_ms / 1e3

@@ -21,7 +21,7 @@ from corpora.lip_clips import read_clips
 from evaluation.lips.clip_scores import score_clip
 from evaluation.lips.schemes import DEFAULT_DELAY_S, HeardClip, hear, live_scheme
 from evaluation.lips.scores import pool
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.lips import lips_for
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
@@ -61,7 +61,7 @@ def main(folder: Path) -> list[RuleScore]:
     UserError
         If there is no such clip in sync.
     """
-    model = load_model()
+    model = load_live_model()
     lips = lips_for(model)
     clips = [
         clip

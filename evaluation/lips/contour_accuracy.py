@@ -33,7 +33,7 @@ from evaluation.lips.schemes import DEFAULT_DELAY_S, FRAME_RATE_HZ, live_events,
 from evaluation.recognizer.disturbances import faster
 from services.cli.mouth_drawing import syllables_of
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.alignment import align_phones, spoken
 from services.recognizer.front_end.pcm import progress_of
 from services.recognizer.lips import lips_for
@@ -93,7 +93,7 @@ def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list
     if not clips:
         raise UserError(f"{folder} has no {part} clips in sync")
     real = scaled([clip.speaker for clip in clips], [clip.faps for clip in clips])
-    model = load_model()
+    model = load_live_model()
     scores = []
     for rate in rates:
         made: dict[str, list[Array]] = {}

@@ -56,7 +56,7 @@ from evaluation.lips.clip_scores import (
 )
 from evaluation.lips.measures import Hits, best_lag
 from evaluation.lips.schemes import all_schemes, hear
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.lips import lips_for
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
@@ -287,7 +287,7 @@ def main(
     folder: Path, parameters: Path | None = None, sources: Collection[str] = ()
 ) -> list[LipScore]:
     """Score every lip model on the held clips of a folder."""
-    model = load_model()
+    model = load_live_model()
     lips = lips_for(model)
     visemes = DynamicVisemes(load_parameters(parameters), model.inventory)
     models = {name: make(model.inventory) for name, make in LIP_MODELS.items()}

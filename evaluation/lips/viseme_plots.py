@@ -23,7 +23,7 @@ from services.driver.render.camera import Camera
 from services.driver.render.renderer import Renderer
 from services.live_chain import sound_events
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.offline import recognize
 from services.recognizer.stream import SILENT_DB
 from services.synthesizer.lips.dynamic_visemes.blending import (
@@ -65,7 +65,7 @@ def plot_visemes(folder: Path, audio: Path, parameters_file: Path | None) -> lis
     UserError
         If the sound cannot be read or the pictures cannot be written.
     """
-    model = load_model()
+    model = load_live_model()
     lips = DynamicVisemes(load_parameters(parameters_file), model.inventory)
     samples = read_mono_16k(audio)
     pictures: dict[str, Callable[[], Any]] = {

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.acoustic.load import load_model, model_path, with_early_network
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.front_end.resample import to_16_khz
 from services.recognizer.lips import LipPredictor, lips_for
 from services.recognizer.recognizer import warm_up
@@ -29,7 +29,7 @@ def measure(path: Path) -> dict[str, float]:
     samples = to_16_khz(*read_audio(path))
     costs = {}
     for name in MODELS:
-        model = with_early_network(load_model(model_path(name)))
+        model = load_live_model(name)
         warm_up(model)
         for number in NUM_SESSIONS:
             for lips, note in ((None, ""), (lips_for(model), " with lips")):

@@ -16,11 +16,11 @@ from services.cli.terminal import print_message
 from services.driver.video import film
 from services.live_chain import LiveChain
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.alignment import align_syllables
 from services.recognizer.lips import LipPredictor, lips_for
 from services.recognizer.voice import read_profile
-from services.recording_chain import animate, hear_recording, load_recording_model
+from services.recording_chain import animate, hear_recording
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.lips.load import load_lip_model
 from shared.clock import MEDIA_RATE_HZ
@@ -101,7 +101,7 @@ def motion_of_sound(
             name: config.model_copy(update={"expressiveness": expressiveness})
             for name, config in settings.items()
         }
-    model = load_model() if live else load_recording_model()
+    model = load_live_model()
     lips_from_sound = _lips_of(model, voice)
     events: Sequence[SoundEvent]
     if live:

@@ -18,7 +18,7 @@ from services.cli.sound_file import read_mono_16k
 from services.cli.spoken_text import text_of
 from services.cli.terminal import CONSOLE, check_output, print_message, write_text
 from services.driver.video.writer import VideoWriter, write_picture
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.alignment import align_text, spoken
 from services.recognizer.front_end.pcm import progress_of
 from services.recognizer.offline import recognize
@@ -142,7 +142,7 @@ def timed_phones(
     if text is not None and timing is Timing.ENDPOINTS:
         inventory = load_inventory()
         return time_text(progress_of(samples), inventory.pronounce(text), load_table(inventory))
-    model = load_model()
+    model = load_live_model()
     if text is None:
         return recognize(model, samples, MEDIA_RATE_HZ)
     return align_text(model, samples, MEDIA_RATE_HZ, text)

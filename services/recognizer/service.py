@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 
 from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.load import load_model, model_path, with_early_network
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.config import RecognizerConfig
 from services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
 from services.recognizer.lip_source import LipsFromSound
@@ -81,8 +81,7 @@ class RecognizerService(Service):
             "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),
             "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
         }
-        model = load_model(model_path(config.acoustic), look_ahead_ms=config.look_ahead_ms)
-        self._model = with_early_network(model, look_ahead_ms=config.look_ahead_ms)
+        self._model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
         self.language = self._model.inventory.language
         self._lips = lips or lips_for(self._model)
         if self._lips is None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
 from services.live_chain import LiveChain
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.config import RecognizerConfig
 from services.recognizer.lip_source import delay_for
 from services.recognizer.service import RecognizerService
@@ -59,7 +59,7 @@ def test_services_send_the_frames_of_the_chain(
     samples = at_rate(samples_of_file(DEMO / f"{name}.wav"), rate_hz)
     samples = samples[: len(samples) // 2 * 2 - 1]  # the sound ends within a slice of 20 ms
     sent = stream(system.control, samples, chunk=chunk, sample_rate_hz=rate_hz)
-    chain = LiveChain(load_model(), load_lip_model(), sample_rate_hz=rate_hz)
+    chain = LiveChain(load_live_model(), load_lip_model(), sample_rate_hz=rate_hz)
     frames = chain.accept_waveform(samples) + chain.input_finished()
 
     assert [frame.media_time for frame in sent.frames] == [
@@ -97,7 +97,7 @@ def test_services_send_the_frames_of_the_chain_with_chosen_lips(
     with System(services, tmp_path, settings={"KOUXING_SYNTHESIZER_LIPS": lips}) as running:
         sent = stream(running.control, samples, chunk=997, sample_rate_hz=rate_hz)
     chain = LiveChain(
-        load_model(),
+        load_live_model(),
         load_lip_model(name=lips),
         sample_rate_hz=rate_hz,
         synthesizer=SynthesizerConfig(lips=lips),
@@ -150,7 +150,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
         )
         sent = stream(running.control, samples, chunk=1021)
     chain = LiveChain(
-        load_model(),
+        load_live_model(),
         load_lip_model(name="learnt"),
         synthesizer=SynthesizerConfig(delay_ms=delay_ms),
         lips_from_sound=LoudLips(),
@@ -167,7 +167,7 @@ def test_services_send_the_frames_of_the_chain_with_learnt_lips(
 
 def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "bilabials-female.wav")
-    chain = LiveChain(load_model(), load_lip_model(name="learnt"), lips_from_sound=LoudLips())
+    chain = LiveChain(load_live_model(), load_lip_model(name="learnt"), lips_from_sound=LoudLips())
     frames = chain.accept_waveform(samples) + chain.input_finished()
     settings = {
         "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",
@@ -194,10 +194,10 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     samples = samples_of_file(DEMO / "vowels-male.wav")
-    chain = LiveChain(load_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
+    chain = LiveChain(load_live_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
     frames = chain.accept_waveform(samples) + chain.input_finished()
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    scored = live_scheme("lips", LIPS, DEFAULT_DELAY_S).frames(hear(load_model(), clip, None))
+    scored = live_scheme("lips", LIPS, DEFAULT_DELAY_S).frames(hear(load_live_model(), clip, None))
     assert scored is not None
     np.testing.assert_array_equal(scored[:, MOUTH], np.array([faps[MOUTH] for _, faps in frames]))
     assert scored[:, MOUTH].any()

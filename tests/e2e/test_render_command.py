@@ -24,7 +24,7 @@ from services.driver.head.glb_export import export_glb
 from services.driver.head.head import Head
 from services.driver.video.film import frames_of
 from services.live_chain import LiveChain
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.lips import load_lips
 from services.recognizer.voice import Voice
 from services.synthesizer.lips.load import load_lip_model
@@ -147,7 +147,7 @@ def test_a_sound_becomes_curves(tmp_path: Path) -> None:
 
 def test_live_shows_what_the_stream_would_have(tmp_path: Path) -> None:
     render(SENTENCE, tmp_path / "live.fap", live=True)
-    chain = LiveChain(load_model(), load_lip_model())
+    chain = LiveChain(load_live_model(), load_lip_model())
     samples = read_audio(SENTENCE)[0][:, 0]
     frames = chain.accept_waveform(samples) + chain.input_finished()
     written = read_fap(tmp_path / "live.fap").faps[:, 2:]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from corpora.scoring import count_errors
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import DEFAULT_MODEL, load_model, model_path
+from services.recognizer.acoustic.load import load_model, model_path
 from services.recognizer.front_end.features import Differences, LogMel, cepstra, with_differences
 from services.recognizer.front_end.resample import Resampler, to_16_khz
 from services.recognizer.offline import recognize
@@ -35,7 +35,7 @@ def pieces(samples: np.ndarray, cuts: list[int]) -> list[np.ndarray]:
 
 
 @cache
-def the_model(name: str = DEFAULT_MODEL) -> AcousticModel:
+def the_model(name: str = "neural") -> AcousticModel:
     return load_model(model_path(name))
 
 

@@ -7,7 +7,7 @@ from scipy.stats import norm
 
 from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
 from services.recognizer.acoustic.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
-from services.recognizer.acoustic.load import MODEL_PATH, load_model
+from services.recognizer.acoustic.load import NEURAL_PATH, load_model
 from services.recognizer.acoustic.model_file import read_archive
 from services.recognizer.front_end.features import NUM_BANDS, NUM_FEATURES, NUM_STATIC
 from services.recognizer.front_end.vtln import VocalTractNormalizer, without_pitch
@@ -140,7 +140,7 @@ def test_the_model_that_ships_loads_and_fits() -> None:
     np.testing.assert_allclose(np.exp(topology.log_stay) + np.exp(topology.log_leave), 1, rtol=1e-4)
     assert (topology.duration_mean_s > 0.03).all()
     assert (topology.duration_mean_s < 0.6).all()
-    assert MODEL_PATH.with_suffix(".md").is_file()  # its card
+    assert NEURAL_PATH.with_suffix(".md").is_file()  # its card
 
 
 def test_broken_files_are_named(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     path.write_bytes(b"not a model")
     with pytest.raises(UserError, match="is no acoustic model"):
         load_model(path)
-    whole = MODEL_PATH.read_bytes()
+    whole = NEURAL_PATH.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(UserError, match="is no acoustic model"):
         load_model(path)

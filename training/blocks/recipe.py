@@ -18,7 +18,7 @@ import torch
 
 from corpora.speech_corpus import RowErrors
 from services.recognizer.acoustic.blocks import BlockModel
-from services.recognizer.acoustic.load import MODEL_PATH, load_model
+from services.recognizer.acoustic.load import NEURAL_PATH, load_model
 from services.recognizer.acoustic.neural import NeuralModel
 from shared.errors import UserError
 from training.blocks.batches import BATCH_S
@@ -89,7 +89,7 @@ def train_blocks(
     UserError
         If there is nothing to train on, ``start`` is no neural model, or a file cannot be read.
     """
-    start = start or MODEL_PATH
+    start = start or NEURAL_PATH
     before = load_model(start)
     if not isinstance(before, NeuralModel):
         raise UserError(f"{start} is no neural model; give one that 'kouxing train neural' made")

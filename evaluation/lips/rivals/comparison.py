@@ -34,7 +34,7 @@ from evaluation.lips.rivals.rows import (
 )
 from evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme, hear, live_scheme
 from evaluation.lips.scores import LipScore, clips_to_score, pool
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.lips import lips_for
 from services.synthesizer.lips.load import LIP_MODELS
 from shared.errors import UserError
@@ -55,7 +55,7 @@ def main(folder: Path) -> list[LipScore]:
     UserError
         If there are no clips to learn from or to score, or a package is missing.
     """
-    model = load_model()
+    model = load_live_model()
     lips = lips_for(model)
     held = clips_to_score(folder, None)
     learnt_from = [

@@ -14,8 +14,8 @@ from shared.errors import UserError
 
 MODELS = Path(__file__).parents[1] / "models"
 SHIPPED = ("blocks", "gmm", "neural")
-DEFAULT_MODEL = "neural"
-MODEL_PATH = MODELS / f"{DEFAULT_MODEL}.npz"
+DEFAULT_MODEL = "blocks"
+NEURAL_PATH = MODELS / "neural.npz"
 _READERS: dict[str, Callable[[Archive], AcousticModel]] = {
     gmm.FORMAT: gmm.gmm_from,
     neural.FORMAT: neural.neural_from,
@@ -28,13 +28,13 @@ def model_path(name: str) -> Path:
     return MODELS / f"{name}.npz" if name in SHIPPED else Path(name)
 
 
-def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -> AcousticModel:
+def load_model(path: Path = NEURAL_PATH, *, look_ahead_ms: float | None = None) -> AcousticModel:
     """Read a model file.
 
     Parameters
     ----------
     path
-        A file that the ``save`` of a model wrote.
+        A file that the ``save`` of a model wrote; by default the shipped causal network.
     look_ahead_ms
         How far a neural model looks ahead, one of those it was trained for; None is the model's
         default. Other models have a fixed look-ahead and ignore this.
@@ -61,6 +61,20 @@ def load_model(path: Path = MODEL_PATH, *, look_ahead_ms: float | None = None) -
     if look_ahead_ms is not None and isinstance(model, neural.NeuralModel):
         return model.with_look_ahead(look_ahead_ms)
     return model
+
+
+def load_live_model(
+    name: str = DEFAULT_MODEL, *, look_ahead_ms: float | None = None
+) -> AcousticModel:
+    """Read a model, by its name or path, as the recognizer runs it.
+
+    Raises
+    ------
+    UserError
+        As :func:`load_model`.
+    """
+    model = load_model(model_path(name), look_ahead_ms=look_ahead_ms)
+    return with_early_network(model, look_ahead_ms=look_ahead_ms)
 
 
 def with_early_network(
