@@ -6,7 +6,7 @@ import dataclasses
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from shared.bus import AUDIO_QUEUE_LENGTH, Bus, Received
 from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
+from shared.face.expressions import DEFAULT_HOLD_S
 from shared.follower import PollingLoop, SessionFollower
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.codec import BadMessage
@@ -25,6 +26,7 @@ from shared.wire.session import (
     CloseSession,
     Error,
     ErrorCode,
+    Express,
     FlushSession,
     OpenSession,
     SessionMoved,
@@ -98,6 +100,34 @@ class Client:
         """
         self._ask(ChooseLips(session=session, token=token, request=_request_id(), lips=lips))
 
+    def express(
+        self, session: str, expressions: Mapping[str, float], hold_s: float = DEFAULT_HOLD_S
+    ) -> None:
+        """Let the face of a session, anybody's, show expressions for a while.
+
+        Parameters
+        ----------
+        session
+            Its name.
+        expressions
+            Strengths, 0 to 1, by name, in place of those before; none: they fade now.
+        hold_s
+            How long they stay before they fade.
+
+        Raises
+        ------
+        Refused
+            If there is no such session or expression, or a number is out of range.
+        """
+        self._ask(
+            Express(
+                session=session,
+                request=_request_id(),
+                expressions=dict(expressions),
+                hold_s=hold_s,
+            )
+        )
+
     def status(self) -> StatusReport:
         """Return the state of all services and sessions."""
         report = self._ask(StatusRequest(request=_request_id()))
@@ -115,7 +145,8 @@ class Client:
             self._sessions[message.session].move(message)
 
     def _ask(
-        self, message: OpenSession | CloseSession | FlushSession | ChooseLips | StatusRequest
+        self,
+        message: OpenSession | CloseSession | FlushSession | ChooseLips | Express | StatusRequest,
     ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
         while time.monotonic() < deadline_s:
@@ -281,6 +312,10 @@ class Session:
     def choose_lips(self, lips: str) -> None:
         """Let another lip model move the mouth: "dynamic-visemes" or "learnt"."""
         self._client.choose_lips(self.name, self.opened.token, lips)
+
+    def express(self, expressions: Mapping[str, float], hold_s: float = DEFAULT_HOLD_S) -> None:
+        """Let the face show expressions for a while, as in ``Client.express``."""
+        self._client.express(self.name, expressions, hold_s)
 
     def close(self) -> None:
         """Close the session."""

@@ -33,7 +33,7 @@ from shared.wire.control import (
     UseLips,
 )
 from shared.wire.message import Message
-from shared.wire.session import Done, Error, ErrorCode
+from shared.wire.session import Done, Error, ErrorCode, Express
 
 HEARTBEAT_S = 0.5
 TICK_S = 0.01
@@ -49,8 +49,8 @@ class Service:
 
     A subclass says its role and the endpoints it needs, fills in ``endpoints`` with those it
     provides, calls ``register`` for its own sockets, and overrides ``start_session``,
-    ``stop_session``, ``flush_session``, ``use_lips``, ``session_inputs``, ``on_tick``,
-    ``on_drain``.
+    ``stop_session``, ``flush_session``, ``use_lips``, ``express``, ``session_inputs``,
+    ``on_tick``, ``on_drain``.
     """
 
     name: ClassVar[str]
@@ -86,6 +86,7 @@ class Service:
                     StopSession: lambda message, _: self.stop_session(message.session),
                     FlushNow: lambda message, _: self.flush_session(message.session),
                     UseLips: lambda message, _: self.use_lips(message.session, message.lips),
+                    Express: lambda message, _: self.express(message),
                     Error: self._on_error,
                     Done: lambda _message, _sender: None,
                 },
@@ -105,6 +106,9 @@ class Service:
 
     def use_lips(self, session: str, lips: str) -> None:
         """Let another lip model move the mouth of a session, if that is made here."""
+
+    def express(self, message: Express) -> None:
+        """Let the face of a session show expressions, if it is made here."""
 
     def on_start(self) -> None:
         """Begin what needs the loop; called once, before the service says that it is ready."""

@@ -27,6 +27,7 @@ from shared.wire.session import (
     CloseSession,
     Done,
     Error,
+    Express,
     FlushSession,
     Joined,
     OpenSession,
@@ -142,4 +143,5 @@ SAMPLES: tuple[Message, ...] = (
     FapFrame(**COMMON, values=FAPS, mask=bytes([252] + [255] * 7 + [15])),  # type: ignore[arg-type]
     EndOfFaps(**COMMON),  # type: ignore[arg-type]
     Joined(session="demo", publisher="p1"),
+    Express(session="demo", request="r5", expressions={"joy": 0.5, "squint": 1.0}, hold_s=2.5),
 )

@@ -20,6 +20,7 @@ from services.cli.terminal import CONSOLE, JsonFile, VoiceFile, print_message, w
 from services.kinds import read_settings
 from shared.config import ServiceConfig
 from shared.errors import UserError
+from shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 
 SHOWN_FIGURES = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
@@ -99,6 +100,37 @@ def listen(
     from services.cli.follow import follow
 
     follow(_session_name(session), output, show, control_address(control))
+
+
+def express(
+    session: Annotated[str, typer.Argument(help="Name of the session.")],
+    expressions: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[NAME=STRENGTH]...",
+            help=f"Strengths from 0 to 1 of {', '.join(ExpressionName)}.",
+        ),
+    ] = None,
+    hold: Annotated[
+        float, typer.Option(help="Seconds that they stay before they fade.")
+    ] = DEFAULT_HOLD_S,
+    control: Control = "",
+) -> None:
+    """Let the face of a session show expressions for a while; none ends those before."""
+    from shared.client import Client
+
+    strengths = dict(map(_strength, expressions or ()))
+    check_expressions(strengths, hold)
+    with Client(control_address(control)) as client:
+        client.express(_session_name(session), strengths, hold)
+
+
+def _strength(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name, float(value)
+    except ValueError:
+        raise UserError(f"{text!r}: write NAME=STRENGTH, for example joy=0.4") from None
 
 
 def status(control: Control = "", json_file: JsonFile = None) -> None:

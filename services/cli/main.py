@@ -76,7 +76,7 @@ def kouxing(
 for kind in KINDS.values():
     app.command(kind.name, help=kind.summary)(service_command(kind))
 for command in (
-    run.run, clients.speak, clients.listen, clients.status, configuration.config,
+    run.run, clients.speak, clients.listen, clients.express, clients.status, configuration.config,
     offline.render, offline.phones, offline.align, offline.lips,
 ):  # fmt: skip
     app.command()(command)

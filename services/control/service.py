@@ -3,10 +3,11 @@
 Li et al. 2011, section 2: the control module initialises the others, passes messages between them
 and keeps them in step. Audio, phones and FAPs never pass through it.
 
-Reacts to: open-session, close-session, flush-session, status-request (clients), heartbeat, done,
-speech, recorded, error (services).
+Reacts to: open-session, close-session, flush-session, choose-lips, express, status-request
+(clients), heartbeat, done, speech, recorded, error (services).
 Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
-start-session, stop-session, flush-now (services), event, session-moved (subscribers).
+start-session, stop-session, flush-now, use-lips, express (services), event, session-moved
+(subscribers).
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from shared.wire.session import (
     Done,
     Error,
     ErrorCode,
+    Express,
     FlushSession,
     OpenSession,
 )
@@ -54,7 +56,7 @@ STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session
 REPLACE_LIMIT_S = 20.0  # for another worker to take the place of a lost one
 MAX_ANSWERS = 1000  # kept for repeated requests
-Request = OpenSession | CloseSession | FlushSession | ChooseLips | StatusRequest
+Request = OpenSession | CloseSession | FlushSession | ChooseLips | Express | StatusRequest
 
 
 class ControlService(Service):
@@ -83,6 +85,7 @@ class ControlService(Service):
                 CloseSession: self._request_handler(self._close),
                 FlushSession: self._request_handler(self._flush),
                 ChooseLips: self._request_handler(self._choose_lips),
+                Express: self._request_handler(self._express),
                 StatusRequest: self._request_handler(self._status),
                 Heartbeat: self._on_heartbeat,
                 Done: self._on_started,
@@ -171,6 +174,10 @@ class ControlService(Service):
         record.lips = message.lips
         use = UseLips(session=record.name, epoch=record.epoch, lips=message.lips)
         self._send_to_participants(record, use)
+        return Done(session=message.session, request=message.request)
+
+    def _express(self, message: Express, _sender: bytes) -> Message:
+        self._send_to_participants(self._sessions.find(message.session), message)
         return Done(session=message.session, request=message.request)
 
     def _status(self, message: StatusRequest, _sender: bytes) -> Message:

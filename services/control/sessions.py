@@ -103,13 +103,24 @@ class Sessions:
         Refusal
             There is no such session, or the token is another's.
         """
+        record = self.find(session)
+        if not secrets.compare_digest(record.token.encode(), token.encode()):
+            raise Refusal(ErrorCode.BAD_TOKEN, f"the token is not that of session {session!r}")
+        return record
+
+    def find(self, session: str) -> SessionRecord:
+        """Return a session.
+
+        Raises
+        ------
+        Refusal
+            There is no such session.
+        """
         record = self._records.get(session)
         if record is None:
             raise Refusal(
                 ErrorCode.UNKNOWN_SESSION, f"there is no session {session!r}; open it first"
             )
-        if not secrets.compare_digest(record.token.encode(), token.encode()):
-            raise Refusal(ErrorCode.BAD_TOKEN, f"the token is not that of session {session!r}")
         return record
 
     def participants(self, record: SessionRecord) -> set[str]:

@@ -1,8 +1,9 @@
 """The gateway as a service: sessions to browsers, a browser's microphone to a session.
 
 Reacts to: start-session, stop-session, use-lips, status-report (control), fap-frame, end-of-faps
-(synthesizer), sound, phone, speech (recognizer), and to what browsers send. Emits: status-request
-(control), WebSocket messages (browsers), and, as an ordinary client, audio-chunk (recognizer).
+(synthesizer), sound, phone, speech (recognizer), and to what browsers send. Emits: status-request,
+express (control), WebSocket messages (browsers), and, as an ordinary client, audio-chunk
+(recognizer).
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from shared.wire.control import SessionInput, StartSession, StatusReport, Status
 from shared.wire.events import phone_of
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
-from shared.wire.session import Error
+from shared.wire.session import Done, Error, Express
 from shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
@@ -79,7 +80,11 @@ class GatewayService(Service):
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
         self._viewers = Viewers(
-            self._web_sockets, self.metrics, self._play_sample, self._choose_sample_lips
+            self._web_sockets,
+            self.metrics,
+            self._play_sample,
+            self._choose_sample_lips,
+            self._express,
         )
         self._own_sessions = OwnSessions(config.control, self.warn)
         self._microphones = Microphones(self._web_sockets, self._own_sessions)
@@ -99,11 +104,12 @@ class GatewayService(Service):
         self._closing: asyncio.Task[None] | None = None
         self._report_s = 0.0
         self._request_s = 0.0
-        self._status_socket = self.bus.connect_dealer(config.control)
+        self._commands = self.bus.connect_dealer(config.control)
         self.register(
-            self._status_socket,
+            self._commands,
             {
                 StatusReport: lambda report, _: self._on_report(report),
+                Done: lambda _message, _sender: None,
                 Error: lambda error, _: self.warn(error.code, f"control says: {error.text}"),
             },
         )
@@ -201,7 +207,7 @@ class GatewayService(Service):
         answered = self._report_s >= self._request_s
         if now_s - self._request_s > (STATUS_S if answered else STATUS_LOST_S):
             self._request_s = now_s
-            self._status_socket.send(StatusRequest(request=secrets.token_hex(8)))
+            self._commands.send(StatusRequest(request=secrets.token_hex(8)))
         if now_s - self._report_s > STATUS_LOST_S:
             self._viewers.set_missing(("control",))
 
@@ -210,6 +216,16 @@ class GatewayService(Service):
         running = {state.service for state in report.services if state.state == "ready"}
         needed = ("recognizer", "synthesizer")
         self._viewers.set_missing(tuple(service for service in needed if service not in running))
+
+    def _express(self, session: str, expressions: wire.Expressions) -> None:
+        self._commands.send(
+            Express(
+                session=session,
+                request=secrets.token_hex(8),
+                expressions=expressions.strengths,
+                hold_s=expressions.hold_s,
+            )
+        )
 
     # --- from the publishers ---------------------------------------------------------------------
 

@@ -51,6 +51,8 @@ class Viewers:
         session, which counts as the newest only if there is no other.
     choose_sample_lips
         Lets another lip model move the mouth while the sample sentence is spoken.
+    express
+        Lets the face of a session show expressions.
     """
 
     def __init__(
@@ -59,11 +61,13 @@ class Viewers:
         metrics: Metrics,
         play_sample: Callable[[str], str],
         choose_sample_lips: Callable[[str], None],
+        express: Callable[[str, wire.Expressions], None],
     ) -> None:
         self._web_sockets = web_sockets
         self._metrics = metrics
         self._play_sample = play_sample
         self._choose_sample_lips = choose_sample_lips
+        self._express = express
         self._viewers: set[Viewer] = set()
         self._sessions: dict[str, _Session] = {}  # in the order they were opened
         self._sample = ""  # the session of the sample sentence, while it is spoken
@@ -147,8 +151,13 @@ class Viewers:
             command = wire.parse_object(message)
             session = command.get("follow")
             lips = wire.parse_lips(command)
+            expressions = wire.parse_expressions(command)
             if command.get("play") == "sample":
                 self._sample = viewer.chosen = self._play_sample(lips)
+            elif expressions is not None:
+                if viewer.shown is None:
+                    raise UserError("no session is shown whose face could express anything")
+                self._express(viewer.shown[0], expressions)
             elif lips:
                 if not self._sample or viewer.chosen != self._sample:
                     raise UserError("lips can be chosen here only for the sample sentence")
@@ -156,7 +165,9 @@ class Viewers:
             elif isinstance(session, str) and (not session or _SESSION.fullmatch(session)):
                 viewer.chosen = session
             else:
-                raise UserError("expected 'follow' with a session's name, 'play' or 'lips'")
+                raise UserError(
+                    "expected 'follow' with a session's name, 'play', 'lips' or 'express'"
+                )
         except UserError as error:
             self._put(viewer, Kind.TEXT, wire.error_text(str(error)))
         self._notify_viewer(viewer)

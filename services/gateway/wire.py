@@ -12,6 +12,7 @@ import struct
 from dataclasses import dataclass
 
 from shared.errors import UserError
+from shared.face.expressions import DEFAULT_HOLD_S, check_expressions
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 _HEADER = struct.Struct("<B3xId")
@@ -127,6 +128,31 @@ def parse_lips(fields: dict[str, object]) -> str:
     if not isinstance(lips, str) or lips not in ("", *LipModelName):
         raise UserError(f"lips must be one of {', '.join(LipModelName)}")
     return lips
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Expressions:
+    """What the face is to show beside speech."""
+
+    strengths: dict[str, float]  # 0 to 1, by name; empty: nothing any more
+    hold_s: float  # before they fade
+
+
+def parse_expressions(fields: dict[str, object]) -> Expressions | None:
+    """Return the expressions that a message asks for, if it does.
+
+    Raises
+    ------
+    UserError
+        If there is no such expression, or a number is out of range.
+    """
+    strengths, hold_s = fields.get("express"), fields.get("hold_s", DEFAULT_HOLD_S)
+    if strengths is None:
+        return None
+    if not isinstance(strengths, dict):
+        raise UserError("express must be an object of strengths by name")
+    check_expressions(strengths, hold_s)
+    return Expressions(strengths=strengths, hold_s=float(hold_s))  # type: ignore[arg-type]
 
 
 def parse_object(message: str) -> dict[str, object]:

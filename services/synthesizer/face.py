@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from typing import TypeAlias
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from services.synthesizer.lips.dynamic_visemes.trajectory import NO_TRANSITION, Motion, Transition
 from services.synthesizer.lips.lip_model import LipModel, MouthFrame
 from services.synthesizer.modifiers.amplitude import Amplitude
+from services.synthesizer.modifiers.expression import Expression
 from services.synthesizer.modifiers.expressiveness import Expressiveness
 from services.synthesizer.modifiers.idle_motion import IdleMotion
 from services.synthesizer.modifiers.modifier import Modifier, Moment
@@ -79,6 +81,7 @@ class Face:
         self._delay_s = delay_s
         self._idle_motion_seed = idle_motion_seed
         self._expressiveness = expressiveness
+        self._expression = Expression()
         self._event_s = 0.0  # of the last event
         self._begin(0.0)
 
@@ -99,6 +102,7 @@ class Face:
         self._modifiers: list[Modifier] = [Amplitude()]  # applied in this order
         if self._expressiveness != 1.0:
             self._modifiers.append(Expressiveness(self._expressiveness))
+        self._modifiers.append(self._expression)
         if self._idle_motion_seed:
             self._modifiers.append(IdleMotion(self._idle_motion_seed))
 
@@ -137,6 +141,10 @@ class Face:
         """Drop what is known (an interruption); the frames to come lead to rest."""
         self._recent.clear()
         self._lips.flush()
+
+    def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
+        """Show expressions, strengths 0 to 1 by name, for a time; in place of those before."""
+        self._expression.show(strengths, hold_s)
 
     def use_lips(self, lips: LipModel) -> None:
         """Let another lip model move the mouth, without a jump from where it is."""
@@ -194,6 +202,7 @@ class Face:
             elapsed_s=self._num_frames / self._frame_rate_hz,
             step_s=1.0 / self._frame_rate_hz,
             is_speaking=self._is_speaking,
+            is_speech_near=self._is_speaking or any(each.active for each in self._changes),
             levels=self._levels,
             articulation=mouth.articulation,
             amplitude_applies=self._lip_model.amplitude_applies,

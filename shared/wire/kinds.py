@@ -22,6 +22,7 @@ from shared.wire.session import (
     CloseSession,
     Done,
     Error,
+    Express,
     FlushSession,
     Joined,
     OpenSession,
@@ -63,6 +64,7 @@ MESSAGES: dict[str, type[Message]] = {
         FapFrame,
         EndOfFaps,
         Joined,
+        Express,
     )
 }
 

@@ -14,6 +14,7 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
+from shared.face.expressions import MAX_HOLD_S, ExpressionName
 from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
@@ -39,6 +40,10 @@ LanguageName = Annotated[str, Meta(max_length=64)]  # empty: not known
 PhoneSymbol = Annotated[str, Meta(pattern=r"^[a-z]{1,4}$")]
 LipsOrNone = Annotated[str, Meta(max_length=64)]  # empty: not chosen
 ChosenLips = Annotated[str, Meta(pattern=f"^({'|'.join(LipModelName)})$")]
+KnownExpression = Annotated[str, Meta(pattern=f"^({'|'.join(ExpressionName)})$")]
+Strength = Annotated[float, Meta(ge=0, le=1)]
+ExpressionMap = Annotated[dict[KnownExpression, Strength], Meta(max_length=len(ExpressionName))]
+HoldTime = Annotated[float, Meta(ge=0, le=MAX_HOLD_S)]  # s
 VoiceProfile = Annotated[bytes, Meta(max_length=MAX_VOICE_BYTES)]  # empty: anybody's
 Endpoint = Annotated[str, Meta(max_length=256)]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]

@@ -8,12 +8,15 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from shared.face.expressions import DEFAULT_HOLD_S
 from shared.wire.message import (
     ChosenLips,
     Count,
     Encoding,
     Endpoint,
+    ExpressionMap,
     FrameRate,
+    HoldTime,
     LanguageName,
     Message,
     Name,
@@ -104,6 +107,15 @@ class ChooseLips(Message):
     request: Name
     token: Name
     lips: ChosenLips
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Express(Message):
+    """Lets the face show expressions for a while; control passes it on to the services."""
+
+    request: Name
+    expressions: ExpressionMap  # strengths by name, in place of those before; empty: they fade now
+    hold_s: HoldTime = DEFAULT_HOLD_S  # that they stay before they fade
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

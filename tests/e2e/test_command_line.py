@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 import soundfile
 
-from shared.client import Client
+from shared.client import Client, Refused, Subscription
 from shared.face.fap_file import read_fap
+from shared.face.faps import FAP_NUMBER
+from shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file, stream_into
 from tests.system import DEMO, ROOT, System, free_port, kouxing
 
@@ -241,6 +243,11 @@ def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: P
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["speak", SENTENCE, "--session", "two words"], "letters, digits"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),
+        (["express", "heard", "glee=1"], "joy, sadness, anger"),
+        (["express", "heard", "joy=2"], "0 to 1"),
+        (["express", "heard", "joy"], "joy=0.4"),
+        (["express", "heard", "joy=1", "--hold", "-1"], "0 to 3600"),
+        (["express", "nobody", "joy=1"], "no session 'nobody'"),
     ],
 )
 def test_a_running_system_is_not_asked_for_what_cannot_be(
@@ -249,6 +256,35 @@ def test_a_running_system_is_not_asked_for_what_cannot_be(
     result = kouxing(*arguments, control=system.control)
     assert result.returncode == 2
     assert word in result.stderr
+
+
+def wait_for_corner(faces: Subscription, low: float, high: float) -> None:
+    """Wait until the corner of the mouth is raised by so much, in FAP units."""
+    corner = FAP_NUMBER["raise_l_cornerlip"] - 1
+    while faces.wait(60.0):
+        for received in faces.receive():
+            assert isinstance(received.message, FapFrame)
+            if low < np.frombuffer(received.message.values, "<f4")[corner] < high:
+                return
+    raise TimeoutError
+
+
+def test_a_face_shows_what_another_program_asks_for(system: System) -> None:
+    with Client(system.control) as client:
+        session = client.open_session(session="smiling")
+        faces = session.subscribe(FapFrame)
+        asked = kouxing("express", "smiling", "joy=1", "--hold", 600, control=system.control)
+        assert asked.returncode == 0, asked.stderr
+        wait_for_corner(faces, 300.0, 400.0)  # the frames of a face at rest go on without sound
+        session.express({"smile": 0.25, "squint": 1.0}, hold_s=600.0)
+        wait_for_corner(faces, 150.0, 200.0)
+        session.express({})
+        wait_for_corner(faces, -50.0, 50.0)
+        with pytest.raises(Refused, match=r"joy.*squint"):
+            session.express({"glee": 1.0})
+        with pytest.raises(Refused, match="<= 1"):
+            session.express({"joy": 1.5})
+        session.close()
 
 
 def test_status_shows_services_and_writes_json(system: System, tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ from shared.wire.session import (
     CloseSession,
     Done,
     Error,
+    Express,
     FlushSession,
     OpenSession,
     SessionOpened,
@@ -83,6 +84,7 @@ class ScriptedSystem:
         self.closed: list[str] = []
         self.flushed: list[str] = []
         self.chosen: list[tuple[str, str]] = []  # session, lip model
+        self.expressions: list[Express] = []
         self.voices: list[bytes] = []  # of the sessions opened
         self.audio_messages: list[Message] = []
         self.forget()
@@ -103,6 +105,7 @@ class ScriptedSystem:
         for received in (self.started, self.closed, self.flushed, self.audio_messages):
             received.clear()
         self.chosen.clear()
+        self.expressions.clear()
         self.voices.clear()
 
     def do(self, job: Callable[[], object]) -> None:
@@ -201,6 +204,9 @@ class ScriptedSystem:
                 self.chosen.append((message.session, message.lips))
                 use = UseLips(session=message.session, lips=message.lips)
                 self.commands.send(use, to=self.gateway)
+                answer = Done(session=message.session, request=message.request)
+            case Express():
+                self.expressions.append(message)
                 answer = Done(session=message.session, request=message.request)
             case StatusRequest():
                 states = [
@@ -548,6 +554,42 @@ def test_microphone_and_sample_may_choose_their_lips(
     (first, second, third, fourth) = system.chosen
     assert first[0] == second[0] != third[0] == fourth[0]
     assert [first[1], second[1]] == [third[1], fourth[1]] == ["learnt", "dynamic-visemes"]
+
+
+def test_a_viewer_lets_the_face_it_sees_express_something(
+    system: ScriptedSystem, gateway: GatewayProcess
+) -> None:
+    async def express() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer?session=seen") as viewer,
+        ):
+            await viewer.send_json({"express": {"joy": 0.5}})
+            assert "no session is shown" in (await receive_json(viewer, "error"))["text"]
+            system.do(lambda: system.start("seen"))
+            while (await receive_json(viewer, "session"))["session"] != "seen":
+                pass
+            for wrong, named in (
+                ({"express": {"glee": 0.5}}, "use joy, sadness,"),
+                ({"express": {"joy": 2}}, "joy is 2"),
+                ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
+                ({"express": "joy"}, "strengths by name"),
+            ):
+                await viewer.send_json(wrong)
+                assert named in (await receive_json(viewer, "error"))["text"]
+            await viewer.send_json({"express": {"joy": 0.5, "squint": 1}, "hold_s": 7})
+            await viewer.send_json({"express": {}})
+            await until(lambda: len(system.expressions) == 2)
+
+    asyncio.run(express())
+    first, second = system.expressions
+    assert (first.session, first.expressions, first.hold_s) == (
+        "seen",
+        {"joy": 0.5, "squint": 1.0},
+        7.0,
+    )
+    assert (second.session, second.expressions) == ("seen", {})
+    system.do(lambda: system.commands.send(StopSession(session="seen"), to=system.gateway))
 
 
 def test_bad_microphones_are_told_why(system: ScriptedSystem, gateway: GatewayProcess) -> None:

@@ -1,1 +1,1 @@
-"""What changes a face after its lip model: amplitude, idle motion."""
+"""What changes a face after its lip model: amplitude, expression, idle motion."""

@@ -15,7 +15,7 @@ d       width or push beside the usual one              FAP       (1,)
     x' = x + (e - 1) * max(x - 20, 0)                                       for e < 1
     d' = d + 2 * (e - 1) * d
 
-A closure is kept: a lip within ``_SHUT`` of where it is shut does not move, two lips whose gap is
+A closure is kept: a lip within ``SHUT`` of where it is shut does not move, two lips whose gap is
 no larger keep it, and so do those whose lower one is shut against the teeth (f). Very open lips
 open no further, so that no jaw drops too far. The movements from side to side are small, and weigh
 as much to the eye: they count twice.
@@ -28,17 +28,17 @@ from numpy.typing import NDArray
 
 from services.synthesizer.modifiers.modifier import Moment
 
-_SHUT = 20.0  # a gap up to this is a closure, FAP units
-_OPEN = 80.0  # from this gap on, the width of the lips is that of an open mouth
+SHUT = 20.0  # a gap up to this is a closure, FAP units
+OPEN = 80.0  # from this gap on, the width of the lips is that of an open mouth
 _WIDEST = 900.0  # an opening that grows no more
 _USUAL_WIDTH = -40.0  # of a corner of the mouth in speech, by the dynamic visemes
 _USUAL_PUSH = 40.0
 _SIDEWAYS = 2.0
 _MIN_WIDTH, _MAX_PUSH = -260.0, 400.0
 
-_JAW = 3 - 1
-_UPPER = np.array([4, 8, 9, 51, 55, 56]) - 1  # positive is down
-_LOWER = np.array([5, 10, 11, 52, 57, 58]) - 1  # positive is up; each meets the upper lip's
+JAW = 3 - 1
+UPPER = np.array([4, 8, 9, 51, 55, 56]) - 1  # positive is down
+LOWER = np.array([5, 10, 11, 52, 57, 58]) - 1  # positive is up; each meets the upper lip's
 _WIDTH = np.array([6, 7, 53, 54]) - 1  # positive is outwards
 _PUSH = np.array([16, 17]) - 1  # positive is forwards
 
@@ -61,19 +61,19 @@ class Expressiveness:
 
     def scale(self, faps: NDArray[np.float32]) -> None:
         """Scale the mouth of FAPs (68,), in place."""
-        upper, lower = -faps[_UPPER], -faps[_LOWER]  # openings
-        beyond = np.maximum(upper + lower - _SHUT, 0.0)  # (6,) of the gaps
-        free_upper, free_lower = (np.maximum(lip - _SHUT, 0.0) for lip in (upper, lower))
+        upper, lower = -faps[UPPER], -faps[LOWER]  # openings
+        beyond = np.maximum(upper + lower - SHUT, 0.0)  # (6,) of the gaps
+        free_upper, free_lower = (np.maximum(lip - SHUT, 0.0) for lip in (upper, lower))
         free = free_upper + free_lower
         # the lower lip shut against the teeth (f) is a closure, too
-        apart = np.minimum(free_lower / (_OPEN - _SHUT), 1.0)
+        apart = np.minimum(free_lower / (OPEN - SHUT), 1.0)
         grown = apart * self._growth(np.minimum(free, beyond))
         share = grown / np.maximum(free, 1.0)
-        faps[_UPPER] -= share * free_upper
-        faps[_LOWER] -= share * free_lower
+        faps[UPPER] -= share * free_upper
+        faps[LOWER] -= share * free_lower
         gap = float(upper[0] + lower[0])
-        is_open = float(apart[0]) * min(max((gap - _SHUT) / (_OPEN - _SHUT), 0.0), 1.0)
-        faps[_JAW] += is_open * self._growth(np.maximum(faps[_JAW], 0.0))
+        is_open = float(apart[0]) * min(max((gap - SHUT) / (OPEN - SHUT), 0.0), 1.0)
+        faps[JAW] += is_open * self._growth(np.maximum(faps[JAW], 0.0))
         width = faps[_WIDTH] - _USUAL_WIDTH
         # at rest the mouth is wider than in speech, which is no spreading
         change = _SIDEWAYS * self._more * np.where(width > 0.0, is_open * width, width)

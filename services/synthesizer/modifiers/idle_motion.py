@@ -96,8 +96,10 @@ class IdleMotion:
         # the eyes stay on what they look at while the head turns
         faps[_EYES_PITCH] += pitch - head[0]
         faps[_EYES_YAW] += yaw - head[1]
-        faps[_LIDS_UPPER] += lid * _UPPER_LID + (1.0 - lid) * _LID_PER_GAZE * (pitch - head[0])
-        faps[_LIDS_LOWER] += lid * _LOWER_LID
+        faps[_LIDS_UPPER] += _LID_PER_GAZE * (pitch - head[0])
+        # from wherever an expression has put the lids
+        faps[_LIDS_UPPER] += lid * (_UPPER_LID - faps[_LIDS_UPPER])
+        faps[_LIDS_LOWER] += lid * (_LOWER_LID - faps[_LIDS_LOWER])
 
     def _draw_blink(self, after_s: float) -> float:
         interval_s = _BLINK_MEDIAN_S * math.exp(_BLINK_LOG_SD * self._blink_rng.standard_normal())

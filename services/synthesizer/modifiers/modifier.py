@@ -21,6 +21,7 @@ class Moment:
     elapsed_s: float  # since the first frame; goes on while media time stands still
     step_s: float  # since the frame before
     is_speaking: bool
+    is_speech_near: bool  # somebody speaks, or is known to begin soon
     levels: Sequence[tuple[float, float]]  # new since the frame before: media time s, level dB
     articulation: Articulation
     amplitude_applies: bool = True  # else the lips follow the level already
