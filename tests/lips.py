@@ -51,7 +51,6 @@ def moment(
         elapsed_s=time_s,
         step_s=step_s,
         is_speaking=True,
-        is_speech_near=True,
         levels=levels,
         articulation=articulation or articulation_of(()),
     )

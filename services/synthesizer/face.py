@@ -21,7 +21,7 @@ from services.synthesizer.lips.lip_model import LipModel, MouthFrame
 from services.synthesizer.modifiers.amplitude import Amplitude
 from services.synthesizer.modifiers.expression import Expression
 from services.synthesizer.modifiers.expressiveness import Expressiveness
-from services.synthesizer.modifiers.idle_motion import IdleMotion
+from services.synthesizer.modifiers.life import Life
 from services.synthesizer.modifiers.modifier import Modifier, Moment
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -35,6 +35,7 @@ REST_S = 0.3  # frames that lead to rest after the end of the sound
 _RECENT_S = 2.0  # of events that a new lip model is told
 _CATCH_UP_FRAMES = 10  # that it makes before it is seen
 _CHANGE_S = 0.14  # from one lip model to the next
+_SPEECH_LEAD_S = 0.04  # speech that begins within this, if known, counts as begun
 _ROUNDING = 0.01  # of media time, in frames, that is forgiven
 
 _MOUTH = np.array(MOUTH_FAPS) - 1
@@ -53,7 +54,7 @@ class Face:
         0 to 1.5: how much later than its sound a frame is made; with 1.5 a recording's visemes are
         blended as if all were known.
     idle_motion_seed
-        Seed of blinks, gaze and head motion; with 0 the mouth alone moves.
+        Seed of blinks, gaze, brows and head motion; with 0 the mouth alone moves.
     expressiveness
         0.5 to 2: how large the mouth's movements are; 1 for those of the lip model.
 
@@ -79,9 +80,10 @@ class Face:
         self._lip_model = lips
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s
-        self._idle_motion_seed = idle_motion_seed
         self._expressiveness = expressiveness
         self._expression = Expression()
+        self._life = Life(idle_motion_seed) if idle_motion_seed else None
+        self._num_frames = 0  # made so far, while media time stood still too
         self._event_s = 0.0  # of the last event
         self._begin(0.0)
 
@@ -89,7 +91,6 @@ class Face:
         """Begin at rest, with the next frame at or after a media time."""
         self._next_frame = math.ceil(start_s * self._frame_rate_hz - _ROUNDING)
         self._time_s = self._next_frame / self._frame_rate_hz  # of the last frame
-        self._num_frames = 0  # made so far, while media time stood still too
         self._is_speaking = False  # at the last frame
         self._changes: deque[SpeechChange] = deque()  # of frames to come
         self._levels: list[tuple[float, float]] = []  # since the last frame
@@ -103,8 +104,8 @@ class Face:
         if self._expressiveness != 1.0:
             self._modifiers.append(Expressiveness(self._expressiveness))
         self._modifiers.append(self._expression)
-        if self._idle_motion_seed:
-            self._modifiers.append(IdleMotion(self._idle_motion_seed))
+        if self._life is not None:
+            self._modifiers.append(self._life)
 
     def accept(self, event: SoundEvent) -> list[Frame]:
         """Take an event; return the frames that are due then.
@@ -190,6 +191,10 @@ class Face:
         while self._changes and self._changes[0].time_s <= time_s:
             self._is_speaking = self._changes.popleft().active
 
+    def _will_speak(self) -> bool:
+        soon_s = self._time_s + _SPEECH_LEAD_S
+        return any(each.active and each.time_s <= soon_s for each in self._changes)
+
     def _frame(self, mouth: MouthFrame) -> Frame:
         self._change_s += 1.0 / self._frame_rate_hz
         self._mouth_before = self._mouth
@@ -201,8 +206,7 @@ class Face:
             known_s=self._time_s + self._delay_s,
             elapsed_s=self._num_frames / self._frame_rate_hz,
             step_s=1.0 / self._frame_rate_hz,
-            is_speaking=self._is_speaking,
-            is_speech_near=self._is_speaking or any(each.active for each in self._changes),
+            is_speaking=self._is_speaking or self._will_speak(),
             levels=self._levels,
             articulation=mouth.articulation,
             amplitude_applies=self._lip_model.amplitude_applies,

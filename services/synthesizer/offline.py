@@ -68,7 +68,6 @@ def synthesize(
             elapsed_s=float(frame_s),
             step_s=1.0 / frame_rate_hz,
             is_speaking=True,
-            is_speech_near=True,
             levels=levels if number == 0 else (),
             articulation=articulation,
         )

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from services.synthesizer.face import REST_S, Face, Frame
 from services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
 from services.synthesizer.lips.dynamic_visemes.visemes import LIP_HEIGHT_FAPS
-from services.synthesizer.modifiers.idle_motion import IdleMotion
 from services.synthesizer.offline import synthesize
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
+from shared.face.idle_motion import IdleMotion, State
 from shared.phones.events import EndOfSound, Phone, Progress, SpeechChange
-from tests.lips import DELAY_S, INVENTORY, LIPS, advance, make_face, moment
+from tests.lips import DELAY_S, INVENTORY, LIPS, advance, make_face
 
 pytestmark = pytest.mark.unit
 
@@ -332,7 +332,7 @@ def test_idle_motion_has_natural_figures() -> None:
     motion, minutes, rate_hz = IdleMotion(7), 10, 50
     faps = np.zeros((minutes * 60 * rate_hz, 68), dtype=np.float32)
     for k, row in enumerate(faps):
-        motion.apply(row, moment(k / rate_hz))
+        motion.apply(row, k / rate_hz, State.SPEAKING)
     shut = faps[:, 18] > 500.0
     assert 12 < np.count_nonzero(shut[1:] & ~shut[:-1]) / minutes < 24  # blinks a minute
     np.testing.assert_array_equal(faps[:, 18], faps[:, 19])

@@ -97,4 +97,4 @@ def test_the_face_knows_of_speech_when_it_is_due() -> None:
         animate(replace(heard, events=[*quiet, *changes]), lips, config) for changes in ([], speech)
     )
     moved = [s for (s, one), (_, other) in zip(silent, spoken, strict=True) if (one != other).any()]
-    assert moved[0] == pytest.approx(2.0, abs=0.041)
+    assert 1.95 < moved[0] < 2.2  # from the first loud syllable on

@@ -17,8 +17,7 @@ a       how far the lips are free, 0 to 1                     1         (6,)
     both lips move up by c if c > 0, else by a c
 
 ``a`` is 0 where the gap is at most 20, or the lower lip is that near to where it is shut (f), and 1
-from 80 on. While nobody speaks all lips are free; they are bound again within 40 ms of when speech
-is known, which is before its sound.
+from 80 on. While nobody speaks all lips are free; they are bound again when its sound begins.
 """
 
 from __future__ import annotations
@@ -76,7 +75,7 @@ class Expression:
         share = -math.expm1(-moment.step_s / (_EASE_S if is_held else _FADE_S))
         self._halfway = self._halfway + share * (is_held * self._goal - self._halfway)
         self._shown = self._shown + share * (self._halfway - self._shown)
-        if moment.is_speech_near:
+        if moment.is_speaking:
             self._free = max(self._free - moment.step_s / _BIND_S, 0.0)
         else:
             self._free -= (1.0 - self._free) * math.expm1(-moment.step_s / _FREE_S)

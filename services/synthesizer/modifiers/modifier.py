@@ -20,8 +20,7 @@ class Moment:
     known_s: float  # media time up to which the sound is known
     elapsed_s: float  # since the first frame; goes on while media time stands still
     step_s: float  # since the frame before
-    is_speaking: bool
-    is_speech_near: bool  # somebody speaks, or is known to begin soon
+    is_speaking: bool  # somebody speaks, or is known to begin in a moment
     levels: Sequence[tuple[float, float]]  # new since the frame before: media time s, level dB
     articulation: Articulation
     amplitude_applies: bool = True  # else the lips follow the level already

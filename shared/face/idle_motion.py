@@ -1,10 +1,11 @@
-"""Blinks, gaze and small head motion, so that the face is not a mask with a mouth.
+"""Blinks, gaze, breath and small head motion, so that the face is not a mask with a mouth.
 
 Figures: about 17 to 20 blinks a minute in conversation, intervals skewed (log-normal), the lid
 falls in about 80 ms and rises twice as slowly (Bentivoglio et al. 1997; VanderWerf et al. 2003).
 Saccades last 21 ms and 2.2 ms a degree (Bahill et al. 1975); most fixations of a speaker rest on
-the listener. Head turns of about a degree, slower than 1.5 Hz. When the head turns, the eyes turn
-back (vestibulo-ocular reflex).
+the listener, and those of somebody who pauses to think do so less (Kendon 1967). Head turns of
+about a degree, slower than 1.5 Hz; breath, 14 times a minute, moves the head by a third of one.
+When the head turns, the eyes turn back (vestibulo-ocular reflex).
 
 Everything follows from the seed and the time: the same times, in whatever portions, give the same
 face.
@@ -13,11 +14,11 @@ face.
 from __future__ import annotations
 
 import math
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.modifiers.modifier import Moment
 from shared.face.faps import FAP_NUMBER
 
 _DEGREE = math.pi / 180.0 / 1e-5  # in the FAPs' angle unit, 1e-5 rad
@@ -30,7 +31,7 @@ _UPPER_LID, _LOWER_LID = 900.0, 150.0  # together a little over the open eye's 1
 
 _FIXATION_MEAN_S = 1.4
 _FIXATION_MIN_S = 0.3
-_ON_LISTENER = 0.7  # share of the fixations
+_REACTION_S = 0.15  # after which the gaze follows another state
 _GAZE_SD_DEG = (0.5, 0.4)  # on the listener, sideways and up or down
 _GLANCE_SD_DEG = (5.0, 2.5)
 _GLANCE_LIMIT_DEG = 12.0
@@ -41,12 +42,25 @@ _HEAD_HZ = (0.07, 1.4)
 _NUM_WAVES = 9
 _LISTENING_HEAD = 0.35  # head motion of a listener, as a share of a speaker's
 _SPEAKING_S = 0.8  # time constant between the two
+_BREATH_HZ, _BREATH_DEG = 0.23, 0.35
 
 _LIDS_UPPER = [FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_t_r_eyelid"] - 1]
 _LIDS_LOWER = [FAP_NUMBER["close_b_l_eyelid"] - 1, FAP_NUMBER["close_b_r_eyelid"] - 1]
 _EYES_YAW = [FAP_NUMBER["yaw_l_eyeball"] - 1, FAP_NUMBER["yaw_r_eyeball"] - 1]
 _EYES_PITCH = [FAP_NUMBER["pitch_l_eyeball"] - 1, FAP_NUMBER["pitch_r_eyeball"] - 1]
 _HEAD = [FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw", "roll")]
+
+
+class State(Enum):
+    """What somebody does, which the eyes and the head tell."""
+
+    LISTENING = "listening"
+    SPEAKING = "speaking"
+    THINKING = "thinking"  # in a pause of one's own speech
+
+
+# share of the fixations that rest on the listener
+_ON_LISTENER = {State.LISTENING: 0.8, State.SPEAKING: 0.88, State.THINKING: 0.5}
 
 
 class IdleMotion:
@@ -71,25 +85,32 @@ class IdleMotion:
         size *= np.sqrt(2.0 / np.sum(size**2, axis=1, keepdims=True))
         self._wave_size = size * np.array(_HEAD_SD_DEG)[:, None] * _DEGREE
         self._liveliness = _LISTENING_HEAD
+        self._breath_phase = waves.uniform(0.0, 2.0 * np.pi)
         self._time_s = 0.0
+        self._state = State.LISTENING
         self._blink_s = self._draw_blink(0.0)
         self._gaze_from = self._gaze_to = np.zeros(2)
         self._saccade_s, self._saccade_length_s = 0.0, 0.03
         self._next_saccade_s = self._draw_fixation(0.0)
 
-    def apply(self, faps: NDArray[np.float32], moment: Moment) -> None:
-        """Add the motion to a frame, FAPs (68,), in place.
+    def apply(
+        self, faps: NDArray[np.float32], time_s: float, state: State = State.LISTENING
+    ) -> None:
+        """Add the motion at a time since the first frame to FAPs (68,), in place.
 
-        A speaker's head moves more than a listener's. Media time may stand still; what counts is
-        the time since the first frame.
+        A speaker's head moves more than a listener's.
         """
-        time_s = moment.elapsed_s
+        if state is not self._state:
+            self._state = state
+            self._next_saccade_s = min(self._next_saccade_s, time_s + _REACTION_S)
         elapsed_s = max(time_s - self._time_s, 0.0)
         self._time_s = time_s
-        goal = 1.0 if moment.is_speaking else _LISTENING_HEAD
+        goal = _LISTENING_HEAD if state is State.LISTENING else 1.0
         self._liveliness += (goal - self._liveliness) * -math.expm1(-elapsed_s / _SPEAKING_S)
         angles = 2.0 * np.pi * self._wave_hz * time_s + self._wave_phase
         head = self._liveliness * np.sum(self._wave_size * np.sin(angles), axis=1)
+        breath = math.sin(2.0 * math.pi * _BREATH_HZ * time_s + self._breath_phase)
+        head[0] += _BREATH_DEG * _DEGREE * breath
         yaw, pitch = self._gaze(time_s)
         lid = self._lid(time_s)
         faps[_HEAD] += head.astype(np.float32)
@@ -120,7 +141,8 @@ class IdleMotion:
     def _gaze(self, time_s: float) -> NDArray[np.float64]:
         """Yaw (to the left) and pitch (downwards) of the gaze in space."""
         while time_s >= self._next_saccade_s:
-            sd = _GAZE_SD_DEG if self._gaze_rng.random() < _ON_LISTENER else _GLANCE_SD_DEG
+            is_on_listener = self._gaze_rng.random() < _ON_LISTENER[self._state]
+            sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
             target_deg = np.clip(
                 self._gaze_rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG
             )

@@ -1,0 +1,115 @@
+"""Brows, head and eyes that go with speech."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.synthesizer.face import Face
+from shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from shared.face.idle_motion import IdleMotion, State
+from shared.phones.events import Progress, SpeechChange
+from tests.lips import make_face
+
+pytestmark = pytest.mark.unit
+
+FRAME_S = 0.02
+BROW = FAP_NUMBER["raise_l_m_eyebrow"] - 1
+PITCH, YAW = (FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw"))
+EYE_PITCH, EYE_YAW = (FAP_NUMBER[f"{axis}_l_eyeball"] - 1 for axis in ("pitch", "yaw"))
+QUIET_DB, SILENT_DB, STRESS_DB = -26.0, -80.0, -14.0
+
+
+def levels(*parts: tuple[float, float]) -> list[float]:
+    """Levels every 20 ms of parts that last so long and are so loud."""
+    return [level_db for duration_s, level_db in parts for _ in range(round(duration_s / FRAME_S))]
+
+
+def show(face: Face, levels_db: Sequence[float], step: int = 1) -> NDArray[np.float32]:
+    """Frames of a sound with these levels, which arrives in so many at a time."""
+    frames = face.accept(SpeechChange(active=True, time_s=0.0))
+    for first in range(0, len(levels_db), step):
+        for number in range(first, min(first + step, len(levels_db))):
+            progress = Progress(time_s=(number + 1) * FRAME_S, level_db=levels_db[number])
+            frames += face.accept(progress)
+    return np.array([faps for _, faps in frames])
+
+
+def lively(levels_db: Sequence[float], seed: int) -> NDArray[np.float32]:
+    """What speech adds to the face, beside what goes on anyway."""
+    flat = [QUIET_DB] * len(levels_db)
+    return show(make_face(idle_motion_seed=seed), levels_db) - show(
+        make_face(idle_motion_seed=seed), flat
+    )
+
+
+STRESSED = levels((1.0, QUIET_DB), (0.2, STRESS_DB), (0.8, QUIET_DB))
+
+
+def test_brows_rise_and_the_head_dips_with_most_stressed_syllables() -> None:
+    raised = [lively(STRESSED, seed)[:, BROW] for seed in range(1, 41)]
+    heights = np.array([curve.max() for curve in raised])
+    assert 12 < np.count_nonzero(heights > 10.0) < 35  # not each time
+    assert heights.max() < 60.0  # a small movement
+    peaks_s = FRAME_S * np.array([curve.argmax() for curve in raised if curve.max() > 10.0])
+    assert (np.abs(peaks_s - 1.15) < 0.2).all()
+    assert all(np.abs(np.diff(curve, n=2)).max() < 5.0 for curve in raised)  # no corner
+    dips = np.array([lively(STRESSED, seed)[:, PITCH].max() for seed in range(1, 21)])
+    assert 8 < np.count_nonzero(dips > 500.0) < 20
+    assert dips.max() < np.deg2rad(2.5) * 1e5
+
+
+def test_the_head_nods_when_a_phrase_ends_and_the_eyes_stay() -> None:
+    phrase = levels((1.5, QUIET_DB), (0.4, SILENT_DB))
+    nods = np.array([lively(phrase, seed) for seed in range(1, 21)])
+    depth_deg = np.rad2deg(nods[:, 75:, PITCH].max(axis=1) * 1e-5)
+    assert 12 < np.count_nonzero(depth_deg > 0.4) < 20
+    assert depth_deg.max() < 2.5
+    gaze = nods[:, :, PITCH] + nods[:, :, EYE_PITCH]
+    assert np.median(np.abs(gaze[:, 75:])) < 1.0
+    short = levels((0.5, QUIET_DB), (0.4, SILENT_DB))
+    assert max(lively(short, seed)[:, PITCH].max() for seed in range(1, 11)) < 100.0
+
+
+def test_nothing_moves_a_lip_and_any_portions_give_the_same() -> None:
+    sound = STRESSED + levels((0.5, SILENT_DB)) + STRESSED
+    one, other = (show(make_face(idle_motion_seed=5), sound, step) for step in (1, 17))
+    np.testing.assert_array_equal(one, other)
+    assert one[:, BROW].any() or one[:, PITCH].any()
+    assert not one[:, np.array(MOUTH_FAPS) - 1].any()
+    assert not show(make_face(), sound).any()  # turned off
+
+
+def test_noise_without_speech_moves_no_brow() -> None:
+    face = make_face(idle_motion_seed=5)
+    frames = [
+        faps
+        for number, level_db in enumerate(STRESSED)
+        for _, faps in face.accept(Progress(time_s=(number + 1) * FRAME_S, level_db=level_db))
+    ]
+    assert not np.array(frames)[:, BROW].any()
+
+
+def test_eyes_leave_the_viewer_more_often_in_thought() -> None:
+    def share_on_viewer(state: State) -> float:
+        motion = IdleMotion(3)
+        faps = np.zeros((15_000, 68), np.float32)
+        for number, row in enumerate(faps):
+            motion.apply(row, number * FRAME_S, state)
+        gaze_deg = np.rad2deg((faps[:, [EYE_YAW, EYE_PITCH]] + faps[:, [YAW, PITCH]]) * 1e-5)
+        return float((np.abs(gaze_deg).max(axis=1) < 1.7).mean())
+
+    assert share_on_viewer(State.SPEAKING) > 0.8
+    assert share_on_viewer(State.LISTENING) > 0.7
+    assert share_on_viewer(State.THINKING) < 0.65
+
+
+def test_the_head_does_not_jump_when_the_sound_begins_anew() -> None:
+    face = make_face(idle_motion_seed=5)
+    before = show(face, levels((2.0, QUIET_DB)))[-1]
+    face.restart(2.0)
+    after = np.array([faps for _, faps in face.accept(Progress(time_s=2.2, level_db=SILENT_DB))])
+    assert np.abs(after[0, [PITCH, YAW]] - before[[PITCH, YAW]]).max() < 300.0  # 0.2 degrees
