@@ -13,14 +13,18 @@ export async function openCaptureContext() {
   return context;
 }
 
-/** Hand over a stream's microphone: onChunk(samples, int16, of 20 ms, and their level, 0 to 1). */
+/**
+ * Hand over a stream's microphone: onChunk(samples, int16, of 20 ms, their level, 0 to 1, and when
+ * they were recorded, ms of the page's clock, however long this page was busy since).
+ */
 export function capture(context, stream, onChunk) {
   const node = new AudioWorkletNode(context, "capture", {
     numberOfOutputs: 0,
     channelCount: 1,
     channelCountMode: "explicit",
   });
-  node.port.onmessage = ({ data: { chunk, rms } }) => onChunk(chunk, rms);
+  node.port.onmessage = ({ data: { chunk, rms, recordedMs } }) =>
+    onChunk(chunk, rms, performance.now() - (Date.now() - recordedMs));
   context.createMediaStreamSource(stream).connect(node);
   context.resume();
 }

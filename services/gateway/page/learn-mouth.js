@@ -170,7 +170,9 @@ export class MouthLesson {
       drawLips(video, tracker.lips, landmarks);
       if (beganMs === null && landmarks !== null) {
         beganMs = performance.now();
-        capture(context, stream, (chunk, rms) => recording.addSound(performance.now(), chunk, rms));
+        capture(context, stream, (chunk, rms, recordedMs) =>
+          recording.addSound(recordedMs, chunk, rms),
+        );
       }
       if (beganMs !== null) recording.addFace(takenMs, landmarks);
       this.#tellTime(beganMs, recording);

@@ -9,11 +9,13 @@ import { Microphone } from "./microphone.js";
 import { PhoneTrack } from "./phones.js";
 import { FapTrack, Playout } from "./playout.js";
 import { Presence } from "./presence.js";
+import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
 import { missingHint, stateKind, stateText } from "./status.js";
 import { VoiceStore } from "./voice.js";
 
 const LABEL_EVERY_MS = 250;
+const DELAY_MS = 2000; // over which the delay is measured
 const ERROR_MS = 8000; // for which an error stays to be read
 const SHOW_PHONES = "kouxing.show-phones"; // where the browser keeps that choice
 const OTHER_MODEL =
@@ -26,6 +28,7 @@ const syllables = new PhoneTrack();
 const phones = new PhoneTrack(); // shown instead of the syllables, on request
 const meter = new LevelMeter();
 const presence = new Presence();
+const delays = new Recent(DELAY_MS); // ms, from the own voice to the picture
 const sound = new Sound(onSoundState);
 const voices = new VoiceStore(storage());
 let head = null; // until it is loaded
@@ -56,6 +59,7 @@ window.kouxing = {
       faps: Array.from(faps),
       mediaTime: playout.mediaAt(nowMs),
       playoutDelayMs: playout.delayMs,
+      voiceToPictureMs: delays.percentile(0.5),
       sound: sound.state,
       soundSamplesPlayed: sound.numPlayed,
       soundMinusPictureMs: heardMs === null ? null : heardMs - playout.offsetMs,
@@ -76,6 +80,7 @@ function forget() {
   syllables.reset();
   phones.reset();
   meter.reset();
+  delays.reset();
 }
 
 const link = new Link(new URLSearchParams(location.search).get("session") ?? "", {
@@ -142,16 +147,16 @@ let labelledMs = 0;
 
 function draw(nowMs) {
   requestAnimationFrame(draw);
-  playout.displayFrameMs = Math.min(100, head?.frameMs ?? playout.displayFrameMs);
   playout.outputLatencyMs = sound.outputLatencyMs;
   const heardMs = sound.offsetMs(nowMs);
   if (heardMs !== null) playout.follow(heardMs);
   if (playout.adjust(nowMs)) sound.align(nowMs, playout.offsetMs);
 
   const mediaTime = playout.mediaAt(nowMs);
-  const hasFace = mediaTime !== null && track.sample(mediaTime, wanted);
-  if (scaleFace(presence.update(nowMs, hasFace))) head?.pose(faps);
+  const shownTime = mediaTime === null ? null : track.sample(mediaTime, wanted);
+  if (scaleFace(presence.update(nowMs, shownTime !== null))) head?.pose(faps);
   head?.draw(nowMs);
+  measureDelay(shownTime);
 
   showLevel(mediaTime);
   if (mediaTime !== null) showCaption(mediaTime);
@@ -159,6 +164,15 @@ function draw(nowMs) {
     labelledMs = nowMs;
     showState();
   }
+}
+
+/** Measure how long ago the picture's sound was spoken, where that was here. */
+function measureDelay(shownTime) {
+  const nowMs = performance.now();
+  delays.forget(nowMs);
+  if (shownTime === null || session !== ownSession || !presence.isLive(nowMs)) return;
+  const ageMs = microphone.ageMs(nowMs, shownTime);
+  if (ageMs !== null) delays.add(nowMs, ageMs);
 }
 
 /** Set the face to a share of what is wanted; return whether it changed. */
@@ -177,7 +191,7 @@ function scaleFace(share) {
 function showState() {
   const nowMs = performance.now();
   const isLive = connected && presence.isLive(nowMs);
-  const delayMs = microphone.ageMs(nowMs, playout.mediaAt(nowMs)) ?? playout.delayMs;
+  const delayMs = delays.percentile(0.5);
   element("status").dataset.state = stateKind({ connected, isLive });
   const text = stateText({ connected, session, isLive, delayMs });
   setText(element("status").lastElementChild, text);

@@ -13,7 +13,7 @@ class Capture extends AudioWorkletProcessor {
       if (this.#filled === this.#chunk.length) {
         const chunk = this.#chunk.slice();
         const rms = Math.sqrt(this.#squares / chunk.length);
-        this.port.postMessage({ chunk, rms }, [chunk.buffer]);
+        this.port.postMessage({ chunk, rms, recordedMs: Date.now() }, [chunk.buffer]);
         this.#filled = 0;
         this.#squares = 0;
       }

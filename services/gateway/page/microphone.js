@@ -88,9 +88,9 @@ export class Microphone {
     this.#uplink = uplink;
     const lips = this.#handlers.lips();
     if (lips !== null) this.chooseLips(lips);
-    capture(this.#context, this.#stream, (chunk, rms) => {
+    capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
-      uplink.send(performance.now(), chunk);
+      uplink.send(performance.now(), recordedMs, chunk);
     });
   }
 

@@ -1,7 +1,10 @@
 // When to show and sound what: the only clock between sound and picture is media time (samples at
 // 16 kHz since the session's first sample). Pure code: time is handed in, nothing is drawn.
 
+import { Recent } from "./recent.js";
+
 export const SAMPLES_PER_MS = 16;
+const FRAME_MS = 20; // between two FAP frames: a face between them needs both
 const FIRST_DELAY_MS = 120; // before anything has been measured
 const DEAD_ZONE_MS = 30;
 const ADJUST_EVERY_MS = 500;
@@ -12,38 +15,12 @@ const SURE_MS = 100; // for which it must be late; less than the delay, so that 
 const MAX_BEHIND_MS = 3000; // media time that leaps ahead by this: start again at once
 const MAX_FRAMES = 1000;
 
-/** Lateness (arrival - media time, ms) over the last seconds. */
-class Lateness {
-  #entries = [];
-
-  add(nowMs, latenessMs) {
-    this.#entries.push([nowMs, latenessMs]);
-    const oldest = nowMs - WINDOW_MS;
-    while (this.#entries[0][0] < oldest) this.#entries.shift();
-  }
-
-  get count() {
-    return this.#entries.length;
-  }
-
-  /** The greatest of the last moment. */
-  newest(nowMs) {
-    const recent = this.#entries.filter((entry) => entry[0] > nowMs - ADJUST_EVERY_MS);
-    return recent.length ? Math.max(...recent.map((entry) => entry[1])) : Infinity;
-  }
-
-  percentile(fraction) {
-    const sorted = this.#entries.map((entry) => entry[1]).sort((a, b) => a - b);
-    return sorted[Math.min(sorted.length - 1, Math.floor(fraction * sorted.length))];
-  }
-}
-
 /**
  * The playout clock.
  *
  * Media time m is shown at m + offset on the page's clock. Sound reaches us as soon as it was
  * heard, its FAP frame some 60 to 100 ms later, so sound has to wait: the target of the offset is
- * the 95th percentile of (frame arrival - media time) plus one display frame. The difference
+ * the 95th percentile of (frame arrival - media time) plus one FAP frame. The difference
  * between the page's clock and the sender's is in every lateness alike and drops out.
  *
  * The network's and the clocks' drift moves the target. Every half second, if the offset is off by
@@ -51,7 +28,6 @@ class Lateness {
  * half of the error is corrected, so that one bad second is not answered by a leap.
  */
 export class Playout {
-  displayFrameMs = 1000 / 60;
   outputLatencyMs = 0; // from the audio thread to the loudspeaker; sound must leave so much earlier
   #offsetMs = null;
   #begunMs = 0; // when the first offset was set
@@ -66,9 +42,10 @@ export class Playout {
   reset() {
     this.#offsetMs = null;
     this.#lateSinceMs = null;
-    this.frames = new Lateness();
-    this.soundStarts = new Lateness();
-    this.soundEnds = new Lateness();
+    // Each one's lateness: arrival - media time, ms.
+    this.frames = new Recent(WINDOW_MS);
+    this.soundStarts = new Recent(WINDOW_MS);
+    this.soundEnds = new Recent(WINDOW_MS);
   }
 
   get offsetMs() {
@@ -109,7 +86,7 @@ export class Playout {
     if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return false;
     if (this.frames.count < ENOUGH) return false;
     this.#adjustedMs = nowMs;
-    if (this.frames.newest(nowMs) < this.#offsetMs - JUMP_MS) {
+    if (this.frames.greatestSince(nowMs - ADJUST_EVERY_MS) < this.#offsetMs - JUMP_MS) {
       this.reset(); // what was held up on the way has come, and the stream is live again
       return false;
     }
@@ -120,7 +97,7 @@ export class Playout {
       const soundMs = this.soundStarts.percentile(0.95) + this.outputLatencyMs;
       latestMs = Math.max(frameMs, soundMs);
     }
-    const errorMs = latestMs + this.displayFrameMs - this.#offsetMs;
+    const errorMs = latestMs + FRAME_MS - this.#offsetMs;
     if (Math.abs(errorMs) <= DEAD_ZONE_MS) return false;
     this.#offsetMs += errorMs / 2;
     return true;
@@ -174,15 +151,15 @@ export class FapTrack {
     return true;
   }
 
-  /** Write the face at a media time; return false if there is none yet. */
+  /** Write the face at a media time; return the media time it belongs to, null without any. */
   sample(mediaTime, out) {
     const frames = this.#frames;
     while (frames.length > 2 && frames[1][0] <= mediaTime) frames.shift();
-    if (frames.length === 0) return false;
+    if (frames.length === 0) return null;
     const [t0, a] = frames[0];
     const [t1, b] = frames[Math.min(1, frames.length - 1)];
     const mix = t1 > t0 ? Math.min(1, Math.max(0, (mediaTime - t0) / (t1 - t0))) : 1;
     for (let i = 0; i < out.length; i++) out[i] = a[i] + mix * (b[i] - a[i]);
-    return true;
+    return Math.min(Math.max(mediaTime, t0), t1);
   }
 }

@@ -6,12 +6,12 @@ export function stateKind({ connected, isLive }) {
   return isLive ? "live" : "waiting";
 }
 
-/** Return the words for a state; delayMs, if not null, is how late the face is. */
+/** Return the words for a state; delayMs, if not null, is measured from the voice to the picture. */
 export function stateText({ connected, session, isLive, delayMs }) {
   if (!connected) return "connecting … 连接中";
   if (session === null) return "waiting for speech 等待语音";
   if (!isLive) return "paused 暂停";
-  return delayMs === null ? "live 直播" : `live 直播 · ${Math.round(delayMs / 5) * 5} ms`;
+  return delayMs === null ? "live 直播" : `live 直播 · ${Math.round(delayMs / 10) * 10} ms`;
 }
 
 /** Return what to do about services that do not run; "" if none is missing. */

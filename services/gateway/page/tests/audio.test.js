@@ -29,10 +29,13 @@ test("a microphone is cut into chunks of 20 ms, gapless and clipped", () => {
   assert.deepEqual(heard, [...expected]);
 });
 
-test("a chunk comes with its level", () => {
+test("a chunk comes with its level and its time", () => {
   const capture = new processors.capture();
+  const before = Date.now();
   for (let i = 0; i < 8; i++) capture.process([[new Float32Array(BLOCK).fill(0.5)]]);
-  assert.equal(capture.port.posted[0].rms, 0.5);
+  const { rms, recordedMs } = capture.port.posted[0];
+  assert.equal(rms, 0.5);
+  assert.ok(before <= recordedMs && recordedMs <= Date.now());
 });
 
 test("a microphone that is not there yet is no error", () => {
@@ -102,29 +105,45 @@ test("what a slow network does not take is left out, and the gateway is told", (
   const socket = new FakeSocket();
   const uplink = new Uplink(socket, 16000);
   const chunk = () => new Int16Array(320);
-  uplink.send(20, chunk());
+  uplink.send(20, 20, chunk());
   socket.bufferedAmount = 1 << 20;
-  uplink.send(40, chunk());
-  uplink.send(60, chunk());
+  uplink.send(40, 40, chunk());
+  uplink.send(60, 60, chunk());
   socket.bufferedAmount = 0;
-  uplink.send(80, chunk());
-  uplink.send(100, chunk());
+  uplink.send(80, 80, chunk());
+  uplink.send(100, 100, chunk());
   assert.deepEqual(socket.sent, [640, { skip: 640 }, 640, 640]);
   assert.equal(uplink.ageMs(100, 100 * 16), 0, "media time went on");
+});
+
+test("what a busy page hands over too late is left out", () => {
+  const socket = new FakeSocket();
+  const uplink = new Uplink(socket, 16000);
+  for (const recordedMs of [20, 40, 1000]) uplink.send(1020, recordedMs, new Int16Array(320));
+  assert.deepEqual(socket.sent, [{ skip: 640 }, 640]);
 });
 
 test("the age of sound counts from its recording, whatever was late on the way", () => {
   const uplink = new Uplink(new FakeSocket(), 48000);
   assert.equal(uplink.ageMs(0, 0), null);
-  uplink.send(1070, new Int16Array(960)); // 50 ms late
-  uplink.send(1041, new Int16Array(960)); // 1 ms late
+  uplink.send(1070, 1070, new Int16Array(960)); // 50 ms late
+  uplink.send(1041, 1041, new Int16Array(960)); // 1 ms late
   assert.equal(uplink.ageMs(1101, 1600), 0);
+});
+
+test("sound that the sound card loses does not count as age for ever", () => {
+  const uplink = new Uplink(new FakeSocket(), 16000);
+  for (let ms = 20; ms <= 40000; ms += 20) {
+    const lostMs = ms > 20000 ? 700 : 0;
+    uplink.send(ms + lostMs, ms + lostMs, new Int16Array(320));
+  }
+  assert.equal(uplink.ageMs(40700, 40000 * 16), 0);
 });
 
 test("a socket that is not open gets nothing", () => {
   const socket = new FakeSocket();
   socket.readyState = 2;
   const uplink = new Uplink(socket, 16000);
-  uplink.send(20, new Int16Array(320));
+  uplink.send(20, 20, new Int16Array(320));
   assert.deepEqual(socket.sent, []);
 });

@@ -95,7 +95,7 @@ test("that the page was busy is no stall", () => {
 
 test("the state is told in words", () => {
   const state = { connected: true, session: "a", isLive: true, delayMs: 123.4 };
-  assert.equal(stateText(state), "live 直播 · 125 ms");
+  assert.equal(stateText(state), "live 直播 · 120 ms");
   assert.equal(stateText({ ...state, delayMs: null }), "live 直播");
   assert.equal(stateText({ ...state, isLive: false }), "paused 暂停");
   assert.equal(stateText({ ...state, session: null }), "waiting for speech 等待语音");
