@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,44 +17,17 @@ from shared.client import Client, Session
 from shared.errors import UserError
 from shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
-from tests.system import DEMO, own_environment
+from tests.system import DEMO
+from tests.watched import Watched
 
 pytestmark = pytest.mark.e2e
-
-
-class Watched:
-    """A supervisor on ports of its own, which watches as in ``kouxing run``: beside other work."""
-
-    def __init__(self, folder: Path) -> None:
-        environment = own_environment(folder)
-        self.control = environment["KOUXING_CONTROL"]
-        self.shown = io.StringIO()
-        console = Console(file=self.shown, width=200)
-        self.supervisor = Supervisor([], folder, console, environment)
-
-    def instance(self, client: Client, service: str) -> str:
-        for state in client.status().services:
-            if state.service == service:
-                return state.instance
-        return ""
-
-    def kill(self, service: str) -> None:
-        os.kill(self.supervisor.process_number(service), signal.SIGKILL)
-
-    def until_replaced(self, client: Client, service: str, old: str) -> None:
-        end_s = time.monotonic() + 100
-        while self.instance(client, service) in ("", old):
-            assert time.monotonic() < end_s, f"{service} did not come back"
-            time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
     made = Watched(tmp_path_factory.mktemp("logs"))
     try:
-        made.supervisor.start()
-        made.supervisor.wait_ready(made.control)
-        made.supervisor.watch()
+        made.start()
         yield made
     finally:
         made.supervisor.stop()

@@ -11,12 +11,12 @@ import { FapTrack, Playout } from "./playout.js";
 import { Presence } from "./presence.js";
 import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
-import { missingHint, stateKind, stateText } from "./status.js";
+import { hint, stateKind, stateText } from "./status.js";
 import { VoiceStore } from "./voice.js";
 
 const LABEL_EVERY_MS = 250;
 const DELAY_MS = 2000; // over which the delay is measured
-const ERROR_MS = 8000; // for which an error stays to be read
+const NEWS_MS = 8000; // for which an error, or what happened, stays to be read
 const SHOW_PHONES = "kouxing.show-phones"; // where the browser keeps that choice
 const OTHER_MODEL =
   "What was learnt of your mouth does not fit this version: press Learn my mouth. 口型模型已更新，请重新学习。";
@@ -34,7 +34,11 @@ const voices = new VoiceStore(storage());
 let head = null; // until it is loaded
 
 let connected = false;
+let wasConnected = false;
 let session = null; // the one we look at
+let epoch = 0; // of the session; a greater one is a restart
+let wasLive = false; // in this session
+let microphoneState = "off";
 let missing = []; // services that do not run
 let ownSession = null; // the one our microphone feeds
 let isSample = false; // the session is the sample sentence, which we asked for
@@ -63,7 +67,7 @@ window.kouxing = {
       sound: sound.state,
       soundSamplesPlayed: sound.numPlayed,
       soundMinusPictureMs: heardMs === null ? null : heardMs - playout.offsetMs,
-      microphone: element("microphone").getAttribute("aria-pressed") === "true",
+      microphone: microphoneState === "on",
       lips,
       caption: element("spoken").value,
       voice: voices.voice?.profile ?? "",
@@ -86,6 +90,7 @@ function forget() {
 const link = new Link(new URLSearchParams(location.search).get("session") ?? "", {
   state(isConnected) {
     connected = isConnected;
+    wasConnected ||= connected;
     if (!connected) session = null;
     showLips();
     showState();
@@ -103,13 +108,18 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     const offsetMs = playout.offsetMs;
     playout.soundArrived(nowMs, mediaTime, samples.length);
     if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
+    presence.soundArrived(nowMs);
     sound.push(mediaTime, samples);
     meter.push(mediaTime, samples);
   },
   text(message) {
     switch (message.type) {
       case "session":
-        session = message.session;
+        if (message.session === session && session !== null && message.epoch > epoch) {
+          showNews("A service crashed and was started again. It goes on.", "hint");
+        }
+        if (message.session !== session) wasLive = false;
+        ({ session, epoch } = message);
         isSample = message.sample;
         // A session that ends is still seen and heard to its end.
         if (session !== null) {
@@ -191,23 +201,33 @@ function scaleFace(share) {
 function showState() {
   const nowMs = performance.now();
   const isLive = connected && presence.isLive(nowMs);
+  wasLive ||= isLive;
+  const isInterrupted =
+    microphoneState === "interrupted" || (wasLive && session !== null && session === ownSession);
   const delayMs = delays.percentile(0.5);
   element("status").dataset.state = stateKind({ connected, isLive });
-  const text = stateText({ connected, session, isLive, delayMs });
+  const text = stateText({ connected, isLive, isInterrupted, delayMs });
   setText(element("status").lastElementChild, text);
   element("status").title = session === null ? "" : `session ${session}`;
-  if (errorTimer === null) showNotice(connected ? missingHint(missing) : "", "hint");
+  if (newsTimer === null) {
+    const isMicrophoneInterrupted = microphoneState === "interrupted";
+    showNotice(hint({ connected, wasConnected, isMicrophoneInterrupted, missing }), "hint");
+  }
 }
 
-let errorTimer = null;
+let newsTimer = null;
 
 function showError(text) {
-  clearTimeout(errorTimer);
-  errorTimer = setTimeout(() => {
-    errorTimer = null;
+  showNews(text, "error");
+}
+
+function showNews(text, kind) {
+  clearTimeout(newsTimer);
+  newsTimer = setTimeout(() => {
+    newsTimer = null;
     showState();
-  }, ERROR_MS);
-  showNotice(text, "error");
+  }, NEWS_MS);
+  showNotice(text, kind);
 }
 
 function showNotice(text, kind) {
@@ -287,8 +307,12 @@ const microphone = new Microphone({
     return chosenLips;
   },
   state(state) {
-    element("microphone").setAttribute("aria-pressed", state === "on");
-    element("microphone").setAttribute("aria-busy", state === "starting");
+    if (microphoneState === "interrupted" && state === "on") {
+      showNews("The microphone is on again.", "hint");
+    }
+    microphoneState = state;
+    element("microphone").setAttribute("aria-pressed", state === "on" || state === "interrupted");
+    element("microphone").setAttribute("aria-busy", state === "starting" || state === "interrupted");
     if (state === "off" && ownSession !== null) {
       ownSession = null;
       link.follow("");
@@ -299,10 +323,12 @@ const microphone = new Microphone({
     meter.raise(value);
   },
   session(name) {
+    if (ownSession === null) {
+      wasSoundWanted = sound.wanted;
+      sound.turnOff(); // nobody wants to hear himself late, unless he asks for it
+    }
     ownSession = name;
     showLips();
-    wasSoundWanted = sound.wanted;
-    sound.turnOff(); // nobody wants to hear himself late, unless he asks for it
     link.follow(name);
   },
   error({ code, text }) {

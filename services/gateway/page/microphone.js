@@ -4,16 +4,22 @@ import { capture, openCaptureContext } from "./capture.js";
 import { socketUrl } from "./link.js";
 import { Uplink } from "./uplink.js";
 
+const RETRY_MS = 500;
+const GIVE_UP_MS = 30000; // a crashed service is started again within this
+
 export class Microphone {
   #handlers;
   #socket = null;
   #stream = null;
   #context = null;
   #uplink = null; // while it streams
+  #retry = null; // timer
+  #giveUpMs = null; // until when to try again, once it has streamed
 
   /**
    * @param handlers { voice(): the speaker's in base64, or "", lips(): the lip model to begin with,
-   *   or null, state("off" | "starting" | "on"), level(rms), session(name), error({ code, text }) }
+   *   or null, state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
+   *   error({ code, text }) }
    */
   constructor(handlers) {
     this.#handlers = handlers;
@@ -50,48 +56,65 @@ export class Microphone {
       this.#fail(isDenied ? denied : `no microphone: ${error.message}`);
       return;
     }
+    for (const track of this.#stream.getTracks()) {
+      track.onended = () => this.#fail("the microphone was unplugged");
+    }
+    capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
+      this.#handlers.level(rms);
+      this.#uplink?.send(performance.now(), recordedMs, chunk);
+    });
     this.#connect();
   }
 
   stop() {
-    this.#socket?.close();
     this.#release();
   }
 
   #connect() {
-    const context = this.#context;
     const socket = new WebSocket(socketUrl("/microphone"));
-    let isAnswered = false;
+    let refusal = null;
     this.#socket = socket;
     socket.onopen = () => {
-      const hello = { sample_rate_hz: context.sampleRate, num_channels: 1, encoding: "s16le" };
+      const { sampleRate } = this.#context;
+      const hello = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
       socket.send(JSON.stringify({ ...hello, voice: this.#handlers.voice() }));
     };
     socket.onmessage = (event) => {
+      if (this.#socket !== socket) return;
       const message = JSON.parse(event.data);
-      isAnswered = true;
-      if (message.type === "opened") this.#capture(socket, message.session);
-      else this.#handlers.error(message);
+      if (message.type === "opened") this.#begin(message.session);
+      else if (this.#uplink !== null && message.type === "error") this.#handlers.error(message);
+      else refusal = message;
     };
     socket.onclose = () => {
-      if (this.#socket !== socket) return;
-      if (isAnswered) this.#release();
-      else this.#fail("the gateway takes no microphone now");
+      if (this.#socket === socket) this.#onClose(refusal);
     };
   }
 
-  #capture(socket, session) {
-    if (this.#socket !== socket) return;
+  #begin(session) {
+    this.#uplink = new Uplink(this.#socket, this.#context.sampleRate);
+    this.#giveUpMs = null;
     this.#handlers.session(session);
     this.#handlers.state("on");
-    const uplink = new Uplink(socket, this.#context.sampleRate);
-    this.#uplink = uplink;
     const lips = this.#handlers.lips();
     if (lips !== null) this.chooseLips(lips);
-    capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
-      this.#handlers.level(rms);
-      uplink.send(performance.now(), recordedMs, chunk);
-    });
+  }
+
+  /** Once it has streamed, it goes on by itself: a service, or the gateway, is started again. */
+  #onClose(refusal) {
+    if (this.#uplink !== null) {
+      this.#uplink = null;
+      this.#giveUpMs = performance.now() + GIVE_UP_MS;
+      this.#handlers.state("interrupted");
+    }
+    if (this.#giveUpMs !== null && performance.now() < this.#giveUpMs) {
+      this.#retry = setTimeout(() => this.#connect(), RETRY_MS);
+    } else if (refusal?.code) {
+      this.#handlers.error(refusal);
+      this.#release();
+    } else {
+      this.#fail("the microphone stopped: the gateway takes none now; press Microphone to try again");
+    }
   }
 
   #fail(text) {
@@ -100,9 +123,12 @@ export class Microphone {
   }
 
   #release() {
+    const socket = this.#socket;
+    clearTimeout(this.#retry);
     for (const track of this.#stream?.getTracks() ?? []) track.stop();
     this.#context?.close();
-    this.#socket = this.#stream = this.#context = this.#uplink = null;
+    this.#socket = this.#stream = this.#context = this.#uplink = this.#giveUpMs = null;
+    socket?.close();
     this.#handlers.level(0);
     this.#handlers.state("off");
   }

@@ -6,18 +6,31 @@ export function stateKind({ connected, isLive }) {
   return isLive ? "live" : "waiting";
 }
 
-/** Return the words for a state; delayMs, if not null, is measured from the voice to the picture. */
-export function stateText({ connected, session, isLive, delayMs }) {
+/**
+ * Return the words for a state; isInterrupted: our microphone was live and is to be; delayMs, if not
+ * null, is measured from the voice to the picture.
+ */
+export function stateText({ connected, isLive, isInterrupted, delayMs }) {
   if (!connected) return "connecting … 连接中";
-  if (session === null) return "waiting for speech 等待语音";
-  if (!isLive) return "paused 暂停";
+  if (!isLive) return isInterrupted ? "interrupted 中断" : "waiting for speech 等待语音";
   return delayMs === null ? "live 直播" : `live 直播 · ${Math.round(delayMs / 10) * 10} ms`;
 }
 
-/** Return what to do about services that do not run; "" if none is missing. */
-export function missingHint(missing) {
-  if (missing.length === 0) return "";
-  const isControl = missing[0] === "control";
-  const start = isControl ? "kouxing run" : missing.map((name) => `kouxing ${name}`).join("; ");
-  return `no ${missing.join(", no ")} is running; start: ${start}`;
+/** Return what does not work and what happens next; "" if all is well. */
+export function hint({ connected, wasConnected, isMicrophoneInterrupted, missing }) {
+  if (!connected && wasConnected) {
+    return "The gateway stopped. This page goes on by itself when it runs again (kouxing run).";
+  }
+  if (connected && missing.length > 0) return missingHint(missing);
+  if (isMicrophoneInterrupted) return "The microphone was interrupted. It goes on by itself.";
+  return "";
+}
+
+function missingHint(missing) {
+  if (missing[0] === "control") {
+    return "Control stopped. All goes on by itself when it runs again (kouxing run).";
+  }
+  const services = missing.join(" and the ");
+  const commands = missing.map((name) => `kouxing ${name}`).join("; ");
+  return `The ${services} stopped. It goes on by itself under kouxing run; otherwise: ${commands}`;
 }

@@ -3,7 +3,7 @@ import test from "node:test";
 import { LevelMeter, rms, SILENT_DB } from "../level.js";
 import { PhoneTrack } from "../phones.js";
 import { Presence } from "../presence.js";
-import { missingHint, stateKind, stateText } from "../status.js";
+import { hint, stateKind, stateText } from "../status.js";
 
 function track(...symbols) {
   const phones = new PhoneTrack();
@@ -89,27 +89,47 @@ test("that the page was busy is no stall", () => {
   const presence = new Presence();
   presence.update(0, true);
   presence.frameArrived(0);
+  presence.soundArrived(0);
   presence.update(5000, true);
   assert.ok(presence.isLive(5000));
 });
 
+test("an idle face without sound is not live", () => {
+  const presence = new Presence();
+  for (let ms = 0; ms <= 1000; ms += 20) {
+    presence.frameArrived(ms);
+    presence.soundArrived(ms);
+    presence.update(ms, true);
+  }
+  assert.ok(presence.isLive(1900));
+  for (let ms = 1000; ms <= 3000; ms += 20) {
+    presence.frameArrived(ms);
+    presence.update(ms, true);
+  }
+  assert.ok(!presence.isLive(3000));
+});
+
 test("the state is told in words", () => {
-  const state = { connected: true, session: "a", isLive: true, delayMs: 123.4 };
+  const state = { connected: true, isLive: true, isInterrupted: true, delayMs: 123.4 };
   assert.equal(stateText(state), "live 直播 · 120 ms");
   assert.equal(stateText({ ...state, delayMs: null }), "live 直播");
-  assert.equal(stateText({ ...state, isLive: false }), "paused 暂停");
-  assert.equal(stateText({ ...state, session: null }), "waiting for speech 等待语音");
+  assert.equal(stateText({ ...state, isLive: false }), "interrupted 中断");
+  assert.match(stateText({ ...state, isLive: false, isInterrupted: false }), /waiting for speech/);
   assert.equal(stateText({ ...state, connected: false }), "connecting … 连接中");
   assert.equal(stateKind(state), "live");
   assert.equal(stateKind({ ...state, isLive: false }), "waiting");
   assert.equal(stateKind({ ...state, connected: false }), "lost");
 });
 
-test("what is missing is named with the command that starts it", () => {
-  assert.equal(missingHint([]), "");
-  assert.equal(missingHint(["control"]), "no control is running; start: kouxing run");
-  assert.equal(
-    missingHint(["recognizer", "synthesizer"]),
-    "no recognizer, no synthesizer is running; start: kouxing recognizer; kouxing synthesizer",
+test("what does not work is named with what happens next", () => {
+  const well = { connected: true, wasConnected: true, isMicrophoneInterrupted: false, missing: [] };
+  assert.equal(hint(well), "");
+  assert.match(hint({ ...well, connected: false }), /gateway stopped/);
+  assert.equal(hint({ ...well, connected: false, wasConnected: false }), "", "it only begins");
+  assert.match(hint({ ...well, missing: ["control"] }), /Control stopped.*kouxing run/);
+  assert.match(
+    hint({ ...well, missing: ["recognizer", "synthesizer"] }),
+    /recognizer and the synthesizer stopped.*kouxing recognizer; kouxing synthesizer/,
   );
+  assert.match(hint({ ...well, isMicrophoneInterrupted: true }), /microphone was interrupted/);
 });

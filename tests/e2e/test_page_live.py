@@ -1,0 +1,84 @@
+"""The page with the real services and a microphone that speaks: its delay, and crashes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.browser import Browser
+from tests.system import DEMO
+from tests.watched import Watched
+
+pytestmark = pytest.mark.e2e
+
+STATUS = "document.getElementById('status').textContent"
+IS_LIVE = f"{STATUS}.includes('live') && window.kouxing.state.voiceToPictureMs !== null"
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
+    made = Watched(tmp_path_factory.mktemp("logs"))
+    try:
+        made.start()
+        yield made
+    finally:
+        made.supervisor.stop()
+
+
+@pytest.fixture(scope="module")
+def browser(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    browser = Browser(tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav")
+    browser.command("Page.navigate", url=watched.page)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    # What is announced, however short.
+    browser.evaluate(
+        "window.told = []; new MutationObserver(() => window.told.push("
+        "document.getElementById('notice').textContent)).observe("
+        "document.getElementById('notice'), { childList: true, characterData: true, subtree: true })"
+    )
+    yield browser
+    browser.close()
+
+
+def test_the_delay_is_shown_once_it_is_measured(browser: Browser) -> None:
+    assert browser.evaluate("window.kouxing.state.voiceToPictureMs") is None
+    assert "ms" not in browser.evaluate(STATUS)
+    browser.click("microphone")
+    browser.wait_for(IS_LIVE)
+    browser.wait_for(rf"/live .* \d+ ms/.test({STATUS})")
+    # A frame is made 60 ms after its sound; the first number of the label is the delay.
+    assert browser.evaluate("window.kouxing.state.voiceToPictureMs") > 60
+    assert browser.evaluate(rf"Number({STATUS}.match(/(\d+) ms/)[1])") > 60
+
+
+@pytest.mark.parametrize(
+    ("service", "told"),
+    [
+        ("recognizer", "A service crashed"),
+        ("synthesizer", "A service crashed"),
+        ("control", "The microphone is on again"),
+        ("gateway", "The gateway stopped"),
+    ],
+)
+def test_a_crash_is_told_and_the_microphone_goes_on(
+    watched: Watched, browser: Browser, service: str, told: str
+) -> None:
+    browser.wait_for(IS_LIVE)
+    browser.wait_for("document.getElementById('notice').hidden")
+    browser.evaluate("window.told = []")
+    watched.kill(service)
+    browser.wait_for(f"!{STATUS}.includes('live') || !window.kouxing.state.microphone")
+    browser.wait_for(f"window.told.some((text) => text.includes('{told}'))")
+    browser.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
+
+
+def test_an_abandoned_session_is_not_live(watched: Watched, browser: Browser) -> None:
+    browser.wait_for(IS_LIVE)
+    watched.kill("gateway")
+    browser.evaluate("document.getElementById('microphone').click()")  # nobody closes the session
+    browser.wait_for("window.kouxing.state.connected && window.kouxing.state.session !== null")
+    frames = browser.evaluate("window.kouxing.state.numFrames")
+    browser.wait_for(f"window.kouxing.state.numFrames > {frames + 50}")  # its face idles on
+    assert "waiting for speech" in browser.evaluate(STATUS)

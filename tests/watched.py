@@ -1,0 +1,48 @@
+"""A supervised system for tests: services that crash are started again, as in ``kouxing run``."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from services.cli.supervisor import Supervisor
+from shared.client import Client
+from tests.system import own_environment
+
+
+class Watched:
+    """A supervisor on ports of its own, which watches as in ``kouxing run``: beside other work."""
+
+    def __init__(self, folder: Path) -> None:
+        environment = own_environment(folder)
+        self.control = environment["KOUXING_CONTROL"]
+        self.page = f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/"
+        self.shown = io.StringIO()
+        console = Console(file=self.shown, width=200)
+        self.supervisor = Supervisor([], folder, console, environment)
+
+    def start(self) -> None:
+        """Start all services, wait until they are ready, and watch them."""
+        self.supervisor.start()
+        self.supervisor.wait_ready(self.control)
+        self.supervisor.watch()
+
+    def instance(self, client: Client, service: str) -> str:
+        for state in client.status().services:
+            if state.service == service:
+                return state.instance
+        return ""
+
+    def kill(self, service: str) -> None:
+        os.kill(self.supervisor.process_number(service), signal.SIGKILL)
+
+    def until_replaced(self, client: Client, service: str, old: str) -> None:
+        end_s = time.monotonic() + 100
+        while self.instance(client, service) in ("", old):
+            assert time.monotonic() < end_s, f"{service} did not come back"
+            time.sleep(0.05)
