@@ -323,9 +323,10 @@ def test_the_lips_are_switched_while_the_microphone_is_on(system: System, browse
 def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None:
     browser.wait_for("document.getElementById('notice').hidden")
     system.lose_recognizer()
-    browser.wait_for("document.getElementById('notice').textContent.includes('no recognizer')")
+    notice = "document.getElementById('notice').textContent"
+    browser.wait_for(f"{notice}.includes('recognizer does not run')")
     browser.click("microphone")
-    browser.wait_for("document.getElementById('notice').textContent.includes('kouxing recognizer')")
+    browser.wait_for(f"{notice}.includes('kouxing recognizer')")
     browser.wait_for("!window.kouxing.state.microphone")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -34,9 +33,9 @@ def browser(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> Itera
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
     # What is announced, however short.
     browser.evaluate(
-        "window.told = []; new MutationObserver(() => window.told.push("
-        "document.getElementById('notice').textContent)).observe("
-        "document.getElementById('notice'), { childList: true, characterData: true, subtree: true })"
+        "window.told = []; const notice = document.getElementById('notice');"
+        "new MutationObserver(() => window.told.push(notice.textContent))"
+        ".observe(notice, { childList: true, characterData: true, subtree: true })"
     )
     yield browser
     browser.close()

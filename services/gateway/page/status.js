@@ -28,9 +28,10 @@ export function hint({ connected, wasConnected, isMicrophoneInterrupted, missing
 
 function missingHint(missing) {
   if (missing[0] === "control") {
-    return "Control stopped. All goes on by itself when it runs again (kouxing run).";
+    return "Control does not run. All goes on by itself when it does (kouxing run).";
   }
   const services = missing.join(" and the ");
   const commands = missing.map((name) => `kouxing ${name}`).join("; ");
-  return `The ${services} stopped. It goes on by itself under kouxing run; otherwise: ${commands}`;
+  const verb = missing.length > 1 ? "do" : "does";
+  return `The ${services} ${verb} not run. Under kouxing run it starts again by itself; otherwise: ${commands}`;
 }

@@ -126,10 +126,10 @@ test("what does not work is named with what happens next", () => {
   assert.equal(hint(well), "");
   assert.match(hint({ ...well, connected: false }), /gateway stopped/);
   assert.equal(hint({ ...well, connected: false, wasConnected: false }), "", "it only begins");
-  assert.match(hint({ ...well, missing: ["control"] }), /Control stopped.*kouxing run/);
+  assert.match(hint({ ...well, missing: ["control"] }), /Control does not run.*kouxing run/);
   assert.match(
     hint({ ...well, missing: ["recognizer", "synthesizer"] }),
-    /recognizer and the synthesizer stopped.*kouxing recognizer; kouxing synthesizer/,
+    /recognizer and the synthesizer do not run.*kouxing recognizer; kouxing synthesizer/,
   );
   assert.match(hint({ ...well, isMicrophoneInterrupted: true }), /microphone was interrupted/);
 });
