@@ -352,7 +352,7 @@ def plot_lip_line(
 def plot_mouths(
     folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/mouths"),
 ) -> None:
-    """Draw the mouths of the visemes on every head, and with more or less expressiveness."""
+    """Draw visemes and expressions on every head, and mouths with more or less expressiveness."""
     from evaluation.lips.mouth_sheets import draw_mouth_sheets
 
     for path in draw_mouth_sheets(folder):

@@ -90,6 +90,8 @@ class ServiceConfig(BaseModel):
     """Least level of the log lines that are written."""
     instance: str = ""
     """Name of this process; chosen when empty."""
+    idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
+    """Seed of blinks, gaze, brows and head motion, of what makes or shows a face; 0: none."""
 
 
 Config = TypeVar("Config", bound=ServiceConfig)

@@ -1,4 +1,4 @@
-"""Sheets of pictures of the mouth: visemes on every head, and how expressiveness changes them."""
+"""Sheets of faces: visemes and expressions on every head, and how expressiveness changes mouths."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from services.driver.render.scene import camera
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
 from services.synthesizer.modifiers.expressiveness import Expressiveness
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS, NUM_FAPS
@@ -28,6 +29,7 @@ _VISEMES = {
     "b": "b", "d": "d", "g": "g",
 }  # fmt: skip
 _VOWELS = ("a", "i", "u", "o", "e", "v")
+_EXPRESSIONS = ("joy", "sadness", "anger", "surprise")
 _AMOUNTS = (0.5, 1.0, SynthesizerConfig().expressiveness, 2.0)
 _CELL_PX = (176, 132)
 _FACE_PX = (272, 204)
@@ -37,7 +39,7 @@ _PROFILE_DEG, _THREE_QUARTER_DEG = 90.0, 40.0
 
 
 def draw_mouth_sheets(folder: Path) -> list[Path]:
-    """Write ``mouths.webp`` and ``expressiveness.webp`` into a folder; return their paths.
+    """Write mouths, expressiveness and expressions (.webp) into a folder; return their paths.
 
     Raises
     ------
@@ -45,12 +47,14 @@ def draw_mouth_sheets(folder: Path) -> list[Path]:
         If they cannot be written.
     """
     usual = SynthesizerConfig().expressiveness
-    rows = []
+    rows, faces = [], []
     names = sorted((path.stem for path in ASSETS.glob("*.npz")), key=DEFAULT_HEAD.__ne__)
     for name in names:
         turns = [0.0, _THREE_QUARTER_DEG] + [_PROFILE_DEG] * (name == DEFAULT_HEAD)
         shapes = {label: _expressed(viseme, usual) for viseme, label in _VISEMES.items()}
         rows += [_row(name, shapes, Framing.MOUTH, turn, _CELL_PX) for turn in turns]
+        shapes = {each or "rest": _shown(each) for each in ("", *_EXPRESSIONS)}
+        faces.append(_row(name, shapes, Framing.FACE, 0.0, _FACE_PX))
     levels = []
     for amount in _AMOUNTS:
         shapes = {f"{_VISEMES[each]}  {amount:g}": _expressed(each, amount) for each in _VOWELS}
@@ -58,6 +62,7 @@ def draw_mouth_sheets(folder: Path) -> list[Path]:
     return [
         _save(folder / "mouths.webp", rows),
         _save(folder / "expressiveness.webp", levels),
+        _save(folder / "expressions.webp", faces),
     ]
 
 
@@ -66,6 +71,14 @@ def _expressed(viseme: str, amount: float) -> Float32:
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
     Expressiveness(amount).scale(faps)
+    return faps
+
+
+def _shown(expression: str) -> Float32:
+    """FAPs (68,) of a face at rest that shows an expression; "": none."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    if expression:
+        mix(faps, EXPRESSION_FAPS[expression], free=1.0)
     return faps
 
 

@@ -8,18 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.face.faps import NUM_FAPS
+from shared.face.idle_motion import RestingFace
 
 NEWEST = "newest"
 STALL_S = 1.0  # a face goes to rest after so long without frames
-FADE_S = 0.3  # time it takes to get there
+FADE_S = 0.3  # time it takes to get there, and to come back
 
 Faps = NDArray[np.float32]
 
 
 @dataclass(slots=True)
 class _Pose:
-    faps: Faps  # (68,), FAP units
-    updated_s: float
+    updated_s: float  # when the newest frame came, or the session was opened
+    faps: Faps | None = None  # (68,), FAP units; None: no frame has come
     has_ended: bool = False
 
 
@@ -33,13 +34,17 @@ class Poses:
     ----------
     session
         Name of the session to show; ``newest`` for the one that was opened last.
+    idle_motion_seed
+        Of the face at rest; 0: it stands still.
     """
 
-    def __init__(self, session: str = NEWEST) -> None:
+    def __init__(self, session: str = NEWEST, idle_motion_seed: int = 0) -> None:
         self._configured = session
         self._switched_to = ""
         self._poses: dict[str, _Pose] = {}  # in the order in which the sessions were opened
-        self._last = _Pose(np.zeros(NUM_FAPS, np.float32), 0.0)  # the pose that was shown last
+        self._rest = RestingFace(idle_motion_seed)
+        self._face = np.zeros(NUM_FAPS, np.float32)  # of a session, that was shown last,
+        self._share, self._shown_s = 0.0, 0.0  # its share, and when that was
 
     @property
     def shown(self) -> str:
@@ -53,13 +58,11 @@ class Poses:
         return self._configured if self._configured in self._poses else ""
 
     def add(self, session: str, now_s: float) -> None:
-        """Take a session in, with its face at rest."""
-        self._poses[session] = _Pose(np.zeros(NUM_FAPS, np.float32), now_s)
+        """Take a session in, whose frames are to come."""
+        self._poses[session] = _Pose(now_s)
 
     def remove(self, session: str) -> None:
         """Forget a session; if no other takes its place its face fades to rest."""
-        if session == self.shown:
-            self._last = self._poses[session]
         if session == self._switched_to:
             self._switched_to = ""
         del self._poses[session]
@@ -87,11 +90,20 @@ class Poses:
         return pose is not None and not pose.has_ended and now_s - pose.updated_s > STALL_S
 
     def faps(self, now_s: float) -> Faps:
-        """Return the FAPs (68,) to show: the newest, or while none come a fade to rest."""
-        pose = self._poses.get(self.shown, self._last)
-        silent_s = now_s - pose.updated_s
-        weight = np.float32(np.clip(1.0 - (silent_s - STALL_S) / FADE_S, 0.0, 1.0))
-        return pose.faps * weight
+        """Return the FAPs (68,) to show: the newest, or while none come a fade to rest.
+
+        Times must not decrease.
+        """
+        pose = self._poses.get(self.shown)
+        step = (now_s - self._shown_s) / FADE_S
+        self._shown_s = now_s
+        if pose is not None and pose.faps is not None and now_s - pose.updated_s <= STALL_S:
+            self._face = pose.faps
+            self._share = min(self._share + step, 1.0)
+        else:
+            self._share = max(self._share - step, 0.0)
+        rest = self._rest.at(now_s)
+        return rest + np.float32(self._share) * (self._face - rest)
 
     def caption(self, now_s: float) -> str:
         """Say which session is shown, and what is to be known about it."""

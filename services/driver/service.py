@@ -55,7 +55,7 @@ class DriverService(Service):
         self._config = config
         self._sessions: dict[str, _Session] = {}
         self._was_stalled = False
-        self.poses = Poses(config.session)
+        self.poses = Poses(config.session, config.idle_motion_seed)
         self.view = View(config, self.poses.switch)
         self._recordings = Recordings(
             self._make_recording,

@@ -32,6 +32,7 @@ from shared.bus import Socket
 from shared.clock import to_samples
 from shared.endpoints import is_loopback
 from shared.errors import UserError
+from shared.face.idle_motion import REST_RATE_HZ, RestingFace
 from shared.follower import SessionFollower
 from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from shared.phones.known_text import Characters, characters_of
@@ -102,6 +103,8 @@ class GatewayService(Service):
         self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is spoken
         self._sample_characters: Characters = ()  # once they are needed
         self._closing: asyncio.Task[None] | None = None
+        self._resting_face = RestingFace(config.idle_motion_seed)
+        self._rest_due_s = 0.0
         self._report_s = 0.0
         self._request_s = 0.0
         self._commands = self.bus.connect_dealer(config.control)
@@ -203,7 +206,10 @@ class GatewayService(Service):
         return dict.fromkeys(self._sessions, SessionInput())
 
     def on_tick(self, now_s: float) -> None:
-        """Ask control which services run."""
+        """Ask control which services run, and let the face at rest live."""
+        if now_s >= self._rest_due_s:
+            self._rest_due_s = max(self._rest_due_s + 1.0 / REST_RATE_HZ, now_s)
+            self._viewers.show_rest(self._resting_face.at(now_s).astype("<f4").tobytes())
         answered = self._report_s >= self._request_s
         if now_s - self._request_s > (STATUS_S if answered else STATUS_LOST_S):
             self._request_s = now_s

@@ -118,6 +118,12 @@ class Viewers:
             if viewer.shown is not None and viewer.shown[0] == session:
                 self._put(viewer, kind, message)
 
+    def show_rest(self, faps: bytes) -> None:
+        """Send every viewer the face at rest, which is seen while no session moves it."""
+        message = wire.binary(wire.REST_TYPE, 0, 0, faps)
+        for viewer in self._viewers:
+            self._put(viewer, Kind.FRAME, message)
+
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one viewer until it leaves."""
         chosen = request.query.get("session", "")

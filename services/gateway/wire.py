@@ -18,6 +18,7 @@ from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
 SOUND_TYPE = 2  # payload: int16, 16 kHz mono
+REST_TYPE = 3  # payload: as of FAP_TYPE, for who sees no frames of a session
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 RATES_HZ = (8000, 48000)

@@ -32,9 +32,6 @@ class SynthesizerConfig(ServiceConfig):
     lips: LipModelName = DEFAULT_LIP_MODEL
     """Lip model: of recognised phones (dynamic-visemes), of the sound itself (learnt), or of one
     opening (ferguson)."""
-    idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
-    """Seed of blinks, gaze, brows and head motion; with 0 the mouth alone moves."""
-
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """How large the mouth's movements are; 1 for those of the lip model. Closures stay closed."""
 

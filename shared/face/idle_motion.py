@@ -19,7 +19,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import FAP_NUMBER
+from shared.face.faps import FAP_NUMBER, NUM_FAPS
 
 _DEGREE = math.pi / 180.0 / 1e-5  # in the FAPs' angle unit, 1e-5 rad
 
@@ -43,6 +43,8 @@ _NUM_WAVES = 9
 _LISTENING_HEAD = 0.35  # head motion of a listener, as a share of a speaker's
 _SPEAKING_S = 0.8  # time constant between the two
 _BREATH_HZ, _BREATH_DEG = 0.23, 0.35
+
+REST_RATE_HZ = 25.0  # of faces that are shown without a session
 
 _LIDS_UPPER = [FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_t_r_eyelid"] - 1]
 _LIDS_LOWER = [FAP_NUMBER["close_b_l_eyelid"] - 1, FAP_NUMBER["close_b_r_eyelid"] - 1]
@@ -153,6 +155,28 @@ class IdleMotion:
             self._next_saccade_s = self._draw_fixation(self._saccade_s)
         done = _smooth_step((time_s - self._saccade_s) / self._saccade_length_s)
         return self._gaze_from + done * (self._gaze_to - self._gaze_from)
+
+
+class RestingFace:
+    """The face that is shown while there is no session.
+
+    Parameters
+    ----------
+    seed
+        Of its idle motion; 0: it stands still.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._motion = IdleMotion(seed) if seed else None
+        self._began_s: float | None = None
+
+    def at(self, now_s: float) -> NDArray[np.float32]:
+        """Return the FAPs (68,) at a time of any clock; times must not decrease."""
+        self._began_s = now_s if self._began_s is None else self._began_s
+        faps = np.zeros(NUM_FAPS, np.float32)
+        if self._motion is not None:
+            self._motion.apply(faps, now_s - self._began_s)
+        return faps
 
 
 def _smooth_step(part: float) -> float:

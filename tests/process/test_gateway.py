@@ -21,12 +21,15 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import aiohttp
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.gateway.microphone import SAMPLE, SAMPLE_TEXT
+from services.gateway.wire import REST_TYPE
 from shared.bus import AUDIO_QUEUE_LENGTH, Bus
 from shared.clock import now_ns
-from shared.face.faps import MASK_BYTES, NUM_FAPS
+from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import (
     Heartbeat,
@@ -287,6 +290,14 @@ async def until(condition: Callable[[], bool]) -> None:
     await asyncio.to_thread(wait_until, condition)
 
 
+async def receive_of_session(browser: aiohttp.ClientWebSocketResponse) -> aiohttp.WSMessage:
+    """Return the next message that is not of the face at rest."""
+    while True:
+        message = await browser.receive(60)
+        if message.type is not aiohttp.WSMsgType.BINARY or message.data[0] != REST_TYPE:
+            return message
+
+
 async def receive_json(browser: aiohttp.ClientWebSocketResponse, kind: str) -> dict[str, Any]:
     """Return the next text message of a kind."""
     while True:
@@ -338,6 +349,27 @@ def own_gateway(own_system: ScriptedSystem) -> Iterator[GatewayProcess]:
     gateway.stop()
 
 
+def test_the_face_lives_before_any_session(gateway: GatewayProcess) -> None:
+    async def look() -> NDArray[np.float32]:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(f"{gateway.page}viewer?session=later") as viewer,
+        ):
+            faces: list[NDArray[np.float32]] = []
+            while len(faces) < 25:
+                message = await viewer.receive(60)
+                if message.type is aiohttp.WSMsgType.BINARY:
+                    assert struct.unpack_from("<B3xId", message.data) == (REST_TYPE, 0, 0.0)
+                    faces.append(np.frombuffer(message.data, "<f4", offset=16))
+            return np.array(faces)
+
+    faces = asyncio.run(look())
+    assert faces.shape[1:] == (NUM_FAPS,)
+    moved = np.flatnonzero(np.ptp(faces, axis=0)) + 1
+    assert {48, 49, 50} <= {*moved.tolist()}  # the head
+    assert not {*moved.tolist()} & {*MOUTH_FAPS}
+
+
 def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayProcess) -> None:
     async def look() -> None:
         async with (
@@ -353,7 +385,7 @@ def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayP
             shown = await receive_json(newest, "session")
             assert (shown["session"], shown["lips"]) == ("one", "dynamic-visemes")
             assert shown["sample"] is False
-            got = [await newest.receive(60) for _ in range(5)]
+            got = [await receive_of_session(newest) for _ in range(5)]
             binary = {m.data[0]: m.data for m in got if m.type is aiohttp.WSMsgType.BINARY}
             texts = [json.loads(m.data) for m in got if m.type is aiohttp.WSMsgType.TEXT]
             assert struct.unpack_from("<B3xId", binary[1]) == (1, EPOCH, 320.0)

@@ -104,8 +104,8 @@ class Stage:
         )
 
     def shown(self) -> float:
-        """FAP 1 as shown before it fades for want of frames."""
-        return float(self.driver.poses.faps(0.0)[0])
+        """FAP 1 as shown."""
+        return float(self.driver.poses.faps(time.monotonic())[0])
 
 
 @pytest.fixture

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.driver.poses import Poses
+from services.driver.poses import FADE_S, Poses
 from shared.face.faps import NUM_FAPS
+from shared.face.idle_motion import IdleMotion
 
 pytestmark = pytest.mark.unit
 
@@ -16,20 +17,21 @@ def faps(value: float) -> np.ndarray:
 
 
 def poses_of(*sessions: str, configured: str = "newest") -> Poses:
-    """Poses of sessions opened in this order; the FAPs of each are its number, from 1."""
+    """Poses of sessions opened in this order at 1 s; the FAPs of each are its number, from 1."""
     poses = Poses(configured)
     for number, session in enumerate(sessions, start=1):
-        poses.add(session, 0.0)
-        poses.accept_frame(session, faps(number), 0.0)
+        poses.add(session, 1.0)
+        poses.accept_frame(session, faps(number), 1.0)
     return poses
 
 
 def test_frames_of_two_sessions_do_not_mix() -> None:
     poses = poses_of("a", "b")
     for number in range(10):
-        poses.accept_frame("a", faps(100), 0.02 * number)
-        poses.accept_frame("b", faps(200), 0.02 * number)
-        assert poses.faps(0.02 * number)[0] == 200
+        now_s = 1.0 + 0.02 * number
+        poses.accept_frame("a", faps(100), now_s)
+        poses.accept_frame("b", faps(200), now_s)
+        assert poses.faps(now_s)[0] == 200
 
 
 def test_the_newest_is_shown_until_it_closes() -> None:
@@ -86,29 +88,54 @@ def test_without_sessions_a_switch_does_nothing() -> None:
 
 def test_a_stalled_face_fades_to_rest_and_comes_back() -> None:
     poses = poses_of("a")
-    assert poses.faps(0.9)[0] == 1
-    assert not poses.is_stalled(0.9)
-    assert 0 < poses.faps(1.2)[0] < 1
-    assert poses.is_stalled(1.2)
-    assert poses.caption(1.2) == "a (no frames come)"
-    assert not poses.faps(2.0).any()
-    poses.accept_frame("a", faps(1), 3.0)
-    assert poses.faps(3.0)[0] == 1
-    assert not poses.is_stalled(3.0)
+    assert poses.faps(1.9)[0] == 1
+    assert not poses.is_stalled(1.9)
+    assert 0 < poses.faps(2.1)[0] < 1
+    assert poses.is_stalled(2.1)
+    assert poses.caption(2.1) == "a (no frames come)"
+    assert not poses.faps(3.0).any()
+    for number in range(25):
+        poses.accept_frame("a", faps(1), 3.0 + 0.02 * number)
+        came_back = poses.faps(3.0 + 0.02 * number)[0]
+        assert came_back == pytest.approx(min(0.02 * number / FADE_S, 1.0), abs=0.01)
+    assert not poses.is_stalled(3.5)
 
 
 def test_a_face_that_has_ended_rests_without_a_remark() -> None:
     poses = poses_of("a")
     poses.end("a")
-    assert not poses.faps(2.0).any()
+    assert not poses.faps(5.0).any()
     assert poses.caption(2.0) == "a"
 
 
 def test_the_last_face_fades_after_its_session_closed() -> None:
     poses = poses_of("a")
+    assert poses.faps(1.5)[0] == 1
     poses.remove("a")
-    assert poses.faps(0.5)[0] == 1
+    assert 0 < poses.faps(1.6)[0] < 1
     assert not poses.faps(2.0).any()
+
+
+def test_a_face_without_a_session_lives_and_does_not_jump_when_one_comes_or_goes() -> None:
+    poses, session = Poses(idle_motion_seed=3), IdleMotion(8)
+    shown = []
+    for number in range(60 * 30):
+        now_s = 100.0 + number / 60.0
+        if number == 60 * 12:
+            poses.add("a", now_s)
+        if 60 * 13 < number < 60 * 18:
+            frame = np.zeros(NUM_FAPS, np.float32)
+            session.apply(frame, now_s - 100.0)
+            poses.accept_frame("a", frame, now_s)
+        if number == 60 * 18:
+            poses.remove("a")
+        shown.append(poses.faps(now_s))
+    lids, head = np.array(shown)[:, 18], np.array(shown)[:, 47:50]
+    assert (lids[: 60 * 12] > 500.0).any()
+    assert (lids[60 * 19 :] > 500.0).any()
+    assert (np.ptp(head[: 60 * 12], axis=0) > 100.0).all()
+    step_deg = np.rad2deg(np.abs(np.diff(head, axis=0)).max() * 1e-5)
+    assert step_deg < 0.15  # 9 degrees a second
 
 
 def test_the_caption_counts_the_sessions() -> None:

@@ -18,7 +18,7 @@ export class Link {
   /**
    * @param {string} chosen session to look at; "" for the newest
    * @param handlers { state(connected), fap(mediaTime, values), sound(mediaTime, samples),
-   *   text(object) }
+   *   rest(values), text(object) }
    */
   constructor(chosen, handlers) {
     this.#chosen = chosen;
@@ -71,5 +71,6 @@ export class Link {
     const message = readMessage(data);
     if (message?.faps) this.#handlers.fap(message.mediaTime, message.faps);
     else if (message?.samples) this.#handlers.sound(message.mediaTime, message.samples);
+    else if (message?.rest) this.#handlers.rest(message.rest);
   }
 }

@@ -112,6 +112,9 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     sound.push(mediaTime, samples);
     meter.push(mediaTime, samples);
   },
+  rest(values) {
+    rest = values;
+  },
   text(message) {
     switch (message.type) {
       case "session":
@@ -153,6 +156,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
 // --- every display frame -------------------------------------------------------------------------
 
 const wanted = new Float32Array(NUM_FAPS);
+let rest = new Float32Array(NUM_FAPS); // the face while no session moves it
 let labelledMs = 0;
 
 function draw(nowMs) {
@@ -164,7 +168,8 @@ function draw(nowMs) {
 
   const mediaTime = playout.mediaAt(nowMs);
   const shownTime = mediaTime === null ? null : track.sample(mediaTime, wanted);
-  if (scaleFace(presence.update(nowMs, shownTime !== null))) head?.pose(faps);
+  const hasChanged = mixFace(presence.update(nowMs, shownTime !== null));
+  if (hasChanged && lesson.step === "closed") head?.pose(faps); // else the lesson has the machine
   head?.draw(nowMs);
   measureDelay(shownTime);
 
@@ -185,11 +190,11 @@ function measureDelay(shownTime) {
   if (ageMs !== null) delays.add(nowMs, ageMs);
 }
 
-/** Set the face to a share of what is wanted; return whether it changed. */
-function scaleFace(share) {
+/** Set the face to a share of what is wanted, and else to rest; return whether it changed. */
+function mixFace(share) {
   let changed = false;
   for (let i = 0; i < NUM_FAPS; i++) {
-    const value = Math.fround(share * wanted[i]);
+    const value = Math.fround(rest[i] + share * (wanted[i] - rest[i]));
     changed ||= value !== faps[i];
     faps[i] = value;
   }

@@ -3,6 +3,7 @@
 export const NUM_FAPS = 68;
 const FAP_TYPE = 1;
 const SOUND_TYPE = 2;
+const REST_TYPE = 3;
 const HEADER_BYTES = 16;
 
 /**
@@ -10,7 +11,7 @@ const HEADER_BYTES = 16;
  *
  * @param {ArrayBuffer} data
  * @returns { mediaTime, faps: Float32Array } for a FAP frame, { mediaTime, samples: Int16Array } for
- *   sound, null for what a later gateway may send
+ *   sound, { rest: Float32Array } for the face at rest, null for what a later gateway may send
  */
 export function readMessage(data) {
   const header = new DataView(data);
@@ -20,6 +21,8 @@ export function readMessage(data) {
       return { mediaTime, faps: new Float32Array(data, HEADER_BYTES, NUM_FAPS) };
     case SOUND_TYPE:
       return { mediaTime, samples: new Int16Array(data, HEADER_BYTES) };
+    case REST_TYPE:
+      return { rest: new Float32Array(data, HEADER_BYTES, NUM_FAPS) };
     default:
       return null;
   }

@@ -43,7 +43,7 @@ _GESTURES = {
     ExpressionName.BROW_DOWN: ("browDownLeft", "browDownRight"),
     ExpressionName.SQUINT: ("eyeSquintLeft", "eyeSquintRight"),
 }
-_FAPS: dict[str, NDArray[np.float32]] = {  # (68,) at full strength
+EXPRESSION_FAPS: dict[str, NDArray[np.float32]] = {  # (68,) at full strength
     **dict(zip(EXPRESSION_NAMES[1:], EXPRESSIONS[1:], strict=True)),
     **{
         name: ARKIT[[ARKIT_NAMES.index(shape) for shape in shapes]].sum(axis=0)
@@ -65,7 +65,7 @@ class Expression:
         """Show expressions in place of those before, for a time; none: they fade now."""
         self._goal = np.zeros(NUM_FAPS, np.float32)
         for name, strength in strengths.items():
-            self._goal += np.float32(strength) * _FAPS[name]
+            self._goal += np.float32(strength) * EXPRESSION_FAPS[name]
         self._held_s = hold_s if strengths else 0.0
 
     def apply(self, faps: NDArray[np.float32], moment: Moment) -> None:

@@ -38,7 +38,7 @@ test.beforeEach(() => {
 
 function record() {
   const calls = [];
-  const names = ["state", "fap", "sound", "text"];
+  const names = ["state", "fap", "sound", "rest", "text"];
   const handlers = Object.fromEntries(names.map((name) => [name, (...args) => calls.push([name, ...args])]));
   return { calls, handlers };
 }
@@ -56,7 +56,8 @@ test("binary messages are frames or sound; others of a later gateway are left ou
   assert.deepEqual(frame.faps, faps);
   const sound = readMessage(binary(2, 320, Int16Array.of(1, -32768)));
   assert.deepEqual(sound, { mediaTime: 320, samples: Int16Array.of(1, -32768) });
-  assert.equal(readMessage(binary(3, 0, new Uint8Array(4))), null);
+  assert.deepEqual(readMessage(binary(3, 0, faps)), { rest: faps });
+  assert.equal(readMessage(binary(4, 0, new Uint8Array(4))), null);
 });
 
 test("messages go to their handlers", () => {
@@ -66,10 +67,12 @@ test("messages go to their handlers", () => {
   socket.open();
   socket.onmessage({ data: binary(2, 320, Int16Array.of(5)) });
   socket.onmessage({ data: binary(9, 320, Int16Array.of(5)) });
+  socket.onmessage({ data: binary(3, 0, new Float32Array(68)) });
   socket.onmessage({ data: '{"type": "end"}' });
   assert.deepEqual(calls, [
     ["state", true],
     ["sound", 320, Int16Array.of(5)],
+    ["rest", new Float32Array(68)],
     ["text", { type: "end" }],
   ]);
 });
