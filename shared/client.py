@@ -22,6 +22,7 @@ from shared.wire.codec import BadMessage
 from shared.wire.control import StatusReport, StatusRequest
 from shared.wire.message import MAX_AUDIO_BYTES, Message
 from shared.wire.session import (
+    ChooseExpressiveness,
     ChooseLips,
     CloseSession,
     Error,
@@ -128,6 +129,20 @@ class Client:
             )
         )
 
+    def choose_expressiveness(self, session: str, expressiveness: float) -> None:
+        """Let the mouth of a session, anybody's, move more or less: 0.5 to 2.
+
+        Raises
+        ------
+        Refused
+            If there is no such session, or the number is out of range.
+        """
+        self._ask(
+            ChooseExpressiveness(
+                session=session, request=_request_id(), expressiveness=expressiveness
+            )
+        )
+
     def status(self) -> StatusReport:
         """Return the state of all services and sessions."""
         report = self._ask(StatusRequest(request=_request_id()))
@@ -146,7 +161,13 @@ class Client:
 
     def _ask(
         self,
-        message: OpenSession | CloseSession | FlushSession | ChooseLips | Express | StatusRequest,
+        message: OpenSession
+        | CloseSession
+        | FlushSession
+        | ChooseLips
+        | Express
+        | ChooseExpressiveness
+        | StatusRequest,
     ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
         while time.monotonic() < deadline_s:

@@ -33,7 +33,7 @@ from shared.wire.control import (
     UseLips,
 )
 from shared.wire.message import Message
-from shared.wire.session import Done, Error, ErrorCode, Express
+from shared.wire.session import ChooseExpressiveness, Done, Error, ErrorCode, Express
 
 HEARTBEAT_S = 0.5
 TICK_S = 0.01
@@ -49,8 +49,8 @@ class Service:
 
     A subclass says its role and the endpoints it needs, fills in ``endpoints`` with those it
     provides, calls ``register`` for its own sockets, and overrides ``start_session``,
-    ``stop_session``, ``flush_session``, ``use_lips``, ``express``, ``session_inputs``,
-    ``on_tick``, ``on_drain``.
+    ``stop_session``, ``flush_session``, ``use_lips``, ``express``, ``choose_expressiveness``,
+    ``session_inputs``, ``on_tick``, ``on_drain``.
     """
 
     name: ClassVar[str]
@@ -87,6 +87,7 @@ class Service:
                     FlushNow: lambda message, _: self.flush_session(message.session),
                     UseLips: lambda message, _: self.use_lips(message.session, message.lips),
                     Express: lambda message, _: self.express(message),
+                    ChooseExpressiveness: lambda message, _: self.choose_expressiveness(message),
                     Error: self._on_error,
                     Done: lambda _message, _sender: None,
                 },
@@ -109,6 +110,9 @@ class Service:
 
     def express(self, message: Express) -> None:
         """Let the face of a session show expressions, if it is made here."""
+
+    def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
+        """Let the mouth of a session move more or less, if it is made here."""
 
     def on_start(self) -> None:
         """Begin what needs the loop; called once, before the service says that it is ready."""

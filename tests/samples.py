@@ -23,6 +23,7 @@ from shared.wire.control import (
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
 from shared.wire.session import (
+    ChooseExpressiveness,
     ChooseLips,
     CloseSession,
     Done,
@@ -144,4 +145,5 @@ SAMPLES: tuple[Message, ...] = (
     EndOfFaps(**COMMON),  # type: ignore[arg-type]
     Joined(session="demo", publisher="p1"),
     Express(session="demo", request="r5", expressions={"joy": 0.5, "squint": 1.0}, hold_s=2.5),
+    ChooseExpressiveness(session="demo", request="r6", expressiveness=1.25),
 )

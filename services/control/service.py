@@ -3,11 +3,11 @@
 Li et al. 2011, section 2: the control module initialises the others, passes messages between them
 and keeps them in step. Audio, phones and FAPs never pass through it.
 
-Reacts to: open-session, close-session, flush-session, choose-lips, express, status-request
-(clients), heartbeat, done, speech, recorded, error (services).
+Reacts to: open-session, close-session, flush-session, choose-lips, express,
+choose-expressiveness, status-request (clients), heartbeat, done, speech, recorded, error (services).
 Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
-start-session, stop-session, flush-now, use-lips, express (services), event, session-moved
-(subscribers).
+start-session, stop-session, flush-now, use-lips, express, choose-expressiveness (services), event,
+session-moved (subscribers).
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from shared.wire.control import (
 )
 from shared.wire.message import Message
 from shared.wire.session import (
+    ChooseExpressiveness,
     ChooseLips,
     CloseSession,
     Done,
@@ -56,7 +57,15 @@ STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session
 REPLACE_LIMIT_S = 20.0  # for another worker to take the place of a lost one
 MAX_ANSWERS = 1000  # kept for repeated requests
-Request = OpenSession | CloseSession | FlushSession | ChooseLips | Express | StatusRequest
+Request = (
+    OpenSession
+    | CloseSession
+    | FlushSession
+    | ChooseLips
+    | Express
+    | ChooseExpressiveness
+    | StatusRequest
+)
 
 
 class ControlService(Service):
@@ -85,7 +94,8 @@ class ControlService(Service):
                 CloseSession: self._request_handler(self._close),
                 FlushSession: self._request_handler(self._flush),
                 ChooseLips: self._request_handler(self._choose_lips),
-                Express: self._request_handler(self._express),
+                Express: self._request_handler(self._pass_on),
+                ChooseExpressiveness: self._request_handler(self._pass_on),
                 StatusRequest: self._request_handler(self._status),
                 Heartbeat: self._on_heartbeat,
                 Done: self._on_started,
@@ -176,7 +186,7 @@ class ControlService(Service):
         self._send_to_participants(record, use)
         return Done(session=message.session, request=message.request)
 
-    def _express(self, message: Express, _sender: bytes) -> Message:
+    def _pass_on(self, message: Express | ChooseExpressiveness, _sender: bytes) -> Message:
         self._send_to_participants(self._sessions.find(message.session), message)
         return Done(session=message.session, request=message.request)
 

@@ -2,8 +2,8 @@
 
 Reacts to: start-session, stop-session, use-lips, status-report (control), fap-frame, end-of-faps
 (synthesizer), sound, phone, speech (recognizer), and to what browsers send. Emits: status-request,
-express (control), WebSocket messages (browsers), and, as an ordinary client, audio-chunk
-(recognizer).
+express, choose-expressiveness (control), WebSocket messages (browsers), and, as an ordinary client,
+audio-chunk (recognizer).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from shared.wire.control import SessionInput, StartSession, StatusReport, Status
 from shared.wire.events import phone_of
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
-from shared.wire.session import Done, Error, Express
+from shared.wire.session import ChooseExpressiveness, Done, Error, Express
 from shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
@@ -86,6 +86,7 @@ class GatewayService(Service):
             self._play_sample,
             self._choose_sample_lips,
             self._express,
+            self._choose_expressiveness,
         )
         self._own_sessions = OwnSessions(config.control, self.warn)
         self._microphones = Microphones(self._web_sockets, self._own_sessions)
@@ -231,6 +232,12 @@ class GatewayService(Service):
                 expressions=expressions.strengths,
                 hold_s=expressions.hold_s,
             )
+        )
+
+    def _choose_expressiveness(self, session: str, amount: float) -> None:
+        request = secrets.token_hex(8)
+        self._commands.send(
+            ChooseExpressiveness(session=session, request=request, expressiveness=amount)
         )
 
     # --- from the publishers ---------------------------------------------------------------------

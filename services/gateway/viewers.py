@@ -53,6 +53,8 @@ class Viewers:
         Lets another lip model move the mouth while the sample sentence is spoken.
     express
         Lets the face of a session show expressions.
+    choose_expressiveness
+        Lets the mouth of a session move more or less.
     """
 
     def __init__(
@@ -62,12 +64,14 @@ class Viewers:
         play_sample: Callable[[str], str],
         choose_sample_lips: Callable[[str], None],
         express: Callable[[str, wire.Expressions], None],
+        choose_expressiveness: Callable[[str, float], None],
     ) -> None:
         self._web_sockets = web_sockets
         self._metrics = metrics
         self._play_sample = play_sample
         self._choose_sample_lips = choose_sample_lips
         self._express = express
+        self._choose_expressiveness = choose_expressiveness
         self._viewers: set[Viewer] = set()
         self._sessions: dict[str, _Session] = {}  # in the order they were opened
         self._sample = ""  # the session of the sample sentence, while it is spoken
@@ -158,12 +162,17 @@ class Viewers:
             session = command.get("follow")
             lips = wire.parse_lips(command)
             expressions = wire.parse_expressions(command)
+            amount = wire.parse_expressiveness(command)
             if command.get("play") == "sample":
                 self._sample = viewer.chosen = self._play_sample(lips)
             elif expressions is not None:
                 if viewer.shown is None:
                     raise UserError("no session is shown whose face could express anything")
                 self._express(viewer.shown[0], expressions)
+            elif amount is not None:
+                if viewer.shown is None:
+                    raise UserError("no session is shown whose mouth could move more or less")
+                self._choose_expressiveness(viewer.shown[0], amount)
             elif lips:
                 if not self._sample or viewer.chosen != self._sample:
                     raise UserError("lips can be chosen here only for the sample sentence")
@@ -172,7 +181,8 @@ class Viewers:
                 viewer.chosen = session
             else:
                 raise UserError(
-                    "expected 'follow' with a session's name, 'play', 'lips' or 'express'"
+                    "expected 'follow' with a session's name, 'play', 'lips', 'express' "
+                    "or 'expressiveness'"
                 )
         except UserError as error:
             self._put(viewer, Kind.TEXT, wire.error_text(str(error)))

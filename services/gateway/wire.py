@@ -12,7 +12,7 @@ import struct
 from dataclasses import dataclass
 
 from shared.errors import UserError
-from shared.face.expressions import DEFAULT_HOLD_S, check_expressions
+from shared.face.expressions import DEFAULT_HOLD_S, check_expressions, check_expressiveness
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 _HEADER = struct.Struct("<B3xId")
@@ -154,6 +154,18 @@ def parse_expressions(fields: dict[str, object]) -> Expressions | None:
         raise UserError("express must be an object of strengths by name")
     check_expressions(strengths, hold_s)
     return Expressions(strengths=strengths, hold_s=float(hold_s))  # type: ignore[arg-type]
+
+
+def parse_expressiveness(fields: dict[str, object]) -> float | None:
+    """Return how much a message wants the mouth to move, if it does.
+
+    Raises
+    ------
+    UserError
+        If that is out of range.
+    """
+    amount = fields.get("expressiveness")
+    return None if amount is None else check_expressiveness(amount)
 
 
 def parse_object(message: str) -> dict[str, object]:

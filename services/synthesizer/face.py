@@ -80,7 +80,7 @@ class Face:
         self._lip_model = lips
         self._frame_rate_hz = frame_rate_hz
         self._delay_s = delay_s
-        self._expressiveness = expressiveness
+        self._expressiveness = Expressiveness(expressiveness)
         self._expression = Expression()
         self._life = Life(idle_motion_seed) if idle_motion_seed else None
         self._num_frames = 0  # made so far, while media time stood still too
@@ -100,10 +100,11 @@ class Face:
         self._lips = self._lip_model.stream(
             self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s
         )
-        self._modifiers: list[Modifier] = [Amplitude()]  # applied in this order
-        if self._expressiveness != 1.0:
-            self._modifiers.append(Expressiveness(self._expressiveness))
-        self._modifiers.append(self._expression)
+        self._modifiers: list[Modifier] = [  # applied in this order
+            Amplitude(),
+            self._expressiveness,
+            self._expression,
+        ]
         if self._life is not None:
             self._modifiers.append(self._life)
 
@@ -146,6 +147,10 @@ class Face:
     def express(self, strengths: Mapping[str, float], hold_s: float) -> None:
         """Show expressions, strengths 0 to 1 by name, for a time; in place of those before."""
         self._expression.show(strengths, hold_s)
+
+    def choose_expressiveness(self, amount: float) -> None:
+        """Let the mouth move more or less from here on: 0.5 to 2, 1 as the lip model moves it."""
+        self._expressiveness.amount = amount
 
     def use_lips(self, lips: LipModel) -> None:
         """Let another lip model move the mouth, without a jump from where it is."""

@@ -1,7 +1,7 @@
 """The synthesizer as a service: phones and lips in, FAP frames out.
 
 Reacts to: phone, lips, speech, progress, end-of-phones (recognizer), start-session, stop-session,
-flush-now, use-lips, express (control).
+flush-now, use-lips, express, choose-expressiveness (control).
 Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
 
 Frames are clocked by the audio that was processed, so a system under load is late, never wrong, and
@@ -28,7 +28,7 @@ from shared.service import Service
 from shared.wire.control import SessionInput, StartSession
 from shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of
 from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.session import Express
+from shared.wire.session import ChooseExpressiveness, Express
 
 STALL_S = 0.2  # a live stream silent for so long has stalled
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
@@ -117,6 +117,12 @@ class SynthesizerService(Service):
         found = self._sessions.get(message.session)
         if found is not None:
             found.face.express(message.expressions, message.hold_s)
+
+    def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
+        """Let the mouth move more or less from here on."""
+        found = self._sessions.get(message.session)
+        if found is not None:
+            found.face.choose_expressiveness(message.expressiveness)
 
     def on_tick(self, now_s: float) -> None:
         """Acknowledge, and lead faces to rest whose live stream has stalled."""

@@ -7,6 +7,7 @@ from enum import StrEnum
 
 from shared.errors import UserError
 
+MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS = 0.5, 2.0  # 1: as the lip model moves the mouth
 MAX_HOLD_S = 3600.0
 DEFAULT_HOLD_S = 3.0  # that expressions stay before they fade
 
@@ -43,5 +44,20 @@ def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
         raise UserError(f"hold_s is {hold_s}; give 0 to {MAX_HOLD_S:g} seconds")
 
 
-def _is_number(value: object, highest: float) -> bool:
-    return type(value) in (int, float) and 0.0 <= value <= highest  # type: ignore[operator]
+def check_expressiveness(amount: object) -> float:
+    """Return how much the mouth is to move, if that is in range.
+
+    Raises
+    ------
+    UserError
+        If it is not.
+    """
+    if not _is_number(amount, MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS):
+        raise UserError(
+            f"expressiveness is {amount}; give {MIN_EXPRESSIVENESS:g} to {MAX_EXPRESSIVENESS:g}"
+        )
+    return float(amount)  # type: ignore[arg-type]
+
+
+def _is_number(value: object, highest: float, lowest: float = 0.0) -> bool:
+    return type(value) in (int, float) and lowest <= value <= highest  # type: ignore[operator]

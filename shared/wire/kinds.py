@@ -18,6 +18,7 @@ from shared.wire.control import (
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
 from shared.wire.session import (
+    ChooseExpressiveness,
     ChooseLips,
     CloseSession,
     Done,
@@ -65,6 +66,7 @@ MESSAGES: dict[str, type[Message]] = {
         EndOfFaps,
         Joined,
         Express,
+        ChooseExpressiveness,
     )
 }
 

@@ -14,7 +14,12 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from shared.face.expressions import MAX_HOLD_S, ExpressionName
+from shared.face.expressions import (
+    MAX_EXPRESSIVENESS,
+    MAX_HOLD_S,
+    MIN_EXPRESSIVENESS,
+    ExpressionName,
+)
 from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
@@ -44,6 +49,7 @@ KnownExpression = Annotated[str, Meta(pattern=f"^({'|'.join(ExpressionName)})$")
 Strength = Annotated[float, Meta(ge=0, le=1)]
 ExpressionMap = Annotated[dict[KnownExpression, Strength], Meta(max_length=len(ExpressionName))]
 HoldTime = Annotated[float, Meta(ge=0, le=MAX_HOLD_S)]  # s
+ExpressivenessAmount = Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)]
 VoiceProfile = Annotated[bytes, Meta(max_length=MAX_VOICE_BYTES)]  # empty: anybody's
 Endpoint = Annotated[str, Meta(max_length=256)]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]

@@ -15,6 +15,7 @@ from shared.wire.message import (
     Encoding,
     Endpoint,
     ExpressionMap,
+    ExpressivenessAmount,
     FrameRate,
     HoldTime,
     LanguageName,
@@ -116,6 +117,14 @@ class Express(Message):
     request: Name
     expressions: ExpressionMap  # strengths by name, in place of those before; empty: they fade now
     hold_s: HoldTime = DEFAULT_HOLD_S  # that they stay before they fade
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChooseExpressiveness(Message):
+    """Makes the mouth move more or less; control passes it on to the services."""
+
+    request: Name
+    expressiveness: ExpressivenessAmount  # 1: as the lip model moves it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -44,6 +44,7 @@ from shared.wire.control import (
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
 from shared.wire.session import (
+    ChooseExpressiveness,
     ChooseLips,
     CloseSession,
     Done,
@@ -88,6 +89,7 @@ class ScriptedSystem:
         self.flushed: list[str] = []
         self.chosen: list[tuple[str, str]] = []  # session, lip model
         self.expressions: list[Express] = []
+        self.amounts: list[tuple[str, float]] = []  # session, expressiveness
         self.voices: list[bytes] = []  # of the sessions opened
         self.audio_messages: list[Message] = []
         self.forget()
@@ -109,6 +111,7 @@ class ScriptedSystem:
             received.clear()
         self.chosen.clear()
         self.expressions.clear()
+        self.amounts.clear()
         self.voices.clear()
 
     def do(self, job: Callable[[], object]) -> None:
@@ -207,6 +210,9 @@ class ScriptedSystem:
                 self.chosen.append((message.session, message.lips))
                 use = UseLips(session=message.session, lips=message.lips)
                 self.commands.send(use, to=self.gateway)
+                answer = Done(session=message.session, request=message.request)
+            case ChooseExpressiveness():
+                self.amounts.append((message.session, message.expressiveness))
                 answer = Done(session=message.session, request=message.request)
             case Express():
                 self.expressions.append(message)
@@ -606,12 +612,14 @@ def test_a_viewer_lets_the_face_it_sees_express_something(
                 ({"express": {"joy": 2}}, "joy is 2"),
                 ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
                 ({"express": "joy"}, "strengths by name"),
+                ({"expressiveness": 3}, "expressiveness is 3; give 0.5 to 2"),
             ):
                 await viewer.send_json(wrong)
                 assert named in (await receive_json(viewer, "error"))["text"]
             await viewer.send_json({"express": {"joy": 0.5, "squint": 1}, "hold_s": 7})
             await viewer.send_json({"express": {}})
-            await until(lambda: len(system.expressions) == 2)
+            await viewer.send_json({"expressiveness": 2})
+            await until(lambda: len(system.expressions) == 2 and bool(system.amounts))
 
     asyncio.run(express())
     first, second = system.expressions
@@ -621,6 +629,7 @@ def test_a_viewer_lets_the_face_it_sees_express_something(
         7.0,
     )
     assert (second.session, second.expressions) == ("seen", {})
+    assert system.amounts == [("seen", 2.0)]
     system.do(lambda: system.commands.send(StopSession(session="seen"), to=system.gateway))
 
 

@@ -53,7 +53,7 @@ class Expressiveness:
     """
 
     def __init__(self, amount: float) -> None:
-        self._more = amount - 1.0
+        self.amount = amount
 
     def apply(self, faps: NDArray[np.float32], moment: Moment) -> None:
         """Change a frame, FAPs (68,), in place."""
@@ -61,6 +61,8 @@ class Expressiveness:
 
     def scale(self, faps: NDArray[np.float32]) -> None:
         """Scale the mouth of FAPs (68,), in place."""
+        if self.amount == 1.0:
+            return
         upper, lower = -faps[UPPER], -faps[LOWER]  # openings
         beyond = np.maximum(upper + lower - SHUT, 0.0)  # (6,) of the gaps
         free_upper, free_lower = (np.maximum(lip - SHUT, 0.0) for lip in (upper, lower))
@@ -80,6 +82,10 @@ class Expressiveness:
         faps[_WIDTH] = np.maximum(faps[_WIDTH] + change, np.minimum(faps[_WIDTH], _MIN_WIDTH))
         pushed = _SIDEWAYS * self._more * np.maximum(faps[_PUSH] - _USUAL_PUSH, 0.0)
         faps[_PUSH] = np.minimum(faps[_PUSH] + pushed, np.maximum(faps[_PUSH], _MAX_PUSH))
+
+    @property
+    def _more(self) -> float:
+        return self.amount - 1.0
 
     def _growth(self, opening: NDArray[np.float32]) -> NDArray[np.float32]:
         if self._more < 0.0:
