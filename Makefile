@@ -6,6 +6,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
+HEADS := $(PAGE)/head.glb $(PAGE)/head-man.glb $(PAGE)/head-elder.glb $(PAGE)/head-child.glb
 RIVALS := evaluation/lips/rivals
 CLIENT := proto/node
 SAMPLE := shared/demo/hello-female.wav
@@ -24,7 +25,7 @@ run: setup
 demo: setup
 	$(BIN)/kouxing run --play $(SAMPLE) --stop-after
 
-setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(PAGE)/head.glb
+setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(HEADS)
 
 # Two processes: one for the tests that start services, both for the others.
 test: .venv/installed-dev setup $(RIVALS)/node_modules/.package-lock.json $(CLIENT)/node_modules/.package-lock.json
@@ -51,7 +52,7 @@ lock: .venv/installed
 		--no-annotate --custom-compile-command 'make lock' --output-file $(LOCK) pyproject.toml -
 
 clean:
-	rm -rf .venv $(PAGE)/node_modules $(RIVALS)/node_modules $(CLIENT)/node_modules $(PAGE)/head.glb out
+	rm -rf .venv $(PAGE)/node_modules $(RIVALS)/node_modules $(CLIENT)/node_modules $(HEADS) out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
@@ -80,3 +81,6 @@ $(RIVALS)/node_modules/.package-lock.json $(CLIENT)/node_modules/.package-lock.j
 
 $(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py | .venv/installed
 	$(BIN)/kouxing head export $@
+
+$(PAGE)/head-%.glb: services/driver/head/assets/%.npz services/driver/head/glb_export.py | .venv/installed
+	$(BIN)/kouxing head export --head $* $@

@@ -21,6 +21,7 @@ from shared.service import Service
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import StartSession
 from shared.wire.face import FapFrame
+from shared.wire.session import ChooseExpressiveness, Express
 from shared.wire.speech import Phone
 from tests.system import ROOT
 
@@ -75,8 +76,16 @@ class ScriptedSynthesizer(Service):
         self.endpoints = {"phone_input": self.input.endpoint, "faps": self.faps.endpoint}
         self.lips = "dynamic-visemes"
         self.chosen: list[tuple[str, str]] = []  # session, lip model
+        self.amounts: list[tuple[str, float]] = []  # session, expressiveness
+        self.expressions: list[dict[str, float]] = []
         self.register(self.input, {})
         self.register(self.faps, {})
+
+    def express(self, message: Express) -> None:
+        self.expressions.append(message.expressions)
+
+    def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
+        self.amounts.append((message.session, message.expressiveness))
 
     def use_lips(self, session: str, lips: str) -> None:
         self.chosen.append((session, lips))

@@ -4,7 +4,8 @@ Li et al. 2011, section 2: the control module initialises the others, passes mes
 and keeps them in step. Audio, phones and FAPs never pass through it.
 
 Reacts to: open-session, close-session, flush-session, choose-lips, express,
-choose-expressiveness, status-request (clients), heartbeat, done, speech, recorded, error (services).
+choose-expressiveness, status-request (clients), heartbeat, done, speech, recorded, error
+(services).
 Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
 start-session, stop-session, flush-now, use-lips, express, choose-expressiveness (services), event,
 session-moved (subscribers).

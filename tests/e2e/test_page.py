@@ -25,7 +25,8 @@ from tests.system import ROOT, free_port
 
 pytestmark = pytest.mark.e2e
 
-HEAD = ROOT / "services" / "gateway" / "page" / "head.glb"
+PAGE = ROOT / "services" / "gateway" / "page"
+HEADS = {"woman": PAGE / "head.glb", "man": PAGE / "head-man.glb"}
 # Rows 15 (a) and 13 (b) of the Mandarin viseme table: FAP number to value.
 FAP_COLUMNS = [*range(3, 15), 16, 17, 44, 45, 46, 47, *range(51, 61)]
 A_VALUES = [
@@ -67,9 +68,10 @@ def system() -> Iterator[System]:
 
 @pytest.fixture(scope="module")
 def gateway(system: System) -> Iterator[Gateway]:
-    if not HEAD.is_file():
-        kouxing = Path(sys.executable).with_name("kouxing")
-        subprocess.run([kouxing, "head", "export", HEAD], cwd=ROOT, check=True)
+    for name, file in HEADS.items():
+        if not file.is_file():
+            command = [sys.executable, "-m", "services", "head", "export", "--head", name, file]
+            subprocess.run(command, cwd=ROOT, check=True)
     gateway = Gateway(system.address, free_port())
     yield gateway
     assert gateway.stop() == 0
@@ -309,30 +311,81 @@ def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser)
     assert np.sqrt((samples**2).mean()) > 300
 
 
-def test_the_lips_are_switched_while_the_microphone_is_on(system: System, browser: Browser) -> None:
-    system.synthesizer.chosen.clear()
-    assert browser.evaluate("document.getElementById('lips').disabled")  # another's session
+def choose(browser: Browser, name: str, value: object) -> None:
+    """Choose in the panel, as its list or slider does."""
+    browser.evaluate(
+        f"(() => {{ const input = document.getElementById('{name}'); input.value = '{value}';"
+        "input.dispatchEvent(new Event('input')); })()"
+    )
+
+
+def test_what_is_chosen_counts_at_once_and_for_sessions_to_come(
+    system: System, browser: Browser, gateway: Gateway
+) -> None:
+    chosen, amounts = system.synthesizer.chosen, system.synthesizer.amounts
+    chosen.clear()
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips")
     assert browser.evaluate("window.kouxing.state.lips") == "dynamic-visemes"
-    browser.click("lips")
+    choose(browser, "lips", "ferguson")
+    browser.wait_for("window.kouxing.state.lips === 'ferguson'")
+    choose(browser, "expressiveness", 0.7)
+    wait_until(lambda: len(amounts) == 1, 60)
+    browser.evaluate("document.querySelector('#expressions [value=surprise]').click()")
+    wait_until(lambda: system.synthesizer.expressions == [{"surprise": 0.8}], 60)
+    browser.click("microphone")
+    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+
+    browser.command("Page.navigate", url=gateway.page)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    assert browser.evaluate("document.getElementById('lips').value") == "ferguson"
+    browser.click("microphone")
+    browser.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips === 'ferguson'")
+    wait_until(lambda: len(amounts) == 2, 60)
+    choose(browser, "lips", "learnt")
     browser.wait_for("window.kouxing.state.lips === 'learnt'")
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
-    browser.click("microphone")  # the choice counts for sessions to come
-    browser.wait_for("!document.getElementById('lips').disabled")
-    browser.wait_for("window.kouxing.state.lips === 'learnt'")
-    browser.click("lips")
-    browser.wait_for("window.kouxing.state.lips === 'dynamic-visemes'")
-    browser.click("microphone")
-    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
-    sessions, lips = zip(*system.synthesizer.chosen, strict=True)
-    assert lips == ("learnt", "learnt", "dynamic-visemes")
+    sessions, lips = zip(*chosen, strict=True)
+    assert lips == ("ferguson", "ferguson", "learnt")
     assert sessions[0] != sessions[1] == sessions[2]
+    assert amounts == [(sessions[0], 0.7), (sessions[1], 0.7)]
+
+
+def test_another_head_is_shown(browser: Browser) -> None:
+    hide = "for (const part of document.querySelectorAll('header, footer')) part.style.opacity = {}"
+    browser.evaluate(hide.format(0))
+    woman = browser.steady_image()
+    choose(browser, "heads", "man")
+    browser.wait_for("document.getElementById('loading').hidden")
+    man = browser.steady_image()
+    choose(browser, "heads", "woman")
+    browser.wait_for("document.getElementById('loading').hidden")
+    woman_again = browser.steady_image()
+    browser.evaluate(hide.format(1))
+    differs = np.abs(woman.astype(int) - man).max(axis=2) > 40
+    assert differs.mean() > 0.02
+    assert (np.abs(woman.astype(int) - woman_again).max(axis=2) > 40).mean() < 0.005
+
+
+def test_the_page_speaks_one_language(browser: Browser) -> None:
+    shown = "document.body.innerText + document.getElementById('sample').innerText"
+    choose(browser, "language", "zh")
+    assert browser.evaluate("document.documentElement.lang") == "zh"
+    chinese = browser.evaluate(shown)
+    assert "播放示例" in chinese
+    assert "Sample" not in chinese
+    label = "document.getElementById('meter').getAttribute('aria-label')"
+    assert browser.evaluate(label) == "音量"
+    choose(browser, "language", "en")
+    english = browser.evaluate(shown)
+    assert "Sample" in english
+    assert "播放示例" not in english
+    assert browser.evaluate(label) == "level"
 
 
 def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None:
-    browser.wait_for("document.getElementById('notice').hidden")
+    browser.wait_for("document.getElementById('notice').textContent === ''")
     system.lose_recognizer()
     notice = "document.getElementById('notice').textContent"
     browser.wait_for(f"{notice}.includes('recognizer does not run')")

@@ -20,7 +20,7 @@ DIGESTS = {
     "version1.json": "1e1a1c42b3b98fbb2b622eaf0bb0d4f7774ea38f58e2ff5c0daeb109e9178c34",
     "version2.json": "db8042c5cd7e09ad90edf970880b4e7753139607a5156a73d0a48622def0374b",
     "version2-express.json": "9e8243549d328b69ec3077fce7157525af7ecd2dece06b3a58b4c454a5bd4821",
-    "version2-expressiveness.json": "442ab148cb675aec865dff988f7d0a8be1de931df33c48db68deaf43196e81f6",
+    "version2-amount.json": "442ab148cb675aec865dff988f7d0a8be1de931df33c48db68deaf43196e81f6",
     "version2-heartbeat.json": "6ff43c3df98604b937bb4f5c0917f6ece320505ca15292a4e75077d7c3c26aa4",
     "version2-progress.json": "0f497d631815a1fe745f5b5e5a0005170f03f8942de8f19bee013c3db37e508f",
     "version2-status.json": "76082bd28da61ec5ab45bf74abb2c610126af722c0af8ca6bcdbfd83f4e4442e",

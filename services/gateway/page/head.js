@@ -32,6 +32,7 @@ export class Head {
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
+  #model = null; // in the scene
   #meshes = []; // that FAPs move
   #inMouth = []; // materials
   #joints = []; // { node, rest, turns: [[FAP index, axis]] }
@@ -44,6 +45,7 @@ export class Head {
   #judgedMs = 0;
   #turn = new THREE.Quaternion();
 
+  /** @param canvas to draw into; @param overlay the element that covers its lower edge */
   constructor(canvas, overlay) {
     this.#overlay = overlay;
     // Smooth edges come from more pixels than the screen has: multisampling speckles a mesh whose
@@ -63,14 +65,18 @@ export class Head {
     }).observe(canvas);
   }
 
-  /** Load a head into a canvas whose lower edge is covered by another element. */
-  static async load(canvas, overlay, url) {
-    const head = new Head(canvas, overlay);
-    head.#add(await new GLTFLoader().loadAsync(url));
-    return head;
+  /** Load a head, in place of the one before. */
+  async load(url) {
+    const gltf = await new GLTFLoader().loadAsync(url);
+    this.#model?.removeFromParent();
+    this.#meshes = [];
+    this.#inMouth = [];
+    this.#joints = [];
+    this.#add(gltf);
   }
 
   #add(gltf) {
+    this.#model = gltf.scene;
     const about = gltf.scene.getObjectByName("kouxing").userData.kouxing;
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;

@@ -3,6 +3,7 @@
 
 import { capture, openCaptureContext } from "./capture.js";
 import { FaceTracker } from "./face-tracker.js";
+import { say } from "./language.js";
 import { curvePath, extent, figures, verdict } from "./lip-curves.js";
 import { TEXTS } from "./reading.js";
 import { FaceRecording } from "./recording.js";
@@ -13,14 +14,23 @@ const CURVES = ["tracked", "before", "after"];
 const BOX = { width: 600, height: 150 };
 const NEEDS = {
   NotAllowedError:
-    "Camera and microphone were not allowed: allow them for this page and try again. 未允许使用摄像头和麦克风。",
-  NotFoundError: "There is no camera or no microphone: plug one in and try again. 没有摄像头或麦克风。",
+    { en: "Camera and microphone were not allowed: allow them for this page and try again.", zh: "未允许使用摄像头和麦克风：请允许后重试。" },
+  NotFoundError: { en: "There is no camera or no microphone: plug one in and try again.", zh: "没有摄像头或麦克风：请接上后重试。" },
   NotReadableError:
-    "Another program holds the camera or the microphone: close it and try again. 摄像头或麦克风被其他程序占用。",
+    { en: "Another program holds the camera or the microphone: close it and try again.", zh: "摄像头或麦克风被其他程序占用：请关闭后重试。" },
 };
-const UNPLUGGED = "Camera or microphone were unplugged: try again. 摄像头或麦克风断开了，请重试。";
+const UNPLUGGED = { en: "Camera or microphone were unplugged: try again.", zh: "摄像头或麦克风断开了，请重试。" };
 const NEEDS_SECURE =
-  "A camera needs https, or this page at http://localhost or http://127.0.0.1. 使用摄像头需要 https 或 localhost。";
+  { en: "A camera needs https, or this page at http://localhost or http://127.0.0.1.", zh: "使用摄像头需要 https 或 localhost。" };
+
+const STARTING = { en: "Camera and microphone start …", zh: "正在启动摄像头和麦克风…" };
+const SHOW_FACE = { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" };
+const LIPS_CLOSED = { en: "Keep your lips closed …", zh: "请先闭上嘴…" };
+const READ = { en: "Read aloud, again if time is left.", zh: "请朗读，读完可重复。" };
+const NO_ANSWER = {
+  en: "The gateway does not answer; is 'kouxing run' running?",
+  zh: "网关没有应答：kouxing run 在运行吗？",
+};
 
 const element = (id) => document.getElementById(id);
 const dialog = element("learn-mouth");
@@ -41,7 +51,7 @@ export class MouthLesson {
   constructor(voices, handlers) {
     this.#voices = voices;
     this.#handlers = handlers;
-    element("lesson-text").value = navigator.language.startsWith("zh") ? "zh" : "en";
+    element("lesson-text").value = document.documentElement.lang;
     for (const [id, act] of Object.entries({
       "lesson-start": () => this.#record(),
       "lesson-finish": () => this.#finish(),
@@ -72,12 +82,15 @@ export class MouthLesson {
       const [, before, after] = figures(voice)[0];
       const day = new Date(voice.learntOn).toLocaleDateString();
       element("lesson-voice").firstElementChild.textContent =
-        `Your mouth was learnt on ${day}: opening ${before} → ${after}. 已学会你的口型。`;
+        say({
+          en: `Your mouth was learnt on ${day}: opening ${before} → ${after}.`,
+          zh: `${day} 学会了你的口型：张口 ${before} → ${after}。`,
+        });
     }
     const isSecure = navigator.mediaDevices !== undefined;
     element("lesson-start").disabled = !isSecure;
     element("lesson-insecure").hidden = isSecure;
-    element("lesson-insecure").textContent = NEEDS_SECURE;
+    element("lesson-insecure").textContent = say(NEEDS_SECURE);
     this.#show("intro");
     dialog.showModal();
     this.#handlers.opened();
@@ -101,11 +114,11 @@ export class MouthLesson {
     const recording = await this.#film(this.#stop.signal);
     if (recording === null) return;
     const problem = recording.problem();
-    if (problem === "") {
+    if (problem === null) {
       this.#recording = recording.encode();
       this.#learn();
     } else {
-      this.#fail(problem);
+      this.#fail(say(problem));
     }
   }
 
@@ -127,7 +140,7 @@ export class MouthLesson {
       await this.#read(recording, { video, tracker, context, stream, signal });
       return signal.aborted ? null : recording;
     } catch (error) {
-      if (!signal.aborted) this.#fail(NEEDS[error.name] ?? error.message);
+      if (!signal.aborted) this.#fail(NEEDS[error.name] ? say(NEEDS[error.name]) : error.message);
       return null;
     } finally {
       for (const track of stream?.getTracks() ?? []) track.stop();
@@ -145,7 +158,7 @@ export class MouthLesson {
     element("lesson-finish").disabled = true;
     element("lesson-time").value = 0;
     element("lesson-count").textContent = "";
-    element("lesson-advice").textContent = "Camera and microphone start … 正在启动";
+    element("lesson-advice").textContent = say(STARTING);
     this.#show("reading");
   }
 
@@ -159,7 +172,7 @@ export class MouthLesson {
         resolve({});
       };
       signal.addEventListener("abort", this.#finish);
-      for (const track of stream.getTracks()) track.onended = () => reject(new Error(UNPLUGGED));
+      for (const track of stream.getTracks()) track.onended = () => reject(new Error(say(UNPLUGGED)));
     });
     let next = nextPicture(video);
     while (!isOver) {
@@ -182,7 +195,7 @@ export class MouthLesson {
   #tellTime(beganMs, recording) {
     const nowMs = performance.now();
     if (beganMs === null) {
-      element("lesson-advice").textContent = "Show your face to the camera. 请把脸对准摄像头。";
+      element("lesson-advice").textContent = say(SHOW_FACE);
       return;
     }
     const readingMs = nowMs - beganMs - CLOSED_LIPS_MS;
@@ -191,9 +204,8 @@ export class MouthLesson {
     element("lesson-time").value = Math.max(0, readingMs / (1000 * this.readingS));
     element("lesson-reading").classList.toggle("due", readingMs >= 0);
     element("lesson-finish").disabled = readingMs < 1000 * MIN_READING * this.readingS;
-    const what =
-      readingMs < 0 ? "Keep your lips closed … 请先闭上嘴" : "Read aloud, again if time is left. 请朗读，读完可重复";
-    element("lesson-advice").textContent = recording.advice(nowMs) || what;
+    const advice = recording.advice(nowMs) ?? (readingMs < 0 ? LIPS_CLOSED : READ);
+    element("lesson-advice").textContent = say(advice);
     if (leftS <= 0) this.#finish();
   }
 
@@ -209,7 +221,7 @@ export class MouthLesson {
       const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
       answer = isJson ? await response.json() : { error: await response.text() };
     } catch {
-      answer = { error: "The gateway does not answer; is 'kouxing run' running? 网关没有应答。" };
+      answer = { error: say(NO_ANSWER) };
     }
     if (signal.aborted) return;
     if (answer.error !== undefined) {
@@ -223,10 +235,10 @@ export class MouthLesson {
   }
 
   #showResult({ before, after, curves }) {
-    element("lesson-verdict").textContent = verdict({ before, after });
+    element("lesson-verdict").textContent = say(verdict({ before, after }));
     const rows = figures({ before, after }).map((cells) => {
       const row = document.createElement("tr");
-      row.append(...cells.map((text, index) => cell(text, index === 0 ? "th" : "td")));
+      row.append(...cells.map((text, index) => cell(index === 0 ? say(text) : text, index === 0 ? "th" : "td")));
       return row;
     });
     element("lesson-figures").replaceChildren(...rows);

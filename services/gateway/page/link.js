@@ -29,20 +29,11 @@ export class Link {
   /** Look at another session; "" for the newest. */
   follow(session) {
     this.#chosen = session;
-    this.#send({ follow: session });
+    this.send({ follow: session });
   }
 
-  /** Have the gateway speak the sample sentence, and look at it; lips: the lip model, or null. */
-  play(what, lips) {
-    this.#send(lips === null ? { play: what } : { play: what, lips });
-  }
-
-  /** Let another lip model move the mouth of the sample sentence while it is spoken. */
-  chooseLips(lips) {
-    this.#send({ lips });
-  }
-
-  #send(command) {
+  /** Send a command, unless there is no connection. */
+  send(command) {
     if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
   }
 

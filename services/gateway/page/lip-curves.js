@@ -1,19 +1,28 @@
 // What was learnt, for people: curves and words. Pure code: nothing is drawn.
 
 const MEASURES = [
-  ["opening", "Opening 张口"],
-  ["width", "Width 宽度"],
-  ["jaw", "Jaw 下颌"],
+  ["opening", { en: "Opening", zh: "张口" }],
+  ["width", { en: "Width", zh: "宽度" }],
+  ["jaw", { en: "Jaw", zh: "下颌" }],
 ];
 const NOTEWORTHY = 0.02; // a difference of correlations
 const POOR = 0.2; // a correlation
 const GAP_S = 0.1; // between two values that no line joins
 
-const BETTER = "The head's lips now follow yours more closely. 现在头像的口型更像你了。";
-const SAME = "The head's lips follow yours about as well as before. 效果和以前差不多。";
-const WORSE =
-  "The head's lips do not follow yours so: discard this and try again, with light on your face and no " +
-  "other voices. 效果不好：建议放弃，换个光线好、安静的地方再试。";
+const BETTER = {
+  en: "The head's lips now follow yours more closely.",
+  zh: "现在头像的口型更像你了。",
+};
+const SAME = {
+  en: "The head's lips follow yours about as well as before.",
+  zh: "效果和以前差不多。",
+};
+const WORSE = {
+  en:
+    "The head's lips do not follow yours so: discard this and try again, with light on your face and " +
+    "no other voices.",
+  zh: "效果不好：建议放弃，换个光线好、安静的地方再试。",
+};
 
 /** Return an SVG path of a curve in a box; nothing is drawn where values are null or missing. */
 export function curvePath(times, values, { width, height, low, high }) {
@@ -38,7 +47,10 @@ export function extent(...curves) {
   return { low: Math.min(...values), high: Math.max(...values) };
 }
 
-/** Return rows [measure, before, after] of how closely the lips follow the speaker's, 1 at best. */
+/**
+ * Return rows [measure, before, after] of how closely the lips follow the speaker's, 1 at best; the measure in
+ * both languages.
+ */
 export function figures({ before, after }) {
   return MEASURES.map(([key, name]) => [name, figure(before[key]), figure(after[key])]);
 }
@@ -47,7 +59,7 @@ function figure(correlation) {
   return typeof correlation === "number" ? correlation.toFixed(2) : "–";
 }
 
-/** Return what the figures mean. */
+/** Return what the figures mean, in both languages. */
 export function verdict({ before, after }) {
   const gain = mean(after) - mean(before);
   if (mean(after) < POOR || gain < -NOTEWORTHY) return WORSE;

@@ -1,36 +1,37 @@
 // Puts the page together: what arrives, when it is due, and what the buttons do.
 
+import { Caption } from "./caption.js";
+import { Choices } from "./choices.js";
 import { Head } from "./head.js";
+import { say } from "./language.js";
 import { LevelMeter, SILENT_DB } from "./level.js";
 import { Link } from "./link.js";
 import { MouthLesson } from "./learn-mouth.js";
 import { NUM_FAPS } from "./messages.js";
 import { Microphone } from "./microphone.js";
-import { PhoneTrack } from "./phones.js";
+import { Notice } from "./notice.js";
 import { FapTrack, Playout } from "./playout.js";
 import { Presence } from "./presence.js";
 import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
-import { hint, stateKind, stateText } from "./status.js";
+import { Settings } from "./settings.js";
+import { delayText, errorText, hint, stateKind, stateText } from "./status.js";
 import { VoiceStore } from "./voice.js";
 
 const LABEL_EVERY_MS = 250;
 const DELAY_MS = 2000; // over which the delay is measured
-const NEWS_MS = 8000; // for which an error, or what happened, stays to be read
-const SHOW_PHONES = "kouxing.show-phones"; // where the browser keeps that choice
-const OTHER_MODEL =
-  "What was learnt of your mouth does not fit this version: press Learn my mouth. 口型模型已更新，请重新学习。";
 
 const element = (id) => document.getElementById(id);
 const playout = new Playout();
 const track = new FapTrack();
-const syllables = new PhoneTrack();
-const phones = new PhoneTrack(); // shown instead of the syllables, on request
 const meter = new LevelMeter();
 const presence = new Presence();
 const delays = new Recent(DELAY_MS); // ms, from the own voice to the picture
 const sound = new Sound(onSoundState);
 const voices = new VoiceStore(storage());
+const choices = new Choices(storage());
+const caption = new Caption(choices);
+const notice = new Notice();
 let head = null; // until it is loaded
 
 let connected = false;
@@ -43,7 +44,6 @@ let missing = []; // services that do not run
 let ownSession = null; // the one our microphone feeds
 let isSample = false; // the session is the sample sentence, which we asked for
 let lips = null; // the lip model that moves the mouth of the session
-let chosenLips = null; // the one that was chosen here last, for sessions to come
 let numFrames = 0;
 const faps = new Float32Array(NUM_FAPS);
 
@@ -69,7 +69,7 @@ window.kouxing = {
       soundMinusPictureMs: heardMs === null ? null : heardMs - playout.offsetMs,
       microphone: microphoneState === "on",
       lips,
-      caption: element("spoken").value,
+      caption: caption.text,
       voice: voices.voice?.profile ?? "",
       lesson: lesson.step,
     };
@@ -81,8 +81,7 @@ window.kouxing = {
 function forget() {
   playout.reset();
   track.reset();
-  syllables.reset();
-  phones.reset();
+  caption.reset();
   meter.reset();
   delays.reset();
 }
@@ -92,7 +91,6 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     connected = isConnected;
     wasConnected ||= connected;
     if (!connected) session = null;
-    showLips();
     showState();
   },
   fap(mediaTime, values) {
@@ -119,7 +117,8 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     switch (message.type) {
       case "session":
         if (message.session === session && session !== null && message.epoch > epoch) {
-          showNews("A service crashed and was started again. It goes on.", "hint");
+          const en = "A service crashed and was started again. It goes on.";
+          notice.tell(say({ en, zh: "一个服务崩溃后已重启，会话继续。" }), "hint");
         }
         if (message.session !== session) wasLive = false;
         ({ session, epoch } = message);
@@ -129,6 +128,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
           forget();
           lips = message.lips || null;
         }
+        if (isOwn()) chooseExpressiveness();
         showLips();
         showState();
         break;
@@ -141,13 +141,11 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
         showState();
         break;
       case "syllable":
-        syllables.accept(message);
-        break;
       case "phone":
-        phones.accept(message);
+        caption.accept(message);
         break;
       case "error":
-        showError(message.text);
+        showError(message);
         break;
     }
   },
@@ -158,6 +156,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
 const wanted = new Float32Array(NUM_FAPS);
 let rest = new Float32Array(NUM_FAPS); // the face while no session moves it
 let labelledMs = 0;
+let shownDb = SILENT_DB; // of the meter
 
 function draw(nowMs) {
   requestAnimationFrame(draw);
@@ -174,7 +173,7 @@ function draw(nowMs) {
   measureDelay(shownTime);
 
   showLevel(mediaTime);
-  if (mediaTime !== null) showCaption(mediaTime);
+  if (mediaTime !== null) caption.show(mediaTime);
   if (nowMs - labelledMs > LABEL_EVERY_MS) {
     labelledMs = nowMs;
     showState();
@@ -211,66 +210,33 @@ function showState() {
     microphoneState === "interrupted" || (wasLive && session !== null && session === ownSession);
   const delayMs = delays.percentile(0.5);
   element("status").dataset.state = stateKind({ connected, isLive });
-  const text = stateText({ connected, isLive, isInterrupted, delayMs });
-  setText(element("status").lastElementChild, text);
+  setText(element("state"), stateText({ connected, isLive, isInterrupted }));
+  setText(element("delay"), connected && isLive ? delayText(delayMs) : "");
   element("status").title = session === null ? "" : `session ${session}`;
-  if (newsTimer === null) {
-    const isMicrophoneInterrupted = microphoneState === "interrupted";
-    showNotice(hint({ connected, wasConnected, isMicrophoneInterrupted, missing }), "hint");
-  }
+  const isMicrophoneInterrupted = microphoneState === "interrupted";
+  notice.hint(hint({ connected, wasConnected, isMicrophoneInterrupted, missing }));
+  element("meter").setAttribute("aria-valuenow", Math.round(shownDb));
 }
 
-let newsTimer = null;
-
-function showError(text) {
-  showNews(text, "error");
+function showError(error) {
+  notice.tell(errorText(error), "error");
 }
 
-function showNews(text, kind) {
-  clearTimeout(newsTimer);
-  newsTimer = setTimeout(() => {
-    newsTimer = null;
-    showState();
-  }, NEWS_MS);
-  showNotice(text, kind);
+/** Whether the session that is shown is our microphone's, or the sample that we asked for. */
+function isOwn() {
+  return isSample || (session !== null && session === ownSession);
 }
 
-function showNotice(text, kind) {
-  const notice = element("notice");
-  notice.dataset.kind = kind;
-  notice.hidden = text === "";
-  setText(notice, text);
-}
-
-/** Show which lip model it is; only that of our own session can be chosen. */
 function showLips() {
-  const isOwn = isSample || (session !== null && session === ownSession);
-  element("lips").disabled = !isOwn;
-  element("lips").setAttribute("aria-pressed", lips === "learnt");
-}
-
-function showCaption(mediaTime) {
-  const { current, past } = (arePhonesShown() ? phones : syllables).at(mediaTime);
-  setText(element("spoken"), current);
-  const key = past.join(" ");
-  if (element("past").dataset.key !== key) {
-    element("past").dataset.key = key;
-    element("past").replaceChildren(...past.map(listItem));
-  }
-}
-
-function listItem(text) {
-  const item = document.createElement("li");
-  item.textContent = text;
-  return item;
+  if (isOwn() && lips !== null) settings.showLips(lips);
 }
 
 function showLevel(mediaTime) {
   // One's own voice is shown as it is recorded, not once more as it comes back.
   if (mediaTime !== null) meter.advance(mediaTime, ownSession === null);
-  const db = meter.decibels();
-  element("meter").firstElementChild.style.transform = `scaleX(${(1 - db / SILENT_DB).toFixed(3)})`;
-  element("meter").setAttribute("aria-valuenow", Math.round(db));
+  shownDb = meter.decibels();
+  const share = (1 - shownDb / SILENT_DB).toFixed(3);
+  element("meter").firstElementChild.style.transform = `scaleX(${share})`;
 }
 
 /** Return where this browser keeps things; null if it keeps nothing. */
@@ -294,7 +260,8 @@ function onSoundState() {
   if (playout.offsetMs !== null) sound.align(performance.now(), playout.offsetMs);
   button.setAttribute("aria-pressed", sound.state === "on");
   button.classList.toggle("asks", isBlocked);
-  setText(button.querySelector("span").firstChild, isBlocked ? "Turn on sound " : "Sound ");
+  setText(button.querySelector(".en"), isBlocked ? "Turn on sound" : "Sound");
+  setText(button.querySelector(".zh"), isBlocked ? "打开声音" : "声音");
 }
 
 element("sound").onclick = () => {
@@ -309,11 +276,11 @@ const microphone = new Microphone({
     return voices.voice?.profile ?? "";
   },
   lips() {
-    return chosenLips;
+    return choices.get("lips");
   },
   state(state) {
     if (microphoneState === "interrupted" && state === "on") {
-      showNews("The microphone is on again.", "hint");
+      notice.tell(say({ en: "The microphone is on again.", zh: "麦克风已恢复。" }), "hint");
     }
     microphoneState = state;
     element("microphone").setAttribute("aria-pressed", state === "on" || state === "interrupted");
@@ -334,33 +301,34 @@ const microphone = new Microphone({
     }
     ownSession = name;
     showLips();
+    if (name === session) chooseExpressiveness(); // the viewer heard of it first
     link.follow(name);
   },
-  error({ code, text }) {
-    showError(code === "bad-voice" ? OTHER_MODEL : text);
-  },
+  error: showError,
 });
 
 element("sample").onclick = () => {
-  link.play("sample", chosenLips);
+  link.send({ play: "sample", ...(choices.get("lips") && { lips: choices.get("lips") }) });
   if (sound.state === "blocked") sound.turnOn();
 };
 
-element("lips").onclick = () => {
-  chosenLips = lips === "learnt" ? "dynamic-visemes" : "learnt";
-  if (isSample) link.chooseLips(chosenLips);
-  else microphone.chooseLips(chosenLips);
-};
-
-function arePhonesShown() {
-  return element("show-phones").getAttribute("aria-pressed") === "true";
+/** Let the mouth of the session that is shown move as much as was chosen, if anything was. */
+function chooseExpressiveness() {
+  const expressiveness = choices.get("expressiveness");
+  if (expressiveness !== null && session !== null) link.send({ expressiveness });
 }
 
-element("show-phones").setAttribute("aria-pressed", storage()?.getItem(SHOW_PHONES) === "true");
-element("show-phones").onclick = () => {
-  element("show-phones").setAttribute("aria-pressed", !arePhonesShown());
-  storage()?.setItem(SHOW_PHONES, arePhonesShown());
-};
+const settings = new Settings(choices, {
+  heads: showHead,
+  lips(name) {
+    if (isSample) link.send({ lips: name });
+    else microphone.chooseLips(name);
+  },
+  expressiveness: chooseExpressiveness,
+  express(strengths) {
+    link.send({ express: strengths });
+  },
+});
 
 element("microphone").onclick = () => {
   if (microphone.active) microphone.stop();
@@ -381,7 +349,7 @@ const lesson = new MouthLesson(voices, {
 
 function showVoice() {
   element("learn").setAttribute("aria-pressed", voices.voice !== null);
-  if (voices.voice !== null) chosenLips ??= "learnt"; // no others have a voice
+  if (voices.voice !== null && choices.get("lips") === null) choices.set("lips", "learnt");
 }
 
 element("learn").onclick = () => lesson.open();
@@ -389,14 +357,26 @@ showVoice();
 
 // --- begin ---------------------------------------------------------------------------------------
 
+/** Load a head by its name; "" for the one that the gateway was started with. */
+async function showHead(name) {
+  element("loading").hidden = false;
+  const file = name === "" ? "head.glb" : `head-${name}.glb`;
+  try {
+    const loading = head ?? new Head(element("head"), document.querySelector("footer"));
+    await loading.load(file);
+    head = loading;
+    head.pose(faps);
+    head.draw(performance.now()); // the first time takes long, which says nothing about the stream
+    playout.reset();
+  } catch (error) {
+    showError({ text: `no head (is there a ${file}? see 'kouxing head export'): ${error.message}` });
+  }
+  element("loading").hidden = true;
+}
+
+const view = new URLSearchParams(location.search);
+document.body.dataset.view = view.get("view") ?? "";
+if (view.has("background")) document.documentElement.style.background = view.get("background");
 requestAnimationFrame(draw);
 sound.turnOn();
-try {
-  head = await Head.load(element("head"), document.querySelector("footer"), "head.glb");
-  head.pose(faps);
-  head.draw(performance.now()); // the first time takes long, which says nothing about the stream
-  playout.reset();
-} catch (error) {
-  showError(`no head (is there a head.glb? see 'kouxing head export'): ${error.message}`);
-}
-element("loading").hidden = true;
+await showHead(element("heads").value);

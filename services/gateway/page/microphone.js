@@ -1,6 +1,7 @@
 // The browser's microphone as a session's audio.
 
 import { capture, openCaptureContext } from "./capture.js";
+import { say } from "./language.js";
 import { socketUrl } from "./link.js";
 import { Uplink } from "./uplink.js";
 
@@ -42,7 +43,10 @@ export class Microphone {
   async start() {
     this.#handlers.state("starting");
     if (!navigator.mediaDevices) {
-      this.#fail("a microphone needs https, or this page at http://localhost");
+      this.#fail({
+        en: "A microphone needs https, or this page at http://localhost.",
+        zh: "使用麦克风需要 https 或 localhost。",
+      });
       return;
     }
     try {
@@ -51,13 +55,14 @@ export class Microphone {
       });
       this.#context = await openCaptureContext();
     } catch (error) {
-      const isDenied = error.name === "NotAllowedError";
-      const denied = "the microphone was not allowed 未允许使用麦克风";
-      this.#fail(isDenied ? denied : `no microphone: ${error.message}`);
+      const denied = { en: "The microphone was not allowed.", zh: "未允许使用麦克风。" };
+      const none = { en: `No microphone: ${error.message}`, zh: `没有麦克风：${error.message}` };
+      this.#fail(error.name === "NotAllowedError" ? denied : none);
       return;
     }
     for (const track of this.#stream.getTracks()) {
-      track.onended = () => this.#fail("the microphone was unplugged");
+      track.onended = () =>
+        this.#fail({ en: "The microphone was unplugged.", zh: "麦克风断开了。" });
     }
     capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
@@ -113,12 +118,15 @@ export class Microphone {
       this.#handlers.error(refusal);
       this.#release();
     } else {
-      this.#fail("the microphone stopped: the gateway takes none now; press Microphone to try again");
+      this.#fail({
+        en: "The microphone stopped: the gateway takes none now. Press Microphone to try again.",
+        zh: "麦克风已停止：网关暂不接受。请再按“麦克风”重试。",
+      });
     }
   }
 
-  #fail(text) {
-    this.#handlers.error({ type: "error", code: "microphone", text });
+  #fail(texts) {
+    this.#handlers.error({ code: "microphone", text: say(texts) });
     this.#release();
   }
 

@@ -7,14 +7,18 @@ export const LANDMARKS = [
   178, 181, 198, 263, 269, 284, 291, 297, 308, 311, 346, 348, 350, 356, 358, 362, 372, 402, 405, 420,
 ];
 
-export const NO_FACE =
-  "No face is seen: sit before the camera, with light on your face. 看不到脸：请正对摄像头，脸部要有光。";
-export const TOO_QUIET =
-  "Hardly anything is heard: speak up, or turn the microphone up. 声音太小：请大声一点，或调高麦克风音量。";
-
-export const TOO_SLOW =
-  "This computer follows too few pictures a second: close other programs and try again. " +
-  "这台电脑处理画面太慢：请关闭其他程序再试。";
+export const NO_FACE = {
+  en: "No face is seen: sit before the camera, with light on your face.",
+  zh: "看不到脸：请正对摄像头，脸部要有光。",
+};
+export const TOO_QUIET = {
+  en: "Hardly anything is heard: speak up, or turn the microphone up.",
+  zh: "声音太小：请大声一点，或调高麦克风音量。",
+};
+export const TOO_SLOW = {
+  en: "This computer follows too few pictures a second: close other programs and try again.",
+  zh: "这台电脑处理画面太慢：请关闭其他程序再试。",
+};
 
 const NO_FACE_MS = 1000; // without a face before it is said
 const QUIET_MS = 4000; // of quiet before it is said
@@ -60,17 +64,17 @@ export class FaceRecording {
     this.#frames.push({ ms: takenMs, landmarks });
   }
 
-  /** Return what the speaker should do otherwise at the moment; "" if all is well. */
+  /** Return what the speaker should do otherwise at the moment, in both languages; null if all is well. */
   advice(nowMs) {
     if (nowMs - this.#seenMs > NO_FACE_MS) return NO_FACE;
-    return nowMs - this.#heardMs > QUIET_MS ? TOO_QUIET : "";
+    return nowMs - this.#heardMs > QUIET_MS ? TOO_QUIET : null;
   }
 
-  /** Return why nothing can be learnt from all this; "" if it can. */
+  /** Return why nothing can be learnt from all this, in both languages; null if it can. */
   problem() {
     if (this.#numPictures === 0 || this.#frames.length < MIN_SEEN * this.#numPictures) return NO_FACE;
     if (this.#numLoud < MIN_LOUD * this.#chunks.length) return TOO_QUIET;
-    return this.#numPictures < (MIN_RATE_HZ * this.#numSamples) / this.#rateHz ? TOO_SLOW : "";
+    return this.#numPictures < (MIN_RATE_HZ * this.#numSamples) / this.#rateHz ? TOO_SLOW : null;
   }
 
   /** Return the landmark file. */

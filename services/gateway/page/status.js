@@ -1,37 +1,76 @@
 // What the page says about its state. Pure code: nothing is written to the page here.
 
+import { say } from "./language.js";
+
 /** Return the kind of state, for the light beside it: "lost", "waiting" or "live". */
 export function stateKind({ connected, isLive }) {
   if (!connected) return "lost";
   return isLive ? "live" : "waiting";
 }
 
-/**
- * Return the words for a state; isInterrupted: our microphone was live and is to be; delayMs, if not
- * null, is measured from the voice to the picture.
- */
-export function stateText({ connected, isLive, isInterrupted, delayMs }) {
-  if (!connected) return "connecting … 连接中";
-  if (!isLive) return isInterrupted ? "interrupted 中断" : "waiting for speech 等待语音";
-  return delayMs === null ? "live 直播" : `live 直播 · ${Math.round(delayMs / 10) * 10} ms`;
+/** Return the words for a state; isInterrupted: our microphone was live and is to be. */
+export function stateText({ connected, isLive, isInterrupted }) {
+  if (!connected) return say({ en: "connecting …", zh: "连接中…" });
+  if (isLive) return say({ en: "live", zh: "直播" });
+  return isInterrupted ? say({ en: "interrupted", zh: "中断" }) : say({ en: "waiting for speech", zh: "等待语音" });
+}
+
+/** Return the words for the delay from the voice to the picture; "" while it is not known. */
+export function delayText(delayMs) {
+  return delayMs === null ? "" : `${Math.round(delayMs / 10) * 10} ms`;
 }
 
 /** Return what does not work and what happens next; "" if all is well. */
 export function hint({ connected, wasConnected, isMicrophoneInterrupted, missing }) {
   if (!connected && wasConnected) {
-    return "The gateway stopped. This page goes on by itself when it runs again (kouxing run).";
+    return say({
+      en: "The gateway stopped. This page goes on by itself when it runs again (kouxing run).",
+      zh: "网关已停止。重新运行（kouxing run）后，本页会自动恢复。",
+    });
   }
   if (connected && missing.length > 0) return missingHint(missing);
-  if (isMicrophoneInterrupted) return "The microphone was interrupted. It goes on by itself.";
+  if (isMicrophoneInterrupted) {
+    return say({
+      en: "The microphone was interrupted. It goes on by itself.",
+      zh: "麦克风中断，会自动恢复。",
+    });
+  }
   return "";
 }
 
 function missingHint(missing) {
   if (missing[0] === "control") {
-    return "Control does not run. All goes on by itself when it does (kouxing run).";
+    return say({
+      en: "Control does not run. All goes on by itself when it does (kouxing run).",
+      zh: "控制服务（control）没有运行。运行 kouxing run 后会自动恢复。",
+    });
   }
-  const services = missing.join(" and the ");
-  const commands = missing.map((name) => `kouxing ${name}`).join("; ");
   const verb = missing.length > 1 ? "do" : "does";
-  return `The ${services} ${verb} not run. Under kouxing run it starts again by itself; otherwise: ${commands}`;
+  const commands = missing.map((name) => `kouxing ${name}`).join("; ");
+  return say({
+    en:
+      `The ${missing.join(" and the ")} ${verb} not run. Under kouxing run it starts again by itself; ` +
+      `otherwise: ${commands}`,
+    zh: `${missing.join("、")} 没有运行。用 kouxing run 时会自动重启；否则请运行：${commands}`,
+  });
+}
+
+// What services refuse, by the code of the error; the English text says more.
+const REFUSALS = {
+  "bad-audio": "音频有误",
+  "bad-voice": "学到的口型不适用于当前版本：请重新“学我的口型”",
+  "no-service": "缺少服务：请运行 kouxing run",
+  "session-exists": "同名会话已存在",
+  "too-many-sessions": "会话太多：请先关闭一些",
+  "unknown-session": "会话已不存在",
+  timeout: "服务没有及时应答：请重试",
+};
+
+/** Return the words for an error that came over the wire. */
+export function errorText({ code, text }) {
+  if (code === "bad-voice") {
+    text = "What was learnt of your mouth does not fit this version: press Learn my mouth.";
+  }
+  const zh = REFUSALS[code] ? `${REFUSALS[code]}（${text}）` : text;
+  return say({ en: text, zh });
 }

@@ -69,14 +69,14 @@ test("forty seconds fit into what the gateway takes", () => {
 
 test("while one reads, it is said when the face is gone or nothing is heard", () => {
   const good = record({ seconds: 6 });
-  assert.equal(good.advice(7000), "");
+  assert.equal(good.advice(7000), null);
   assert.equal(good.advice(8100), NO_FACE);
   assert.equal(record({ seconds: 6, rms: 0 }).advice(7000), TOO_QUIET);
-  assert.equal(record({ seconds: 3, rms: 0 }).advice(4000), "", "one may pause");
+  assert.equal(record({ seconds: 3, rms: 0 }).advice(4000), null, "one may pause");
 });
 
 test("nothing is learnt without a face or without a voice", () => {
-  assert.equal(record({ seconds: 6 }).problem(), "");
+  assert.equal(record({ seconds: 6 }).problem(), null);
   assert.equal(record({ seconds: 6, seen: (ms) => ms < 3000 }).problem(), NO_FACE);
   assert.equal(record({ seconds: 6, rms: 0.001 }).problem(), TOO_QUIET);
   assert.equal(new FaceRecording(RATE_HZ).problem(), NO_FACE);
@@ -99,15 +99,15 @@ test("the figures are put into words", () => {
   const before = { opening: 0.5, width: 0.412, jaw: null };
   const with_ = (opening) => ({ before, after: { ...before, opening } });
   assert.deepEqual(figures(with_(0.6)), [
-    ["Opening 张口", "0.50", "0.60"],
-    ["Width 宽度", "0.41", "0.41"],
-    ["Jaw 下颌", "–", "–"],
+    [{ en: "Opening", zh: "张口" }, "0.50", "0.60"],
+    [{ en: "Width", zh: "宽度" }, "0.41", "0.41"],
+    [{ en: "Jaw", zh: "下颌" }, "–", "–"],
   ]);
-  assert.match(verdict(with_(0.6)), /more closely/);
-  assert.match(verdict(with_(0.51)), /about as well/);
-  assert.match(verdict(with_(0.4)), /discard/);
+  assert.match(verdict(with_(0.6)).en, /more closely/);
+  assert.match(verdict(with_(0.51)).en, /about as well/);
+  assert.match(verdict(with_(0.4)).en, /discard/);
   const nothing = { opening: 0.1, width: 0.1, jaw: 0 };
-  assert.match(verdict({ before: nothing, after: { ...nothing, opening: 0.3 } }), /discard/);
+  assert.match(verdict({ before: nothing, after: { ...nothing, opening: 0.3 } }).en, /discard/);
 });
 
 class FakeStorage {

@@ -102,20 +102,6 @@ test("it connects again by itself, ever more slowly, to the session chosen last"
 
 test("commands are left out while it is not connected", () => {
   const link = new Link("", record().handlers);
-  link.play("sample", null);
+  link.send({ play: "sample" });
   assert.deepEqual(FakeWebSocket.made[0].sent, []);
-});
-
-test("the sample sentence is spoken with the lips that were chosen", () => {
-  const link = new Link("", record().handlers);
-  FakeWebSocket.made[0].open();
-  link.play("sample", null);
-  link.play("sample", "learnt");
-  link.chooseLips("dynamic-visemes");
-  const expected = [
-    { play: "sample" },
-    { play: "sample", lips: "learnt" },
-    { lips: "dynamic-visemes" },
-  ];
-  assert.deepEqual(FakeWebSocket.made[0].sent, expected);
 });
