@@ -206,10 +206,9 @@ def _find(folder: Path, name: str) -> Path:
 
 
 def _page_file(name: str, page_asset: str) -> web.StreamResponse:
-    if name == "head.glb":
-        path = Path(page_asset) if page_asset else PAGE / name
-    elif name == "head-woman.glb":
-        path = PAGE / "head.glb"
+    if name in ("head.glb", "head-woman.glb"):
+        is_own = name == "head.glb" and page_asset
+        path = Path(page_asset) if is_own else PAGE / "head.glb"
         if not path.is_file():
             text = f"the head is missing; make it with 'kouxing head export {path}'\n"
             raise web.HTTPNotFound(text=text)

@@ -78,7 +78,7 @@ def read_aloud(browser: Browser) -> None:
         " const { FaceRecording, TOO_SLOW } = await import('/recording.js');"
         " const problem = FaceRecording.prototype.problem;"
         " FaceRecording.prototype.problem = function () {"
-        "   const found = problem.call(this); return found === TOO_SLOW ? '' : found; };"
+        "   const found = problem.call(this); return found === TOO_SLOW ? null : found; };"
         "})()"
     )
     browser.evaluate("window.kouxing.readingS = 2")

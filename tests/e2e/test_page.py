@@ -6,6 +6,8 @@ the page has to show is known. The browser is driven by the Chrome DevTools Prot
 
 from __future__ import annotations
 
+import base64
+import io
 import subprocess
 import sys
 import wave
@@ -13,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -70,8 +73,8 @@ def system() -> Iterator[System]:
 def gateway(system: System) -> Iterator[Gateway]:
     for name, file in HEADS.items():
         if not file.is_file():
-            command = [sys.executable, "-m", "services", "head", "export", "--head", name, file]
-            subprocess.run(command, cwd=ROOT, check=True)
+            command = [sys.executable, "-m", "services", "head", "export", "--head", name]
+            subprocess.run([*command, str(file)], cwd=ROOT, check=True)
     gateway = Gateway(system.address, free_port())
     yield gateway
     assert gateway.stop() == 0
@@ -366,6 +369,63 @@ def test_another_head_is_shown(browser: Browser) -> None:
     differs = np.abs(woman.astype(int) - man).max(axis=2) > 40
     assert differs.mean() > 0.02
     assert (np.abs(woman.astype(int) - woman_again).max(axis=2) > 40).mean() < 0.005
+
+
+def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
+    system: System, session: Session, browser: Browser, tmp_path: Path
+) -> None:
+    recognizer = system.recognizer
+    assert recognizer is not None
+    before = set(recognizer.starts)
+    system.talk(session.name, A_FACE, "a")
+    browser.evaluate(
+        "window.saved = null; const make = URL.createObjectURL; URL.createObjectURL = (blob) =>"
+        " (blob.type.startsWith('video') && (window.saved = blob), make(blob))"
+    )
+    browser.click("record")
+    browser.wait_for("window.kouxing.state.recording")
+
+    write_tone(tmp_path / "tone.wav")  # 2 s
+    document = browser.command("DOM.getDocument")["root"]["nodeId"]
+    field = browser.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
+    files = [str(tmp_path / "tone.wav")]
+    browser.command("DOM.setFileInputFiles", nodeId=field, files=files)
+    wait_until(lambda: set(recognizer.starts) > before, 60)
+    (name,) = set(recognizer.starts) - before
+    wait_until(lambda: name in recognizer.finished, 60)  # it ends by itself
+    rate_hz = recognizer.starts[name].sample_rate_hz
+    samples = np.frombuffer(recognizer.pcm[name], "<i2").astype(float)
+    assert len(samples) > 1.9 * rate_hz
+    assert np.sqrt((samples[: 2 * rate_hz] ** 2).mean()) > 3000
+
+    browser.wait_for("window.kouxing.state.session === 'seen'")
+    browser.click("record")
+    browser.wait_for("!window.kouxing.state.recording && window.saved !== null")
+    video = base64.b64decode(
+        browser.evaluate(
+            "window.saved.arrayBuffer().then((data) =>"
+            " btoa(Array.from(new Uint8Array(data), (byte) => String.fromCharCode(byte)).join('')))"
+        )
+    )
+    with av.open(io.BytesIO(video), "r") as container:
+        assert {stream.type for stream in container.streams} == {"video", "audio"}
+        frames = container.decode(video=0)
+        pictures = [np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in frames]
+    assert len(pictures) > 5
+    assert colour(pictures[-1]).max() > 50  # skin
+    assert pictures[-1][2, 2].min() > 200  # its own background, not black
+
+
+def test_a_file_without_sound_is_refused(browser: Browser, tmp_path: Path) -> None:
+    (tmp_path / "not.wav").write_text("no sound")
+    document = browser.command("DOM.getDocument")["root"]["nodeId"]
+    field = browser.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
+    files = [str(tmp_path / "not.wav")]
+    browser.command("DOM.setFileInputFiles", nodeId=field, files=files)
+    browser.wait_for(
+        "document.getElementById('notice').textContent.includes('cannot read the sound of not.wav')"
+    )
+    assert not browser.evaluate("window.kouxing.state.microphone")
 
 
 def test_the_page_speaks_one_language(browser: Browser) -> None:

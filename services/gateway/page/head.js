@@ -90,6 +90,12 @@ export class Head {
     this.#frame(about.camera);
   }
 
+  /** Fill the background with a CSS colour; null: see through. */
+  fill(color) {
+    this.#renderer.setClearColor(color ?? 0, color === null ? 0 : 1);
+    this.#stale = true;
+  }
+
   /** Take on a face with the next picture: 68 values in FAP units. */
   pose(faps) {
     this.#faps = faps;

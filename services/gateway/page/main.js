@@ -16,6 +16,7 @@ import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
 import { Settings } from "./settings.js";
 import { delayText, errorText, hint, stateKind, stateText } from "./status.js";
+import { BACKGROUND, VideoRecorder } from "./video.js";
 import { VoiceStore } from "./voice.js";
 
 const LABEL_EVERY_MS = 250;
@@ -71,6 +72,7 @@ window.kouxing = {
       lips,
       caption: caption.text,
       voice: voices.voice?.profile ?? "",
+      recording: video.isRecording,
       lesson: lesson.step,
     };
   },
@@ -276,14 +278,16 @@ const microphone = new Microphone({
     return voices.voice?.profile ?? "";
   },
   lips() {
-    return choices.get("lips");
+    return chosenLips();
   },
   state(state) {
     if (microphoneState === "interrupted" && state === "on") {
       notice.tell(say({ en: "The microphone is on again.", zh: "麦克风已恢复。" }), "hint");
     }
     microphoneState = state;
-    element("microphone").setAttribute("aria-pressed", state === "on" || state === "interrupted");
+    const isOn = state === "on" || state === "interrupted";
+    element("microphone").setAttribute("aria-pressed", isOn && !microphone.isFile);
+    element("open-file").setAttribute("aria-pressed", isOn && microphone.isFile);
     element("microphone").setAttribute("aria-busy", state === "starting" || state === "interrupted");
     if (state === "off" && ownSession !== null) {
       ownSession = null;
@@ -297,7 +301,8 @@ const microphone = new Microphone({
   session(name) {
     if (ownSession === null) {
       wasSoundWanted = sound.wanted;
-      sound.turnOff(); // nobody wants to hear himself late, unless he asks for it
+      // Nobody wants to hear himself late, unless he asks for it.
+      if (!microphone.isFile) sound.turnOff();
     }
     ownSession = name;
     showLips();
@@ -308,7 +313,8 @@ const microphone = new Microphone({
 });
 
 element("sample").onclick = () => {
-  link.send({ play: "sample", ...(choices.get("lips") && { lips: choices.get("lips") }) });
+  const chosen = chosenLips();
+  link.send(chosen === null ? { play: "sample" } : { play: "sample", lips: chosen });
   if (sound.state === "blocked") sound.turnOn();
 };
 
@@ -331,8 +337,43 @@ const settings = new Settings(choices, {
 });
 
 element("microphone").onclick = () => {
-  if (microphone.active) microphone.stop();
-  else microphone.start();
+  const stops = microphone.active && !microphone.isFile;
+  microphone.stop();
+  if (!stops) microphone.start();
+};
+
+element("open-file").onclick = () => {
+  if (microphone.isFile) microphone.stop();
+  else element("file").click();
+};
+element("file").onchange = ({ target }) => {
+  if (target.files.length > 0) speakFile(target.files[0]);
+  target.value = ""; // the same file again is a choice, too
+};
+document.ondragover = (event) => event.preventDefault();
+document.ondrop = (event) => {
+  event.preventDefault();
+  if (event.dataTransfer.files.length > 0) speakFile(event.dataTransfer.files[0]);
+};
+
+function speakFile(file) {
+  if (sound.state === "blocked") sound.turnOn();
+  microphone.speak(file);
+}
+
+const video = new VideoRecorder();
+
+element("record").onclick = async () => {
+  if (video.isRecording) {
+    video.stop();
+    sound.untap();
+    head.fill(null);
+  } else if (head !== null) {
+    head.fill(BACKGROUND);
+    video.start(element("head"), await sound.tap());
+    if (playout.offsetMs !== null) sound.align(performance.now(), playout.offsetMs);
+  }
+  element("record").setAttribute("aria-pressed", video.isRecording);
 };
 
 const lesson = new MouthLesson(voices, {
@@ -347,9 +388,13 @@ const lesson = new MouthLesson(voices, {
   voice: showVoice,
 });
 
+/** Return the lip model for sessions to come; null for the system's. No others have a voice. */
+function chosenLips() {
+  return choices.get("lips") ?? (voices.voice === null ? null : "learnt");
+}
+
 function showVoice() {
   element("learn").setAttribute("aria-pressed", voices.voice !== null);
-  if (voices.voice !== null && choices.get("lips") === null) choices.set("lips", "learnt");
 }
 
 element("learn").onclick = () => lesson.open();

@@ -1,17 +1,20 @@
-// The browser's microphone as a session's audio.
+// The browser's microphone, or a file in its place, as a session's audio.
 
 import { capture, openCaptureContext } from "./capture.js";
+import { fileSpeech } from "./file-speech.js";
 import { say } from "./language.js";
 import { socketUrl } from "./link.js";
 import { Uplink } from "./uplink.js";
 
 const RETRY_MS = 500;
+const TAIL_MS = 1000; // of silence behind a file, for its last frames
 const GIVE_UP_MS = 30000; // a crashed service is started again within this
 
 export class Microphone {
   #handlers;
   #socket = null;
   #stream = null;
+  #speech = null; // of a file
   #context = null;
   #uplink = null; // while it streams
   #retry = null; // timer
@@ -28,6 +31,11 @@ export class Microphone {
 
   get active() {
     return this.#socket !== null || this.#stream !== null;
+  }
+
+  /** Whether a file is spoken instead. */
+  get isFile() {
+    return this.#speech !== null;
   }
 
   /** How long ago media time m was spoken, ms; null if this is not our session. */
@@ -64,6 +72,25 @@ export class Microphone {
       track.onended = () =>
         this.#fail({ en: "The microphone was unplugged.", zh: "麦克风断开了。" });
     }
+    this.#open();
+  }
+
+  /** Speak a file, as if it were the microphone. */
+  async speak(file) {
+    this.#release();
+    this.#handlers.state("starting");
+    try {
+      this.#context = await openCaptureContext();
+      this.#speech = await fileSpeech(this.#context, file);
+    } catch (error) {
+      this.#fail(error.zh ? error : { en: error.message, zh: error.message });
+      return;
+    }
+    this.#stream = this.#speech.stream;
+    this.#open();
+  }
+
+  #open() {
     capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
       this.#uplink?.send(performance.now(), recordedMs, chunk);
@@ -101,6 +128,7 @@ export class Microphone {
     this.#giveUpMs = null;
     this.#handlers.session(session);
     this.#handlers.state("on");
+    this.#speech?.play(() => setTimeout(() => this.#release(), TAIL_MS));
     const lips = this.#handlers.lips();
     if (lips !== null) this.chooseLips(lips);
   }
@@ -135,7 +163,7 @@ export class Microphone {
     clearTimeout(this.#retry);
     for (const track of this.#stream?.getTracks() ?? []) track.stop();
     this.#context?.close();
-    this.#socket = this.#stream = this.#context = this.#uplink = this.#giveUpMs = null;
+    this.#socket = this.#stream = this.#speech = this.#context = this.#uplink = this.#giveUpMs = null;
     socket?.close();
     this.#handlers.level(0);
     this.#handlers.state("off");

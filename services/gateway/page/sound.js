@@ -11,6 +11,8 @@ export class Sound {
   #node = null;
   #anchor = null;
   #changed;
+  #tap = null; // a node that takes the sound for a recording
+  #speaker = null;
 
   /** @param changed called when the state may have changed */
   constructor(changed) {
@@ -20,12 +22,20 @@ export class Sound {
   /** "off", "blocked" (the browser wants a gesture first) or "on". */
   get state() {
     if (!this.wanted) return "off";
-    return this.#node !== null && this.#context.state === "running" ? "on" : "blocked";
+    return this.#isRunning ? "on" : "blocked";
+  }
+
+  get #isRunning() {
+    return this.#node !== null && this.#context.state === "running";
   }
 
   /** Turn sound on; without a gesture the browser may leave it blocked. */
   async turnOn() {
     this.wanted = true;
+    await this.#run();
+  }
+
+  async #run() {
     if (this.#context === null) {
       this.#context = new AudioContext({ sampleRate: RATE_HZ, latencyHint: "interactive" });
       await this.#context.audioWorklet.addModule("sound-worklet.js");
@@ -34,42 +44,64 @@ export class Sound {
         outputChannelCount: [1],
       });
       node.port.onmessage = ({ data }) => (this.numPlayed = data);
-      node.connect(this.#context.destination);
+      this.#speaker = new GainNode(this.#context);
+      node.connect(this.#speaker).connect(this.#context.destination);
       this.#node = node;
       this.#context.onstatechange = this.#changed;
     }
     // Without a gesture resume() neither succeeds nor fails until there is one: do not wait for it.
-    if (this.wanted) this.#context.resume().catch(() => {});
+    if (this.wanted || this.#tap) this.#context.resume().catch(() => {});
+    if (this.#speaker) this.#speaker.gain.value = this.wanted ? 1 : 0;
     this.#changed();
   }
 
   turnOff() {
     this.wanted = false;
+    if (this.#speaker) this.#speaker.gain.value = 0;
+    if (this.#tap === null) this.#rest();
+    this.#changed();
+  }
+
+  #rest() {
     this.#context?.suspend();
     this.#anchor = null;
-    this.#changed();
+  }
+
+  /** Return the sound as a stream, also while it is off; until untap. */
+  async tap() {
+    await this.#run();
+    this.#tap = new MediaStreamAudioDestinationNode(this.#context);
+    this.#node.connect(this.#tap);
+    await this.#run();
+    return this.#tap.stream;
+  }
+
+  untap() {
+    this.#node.disconnect(this.#tap);
+    this.#tap = null;
+    if (!this.wanted) this.#rest();
   }
 
   /** Queue sound, int16, to be played when media time gets there. */
   push(mediaTime, samples) {
-    if (this.state === "on") this.#node.port.postMessage({ mediaTime, samples });
+    if (this.#isRunning) this.#node.port.postMessage({ mediaTime, samples });
   }
 
   get outputLatencyMs() {
-    if (this.state !== "on") return 0;
+    if (!this.#isRunning) return 0;
     return 1000 * (this.#context.outputLatency || this.#context.baseLatency || 0);
   }
 
   /** Play such that media time m is heard at m + offset on the page's clock. */
   align(nowMs, offsetMs) {
-    if (this.state !== "on") return;
+    if (!this.#isRunning) return;
     this.#anchor = Math.round((nowMs - offsetMs) * SAMPLES_PER_MS - this.#heardFrame(nowMs));
     this.#node.port.postMessage({ anchor: this.#anchor });
   }
 
   /** The offset at which sound is really heard now; null while none is aligned. */
   offsetMs(nowMs) {
-    if (this.state !== "on" || this.#anchor === null) return null;
+    if (!this.#isRunning || this.#anchor === null) return null;
     return nowMs - (this.#heardFrame(nowMs) + this.#anchor) / SAMPLES_PER_MS;
   }
 
