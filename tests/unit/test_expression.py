@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.synthesizer.face import Face
 from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from services.synthesizer.modifiers.expression import mix
+from services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
 from shared.errors import UserError
 from shared.face.expressions import ExpressionName, check_expressions
 from shared.face.faps import FAP_NUMBER, MOUTH_FAPS, NUM_FAPS
@@ -110,6 +110,17 @@ def test_no_expression_opens_lips_that_speech_has_shut(
     shut = gaps(frames)[from_sound] <= SHUT
     assert (gaps(mixed)[from_sound][shut] <= gaps(frames)[from_sound][shut] + 0.01).all()
     assert (gaps(mixed)[from_sound][~shut] >= SHUT - 0.01).all()
+
+
+def test_surprise_on_an_open_vowel_drops_no_jaw() -> None:
+    wide = np.zeros(NUM_FAPS, np.float32)
+    wide[np.array(MOUTH_FAPS) - 1] = LIPS.parameters.target[VISEME_INDEX["a"]]
+    wide[UPPER] *= 1.5
+    wide[LOWER] *= 1.5
+    mixed = wide.copy()
+    mix(mixed, EXPRESSION_FAPS["surprise"], 1.0)
+    assert (gaps(mixed) <= np.maximum(gaps(wide), 900.0) + 0.01).all()
+    assert mixed[JAW] <= max(wide[JAW], 500.0)
 
 
 @settings(max_examples=20)

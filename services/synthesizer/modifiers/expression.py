@@ -13,7 +13,7 @@ c       movement of both lips upwards, by the expression      FAP       (6,)
 a       how far the lips are free, 0 to 1                     1         (6,)
 ======  ====================================================  ========  =====
 
-    g' = g + a d    d >= min(20 - g, 0)
+    g' = g + a d    min(20 - g, 0) <= a d <= max(900 - g, 0)
     both lips move up by c if c > 0, else by a c
 
 ``a`` is 0 where the gap is at most 20, or the lower lip is that near to where it is shut (f), and 1
@@ -50,6 +50,7 @@ EXPRESSION_FAPS: dict[str, NDArray[np.float32]] = {  # (68,) at full strength
         for name, shapes in _GESTURES.items()
     },
 }
+_WIDEST, _WIDEST_JAW = 900.0, 500.0  # that an expression opens the mouth, FAP units
 _LIPS = np.concatenate([UPPER, LOWER, [JAW]])
 
 
@@ -90,11 +91,11 @@ def mix(faps: NDArray[np.float32], expression: NDArray[np.float32], free: float)
     room = np.tile(np.minimum(room[:3], room[3:]), 2)  # the inner lip and the outer one
     apart = np.maximum(room / (OPEN - SHUT), free)
     change = -(expression[UPPER] + expression[LOWER])
-    change = np.maximum(apart * change, np.minimum(SHUT - gap, 0.0))
+    change = np.clip(apart * change, np.minimum(SHUT - gap, 0.0), np.maximum(_WIDEST - gap, 0.0))
     upwards = (expression[LOWER] - expression[UPPER]) / 2.0
     upwards = np.where(upwards > 0.0, upwards, apart * upwards)
     upper, lower = -upwards - change / 2.0, upwards - change / 2.0
-    jaw = apart[0] * expression[JAW]
+    jaw = min(apart[0] * expression[JAW], max(_WIDEST_JAW - faps[JAW], 0.0))
     rest = expression.copy()
     rest[_LIPS] = np.concatenate([upper, lower, [jaw]])
     faps += rest
