@@ -21,6 +21,7 @@ from services.recognizer.acoustic.acoustic_model import (
     run_scoring_tasks,
 )
 from services.recognizer.front_end.pcm import SLICE, progress_at, slices
+from services.recognizer.front_end.pitch import Pitch
 from services.recognizer.front_end.resample import Resampler
 from services.recognizer.lip_source import LipsFromSound, delay_for
 from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
@@ -207,6 +208,7 @@ class _Segment:
         self._start = start  # media time, samples at 16 kHz
         self._num_samples = 0  # processed since then
         self._slice: list[NDArray[np.float32]] = []  # pieces of the 20 ms under way
+        self._pitch = Pitch()
         self._resampler = resampler
         self._recognizer = recognizer
 
@@ -234,7 +236,9 @@ class _Segment:
             self._slice.append(piece)
             outputs += self._placed((yield from self._recognizer.process(piece)))
             if self._num_samples % SLICE == 0:
-                outputs.append(progress_at(self.media_time, np.concatenate(self._slice)))
+                outputs.append(
+                    progress_at(self.media_time, np.concatenate(self._slice), self._pitch)
+                )
                 self._slice.clear()
         return outputs
 

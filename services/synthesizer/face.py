@@ -94,6 +94,7 @@ class Face:
         self._is_speaking = False  # at the last frame
         self._changes: deque[SpeechChange] = deque()  # of frames to come
         self._levels: list[tuple[float, float]] = []  # since the last frame
+        self._pitches: list[tuple[float, float]] = []  # since the last frame
         self._recent: deque[SoundEvent] = deque()  # those a new lip model is told
         self._mouth = self._mouth_before = np.zeros(len(MOUTH_FAPS))  # of the last two frames
         self._change, self._change_s = NO_TRANSITION, 0.0  # from the lip model before; its age
@@ -180,6 +181,8 @@ class Face:
             self._changes.append(event)
         elif isinstance(event, Progress):
             self._levels.append((event.time_s, event.level_db))
+            if event.pitch_hz > 0.0:
+                self._pitches.append((event.time_s, event.pitch_hz))
 
     def _frames_until(self, time_s: float) -> list[Frame]:
         """Frames not made yet that are due when the sound is known up to ``time_s``."""
@@ -213,12 +216,13 @@ class Face:
             step_s=1.0 / self._frame_rate_hz,
             is_speaking=self._is_speaking or self._will_speak(),
             levels=self._levels,
+            pitches=self._pitches,
             articulation=mouth.articulation,
             amplitude_applies=self._lip_model.amplitude_applies,
         )
         for modifier in self._modifiers:
             modifier.apply(faps, moment)
-        self._levels = []
+        self._levels, self._pitches = [], []
         self._num_frames += 1
         return self._time_s, faps
 

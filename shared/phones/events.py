@@ -59,6 +59,7 @@ class Progress:
     time_s: float
     level_db: float  # RMS of the newest 20 ms, full scale = 0
     zero_crossing_rate: float = 0.0  # sign changes a sample in the newest 20 ms, 0 to 1
+    pitch_hz: float = 0.0  # of the voice there; 0: it has none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,6 +42,7 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 media_time=to_samples(event.time_s),
                 level_db=event.level_db,
                 zero_crossing_rate=event.zero_crossing_rate,
+                pitch_hz=event.pitch_hz,
             )
         case events.EndOfSound():
             return EndOfPhones(media_time=to_samples(event.time_s))
@@ -80,6 +81,7 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
                 time_s=time_s,
                 level_db=message.level_db,
                 zero_crossing_rate=message.zero_crossing_rate,
+                pitch_hz=message.pitch_hz,
             )
         case EndOfPhones():
             return events.EndOfSound(time_s=time_s)

@@ -53,6 +53,7 @@ class Progress(Message):
     level_db: Annotated[float, Meta(ge=-200, le=20)]  # RMS of the newest 20 ms, full scale = 0
     # sign changes a sample in the newest 20 ms
     zero_crossing_rate: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    pitch_hz: Annotated[float, Meta(ge=0, le=1000)] = 0.0  # of the voice there; 0: it has none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

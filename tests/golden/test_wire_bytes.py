@@ -24,6 +24,7 @@ DIGESTS = {
     "version2-heartbeat.json": "6ff43c3df98604b937bb4f5c0917f6ece320505ca15292a4e75077d7c3c26aa4",
     "version2-progress.json": "0f497d631815a1fe745f5b5e5a0005170f03f8942de8f19bee013c3db37e508f",
     "version2-status.json": "76082bd28da61ec5ab45bf74abb2c610126af722c0af8ca6bcdbfd83f4e4442e",
+    "version2-pitch.json": "31891c9db98db7a19deb2198869a4f42b05d2b41e1f0f7e885f2e82538d8b66a",
     "version2-voice.json": "1a748175ef62d82ae6c0be096aaaaf969ef9b9b309e68571e4dbaececb2d7289",
 }
 

@@ -28,12 +28,19 @@ def levels(*parts: tuple[float, float]) -> list[float]:
     return [level_db for duration_s, level_db in parts for _ in range(round(duration_s / FRAME_S))]
 
 
-def show(face: Face, levels_db: Sequence[float], step: int = 1) -> NDArray[np.float32]:
-    """Frames of a sound with these levels, which arrives in so many at a time."""
+def show(
+    face: Face, levels_db: Sequence[float], step: int = 1, pitch_hz: Sequence[float] = ()
+) -> NDArray[np.float32]:
+    """Frames of a sound with these levels and pitches, which arrives in so many at a time."""
+    pitch_hz = pitch_hz or [0.0] * len(levels_db)
     frames = face.accept(SpeechChange(active=True, time_s=0.0))
     for first in range(0, len(levels_db), step):
         for number in range(first, min(first + step, len(levels_db))):
-            progress = Progress(time_s=(number + 1) * FRAME_S, level_db=levels_db[number])
+            progress = Progress(
+                time_s=(number + 1) * FRAME_S,
+                level_db=levels_db[number],
+                pitch_hz=pitch_hz[number],
+            )
             frames += face.accept(progress)
     return np.array([faps for _, faps in frames])
 
@@ -60,6 +67,20 @@ def test_brows_rise_and_the_head_dips_with_most_stressed_syllables() -> None:
     dips = np.array([lively(STRESSED, seed)[:, PITCH].max() for seed in range(1, 21)])
     assert 8 < np.count_nonzero(dips > 500.0) < 20
     assert dips.max() < np.deg2rad(2.5) * 1e5
+
+
+def test_a_raised_voice_is_stress_too() -> None:
+    levels_db = levels((1.0, QUIET_DB), (0.2, QUIET_DB + 3.0), (0.8, QUIET_DB))
+    pitch_hz = levels((1.0, 200.0), (0.2, 280.0), (0.8, 200.0))
+    raised, level = (
+        [
+            show(make_face(idle_motion_seed=seed), levels_db, pitch_hz=each)[:, BROW].max() > 10.0
+            for seed in range(1, 21)
+        ]
+        for each in (pitch_hz, [200.0] * len(levels_db))
+    )
+    assert sum(raised) > 5
+    assert sum(level) == 0
 
 
 def test_the_head_nods_when_a_phrase_ends_and_the_eyes_stay() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from services.recognizer.front_end.pitch import Pitch
 from shared.clock import to_seconds
 from shared.phones.events import Progress
 
@@ -87,18 +88,20 @@ def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
     return float(np.count_nonzero(np.diff(np.signbit(samples)))) / len(samples)
 
 
-def progress_at(media_time: int, newest: NDArray[np.float32]) -> Progress:
-    """Tell of the sound up to ``media_time`` by its newest samples, shape (n,)."""
+def progress_at(media_time: int, newest: NDArray[np.float32], pitch: Pitch) -> Progress:
+    """Tell of the sound up to ``media_time`` by its newest slice, shape (320,)."""
     return Progress(
         time_s=to_seconds(media_time),
         level_db=level_db(newest),
         zero_crossing_rate=zero_crossing_rate(newest),
+        pitch_hz=pitch.accept_slice(newest),
     )
 
 
 def progress_of(samples: NDArray[np.float32]) -> list[Progress]:
     """Return what a live recognizer tells of a whole sound, 16 kHz mono, every 20 ms."""
+    pitch = Pitch()
     return [
-        progress_at(end, samples[end - SLICE : end])
+        progress_at(end, samples[end - SLICE : end], pitch)
         for end in range(SLICE, len(samples) + 1, SLICE)
     ]

@@ -2,8 +2,13 @@
 
 Speakers raise their brows and dip their heads with stressed syllables, and nod when a phrase ends
 (Graf et al. 2002; Swerts & Krahmer 2010); not always, and not always as far, which is drawn at
-random. The level of the voice stands for stress: a syllable counts that stands out from those of
-the last seconds. In pauses the eyes leave the listener more often.
+random. A syllable is stressed that stands out from those of the last seconds, by its level and by
+its pitch:
+
+    (level - mean) / spread + (pitch - mean) / spread > 1.2
+
+with the pitch in semitones, and its term between -1 and 1. In pauses the eyes leave the listener
+more often.
 
 Two filters in a row make each movement smooth. No FAP of the mouth is touched, and everything
 follows from the seed and the sound.
@@ -26,7 +31,9 @@ _LEVEL_S = 0.03  # time constants: of the level,
 _USUAL_S = 3.0  # and of what is usual
 _FIRST_DB, _FIRST_SPREAD_DB = -26.0, 5.0  # dBFS, until the speaker is known
 _PAUSE_DB = 15.0  # a level this far below the mean is no speech
-_STRESS = 1.0  # spreads above the mean
+_STRESS = 1.2  # spreads above the mean
+_FIRST_SPREAD_ST = 3.0  # semitones
+_LEAST_SPREAD_DB, _LEAST_SPREAD_ST = 2.0, 1.0
 _STRESS_EVERY_S = 0.8  # at most
 _PHRASE_S, _PHRASE_END_S = 0.8, 0.14  # speech before a nod, and silence
 _THINKING_S = (0.45, 2.5)  # of silence
@@ -62,9 +69,14 @@ class Life:
         self._idle = IdleMotion(seed)
         self._rng = np.random.default_rng([seed, 1])
         self._levels: deque[tuple[float, float]] = deque()
+        self._pitches: deque[tuple[float, float]] = deque()
         self._level_s = 0.0  # media time of the last level
         self._level_db = self._mean_db = _FIRST_DB
         self._spread_db = _FIRST_SPREAD_DB
+        self._pitch_s = 0.0  # media time of the last pitch
+        self._mean_st = math.nan  # nothing is known of the voice
+        self._spread_st = _FIRST_SPREAD_ST
+        self._raised = 0.0  # pitch above the mean, in spreads
         self._is_stressed = False
         self._phrase_s = 0.0  # speech since the last end of a phrase
         self._silence_s = math.inf
@@ -78,6 +90,9 @@ class Life:
         until_s = min(moment.known_s, moment.time_s + _LEAD_S)
         before_s = self._silence_s
         self._silence_s += step_s
+        self._pitches += moment.pitches
+        while self._pitches and self._pitches[0][0] <= until_s:
+            self._follow_pitch(*self._pitches.popleft())
         while self._levels and self._levels[0][0] <= until_s:
             time_s, level_db = self._levels.popleft()
             if moment.is_speaking:  # else it is noise
@@ -96,6 +111,17 @@ class Life:
             return State.SPEAKING
         return State.THINKING if self._silence_s < _THINKING_S[1] else State.LISTENING
 
+    def _follow_pitch(self, time_s: float, pitch_hz: float) -> None:
+        elapsed_s = min(max(time_s - self._pitch_s, 0.0), 1.0)
+        self._pitch_s = time_s
+        pitch_st = 12.0 * math.log2(pitch_hz)
+        if math.isnan(self._mean_st):
+            self._mean_st = pitch_st
+        above_st = pitch_st - self._mean_st
+        self._raised = min(max(above_st / max(self._spread_st, _LEAST_SPREAD_ST), -1.0), 1.0)
+        self._mean_st += above_st * _share(elapsed_s, _USUAL_S)
+        self._spread_st += (abs(above_st) - self._spread_st) * _share(elapsed_s, _USUAL_S)
+
     def _follow_level(self, time_s: float, level_db: float, now_s: float) -> None:
         elapsed_s = min(max(time_s - self._level_s, 0.0), 1.0)
         self._level_s = time_s
@@ -109,7 +135,8 @@ class Life:
         self._mean_db += above_db * _share(elapsed_s, _USUAL_S)
         self._spread_db += (abs(above_db) - self._spread_db) * _share(elapsed_s, _USUAL_S)
         was_stressed = self._is_stressed
-        self._is_stressed = above_db > _STRESS * self._spread_db
+        louder = above_db / max(self._spread_db, _LEAST_SPREAD_DB)
+        self._is_stressed = louder + self._raised > _STRESS
         if self._is_stressed and not was_stressed and now_s - self._stress_s > _STRESS_EVERY_S:
             self._stress_s = now_s
             self._move(self._brow, _BROW_SHARE, 1.0, now_s + _BROW_HELD_S)

@@ -23,6 +23,7 @@ class Moment:
     is_speaking: bool  # somebody speaks, or is known to begin in a moment
     levels: Sequence[tuple[float, float]]  # new since the frame before: media time s, level dB
     articulation: Articulation
+    pitches: Sequence[tuple[float, float]] = ()  # of voices, new as well: media time s, Hz
     amplitude_applies: bool = True  # else the lips follow the level already
 
 

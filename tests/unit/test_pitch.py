@@ -1,0 +1,53 @@
+"""The pitch of made-up voices."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.recognizer.front_end.pitch import Pitch
+
+pytestmark = pytest.mark.unit
+
+RATE_HZ, SLICE = 16_000, 320
+
+
+def voice(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Ten harmonics of a frequency for each sample."""
+    phase = 2.0 * np.pi * np.cumsum(frequency_hz) / RATE_HZ
+    tones = [np.sin(number * phase) / number for number in range(1, 11)]
+    return np.asarray(0.1 * np.sum(tones, axis=0), np.float32)
+
+
+def pitches(samples: NDArray[np.float32]) -> NDArray[np.float64]:
+    pitch = Pitch()
+    return np.array([pitch.accept_slice(each) for each in samples.reshape(-1, SLICE)])
+
+
+def noise(num_samples: int) -> NDArray[np.float32]:
+    return np.random.default_rng(1).normal(0.0, 0.01, num_samples).astype(np.float32)
+
+
+@pytest.mark.parametrize("frequency_hz", [80.0, 120.0, 220.0, 330.0])
+def test_the_pitch_of_a_voice_is_found(frequency_hz: float) -> None:
+    found = pitches(voice(np.full(RATE_HZ, frequency_hz)))[10:]
+    np.testing.assert_allclose(found, frequency_hz, rtol=0.03)
+
+
+def test_it_follows_a_rising_voice_and_noise_and_silence_have_none() -> None:
+    rising = voice(np.linspace(150.0, 250.0, RATE_HZ))
+    silent = np.zeros(RATE_HZ // 2, np.float32)
+    found = pitches(np.concatenate([silent, rising, noise(RATE_HZ)]))
+    assert not found[:25].any()
+    expected_hz = np.linspace(150.0, 250.0, 50)
+    np.testing.assert_allclose(found[35:73], expected_hz[10:48], rtol=0.05)
+    assert np.count_nonzero(found[80:]) < 5
+
+
+def test_a_long_session_starts_again_in_a_pause_and_goes_on() -> None:
+    pause = noise(RATE_HZ)
+    spoken = voice(np.full(11 * RATE_HZ, 200.0))
+    found = pitches(np.concatenate([spoken, pause, spoken[: 2 * RATE_HZ]]))
+    np.testing.assert_allclose(found[10:545], 200.0, rtol=0.03)
+    np.testing.assert_allclose(found[12 * 50 + 10 :], 200.0, rtol=0.03)
