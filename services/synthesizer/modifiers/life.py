@@ -36,7 +36,7 @@ _FIRST_SPREAD_ST = 3.0  # semitones
 _LEAST_SPREAD_DB, _LEAST_SPREAD_ST = 2.0, 1.0
 _STRESS_EVERY_S = 0.8  # at most
 _PHRASE_S, _PHRASE_END_S = 0.8, 0.14  # speech before a nod, and silence
-_THINKING_S = (0.45, 2.5)  # of silence
+_THINKING_S = (0.7, 2.5)  # of silence
 
 _BROW_SHARE, _BEAT_SHARE, _NOD_SHARE = 0.55, 0.7, 0.85  # of the occasions
 _LEAST = 0.5  # of a movement's size, at random
