@@ -18,7 +18,9 @@ _SLICE_MS = 20.0
 _FULL_SCALE = 32768.0  # Kaldi's samples are 16-bit integers
 # Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalised cross-correlation is over 0.8
 _VOICED = -0.43
-_RESTART_S = 10.0  # the tracker keeps all it has heard; it starts again in the next pause
+# The tracker keeps all it has heard. It starts again in the first pause after a while, at last in
+# whatever is heard.
+_RESTART_S, _LONGEST_S = 10.0, 30.0
 
 
 class Pitch:
@@ -52,7 +54,7 @@ class Pitch:
         if num_ready == 0:
             return 0.0
         voicing, log_pitch = self._tracker.get_frame(num_ready - 1)
-        if voicing < _VOICED:
+        if voicing < _VOICED and self._heard_s < _LONGEST_S:
             return math.exp(log_pitch)
         if self._heard_s > _RESTART_S:
             self._start()
