@@ -20,6 +20,7 @@ import numpy as np
 import soundfile
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
 from corpora.feature_cache import as_floats
@@ -42,8 +43,10 @@ _BEYOND = 25  # positions that the teacher alone hears
 _BLOCK_LENGTHS, _BLOCK_PROBS = (5, 10, 20), (0.2, 0.4, 0.4)
 _FROM_START_PROB = 0.5  # of a recording
 _FIRST_ROW_PROB, _MAX_START = 0.7, 1200  # row of the table of positions
-_DISTURB_PROB, _TEMPO_PROB = 0.9, 0.4
-_MAX_STRETCH = 1.6  # samples needed for an excerpt, of any speed and tempo
+_DISTURB_PROB, _TEMPO_PROB, _HURRY_PROB = 0.9, 0.3, 0.4
+_MAX_STRETCH = 2.2  # samples needed for an excerpt, of any speed and tempo
+_MAX_SHORTENING = 0.7  # of the duration of a frame that is like its neighbours
+_STEADY_FRAMES = 5  # that steadiness is averaged over
 _TEACHER_PEAK = 0.5
 _BABBLE_PROB, _MAX_VOICES, _MIN_BABBLE_DB, _MAX_BABBLE_DB = 0.15, 3, 0.0, 20.0
 _CLIP_PROB, _MIN_CLIPPED = 0.1, 0.15  # lowest limit, of the peak
@@ -132,10 +135,28 @@ def _frames(
         [WhisperMel().accept_waveform(one) for one in (sound, scale_level(disturbed, rng))]
     )
     source = source_frames(len(frames), speed, num_source)
-    if rng.random() < _TEMPO_PROB:
-        frames, changed = change_tempo(frames, rng)
+    draw = rng.random()
+    if draw < _TEMPO_PROB + _HURRY_PROB:
+        frames, changed = (change_tempo if draw < _TEMPO_PROB else _hurry)(frames, rng)
         source = source[changed]
     return frames, source
+
+
+def _hurry(frames: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.int64]]:
+    """Shorten what is steady, as fast speakers do: vowels and pauses more than consonants.
+
+    Returns
+    -------
+    tuple
+        The new frames, (m, k), and their source frames, (m,).
+    """
+    change = np.abs(np.diff(frames[:, :NUM_MELS], axis=0, prepend=frames[:1, :NUM_MELS]))
+    change = uniform_filter1d(change.mean(axis=1), _STEADY_FRAMES)
+    steady = 1 / (1 + np.square(change / (np.median(change) + _TINY)))
+    durations = 1 - rng.uniform(0, _MAX_SHORTENING) * steady
+    ends = np.cumsum(durations)
+    kept = np.searchsorted(ends, np.arange(ends[0], ends[-1]))
+    return frames[kept], kept
 
 
 def _with_voices(

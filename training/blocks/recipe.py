@@ -1,6 +1,6 @@
 """From corpora to the block model: labels, readout, tuned encoder, model card.
 
-HMMs, phone language model, the states' prior and the search's weights are those of a neural model
+HMMs, phone language model, the states' prior and the acoustic scale are those of a neural model
 made before, which also aligns the recordings with their texts. A first readout is learnt of
 Whisper's encoder as it is, on windows. Then encoder and readout are tuned in blocks.
 
@@ -12,6 +12,7 @@ are deleted at the end.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -34,8 +35,9 @@ from training.neural.whisper_weights import load_whisper
 from training.progress import Report
 from training.training_set import FRAMES_PER_MINUTE, load_examples
 
-NUM_READOUT_STEPS, NUM_STEPS = 450, 450
+NUM_READOUT_STEPS, NUM_STEPS = 450, 475
 BLOCK_LENGTH = 5  # positions, live
+_PHONE_PENALTY = 2.0  # most of the network's errors are phones that it leaves out
 
 _DRAW = Draw(
     kinds={"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)},
@@ -139,7 +141,7 @@ def train_blocks(
         report=report,
     )
     model = BlockModel(
-        topology=before.topology,
+        topology=replace(before.topology, phone_penalty=_PHONE_PENALTY),
         network=onnx_of(network.encoder, network.readout, BLOCK_LENGTH),
         log_prior=before.log_prior,
         acoustic_scale=before.acoustic_scale,
