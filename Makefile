@@ -6,7 +6,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
-HEADS := $(PAGE)/head.glb $(PAGE)/head-man.glb $(PAGE)/head-elder.glb $(PAGE)/head-child.glb
+HEADS := $(PAGE)/head.glb $(patsubst %,$(PAGE)/head-%.glb,man elder child ada leo rosa mika)
 RIVALS := evaluation/lips/rivals
 CLIENT := proto/node
 SAMPLE := shared/demo/hello-female.wav

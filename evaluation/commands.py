@@ -359,6 +359,20 @@ def plot_mouths(
         print_message(f"wrote {path}")
 
 
+@plot_app.command(name="heads")
+def plot_heads(
+    folder: Annotated[Path, typer.Argument(help="Folder for the sheets.")] = Path("out/heads"),
+    choices: Annotated[
+        Path | None, typer.Option(help="Folder for a small picture of every head.")
+    ] = None,
+) -> None:
+    """Draw every head, and the faces of every viseme, from the front and from 40 degrees."""
+    from evaluation.system.head_pictures import draw_choices, draw_sheets
+
+    for path in draw_sheets(folder) + (draw_choices(choices) if choices else []):
+        print_message(f"wrote {path}")
+
+
 @plot_app.command(name="clip")
 def plot_clip(
     name: Annotated[str, typer.Argument(help="Name of the clip.")],

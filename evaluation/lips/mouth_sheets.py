@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from evaluation.system.head_pictures import head_names
 from services.driver.config import Framing
-from services.driver.head.head import ASSETS, DEFAULT_HEAD, Head
+from services.driver.head.head import DEFAULT_HEAD, Head
 from services.driver.render.renderer import Renderer
 from services.driver.render.scene import camera
 from services.synthesizer.config import SynthesizerConfig
@@ -48,8 +49,7 @@ def draw_mouth_sheets(folder: Path) -> list[Path]:
     """
     usual = SynthesizerConfig().expressiveness
     rows, faces = [], []
-    names = sorted((path.stem for path in ASSETS.glob("*.npz")), key=DEFAULT_HEAD.__ne__)
-    for name in names:
+    for name in head_names():
         turns = [0.0, _THREE_QUARTER_DEG] + [_PROFILE_DEG] * (name == DEFAULT_HEAD)
         shapes = {label: _expressed(viseme, usual) for viseme, label in _VISEMES.items()}
         rows += [_row(name, shapes, Framing.MOUTH, turn, _CELL_PX) for turn in turns]

@@ -12,7 +12,11 @@ from services.driver.config import DriverConfig
 
 DEFAULT_HEAD = DriverConfig().head
 HeadName = Annotated[
-    str, typer.Option("--head", help="woman, man, elder, child, an .npz, or a .glb with morphs.")
+    str,
+    typer.Option(
+        "--head",
+        help="woman, man, elder, child, ada, leo, rosa, mika, an .npz, or a .glb with morphs.",
+    ),
 ]
 
 app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")

@@ -36,7 +36,10 @@ def run(
         bool, typer.Option("--stop-after", help="Stop once the file has been played.")
     ] = False,
     head: Annotated[
-        str, typer.Option(help="woman, man, elder, child, an .npz, or a .glb with morphs.")
+        str,
+        typer.Option(
+            help="woman, man, elder, child, ada, leo, rosa, mika, an .npz, or a .glb with morphs."
+        ),
     ] = "",
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
     port: Annotated[

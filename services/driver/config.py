@@ -32,7 +32,7 @@ class DriverConfig(ServiceConfig):
     out: str = "out"
     """Folder for recorded videos."""
     head: str = "woman"
-    """A head of the package (woman, man, elder, child), an .npz, or a .glb with morph targets."""
+    """woman, man, elder, child, ada, leo, rosa, mika, an .npz, or a .glb with morph targets."""
     background: str = "studio"
     """studio, #rrggbb, or the name of a colour."""
     camera: Framing = Framing.FACE

@@ -26,7 +26,7 @@ THREE = PAGE / "node_modules" / "three"
 FACE_MESH = PAGE / "node_modules" / "@mediapipe" / "face_mesh"
 # The files that are served: of the page, and of the module that finds a face in a picture.
 SUFFIXES = {
-    PAGE: {".html", ".js", ".css", ".svg", ".glb"},
+    PAGE: {".html", ".js", ".css", ".svg", ".glb", ".webp"},
     FACE_MESH: {".js", ".wasm", ".data", ".binarypb"},
 }
 PING_S = 20.0  # a browser that has vanished is noticed within this

@@ -92,7 +92,7 @@ def test_vertices_of_a_group_move_as_one() -> None:
     np.testing.assert_allclose(fields[[30, 31, 50]], [[1, 0], [1, 0], [0, 1]], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["man", "elder", "child"])
+@pytest.mark.parametrize("name", ["man", "elder", "child", "leo", "mika"])
 def test_short_hair_lies_over_the_scalp(name: str) -> None:
     style = people.PEOPLE[name].hair
     rng = np.random.default_rng(1)
@@ -103,7 +103,7 @@ def test_short_hair_lies_over_the_scalp(name: str) -> None:
     assert list(made) == ["hair", "hair_tips"]
     for part in made.values():
         reach = np.linalg.norm(part.vertices - middle, axis=1)
-        assert reach.min() > 0.79
+        assert reach.min() > 0.78
         assert reach.max() < 1.1
         assert (part.uv >= 0).all()
         assert (part.uv <= 1).all()
@@ -113,12 +113,40 @@ def test_short_hair_lies_over_the_scalp(name: str) -> None:
     assert (inside[1:] < 0).all()
 
 
-def test_shells_of_short_hair_thin_out() -> None:
-    painted = paint_parts.hair((0.1, 0.1, 0.1), people.PEOPLE["man"].hair)
-    shells = np.split(painted[..., 3], hair.NUM_SHELLS, axis=1)
-    cover = [float(shell.mean()) for shell in shells]
-    assert cover == sorted(cover, reverse=True)
-    assert all(shell[-1].max() < 0.3 for shell in shells)  # nothing is left at the hairline
+def test_locks_thin_out_and_the_body_does_not() -> None:
+    body, *locks = np.split(paint_parts.hair((0.1, 0.1, 0.1))[..., 3], hair.NUM_BANDS, axis=1)
+    assert (body == 1).all()
+    for lock in locks:
+        middle = lock[100:150].mean()
+        assert lock[-1].max() < 0.3  # nothing is left at the tip
+        assert lock[-20:].mean() < 0.6 * middle
+        assert lock[:, 0].max() == 0
+        assert lock[:, -1].max() == 0
+
+
+def test_coarse_locks_have_the_rims_of_the_fine_ones() -> None:
+    locks = people.PEOPLE["woman"].hair.parts(np.zeros((0, 3)))["hair_tips"]
+    coarse = hair.coarse_locks(len(locks.vertices))
+    assert 2 * len(coarse) == len(locks.triangles)
+    areas = []
+    for triangles in (coarse, locks.triangles):
+        a, b, c = (locks.vertices[triangles[:, corner]] for corner in range(3))
+        areas.append(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    assert areas[0] == pytest.approx(areas[1], rel=0.1)
+
+
+@pytest.mark.parametrize("name", people.PEOPLE)
+def test_hair_faces_outwards(name: str) -> None:
+    """Occlusion is judged, and light is worked out, along the normals."""
+    rng = np.random.default_rng(1)
+    away = rng.standard_normal((1500, 3))
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    middle = np.array([0.0, 5.93, 0.42])
+    for part in people.PEOPLE[name].hair.parts(middle + 0.8 * away).values():
+        a, b, c = (part.vertices[part.triangles[:, corner]] for corner in range(3))
+        centre = (a + b + c) / 3
+        axis = np.where(centre[:, 1:2] > middle[1], middle, centre * [0, 1, 0] + [0, 0, 0.2])
+        assert ((np.cross(b - a, c - a) * (centre - axis)).sum(axis=1) > 0).mean() > 0.8
 
 
 def test_clip_cuts_at_height_zero() -> None:

@@ -17,6 +17,7 @@ from training.heads import paint, paint_parts, parts
 from training.heads.asset import Piece, write
 from training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
 from training.heads.feature_points import FEATURE_POINTS
+from training.heads.hair import coarse_locks
 from training.heads.makehuman import PIVOT, MakeHuman
 from training.heads.measures import (
     eye_sockets,
@@ -41,6 +42,15 @@ Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 LOWEST = 3.4  # dm, where the bust ends
+# the band round the neck, as rings about the garment's edge: outwards and up, dm
+_NECKBAND = (
+    (0.036, 0.000),
+    (0.046, 0.014),
+    (0.044, 0.044),
+    (0.026, 0.056),
+    (0.010, 0.03),
+    (0.0, -0.04),
+)
 # the front edge of the left upper eyelid, from the nose outwards
 LEFT_LID = (6886, 6844, 6841, 6838, 6785, 6784, 6790, 6793, 6796, 6799)
 LEFT_LOWER_LID = (
@@ -106,7 +116,7 @@ class Builder:
         ]
         shade(pieces, self.reference.vertices, self._cavity, person.hair)
         output.parent.mkdir(parents=True, exist_ok=True)
-        write(output, pieces, self._textures(person), skin, self._tongue, fapu)
+        write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
 
     def measured(
         self,
@@ -185,10 +195,7 @@ class Builder:
         # the edge is folded in towards the neck
         ring, local = np.unique(rim, return_inverse=True)
         local = local.reshape(rim.shape)
-        folds = [
-            points[ring] + out * normals[ring] + [0, up, 0]
-            for out, up in ((0.034, 0.012), (0.020, 0.014), (0.002, -0.03))
-        ]
+        folds = [points[ring] + out * normals[ring] + [0, up, 0] for out, up in _NECKBAND]
         strips = []
         before = rim
         for step in range(len(folds)):
@@ -233,7 +240,9 @@ class Builder:
         pieces = []
         for name, part in person.hair.parts(layout).items():
             part.vertices = part.vertices + warp(part.vertices)
-            pieces.append(Piece(name, part, "hair", 0.7, np.ones(len(part.vertices))))
+            count = len(part.vertices)
+            coarse = coarse_locks(count) if name == "hair_tips" else None
+            pieces.append(Piece(name, part, "hair", 0.7, np.ones(count), coarse_triangles=coarse))
         return pieces
 
     def _lashes(self, skin: Skin, fields: Fields, length: float) -> Piece:
@@ -313,11 +322,11 @@ class Builder:
         lips = lip_outline(self.reference)
         return {
             "skin": encode(paint.skin(self._map, brow, lid, lips, look, person.hair)),
-            "eye": encode(paint_parts.eye()),
+            "eye": encode(paint_parts.eye(look.iris, look.iris_size)),
             "teeth_upper": encode(paint_parts.teeth(parts.UPPER_TEETH)),
             "teeth_lower": encode(paint_parts.teeth(parts.LOWER_TEETH)),
             "tongue": encode(paint_parts.tongue()),
             "cloth": encode(paint_parts.cloth(look.cloth)),
-            "hair": encode(paint_parts.hair(look.hair, person.hair)),
+            "hair": encode(paint_parts.hair(look.hair)),
             "lashes": encode(paint_parts.lashes()),
         }

@@ -43,8 +43,10 @@ def write(
     skin: Skin,
     tongue: Skin,
     fapu: dict[str, float],
+    *,
+    cel: bool,
 ) -> None:
-    """Write a head; lengths come in dm and are stored in m."""
+    """Write a head; lengths come in dm and are stored in m; ``cel`` as in ``Head``."""
 
     def metres(points: Float) -> NDArray[np.float32]:
         return np.asarray((points - PIVOT) * METRES_PER_UNIT, dtype=np.float32)
@@ -98,6 +100,7 @@ def write(
     centres = metres(np.stack([(e.vertices.max(0) + e.vertices.min(0)) / 2 for e in eyes]))
     arrays: dict[str, Any] = {
         "format": np.array(FORMAT),
+        "cel": np.array(cel),
         "vertices": metres(vertices),
         "uv": np.round(np.concatenate([p.part.uv for p in pieces]) * 65535).astype(np.uint16),
         "colors": np.round(

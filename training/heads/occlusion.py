@@ -15,6 +15,7 @@ from services.driver.head import surface
 from services.driver.render.renderer import standalone_context
 from training.heads.asset import Piece
 from training.heads.hair import Hair
+from training.heads.measures import neckline_height
 
 Float = NDArray[np.float64]
 
@@ -130,7 +131,7 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
         triangles = [
             p.part.triangles + first
             for p, first in zip(solid, offsets, strict=False)
-            if with_hair or not p.name.startswith("hair")
+            if p.name != "hair_tips" and (with_hair or p.name != "hair")
         ]
         return openness(vertices, normals, np.concatenate(triangles))
 
@@ -145,6 +146,9 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
         own = (1 - under_hair) * seen[rows] + under_hair * seen_with_hair[rows]
         own = np.clip(own, 0, 1)[:, None]
         if piece.name == "skin":
+            # behind the neckband the vertices are too sparse
+            bare = np.clip((layout[:, 1:2] - neckline_height(layout[:, 2:]) - 0.02) / 0.22, 0, 1)
+            own = bare * own + (1 - bare) * 0.55
             shaded = np.clip(0.10 + 1.0 * own, 0, 1) ** np.array([0.90, 1.0, 1.04])
             # ears under hair lie in its shadow, deeper than the sparse vertices tell
             ear = np.clip((np.abs(layout[:, :1]) - 0.645) / 0.04, 0, 1)
@@ -159,7 +163,7 @@ def shade(pieces: list[Piece], layout: Float, cavity: NDArray[np.bool_], hair: H
             )
             part.colors = np.repeat(lit, 3, axis=1)
         elif piece.name.startswith("hair"):
-            part.colors = np.repeat(0.45 + 0.55 * own, 3, axis=1)
+            part.colors = part.colors * (0.45 + 0.55 * own)
         elif piece.name.startswith("teeth"):
             part.colors = part.colors * (0.80 + 0.20 * np.clip(2 * own, 0, 1))
         elif piece.name == "tongue":

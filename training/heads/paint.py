@@ -77,14 +77,17 @@ class Look:
     skin: Color = (0.890, 0.725, 0.625)
     lip: Color = (0.720, 0.405, 0.385)
     lip_strength: float = 0.80
-    hair: Color = (0.135, 0.105, 0.095)
+    hair: Color = (0.175, 0.130, 0.112)
     brow: Color = (0.23, 0.165, 0.14)
     brow_width: float = 1.0
     brow_strength: float = 1.0
     blush: float = 1.0
     stubble: float = 0.0
     age: float = 0.0  # wrinkles and spots
+    iris: Color = (0.36, 0.22, 0.13)
+    iris_size: float = 1.0
     cloth: Color = (0.20, 0.29, 0.38)
+    cel: bool = False  # plain colours, light and shade
 
 
 def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: Hair) -> Float:
@@ -117,7 +120,7 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: 
 
     blotch = noise(shape, 26, 1)
     # the neck is thin: there the texture is squeezed, and grain would turn into streaks
-    grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1)
+    grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1) * (not look.cel)
     image *= 1 + 0.010 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
     fine = 0.010 * noise(shape, 1.1, 2) + 0.006 * noise(shape, 3.5, 3)
     image *= 1 + (grain * fine)[..., None]
@@ -160,7 +163,7 @@ _WRINKLES = (
     (((0.0, 6.335), (0.15, 6.345), (0.33, 6.32)), 0.45),
     (((0.0, 6.255), (0.20, 6.27), (0.40, 6.23)), 0.65),
     (((0.0, 6.175), (0.20, 6.195), (0.42, 6.15)), 0.55),
-    (((0.055, 5.93), (0.050, 6.00), (0.062, 6.07)), 0.6),
+    (((0.055, 5.93), (0.050, 6.00), (0.062, 6.07)), 0.25),
     (((0.45, 5.81), (0.51, 5.835), (0.57, 5.875)), 0.40),
     (((0.45, 5.78), (0.52, 5.78), (0.58, 5.785)), 0.45),
     (((0.45, 5.745), (0.50, 5.715), (0.55, 5.67)), 0.40),
@@ -231,38 +234,53 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> F
     return mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
 
 
+# a calm, friendly brow: from the nose outwards it rises, and falls less at its tail; share of its
+# length, height about the mean of its feature points, half of its breadth, both in dm, and the
+# direction of its hairs against its line, rad
+_BROW = np.array(
+    [
+        [0.00, -0.026, 0.014, 1.20],
+        [0.12, -0.022, 0.025, 1.00],
+        [0.38, -0.008, 0.026, 0.55],
+        [0.68, 0.004, 0.021, 0.25],
+        [0.88, -0.004, 0.012, 0.05],
+        [1.00, -0.016, 0.004, 0.00],
+    ]
+)
+
+
 def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
-    """Strokes along a spindle that follows the brow's middle line."""
-    curve = np.polynomial.Polynomial.fit(brow[:, 0], brow[:, 1], 2)
-    along = (face.x - brow[0, 0]) / (brow[-1, 0] - brow[0, 0])
-    # a calm brow: the feature points alone would have it fall outwards, which looks worried
-    across = face.y - curve(face.x) - 0.024 * (along - 0.45)
-    half = np.interp(along, [-0.05, 0.08, 0.45, 0.8, 1.05], [0.018, 0.034, 0.034, 0.022, 0.004])
-    half *= look.brow_width
-    body = np.clip(1.35 - np.abs(across) / half, 0, 1)
-    ends = np.clip((along + 0.08) / 0.16, 0, 1) * np.clip((1.06 - along) / 0.2, 0, 1)
-    # hairs lean outwards: noise that is long along sheared lines
-    shape = face.x.shape
-    fine = np.random.default_rng(5).standard_normal(shape)
-    lean = np.clip(along, 0, 1)
-    hairs = np.zeros(shape)
-    for slope, weight in ((1.6, 1 - lean), (0.35, lean)):
-        strand = _directed(fine, slope, 9)
-        hairs += weight * strand
-    hairs = np.clip(0.66 + 0.24 * hairs / hairs.std(), 0, 1)
-    amount = body * ends * hairs * (0.72 + 0.20 * np.clip(along, 0, 1))
+    """Draw a brow hair by hair along a spindle, over a soft ground."""
+    nose, temple = brow[0, 0] - 0.012, brow[-1, 0] + 0.015
+    line = interpolate.PchipInterpolator(_BROW[:, 0], _BROW[:, 1:])
+    near = (face.x > nose - 0.05) & (face.x < temple + 0.08) & (face.angle < 1.4)
+    near &= np.abs(face.y - brow[:, 1].mean()) < 0.14
+    x, y = face.x[near], face.y[near] - brow[:, 1].mean()
+    along = (x - nose) / (temple - nose)
+    middle, half, _ = line(np.clip(along, 0, 1)).T
+    half = half * look.brow_width
+    ends = np.clip((along + 0.06) / 0.28, 0, 1) * np.clip((1.03 - along) / 0.15, 0, 1)
+    ground = np.clip(1.25 - np.abs(y - middle) / half, 0, 1) * ends
+    rng = np.random.default_rng(5)
+    hairs = np.zeros(len(x))
+    for root in rng.uniform(0.0, 0.97, 230):
+        height, reach, lean = line(root)
+        reach *= look.brow_width
+        off = rng.uniform(-0.9, 0.7) * reach
+        slope = float(line(root, 1)[0]) / (temple - nose)
+        # hairs above the line lean down to it, those below it up
+        turn = np.arctan(slope) + lean * (0.75 - 0.45 * off / reach) + rng.normal(0, 0.10)
+        length = rng.uniform(0.035, 0.060) * (0.6 + 0.4 * look.brow_width)
+        foot = np.array([nose + root * (temple - nose), height + off])
+        away = np.stack([x, y], axis=1) - foot
+        t = (away @ [np.cos(turn), np.sin(turn)]) / length
+        bend = away @ [-np.sin(turn), np.cos(turn)] + 0.006 * np.clip(t, 0, 1) ** 2
+        thin = 0.0026 * np.clip(1.15 - np.clip(t, 0, 1), 0, 1)
+        hair = np.clip(1.3 - np.abs(bend) / np.maximum(thin, 1e-4), 0, 1) * (t > 0) * (t < 1)
+        hairs = 1 - (1 - hairs) * (1 - 0.62 * hair)
+    amount = np.zeros(face.x.shape)
+    amount[near] = np.clip(0.34 * ground + 0.85 * hairs * np.clip(ends * 1.6, 0, 1), 0, 0.95)
     return mix(image, look.brow, look.brow_strength * amount)
-
-
-def _directed(white: Float, slope: float, length: int) -> Float:
-    """Average noise along short lines, ``slope`` rows up for a column."""
-    total = np.zeros_like(white)
-    for step in np.linspace(-length, length, 2 * length + 1):
-        scale = 1.0 / np.hypot(1.0, slope)
-        total += ndimage.shift(white, (-slope * scale * step, scale * step), order=1, mode="wrap")
-    smooth: Float = ndimage.gaussian_filter(total, 0.7)
-    smooth /= smooth.std()
-    return smooth
 
 
 def _paint_roots(image: Float, face: FaceMap, look: Look, hair: Hair) -> Float:

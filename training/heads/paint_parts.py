@@ -5,15 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from training.heads.hair import NUM_SHELLS, Bob, Hair
+from training.heads.hair import NUM_BANDS
 from training.heads.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
 from training.heads.texture import Color, mix, noise
 
 Float = NDArray[np.float64]
 
 
-def eye(size: int = 256) -> Float:
-    """Paint an eyeball; the distance from the middle counts the angle from the pupil."""
+def eye(color: Color, iris_size: float = 1.0, size: int = 256) -> Float:
+    """Paint an eyeball; the distance from the middle counts the angle from the pupil.
+
+    ``color`` is the iris's where it is lightest, ``iris_size`` its size and the pupil's.
+    """
     place = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(place, place)
     angle = np.hypot(x, y) * EYE_RINGS[-1]
@@ -26,11 +29,11 @@ def eye(size: int = 256) -> Float:
         [0.2, 1.0, 1.0]
     )
     image = white
+    angle = angle / iris_size
     within = np.clip((angle - PUPIL_ANGLE) / (IRIS_ANGLE - PUPIL_ANGLE), 0, 1)
-    iris = np.array([0.17, 0.105, 0.07]) * (1 + 0.08 * spokes[..., None])
-    iris = iris + np.array([0.10, 0.06, 0.035]) * (1 - np.abs(2 * within - 0.9))[..., None]
-    iris = iris + np.array([0.10, 0.06, 0.03]) * np.clip(y / 0.3, -0.4, 1)[..., None]
-    iris *= np.clip(1.25 - within**4, 0.3, 1)[..., None]
+    bright = 0.55 + 0.30 * (1 - np.abs(2 * within - 0.9)) + 0.45 * np.clip(y / 0.3, -0.5, 1)
+    iris = np.array(color) * (bright * (1 + 0.10 * spokes))[..., None]
+    iris *= np.clip(1.25 - within**4, 0.25, 1)[..., None]  # a dark ring about it
     soft = 0.016
     image = _mix_images(image, iris, 1 / (1 + np.exp((angle - IRIS_ANGLE) / soft)))
     pupil = np.array([0.02, 0.016, 0.016])
@@ -79,45 +82,29 @@ def cloth(color: Color, size: int = 16) -> Float:
     return np.broadcast_to(np.array(color), (size, size, 3)).copy()
 
 
-def hair(color: Color, style: Hair) -> Float:
-    """Paint strands that run down the texture and thin out (RGBA)."""
-    return _long_hair(color) if isinstance(style, Bob) else _short_hair(color)
+def hair(color: Color, size: tuple[int, int] = (256, 96)) -> Float:
+    """Paint strands that run down the texture, in bands: one closed, and some that thin out (RGBA).
 
-
-def _long_hair(color: Color, size: tuple[int, int] = (512, 512)) -> Float:
-    """Strands for a sheet of hair; the tips and the front edge are thin."""
+    ``size`` is a band's. Roots fade in at the top, tips thin out at the bottom.
+    """
     rows, columns = size
-    v, u = np.meshgrid(
-        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
-    )
-    strands = 0.7 * noise(size, (70, 1.2), 11) + 0.5 * noise(size, (90, 4), 12)
-    shine = np.exp(-(((v - 0.20 + 0.012 * strands) / 0.07) ** 2))
-    value = 1 + 0.22 * strands + 0.55 * shine
-    image = np.array(color) * value[..., None] + np.array([0.045, 0.03, 0.02]) * shine[..., None]
-    tips = (0.99 - v) / 0.045 + 0.35 * noise(size, (40, 1.2), 13) + 0.35 * noise(size, (40, 5), 14)
-    front = np.clip(u / 0.055, 0, 1)
-    alpha = np.clip(tips, 0, 1) * front * front * (3 - 2 * front)
-    painted: Float = np.clip(np.concatenate([image, alpha[..., None]], axis=2), 0, 1)
-    return painted
-
-
-def _short_hair(color: Color, size: tuple[int, int] = (160, 384)) -> Float:
-    """Strands for the shells of short hair, side by side; the outer the shell, the fewer."""
-    v = ((np.arange(size[0]) + 0.5) / size[0])[:, None]
-    tuft = 0.9 * noise(size, (22, 0.9), 16) + 0.4 * noise(size, (28, 3.0), 17)
-    tone = 0.9 * noise(size, (34, 0.8), 18) + 0.3 * noise(size, (20, 5), 19)
+    v = ((np.arange(rows) + 0.5) / rows)[:, None]
+    edge = 1 - np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :]  # 0 at the band's
+    contrast = 0.22 - 0.14 * max(color)  # light hair shows its shadows more
     bands = []
-    for shell in range(NUM_SHELLS):
-        value = 1 + 0.16 * tone + (0.10 + 0.05 * shell) * tuft
-        image = np.array(color) * value[..., None]
-        ends = (1.0 - v) / 0.10 + 0.35 * tuft - 0.2 - 0.25 * shell  # the hairline
-        alpha = np.clip(ends, 0, 1) * np.clip((1.0 - v) / 0.03, 0, 1)
-        if shell:
-            alpha = alpha * np.clip(1.5 - 0.5 * shell + 1.1 * tuft, 0, 1)
+    for band in range(NUM_BANDS):
+        strands = 0.8 * noise(size, (60, 0.9), 16 + band) + 0.5 * noise(size, (80, 3.5), 30 + band)
+        image = np.array(color) * (1 + contrast * np.clip(strands, -2, 2.5))[..., None]
+        alpha = np.ones(size)
+        if band:
+            ragged = 0.8 * noise(size, (50, 1.0), 50 + band) + 0.4 * noise(size, (60, 4), 70 + band)
+            alpha = np.clip((0.985 - v) / 0.11 + 0.45 * ragged, 0, 1)
+            alpha *= np.clip((1.0 - v) / 0.04, 0, 1) * np.clip(v / 0.10 + 0.25 * ragged, 0, 1)
+            alpha *= np.clip((edge - 0.08) / 0.30 + 0.35 * ragged, 0, 1) * (edge > 0.06)
         bands.append(np.concatenate([image, alpha[..., None]], axis=2))
     painted: Float = np.clip(np.concatenate(bands, axis=1), 0, 1)
     # few levels pack well
-    painted[..., :3] = np.round(painted[..., :3] * 90) / 90
+    painted[..., :3] = np.round(painted[..., :3] * 100) / 100
     painted[..., 3] = np.round(painted[..., 3] * 20) / 20
     return painted
 

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from services.driver.head.head import ASSETS, Head, Part
+from services.driver.render import shaders
 from services.driver.render.renderer import BACKGROUND
 from services.driver.render.scene import camera
 from shared.errors import UserError
@@ -324,6 +325,7 @@ def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, 
 
 
 def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
+    wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
     material: dict[str, Any] = {
         "name": part.name,
         "pbrMetallicRoughness": {
@@ -331,6 +333,7 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
             "metallicFactor": 0.0,
             "roughnessFactor": part.roughness,
         },
+        "extras": {"kouxing": {"wrap": wrap, "gloss": gloss, "shine": shine}},
     }
     if part.transparent:
         material["alphaMode"] = "BLEND"
@@ -386,6 +389,7 @@ def _description(head: Head) -> dict[str, Any]:
     own = (ASSETS / f"{head.name}.npz").is_file()
     return {
         "version": 1,
+        "cel": head.cel,
         "faps": faps,
         "fapu": head.fapu,
         "featurePoints": {

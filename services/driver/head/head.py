@@ -91,6 +91,8 @@ class Head:
         Encoded images (JPEG or PNG) by name.
     shading
         How the normals follow the vertices.
+    cel
+        Drawn with one tone of light and one of shade, as cartoons are.
     """
 
     name: str
@@ -106,6 +108,7 @@ class Head:
     eye_centres: Float32
     textures: dict[str, bytes]
     shading: Shading
+    cel: bool = False
 
     @property
     def normals(self) -> Float32:
@@ -285,6 +288,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
             for key, value in arrays.items()
             if key.startswith("texture_")
         },
+        cel=bool(arrays.get("cel", False)),
     )
 
 

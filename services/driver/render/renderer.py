@@ -244,8 +244,9 @@ class Renderer:
         for program in (self._program, self._eye_program):
             program["view_projection"] = matrix
             program["eye"] = self._camera.position
-        half_way = shaders.KEY + eye / np.linalg.norm(eye)
-        self._eye_program["half_way"] = tuple(half_way / np.linalg.norm(half_way))
+        for name, source in (("half_way", shaders.WINDOW), ("half_way_low", shaders.FLOOR)):
+            half_way = source + eye / np.linalg.norm(eye)
+            self._eye_program[name] = tuple(half_way / np.linalg.norm(half_way))
         for part in self.head.parts:
             if not part.transparent:
                 culled = 0 if part.double_sided else moderngl.CULL_FACE
@@ -270,6 +271,7 @@ class Renderer:
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
             ("two_sided", float(part.double_sided)),
+            ("cel", float(self.head.cel)),
             ("share", self._mouth_light if part.name in shaders.IN_MOUTH else 1.0),
         ):  # fmt: skip
             if name in program:

@@ -64,28 +64,38 @@ void main() {
 FRAGMENT = """
 #version 330
 uniform sampler2D base;
+uniform float cel;
 in vec2 uv;
 in vec3 light;
 in float high;
 out vec4 color;
 void main() {
     vec4 texel = texture(base, uv);
-    color = vec4(sqrt(texel.rgb * texel.rgb * light + high), texel.a);
+    vec3 lit = light;
+    if (cel > 0.0) {
+        float strength = dot(light, vec3(0.333));
+        lit *= mix(0.70, 0.96, smoothstep(0.60, 0.66, strength)) / max(strength, 0.25);
+    }
+    color = vec4(sqrt(texel.rgb * texel.rgb * lit + high * (1.0 - cel)), texel.a);
 }
 """
 
+# An eye mirrors a bright window, sharply, and the ground, softly.
 EYE_FRAGMENT = """
 #version 330
 uniform sampler2D base;
 uniform vec3 half_way;
+uniform vec3 half_way_low;
 in vec2 uv;
 in vec3 light;
 in vec3 normal;
 out vec4 color;
 void main() {
     vec3 texel = texture(base, uv).rgb;
-    float high = pow(max(dot(normalize(normal), half_way), 0.0), 400.0);
-    color = vec4(sqrt(texel * texel * light + 1.6 * high), 1.0);
+    vec3 n = normalize(normal);
+    float high = smoothstep(0.988, 0.9935, dot(n, half_way));
+    high += 0.05 * smoothstep(0.980, 0.992, dot(n, half_way_low));
+    color = vec4(sqrt(min(texel * texel * light + high, 1.0)), 1.0);
 }
 """
 
@@ -112,7 +122,9 @@ void main() {
 
 EYES = ("eye_left", "eye_right")
 IN_MOUTH = ("teeth_upper", "teeth_lower", "tongue")  # lit through the lips
-KEY = np.array([-0.42, 0.50, 0.80]) / np.linalg.norm([-0.42, 0.50, 0.80])  # as in the shader
+# what eyes mirror: lower than the key light, or the lid would hide it
+WINDOW = np.array([-0.36, 0.34, 0.87])
+FLOOR = np.array([0.50, -0.46, 0.82])
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
 MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
@@ -123,8 +135,8 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "teeth_upper": ((0.4, 0.38, 0.36), 30.0, 1.2),
     "teeth_lower": ((0.4, 0.38, 0.36), 30.0, 1.2),
     "tongue": ((0.5, 0.3, 0.3), 14.0, 2.0),
-    "hair": ((0.3, 0.3, 0.3), 14.0, 0.05),
-    "hair_tips": ((0.3, 0.3, 0.3), 14.0, 0.05),
+    "hair": ((0.3, 0.3, 0.3), 18.0, 0.16),
+    "hair_tips": ((0.3, 0.3, 0.3), 18.0, 0.16),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
 PLAIN = ((0.3, 0.3, 0.3), 14.0, 0.08)  # parts with no material known here

@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { dim, drawsInSoftware, physicalMaterial, plainMaterial, studio } from "./materials.js";
 import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
@@ -9,24 +10,15 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 const RADIANS_PER_UNIT = 1e-5;
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
 const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
-const SLOW_MS = 45; // for a picture
-const PAUSE_MS = 1000; // without a change, which is no slowness
+const SLOW_MS = 34; // for a picture: with a rest, 20 of them a second
+const MAX_REST_MS = 16;
 const JUDGE_EVERY_MS = 1500;
-const COARSER = 0.5;
-const MIN_PIXEL_RATIO = 0.6;
+const COARSER = 0.7;
+const MIN_PIXEL_RATIO = 0.35;
 const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
-/** Let what lies in shadow, by its baked vertex colours, shine less, too. */
-function dimInShadow(shader) {
-  shader.fragmentShader = shader.fragmentShader.replace(
-    "#include <aomap_fragment>",
-    "reflectedLight.directSpecular *= min(1.0, 1.6 * vColor.g * diffuse.g);",
-  );
-}
-
 export class Head {
-  frameMs = 1000 / 60; // between two pictures of the moving face, smoothed
   #renderer;
   #overlay;
   #scene = new THREE.Scene();
@@ -39,8 +31,11 @@ export class Head {
   #faps = null; // to be taken on
   #fovYDegrees = 22;
   #stale = true;
-  #pixelRatio = Math.min(2, Math.max(1.5, devicePixelRatio));
+  #software; // the processor draws
+  #pixelRatio;
   #fence = null; // passed when the picture before is done
+  #pictureMs = 0; // that a picture takes, smoothed
+  #restUntilMs = 0;
   #drawnMs = 0;
   #judgedMs = 0;
   #turn = new THREE.Quaternion();
@@ -51,6 +46,9 @@ export class Head {
     // Smooth edges come from more pixels than the screen has: multisampling speckles a mesh whose
     // triangles are as small as pixels.
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
+    this.#software = drawsInSoftware(this.#renderer.getContext());
+    this.#pixelRatio = this.#software ? 0.7 : Math.min(2, Math.max(1.5, devicePixelRatio));
+    if (!this.#software) this.#light();
     this.#controls = new OrbitControls(this.#camera, canvas);
     this.#controls.enablePan = false;
     this.#controls.minAzimuthAngle = -1.2;
@@ -58,7 +56,6 @@ export class Head {
     this.#controls.minPolarAngle = 1.1;
     this.#controls.maxPolarAngle = 1.9;
     this.#controls.addEventListener("change", () => (this.#stale = true));
-    this.#light();
     new ResizeObserver(() => {
       this.#resize();
       this.#render();
@@ -78,10 +75,13 @@ export class Head {
   #add(gltf) {
     this.#model = gltf.scene;
     const about = gltf.scene.getObjectByName("kouxing").userData.kouxing;
+    const plain = this.#software || about.cel;
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
       node.frustumCulled = false; // bounds do not follow the face
-      node.material.onBeforeCompile = dimInShadow;
+      node.material = plain
+        ? plainMaterial(node.name, node.material, about.cel)
+        : physicalMaterial(node.name, node.material);
       if (IN_MOUTH.includes(node.name)) this.#inMouth.push(node.material);
       if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
     });
@@ -105,7 +105,7 @@ export class Head {
   #apply(faps) {
     for (const mesh of this.#meshes) mesh.pose(faps);
     const light = mouthLight(faps);
-    for (const material of this.#inMouth) material.color.setScalar(light);
+    for (const material of this.#inMouth) dim(material, light);
     for (const { node, rest, turns } of this.#joints) {
       node.quaternion.copy(rest);
       for (const [index, axis] of turns) {
@@ -117,32 +117,44 @@ export class Head {
 
   /**
    * Draw, if anything has changed, and if the picture before is done: a slow machine is to have
-   * fewer pictures rather than a queue of late ones that block the page.
+   * fewer pictures rather than a queue of late ones that block the page. Where the processor draws,
+   * it rests as long as a picture took, for sound and messages are its work, too.
    */
   draw(nowMs) {
-    if (!this.#stale || !this.#isDone()) return;
+    if (!this.#stale || !this.#isDone(nowMs) || nowMs < this.#restUntilMs) return;
     this.#stale = false;
-    const intervalMs = nowMs - this.#drawnMs;
     this.#drawnMs = nowMs;
-    if (intervalMs < PAUSE_MS) this.frameMs += 0.1 * (intervalMs - this.frameMs);
     if (nowMs - this.#judgedMs > JUDGE_EVERY_MS) {
       this.#judgedMs = nowMs;
-      if (this.frameMs > SLOW_MS && this.#pixelRatio > MIN_PIXEL_RATIO) {
+      if (this.#pictureMs > SLOW_MS && this.#pixelRatio > MIN_PIXEL_RATIO) {
         this.#pixelRatio = Math.max(MIN_PIXEL_RATIO, COARSER * this.#pixelRatio);
+        this.#pictureMs = 0; // judged anew
         this.#resize();
       }
+      this.#renderer.domElement.title = this.#description();
     }
     if (this.#faps !== null) this.#apply(this.#faps);
     this.#faps = null;
     this.#render();
   }
 
-  #isDone() {
+  /** Say how the head is drawn, if it is less than it could be. */
+  #description() {
+    const { width, height } = this.#renderer.domElement;
+    return this.#software
+      ? `Drawn without a graphics card: ${width} x ${height} pixels`
+      : "";
+  }
+
+  #isDone(nowMs) {
     const gl = this.#renderer.getContext();
     if (this.#fence !== null) {
       if (gl.clientWaitSync(this.#fence, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
       gl.deleteSync(this.#fence);
       this.#fence = null;
+      const tookMs = nowMs - this.#drawnMs;
+      this.#pictureMs += 0.2 * (tookMs - this.#pictureMs);
+      if (this.#software) this.#restUntilMs = nowMs + Math.min(tookMs, MAX_REST_MS);
     }
     return true;
   }
@@ -182,13 +194,13 @@ export class Head {
     this.#resize();
   }
 
-  /** A key from the front upper left, a fill, a rim, and soft light from everywhere. */
+  /** A key from the front upper left, a rim, and the light of a studio. */
   #light() {
-    this.#scene.add(new THREE.HemisphereLight(0xffffff, 0xc4ab9c, 2.1));
+    this.#scene.environment = studio(this.#renderer);
     for (const [color, intensity, x, y, z] of [
-      [0xfff2e4, 2.1, -0.5, 0.6, 1],
-      [0xe6eeff, 0.7, 1, 0.1, 0.9],
-      [0xffffff, 0.6, 0.4, 0.9, -1],
+      [0xfff2e4, 2.4, -0.42, 0.5, 0.8],
+      [0xe6eeff, 0.6, 0.75, 0.1, 0.6],
+      [0xffffff, 0.9, 0.55, 0.45, -0.7],
     ]) {
       const light = new THREE.DirectionalLight(color, intensity);
       light.position.set(x, y, z);

@@ -6,6 +6,10 @@ export const HEADS = [
   ["man", { en: "man", zh: "男士" }],
   ["elder", { en: "elder", zh: "老人" }],
   ["child", { en: "child", zh: "孩子" }],
+  ["ada", { en: "Ada", zh: "艾达" }],
+  ["leo", { en: "Leo", zh: "利奥" }],
+  ["rosa", { en: "Rosa", zh: "罗莎" }],
+  ["mika", { en: "Mika (cartoon)", zh: "米卡（卡通）" }],
 ];
 
 export const LIPS = [

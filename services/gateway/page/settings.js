@@ -52,6 +52,7 @@ export class Settings {
     setLanguage(name);
     element("language").value = name;
     fill("heads", HEADS, "option");
+    showPictures();
     fill("lips", LIPS, "option");
     fill("expressions", EXPRESSIONS, "button");
   }
@@ -69,6 +70,23 @@ function fill(id, values, kind) {
   });
   element(id).replaceChildren(...offers);
   if (chosen) element(id).value = chosen;
+}
+
+/** Let a picture choose each head that has one, as its name in the list does. */
+function showPictures() {
+  const heads = element("heads");
+  const pictures = HEADS.filter(([name]) => name !== "").map(([name, texts]) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.title = say(texts);
+    button.append(Object.assign(new Image(48, 48), { src: `head-${name}.webp`, alt: say(texts) }));
+    button.onclick = () => {
+      heads.value = name;
+      heads.dispatchEvent(new Event("input"));
+    };
+    return button;
+  });
+  element("head-pictures").replaceChildren(...pictures);
 }
 
 function showAmount() {

@@ -1,0 +1,118 @@
+"""Pictures of every head: for the page's chooser, and sheets for the docs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from services.driver.config import Framing
+from services.driver.head.head import ASSETS, DEFAULT_HEAD, Head
+from services.driver.render.renderer import Renderer
+from services.driver.render.scene import camera
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from services.synthesizer.modifiers.expressiveness import Expressiveness
+from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+
+Float32 = NDArray[np.float32]
+
+_TURNS_DEG = (0.0, 40.0)
+_HEAD_PX, _VISEME_PX, _CHOICE_PX = (240, 200), (160, 160), (160, 160)
+_VISEMES_A_ROW = 9
+_SCALE = 2  # drawn so much larger, for smooth edges
+
+
+def head_names() -> list[str]:
+    """Name the heads of the package, the default one first."""
+    return sorted((path.stem for path in ASSETS.glob("*.npz")), key=DEFAULT_HEAD.__ne__)
+
+
+def draw_choices(folder: Path) -> list[Path]:
+    """Write ``head-NAME.webp`` for every head into a folder; return their paths.
+
+    Raises
+    ------
+    UserError
+        If they cannot be written.
+    """
+    return [
+        _save(
+            folder / f"head-{name}.webp", _picture(name, np.zeros(NUM_FAPS, np.float32), _CHOICE_PX)
+        )
+        for name in head_names()
+    ]
+
+
+def draw_sheets(folder: Path) -> list[Path]:
+    """Write ``heads.webp`` and ``faces.webp`` (every viseme) into a folder; return their paths.
+
+    Raises
+    ------
+    UserError
+        If they cannot be written.
+    """
+    rest = np.zeros(NUM_FAPS, np.float32)
+    names = head_names()
+    heads = [
+        [_labelled(_picture(name, rest, _HEAD_PX, turn), name) for name in names]
+        for turn in _TURNS_DEG
+    ]
+    shapes = {name: _spoken(name) for name in VISEME_INDEX}
+    labels = list(shapes)
+    faces = [
+        [
+            _labelled(_picture(DEFAULT_HEAD, shapes[label], _VISEME_PX, turn), label)
+            for label in labels[at : at + _VISEMES_A_ROW]
+        ]
+        for at in range(0, len(labels), _VISEMES_A_ROW)
+        for turn in _TURNS_DEG
+    ]
+    return [
+        _save(folder / "heads.webp", _sheet(heads)),
+        _save(folder / "faces.webp", _sheet(faces)),
+    ]
+
+
+def _spoken(viseme: str) -> Float32:
+    """FAPs (68,) of a viseme's target as the services make it by default."""
+    faps = np.zeros(NUM_FAPS, np.float32)
+    faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
+    Expressiveness(SynthesizerConfig().expressiveness).scale(faps)
+    return faps
+
+
+def _picture(name: str, faps: Float32, size: tuple[int, int], yaw_deg: float = 0.0) -> Image.Image:
+    head = Head.load(name)
+    view = camera(head, Framing.FACE, yaw_deg)
+    renderer = Renderer(head, _SCALE * size[0], _SCALE * size[1], camera=view)
+    drawn = Image.fromarray(renderer.draw(faps))
+    renderer.close()
+    return drawn.resize(size, Image.Resampling.LANCZOS)
+
+
+def _labelled(image: Image.Image, label: str) -> Image.Image:
+    ImageDraw.Draw(image).text((5, 2), label, fill="white", font=ImageFont.load_default(13))
+    return image
+
+
+def _sheet(rows: list[list[Image.Image]]) -> Image.Image:
+    width, height = rows[0][0].size
+    sheet = Image.new("RGB", (width * max(map(len, rows)), height * len(rows)), "#5c6e80")
+    for row, images in enumerate(rows):
+        for column, image in enumerate(images):
+            sheet.paste(image, (width * column, height * row))
+    return sheet
+
+
+def _save(path: Path, image: Image.Image) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        image.save(path, quality=85)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+    return path
