@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from annotated_types import Ge, Le, MultipleOf
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -80,6 +80,9 @@ class ServiceConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
+    safer: ClassVar[str] = "bind a loopback address"
+    """What to do instead of binding an address that others can reach."""
+
     control: Endpoint = "tcp://127.0.0.1:5550"
     """Where control takes commands."""
     advertise: str = ""
@@ -92,6 +95,11 @@ class ServiceConfig(BaseModel):
     """Name of this process; chosen when empty."""
     idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
     """Seed of blinks, gaze, brows and head motion, of what makes or shows a face; 0: none."""
+
+    @property
+    def is_encrypted(self) -> bool:
+        """Whether what others can reach is encrypted."""
+        return False
 
 
 Config = TypeVar("Config", bound=ServiceConfig)
@@ -348,8 +356,8 @@ def _check_addresses(table: str, config: ServiceConfig) -> None:
                     f"{table}.advertise: name the host by which others reach {name} "
                     f"({host} is every address of this host), for example {socket.gethostname()}"
                 )
-        if not is_loopback(host) and not config.insecure:
+        if not is_loopback(host) and not config.insecure and not config.is_encrypted:
             raise UserError(
-                f"{name}: {host} can be reached from other machines and nothing is encrypted; bind "
-                "a loopback address, or accept the risk on a trusted network with insecure = true"
+                f"{name}: {host} can be reached from other machines and nothing is encrypted; "
+                f"{config.safer}, or accept the risk on a trusted network with insecure = true"
             )

@@ -16,6 +16,7 @@ from services.control.config import ControlConfig
 from services.control.service import ControlService
 from services.recognizer.config import RecognizerConfig
 from services.synthesizer.config import SynthesizerConfig
+from shared.config import variable
 from shared.face.faps import MASK_BYTES
 from shared.service import Service
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
@@ -178,10 +179,11 @@ class System:
 
 
 class Gateway:
-    """A gateway process."""
+    """A gateway process; settings by their keys."""
 
-    def __init__(self, control: str, port: int) -> None:
-        self.page = f"http://127.0.0.1:{port}/"
+    def __init__(self, control: str, port: int, **settings: str) -> None:
+        scheme = "https" if "certificate" in settings else "http"
+        self.page = f"{scheme}://127.0.0.1:{port}/"
         self.process = subprocess.Popen(
             [sys.executable, "-m", "services.gateway"],
             cwd=ROOT,
@@ -190,6 +192,7 @@ class Gateway:
                 "KOUXING_CONTROL": control,
                 "KOUXING_GATEWAY_PORT": str(port),
                 "KOUXING_LOG_LEVEL": "error",
+                **{variable("gateway", key): value for key, value in settings.items()},
             },
         )
 

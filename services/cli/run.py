@@ -17,7 +17,6 @@ from services.cli.services import ConfigFile
 from services.cli.terminal import CONSOLE, command_name, print_message
 from services.control.config import ControlConfig
 from services.driver.config import DriverConfig
-from services.gateway.config import GatewayConfig
 from services.kinds import KINDS, available_addresses, read_settings
 from shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
 from shared.endpoints import WILDCARDS, split_endpoint
@@ -77,9 +76,6 @@ def run(
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
-    gateway = settings.load(GatewayConfig)
-    page_port = addresses.get(variable("gateway", "port"), gateway.port)
-    page = f"http://{gateway.host}:{page_port}"
     for remark in _remarks_on_ports(settings, addresses, control):
         print_message(remark)
     try:
@@ -87,6 +83,7 @@ def run(
             supervisor.start()
             supervisor.wait_ready(control)
         supervisor.watch()
+        page = supervisor.page_address(control)
         with announce(control):
             print_message(f"the face is at {page}")
             has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -86,6 +86,13 @@ class Supervisor:
                 time.sleep(0.1)
         raise UserError(f"the services did not start; their logs are in {self._log_folder}")
 
+    @staticmethod
+    def page_address(control: str) -> str:
+        """Return where the gateway serves the page, with the token if it needs one."""
+        with Client(control) as client:
+            gateways = [each for each in client.status().services if each.service == "gateway"]
+        return gateways[0].endpoints["page"].removesuffix("/")
+
     def watch(self) -> None:
         """From now on start crashed services again, whatever this thread does; see ``wait``."""
         self._watcher = threading.Thread(target=self._watch, daemon=True)

@@ -10,14 +10,14 @@ import hashlib
 import logging
 import re
 import socket
-from collections.abc import AsyncIterator, Callable, Iterable
+import ssl
+from collections.abc import AsyncIterator, Callable, Collection
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, web
 from aiohttp.http import HttpProcessingError
-from aiohttp.typedefs import Handler, Middleware
 
+from services.gateway.access import Access
 from shared.errors import UserError
 from shared.logs import LOG
 
@@ -69,13 +69,6 @@ def bind(host: str, port: int) -> socket.socket:
         ) from None
 
 
-def refuse_other_pages(request: web.Request) -> None:
-    """Raise an HTTP error for a browser that shows a page of another host."""
-    origin = request.headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc != request.headers.get("Host"):
-        raise web.HTTPForbidden(text="only this gateway's own page may connect\n")
-
-
 class WebSockets:
     """The WebSockets that browsers have open."""
 
@@ -88,8 +81,7 @@ class WebSockets:
 
     @contextlib.asynccontextmanager
     async def accept(self, request: web.Request) -> AsyncIterator[web.WebSocketResponse]:
-        """Open a WebSocket for a page of this host, and close it in the end."""
-        refuse_other_pages(request)
+        """Open a WebSocket, and close it in the end."""
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway stops\n")
         browser = web.WebSocketResponse(
@@ -116,8 +108,9 @@ class WebSockets:
 def make_application(
     *,
     page_asset: str,
-    is_loopback: Callable[[str], bool] | None,
-    routes: Iterable[web.RouteDef],
+    routes: Collection[web.RouteDef],
+    access: Access = Access(),  # noqa: B008 - it is frozen
+    frame_ancestors: str = "",
 ) -> web.Application:
     """Return the web application.
 
@@ -125,18 +118,20 @@ def make_application(
     ----------
     page_asset
         Another GLB to serve as the page's head; empty: the one beside the page.
-    is_loopback
-        Tells whether a host name is this machine's alone; then no other may be asked for. None
-        where any host name may be.
     routes
-        Further paths.
+        Further paths: sessions and uploads.
+    access
+        What requests must show.
+    frame_ancestors
+        Origins of pages that may show the page in a frame, separated by spaces.
     """
     application = web.Application(
-        middlewares=[_guard(is_loopback)], client_max_size=MAX_UPLOAD_BYTES
+        middlewares=[access.guard({route.path for route in routes})],
+        client_max_size=MAX_UPLOAD_BYTES,
     )
 
     async def serve_page(request: web.Request) -> web.StreamResponse:
-        return _page_file(request.match_info.get("name", "index.html"), page_asset)
+        return _page_file(request.match_info.get("name", "index.html"), page_asset, frame_ancestors)
 
     async def serve_face_mesh(request: web.Request) -> web.StreamResponse:
         return web.FileResponse(_find(FACE_MESH, request.match_info["name"]))
@@ -154,7 +149,10 @@ def make_application(
 
 
 async def start(
-    application: web.Application, listener: socket.socket, on_bad_request: Callable[[], None]
+    application: web.Application,
+    listener: socket.socket,
+    tls: ssl.SSLContext | None,
+    on_bad_request: Callable[[], None],
 ) -> web.AppRunner:
     """Serve an application; ``on_bad_request`` is called when something that is no HTTP arrives."""
 
@@ -169,28 +167,8 @@ async def start(
     log.addFilter(is_worth_logging)
     runner = web.AppRunner(application, access_log=None, logger=log, shutdown_timeout=0.5)
     await runner.setup()
-    await web.SockSite(runner, listener).start()
+    await web.SockSite(runner, listener, ssl_context=tls).start()
     return runner
-
-
-def _guard(is_loopback: Callable[[str], bool] | None) -> Middleware:
-    @web.middleware
-    async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
-        # A page of a strange host that resolves to this machine (DNS rebinding) shows its own name
-        # here; one that only connects to us shows it as the origin.
-        try:
-            host = urlsplit(f"//{request.headers.get('Host', '')}").hostname or ""
-        except ValueError:
-            host = ""
-        if is_loopback is not None and not is_loopback(host):
-            raise web.HTTPForbidden(text="this gateway only answers as localhost\n")
-        response = await handler(request)
-        if not response.prepared:
-            response.headers["X-Content-Type-Options"] = "nosniff"
-            response.headers["Cache-Control"] = "no-cache"
-        return response
-
-    return guard
 
 
 def _has_modules() -> bool:
@@ -205,7 +183,7 @@ def _find(folder: Path, name: str) -> Path:
     return path
 
 
-def _page_file(name: str, page_asset: str) -> web.StreamResponse:
+def _page_file(name: str, page_asset: str, frame_ancestors: str) -> web.StreamResponse:
     if name in ("head.glb", "head-woman.glb"):
         is_own = name == "head.glb" and page_asset
         path = Path(page_asset) if is_own else PAGE / "head.glb"
@@ -219,21 +197,23 @@ def _page_file(name: str, page_asset: str) -> web.StreamResponse:
         raise web.HTTPServiceUnavailable(text=text)
     response = web.FileResponse(path)
     if name == "index.html":
-        response.headers["Content-Security-Policy"] = _content_policy(path)
+        response.headers["Content-Security-Policy"] = _content_policy(path, frame_ancestors)
     elif name == FACE_MESH_FRAME:
         response.headers.update(_FACE_MESH_POLICIES)
     return response
 
 
-def _content_policy(index: Path) -> str:
+def _content_policy(index: Path, frame_ancestors: str) -> str:
     """Return the policy that lets the page load nothing but its own files.
 
     The import map has to stand in the page itself, so it is allowed by its digest.
     """
     found = _IMPORT_MAP.search(index.read_text(encoding="utf-8"))
+    allowed = frame_ancestors or "'none'"
     digest = hashlib.sha256(found[1].encode() if found else b"").digest()
     import_map = f"'sha256-{base64.b64encode(digest).decode()}'"
     return (
         f"default-src 'self'; script-src 'self' {import_map}; img-src 'self' blob: data:; "
-        "connect-src 'self' blob:; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+        "connect-src 'self' blob:; object-src 'none'; base-uri 'none'; "
+        f"frame-ancestors {allowed}"
     )

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from aiohttp import web
 
-from services.gateway.http import MAX_UPLOAD_BYTES, refuse_other_pages
+from services.gateway.http import MAX_UPLOAD_BYTES
 from shared.errors import UserError
 from shared.logs import LOG
 
@@ -59,7 +59,6 @@ class MouthLearner:
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Answer a recording with the voice that was learnt of it, or with what is wrong."""
-        refuse_other_pages(request)
         if self._is_closing:
             return _error(503, "the gateway stops")
         if self._is_busy:

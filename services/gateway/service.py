@@ -10,14 +10,19 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import socket
 import time
 from collections.abc import Coroutine
 from dataclasses import dataclass, replace
+from pathlib import Path
+from urllib.parse import quote
 
 from aiohttp import web
 
 from services.gateway import http, wire
+from services.gateway.access import Access
 from services.gateway.config import GatewayConfig
+from services.gateway.https import own_address, tls_context
 from services.gateway.learn_mouth import MouthLearner
 from services.gateway.microphone import (
     SAMPLE_TEXT,
@@ -30,7 +35,7 @@ from services.gateway.outbox import Kind
 from services.gateway.viewers import Viewers
 from shared.bus import Socket
 from shared.clock import to_samples
-from shared.endpoints import is_loopback
+from shared.endpoints import WILDCARDS, is_loopback
 from shared.errors import UserError
 from shared.face.idle_motion import REST_RATE_HZ, RestingFace
 from shared.follower import SessionFollower
@@ -75,9 +80,16 @@ class GatewayService(Service):
         self._loop = self._runner.get_loop()
         self._is_waiting = False
         super().__init__(config)
-        host = config.advertise or config.host
+        host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
         port = self._listener.getsockname()[1]
-        self.endpoints = {"page": f"http://{f'[{host}]' if ':' in host else host}:{port}/"}
+        token = config.token or (secrets.token_urlsafe(16) if config.certificate else "")
+        self._tls = None
+        if config.certificate:
+            names = (host, socket.gethostname(), "localhost", "127.0.0.1")
+            self._tls = tls_context(Path(config.certificate), names)
+        address = f"{f'[{host}]' if ':' in host else host}:{port}"
+        secret = f"#token={quote(token)}" if token else ""
+        self.endpoints = {"page": f"{'https' if self._tls else 'http'}://{address}/{secret}"}
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
         self._viewers = Viewers(
@@ -93,7 +105,12 @@ class GatewayService(Service):
         self._mouth_learner = MouthLearner()
         self._application = http.make_application(
             page_asset=config.head,
-            is_loopback=is_loopback if is_loopback(config.host) else None,
+            access=Access(
+                is_loopback=is_loopback if is_loopback(config.host) else None,
+                token=token,
+                allowed_origins=config.allowed_origins.split(),
+            ),
+            frame_ancestors=config.frame_ancestors,
             routes=[
                 web.get("/viewer", self._viewers.serve),
                 web.get("/microphone", self._microphones.serve),
@@ -125,6 +142,7 @@ class GatewayService(Service):
         server = http.start(
             self._application,
             self._listener,
+            self._tls,
             lambda: self.warn("bad-http", "dropped a request: it is no HTTP"),
         )
         self._server = self._loop.run_until_complete(server)

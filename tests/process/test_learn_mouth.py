@@ -70,7 +70,7 @@ class Gateway:
 async def serve(script: str) -> AsyncIterator[Gateway]:
     learner = MouthLearner((sys.executable, "-c", script))
     route = web.post("/learn-mouth", learner.serve)
-    runner = web.AppRunner(make_application(page_asset="", is_loopback=None, routes=[route]))
+    runner = web.AppRunner(make_application(page_asset="", routes=[route]))
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)
     await site.start()

@@ -1,6 +1,7 @@
 // "Learn my mouth": records the own lips and voice, has the gateway learn from them, shows what it
 // brought, and keeps it or not.
 
+import { pathOf } from "./address.js";
 import { capture, openCaptureContext } from "./capture.js";
 import { FaceTracker } from "./face-tracker.js";
 import { say } from "./language.js";
@@ -217,7 +218,7 @@ export class MouthLesson {
     this.#show("learning");
     let answer;
     try {
-      const response = await fetch("learn-mouth", { method: "POST", body: this.#recording, signal });
+      const response = await fetch(pathOf("learn-mouth"), { method: "POST", body: this.#recording, signal });
       const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
       answer = isJson ? await response.json() : { error: await response.text() };
     } catch {

@@ -1,12 +1,9 @@
 // The WebSocket to the gateway that brings everything to be seen and heard; proto/GATEWAY.md.
 
+import { socketUrl } from "./address.js";
 import { readMessage } from "./messages.js";
 
 const RETRY_MS = [300, 5000];
-
-export function socketUrl(path) {
-  return `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
-}
 
 /** Connects, and connects again by itself for as long as the page is open. */
 export class Link {
@@ -38,8 +35,7 @@ export class Link {
   }
 
   #connect() {
-    const query = this.#chosen ? `?session=${encodeURIComponent(this.#chosen)}` : "";
-    const socket = new WebSocket(socketUrl(`/viewer${query}`));
+    const socket = new WebSocket(socketUrl("/viewer", { session: this.#chosen }));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.#retryMs = RETRY_MS[0];

@@ -37,6 +37,7 @@ let head = null; // until it is loaded
 
 let connected = false;
 let wasConnected = false;
+let isRefused = false; // it never connected, though the gateway served this page
 let session = null; // the one we look at
 let epoch = 0; // of the session; a greater one is a restart
 let wasLive = false; // in this session
@@ -92,6 +93,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
   state(isConnected) {
     connected = isConnected;
     wasConnected ||= connected;
+    isRefused = !wasConnected;
     if (!connected) session = null;
     showState();
   },
@@ -216,7 +218,7 @@ function showState() {
   setText(element("delay"), connected && isLive ? delayText(delayMs) : "");
   element("status").title = session === null ? "" : `session ${session}`;
   const isMicrophoneInterrupted = microphoneState === "interrupted";
-  notice.hint(hint({ connected, wasConnected, isMicrophoneInterrupted, missing }));
+  notice.hint(hint({ connected, wasConnected, isRefused, isMicrophoneInterrupted, missing }));
   element("meter").setAttribute("aria-valuenow", Math.round(shownDb));
 }
 

@@ -1,9 +1,9 @@
 // The browser's microphone, or a file in its place, as a session's audio.
 
+import { socketUrl } from "./address.js";
 import { capture, openCaptureContext } from "./capture.js";
 import { fileSpeech } from "./file-speech.js";
 import { say } from "./language.js";
-import { socketUrl } from "./link.js";
 import { Uplink } from "./uplink.js";
 
 const RETRY_MS = 500;

@@ -20,12 +20,21 @@ export function delayText(delayMs) {
   return delayMs === null ? "" : `${Math.round(delayMs / 10) * 10} ms`;
 }
 
-/** Return what does not work and what happens next; "" if all is well. */
-export function hint({ connected, wasConnected, isMicrophoneInterrupted, missing }) {
+/**
+ * Return what does not work and what happens next; "" if all is well. isRefused: it never connected,
+ * though the gateway served this page.
+ */
+export function hint({ connected, wasConnected, isRefused, isMicrophoneInterrupted, missing }) {
   if (!connected && wasConnected) {
     return say({
       en: "The gateway stopped. This page goes on by itself when it runs again (kouxing run).",
       zh: "网关已停止。重新运行（kouxing run）后，本页会自动恢复。",
+    });
+  }
+  if (isRefused) {
+    return say({
+      en: "No connection. Open the whole address that kouxing run shows, with its #token=… if it has one.",
+      zh: "无法连接。请打开 kouxing run 显示的完整地址（如有 #token=… 也要包含）。",
     });
   }
   if (connected && missing.length > 0) return missingHint(missing);

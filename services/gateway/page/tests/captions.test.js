@@ -126,6 +126,8 @@ test("what does not work is named with what happens next", () => {
   assert.equal(hint(well), "");
   assert.match(hint({ ...well, connected: false }), /gateway stopped/);
   assert.equal(hint({ ...well, connected: false, wasConnected: false }), "", "it only begins");
+  const refused = { ...well, connected: false, wasConnected: false, isRefused: true };
+  assert.match(hint(refused), /with its #token/);
   assert.match(hint({ ...well, missing: ["control"] }), /Control does not run.*kouxing run/);
   assert.match(
     hint({ ...well, missing: ["recognizer", "synthesizer"] }),

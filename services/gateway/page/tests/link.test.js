@@ -1,6 +1,7 @@
 import assert from "node:assert/strict";
 import test from "node:test";
-import { Link, socketUrl } from "../link.js";
+import { socketUrl } from "../address.js";
+import { Link } from "../link.js";
 import { NUM_FAPS, readMessage } from "../messages.js";
 
 class FakeWebSocket {
@@ -33,7 +34,7 @@ function binary(kind, mediaTime, payload) {
 test.beforeEach(() => {
   FakeWebSocket.made = [];
   globalThis.WebSocket = FakeWebSocket;
-  globalThis.location = { protocol: "http:", host: "localhost:8080" };
+  globalThis.location = { protocol: "http:", host: "localhost:8080", hash: "" };
 });
 
 function record() {
@@ -88,7 +89,7 @@ test("it connects again by itself, ever more slowly, to the session chosen last"
   t.mock.timers.tick(299);
   assert.equal(FakeWebSocket.made.length, 1);
   t.mock.timers.tick(1);
-  assert.equal(FakeWebSocket.made[1].url, "ws://localhost:8080/viewer?session=a%20b");
+  assert.equal(FakeWebSocket.made[1].url, "ws://localhost:8080/viewer?session=a+b");
   FakeWebSocket.made[1].onclose();
   t.mock.timers.tick(599);
   assert.equal(FakeWebSocket.made.length, 2);

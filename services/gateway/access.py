@@ -1,0 +1,67 @@
+"""Who may ask the gateway for what: host names, pages of other origins, and the token."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from aiohttp import web
+from aiohttp.typedefs import Handler, Middleware
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Access:
+    """What a request must show."""
+
+    is_loopback: Callable[[str], bool] | None = None
+    """Tells whether a host name is this machine's alone; then no other may be asked for. None where
+    any host name may be."""
+    token: str = ""
+    """Secret that sessions and uploads need in their query; empty: none."""
+    allowed_origins: Collection[str] = ()
+    """Origins of other pages that may connect."""
+
+    def guard(self, private: Collection[str]) -> Middleware:
+        """Return what refuses requests; paths of ``private`` also need origin and token."""
+
+        @web.middleware
+        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+            self._check_host(request)
+            if request.path in private:
+                self._check_origin(request)
+                self._check_token(request)
+            response = await handler(request)
+            if not response.prepared:
+                response.headers["X-Content-Type-Options"] = "nosniff"
+                response.headers["Cache-Control"] = "no-cache"
+            return response
+
+        return guard
+
+    def _check_host(self, request: web.Request) -> None:
+        # A page of a strange host that resolves to this machine (DNS rebinding) shows its own name
+        # here; one that only connects to us shows it as the origin.
+        try:
+            host = urlsplit(f"//{request.headers.get('Host', '')}").hostname or ""
+        except ValueError:
+            host = ""
+        if self.is_loopback is not None and not self.is_loopback(host):
+            raise web.HTTPForbidden(text="this gateway only answers as localhost\n")
+
+    def _check_origin(self, request: web.Request) -> None:
+        origin = request.headers.get("Origin")
+        if origin is None or origin in self.allowed_origins:  # no browser, or a page that may
+            return
+        if urlsplit(origin).netloc != request.headers.get("Host"):
+            text = (
+                "only this gateway's own page may connect, and those of gateway.allowed_origins\n"
+            )
+            raise web.HTTPForbidden(text=text)
+
+    def _check_token(self, request: web.Request) -> None:
+        given = request.query.get("token", "")
+        if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
+            text = "the token is missing or wrong; 'kouxing run' shows the whole address\n"
+            raise web.HTTPForbidden(text=text)

@@ -1,0 +1,91 @@
+"""https: a certificate that was given, or a self-signed one that is made once."""
+
+from __future__ import annotations
+
+import datetime
+import ipaddress
+import os
+import socket
+import ssl
+from collections.abc import Iterable
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
+
+from shared.errors import UserError
+
+_DAYS = 397  # browsers take no longer ones
+
+
+def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
+    """Return the TLS context of a PEM file with a certificate and its private key.
+
+    If there is no such file, a self-signed certificate for the hosts is written there.
+
+    Raises
+    ------
+    UserError
+        If the file can neither be read nor written, or holds no certificate with its key.
+    """
+    try:
+        if not certificate.exists():
+            _write_private(certificate, _self_signed(hosts))
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        context.load_cert_chain(certificate)
+    except (OSError, ssl.SSLError) as error:
+        raise UserError(
+            f"gateway.certificate: {certificate}: {error.strerror or error}; name a PEM file with "
+            "a certificate and its private key, or a new file, which is then made"
+        ) from None
+    return context
+
+
+def own_address() -> str:
+    """Return the address by which this machine's network reaches it, as far as is known."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # RFC 5737; nothing is sent
+            address: str = probe.getsockname()[0]
+        except OSError:
+            return socket.gethostname()
+    return address
+
+
+def _self_signed(hosts: Iterable[str]) -> bytes:
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "kouxing")])
+    now = datetime.datetime.now(datetime.UTC)
+    names = [_general_name(host) for host in dict.fromkeys(hosts)]
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - datetime.timedelta(days=1))
+        .not_valid_after(now + datetime.timedelta(days=_DAYS - 1))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    pem = serialization.Encoding.PEM
+    private = key.private_bytes(
+        pem, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    return private + certificate.public_bytes(pem)
+
+
+def _general_name(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _write_private(path: Path, content: bytes) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(content)

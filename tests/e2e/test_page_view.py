@@ -1,0 +1,160 @@
+"""The page elsewhere: by https, as a bare overlay, with a keyboard and a screen reader."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.browser import Browser, wait_until
+from tests.scripted_system import Gateway, System
+from tests.system import DEMO, free_port
+
+pytestmark = pytest.mark.e2e
+
+READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
+CONTROLS = [
+    *("show-phones", "microphone", "sample", "open-file", "record", "learn", "sound"),
+    "open-settings",
+]
+
+
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    system = System()
+    certificate = tmp_path_factory.mktemp("https") / "kouxing.pem"
+    settings = {"certificate": str(certificate), "token": "a+secret"}
+    gateway = Gateway(system.address, free_port(), **settings)
+    wait_until(certificate.is_file, 60)
+    yield gateway
+    assert gateway.stop() == 0
+    system.close()
+
+
+@pytest.fixture(scope="module")
+def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    browser = Browser(tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav")
+    browser.command("Security.setIgnoreCertificateErrors", ignore=True)
+    yield browser
+    browser.close()
+
+
+def visit(browser: Browser, address: str) -> None:
+    browser.command("Page.navigate", url="about:blank")
+    browser.command("Page.navigate", url=address)
+
+
+def test_the_token_is_used_and_taken_out_of_the_address(browser: Browser, gateway: Gateway) -> None:
+    visit(browser, gateway.page)
+    browser.wait_for("document.getElementById('notice')?.textContent.includes('#token=')")
+    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    browser.wait_for(READY)
+    assert browser.evaluate("location.href") == gateway.page
+    browser.click("microphone")  # https, and so the browser has one
+    browser.wait_for("window.kouxing.state.microphone")
+    browser.click("microphone")
+    browser.wait_for("!window.kouxing.state.microphone")
+
+
+def test_the_bare_view_is_the_face_alone_on_a_transparent_background(
+    browser: Browser, gateway: Gateway
+) -> None:
+    visit(browser, f"{gateway.page}?view=bare&background=transparent#token=a%2Bsecret")
+    browser.wait_for(READY)
+    clear = {"r": 0, "g": 0, "b": 0, "a": 0}
+    browser.command("Emulation.setDefaultBackgroundColorOverride", color=clear)
+    browser.wait_for("document.getElementById('head').width > 0")
+    data = browser.command("Page.captureScreenshot", format="png")["data"]
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        alpha = np.asarray(image.convert("RGBA"))[..., 3]
+    browser.command("Emulation.setDefaultBackgroundColorOverride")
+    height, width = alpha.shape
+    assert alpha[:, [0, -1]].max() == 0
+    assert alpha[height // 2, width // 2] == 255
+    assert 0.1 < (alpha == 255).mean() < 0.8
+    assert browser.evaluate("document.body.innerText.trim()") == ""
+
+
+def press(browser: Browser, key: str) -> None:
+    codes = {"Tab": 9, "Enter": 13, "Escape": 27}
+    text = {"text": "\r"} if key == "Enter" else {}
+    for kind in ("keyDown", "keyUp"):
+        browser.command(
+            "Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=codes[key], **text
+        )
+
+
+def test_all_is_reached_by_keyboard_with_a_visible_focus(
+    browser: Browser, gateway: Gateway
+) -> None:
+    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    browser.wait_for(READY)
+    reached = []
+    for _ in CONTROLS:
+        press(browser, "Tab")
+        reached.append(browser.evaluate("document.activeElement.id"))
+        outline = "getComputedStyle(document.activeElement).outlineStyle"
+        assert browser.evaluate(outline) == "solid", reached[-1]
+    assert reached == CONTROLS
+    press(browser, "Enter")
+    is_open = "document.getElementById('settings').matches(':popover-open')"
+    browser.wait_for(is_open)
+    press(browser, "Tab")
+    assert browser.evaluate("document.activeElement.id") == "heads"
+    press(browser, "Escape")
+    browser.wait_for(f"!{is_open}")
+    assert browser.evaluate("document.activeElement.id") == "open-settings"
+
+
+def test_a_screen_reader_finds_names_and_is_not_flooded(browser: Browser, gateway: Gateway) -> None:
+    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    browser.wait_for(READY)
+    browser.evaluate("document.getElementById('settings').showPopover()")
+    browser.command("Accessibility.enable")
+    nodes = browser.command("Accessibility.getFullAXTree")["nodes"]
+    named = {
+        node["role"]["value"]: node["name"]["value"]
+        for node in nodes
+        if not node.get("ignored") and "name" in node and "role" in node
+    }
+    assert named["meter"] == "level"
+    assert named["slider"].startswith("Movement of the mouth")
+    roles = ("button", "combobox", "slider", "meter", "image")
+    for node in nodes:
+        if not node.get("ignored") and node["role"]["value"] in roles:
+            assert node["name"]["value"], node
+    # What is announced by itself changes seldom, and politely.
+    live = browser.evaluate(
+        "Array.from(document.querySelectorAll('[role=status], [role=alert], output, [aria-live]'))"
+        ".filter((each) => each.getAttribute('aria-live') !== 'off').map((each) => each.id)"
+    )
+    assert live == ["state", "notice", "lesson-advice", "lesson-problem"]
+    browser.evaluate("document.getElementById('settings').hidePopover()")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_on_a_pressed_button_has_contrast(browser: Browser, scheme: str) -> None:
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.command("Emulation.setEmulatedMedia", features=features)
+    colours = browser.evaluate(
+        "(() => { const button = document.getElementById('record');"
+        "button.style.transition = 'none'; button.setAttribute('aria-pressed', true);"
+        "const style = getComputedStyle(button);"
+        "const found = [style.color, style.backgroundColor].map((text) => text.match(/[\\d.]+/g));"
+        "button.setAttribute('aria-pressed', false); return found; })()"
+    )
+    ink, back = (luminance([float(level) for level in colour[:3]]) for colour in colours)
+    assert (ink + 0.05) / (back + 0.05) >= 4.5  # WCAG 2.2, 1.4.3
+
+
+def luminance(levels: list[float]) -> float:
+    """Return the relative luminance of an sRGB colour (WCAG 2.2)."""
+    linear = [
+        level / 12.92 if level <= 0.04045 else ((level + 0.055) / 1.055) ** 2.4
+        for level in (each / 255 for each in levels)
+    ]
+    return float(np.dot([0.2126, 0.7152, 0.0722], linear))

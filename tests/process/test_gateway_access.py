@@ -1,0 +1,129 @@
+"""Who may reach the gateway: https with a token, other pages, frames."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import ssl
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from http.client import HTTPResponse, HTTPSConnection
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.browser import wait_until
+from tests.scripted_system import Gateway
+from tests.system import ROOT, free_port
+
+pytestmark = pytest.mark.process
+
+NO_CONTROL = "tcp://127.0.0.1:9"
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("https") / "kouxing.pem"
+
+
+@pytest.fixture(scope="module")
+def gateway(certificate: Path) -> Iterator[Gateway]:
+    gateway = Gateway(
+        NO_CONTROL,
+        free_port(),
+        host="0.0.0.0",  # noqa: S104 - with https and a token
+        certificate=str(certificate),
+        token="secret",
+        allowed_origins="https://tool.example",
+        frame_ancestors="https://tool.example https://other.example:8443",
+    )
+    wait_until(certificate.is_file, 60)
+    yield gateway
+    assert gateway.stop() == 0
+
+
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+}
+
+
+def get(gateway: Gateway, certificate: Path, path: str, headers: dict[str, str]) -> HTTPResponse:
+    """Return the head of an answer."""
+    tls = ssl.create_default_context(cafile=certificate)  # names are checked, too
+    with contextlib.closing(
+        HTTPSConnection("127.0.0.1", urlsplit(gateway.page).port, timeout=60, context=tls)
+    ) as connection:
+        wait_until(lambda: can_connect(connection), 60)
+        connection.request("GET", f"/{path}", headers=headers)
+        return connection.getresponse()
+
+
+def can_connect(connection: HTTPSConnection) -> bool:
+    try:
+        connection.connect()
+    except ConnectionRefusedError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("path", ["viewer", "microphone", "learn-mouth"])
+def test_sessions_need_the_token(gateway: Gateway, certificate: Path, path: str) -> None:
+    for query in ("", "?token=wrong"):
+        assert get(gateway, certificate, path + query, UPGRADE).status == 403
+
+
+def test_the_token_opens_and_the_page_itself_needs_none(
+    gateway: Gateway, certificate: Path
+) -> None:
+    assert get(gateway, certificate, "viewer?token=secret", UPGRADE).status == 101
+    page = get(gateway, certificate, "", {})
+    assert page.status == 200
+    ancestors = "frame-ancestors https://tool.example https://other.example:8443"
+    assert page.headers["Content-Security-Policy"].endswith(ancestors)
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"), [("https://tool.example", 101), ("https://evil.example", 403)]
+)
+def test_only_pages_that_are_named_may_connect(
+    gateway: Gateway, certificate: Path, origin: str, status: int
+) -> None:
+    headers = {**UPGRADE, "Origin": origin}
+    assert get(gateway, certificate, "viewer?token=secret", headers).status == status
+
+
+def test_the_made_certificate_is_for_its_owner_alone(gateway: Gateway, certificate: Path) -> None:
+    assert stat.S_IMODE(certificate.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"HOST": "0.0.0.0"}, "gateway.certificate=kouxing.pem"),  # noqa: S104
+        ({"CERTIFICATE": __file__}, "gateway.certificate: "),
+        ({"CERTIFICATE": "/no/such/folder/new.pem"}, "No such file or directory"),
+        ({"FRAME_ANCESTORS": "https://a.example; script-src *"}, "separated by spaces"),
+    ],
+)
+def test_what_is_wrong_is_named(settings: dict[str, str], named: str) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "services.gateway"],
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "KOUXING_GATEWAY_PORT": "0",
+            **{f"KOUXING_GATEWAY_{key}": value for key, value in settings.items()},
+        },
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert named in result.stderr
