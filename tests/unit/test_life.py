@@ -57,14 +57,15 @@ STRESSED = levels((1.0, QUIET_DB), (0.2, STRESS_DB), (0.8, QUIET_DB))
 
 
 def test_brows_rise_and_the_head_dips_with_most_stressed_syllables() -> None:
-    raised = [lively(STRESSED, seed)[:, BROW] for seed in range(1, 41)]
+    added = [lively(STRESSED, seed) for seed in range(1, 21)]
+    raised = [faps[:, BROW] for faps in added]
     heights = np.array([curve.max() for curve in raised])
-    assert 12 < np.count_nonzero(heights > 10.0) < 35  # not each time
+    assert 6 < np.count_nonzero(heights > 10.0) < 18  # not each time
     assert heights.max() < 60.0  # a small movement
     peaks_s = FRAME_S * np.array([curve.argmax() for curve in raised if curve.max() > 10.0])
     assert (np.abs(peaks_s - 1.15) < 0.2).all()
     assert all(np.abs(np.diff(curve, n=2)).max() < 5.0 for curve in raised)  # no corner
-    dips = np.array([lively(STRESSED, seed)[:, PITCH].max() for seed in range(1, 21)])
+    dips = np.array([faps[:, PITCH].max() for faps in added])
     assert 8 < np.count_nonzero(dips > 500.0) < 20
     assert dips.max() < np.deg2rad(2.5) * 1e5
 
@@ -117,9 +118,9 @@ def test_noise_without_speech_moves_no_brow() -> None:
 def test_eyes_leave_the_viewer_more_often_in_thought() -> None:
     def share_on_viewer(state: State) -> float:
         motion = IdleMotion(3)
-        faps = np.zeros((15_000, 68), np.float32)
+        faps = np.zeros((3000, 68), np.float32)
         for number, row in enumerate(faps):
-            motion.apply(row, number * FRAME_S, state)
+            motion.apply(row, number * 0.1, state)
         gaze_deg = np.rad2deg((faps[:, [EYE_YAW, EYE_PITCH]] + faps[:, [YAW, PITCH]]) * 1e-5)
         return float((np.abs(gaze_deg).max(axis=1) < 1.7).mean())
 
