@@ -75,6 +75,19 @@ def test_the_thresholds_follow_the_noise() -> None:
         assert one.start_s == pytest.approx(other.start_s, abs=0.045)
 
 
+def test_pieces_are_found_in_loud_noise_and_again_after_it_has_begun() -> None:
+    parts = [("-", 0.8), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 4.0), ("v", 0.2), ("-", 0.5)]
+    sound = 0.3 * speech(parts)
+    noise = 0.03 * np.random.default_rng(1).standard_normal(len(sound))  # 3 dB below the vowels
+    starts = [piece.start_s for piece in pieces_of(progress_of((sound + noise).astype(np.float32)))]
+    np.testing.assert_allclose(starts, [0.8, 1.3, 5.5], atol=0.045)
+    noise[: 2 * RATE_HZ] = 0.0
+    pieces = pieces_of(progress_of((sound + noise).astype(np.float32)))
+    assert pieces[2].end_s - pieces[2].start_s == pytest.approx(3.0, abs=0.2)  # noise, until known
+    assert pieces[3].start_s == pytest.approx(5.5, abs=0.045)
+    assert pieces[3].end_s == pytest.approx(5.7, abs=0.045)
+
+
 @pytest.mark.parametrize("chunk", [113, 4000])
 def test_pieces_of_a_stream_are_those_of_the_whole(chunk: int) -> None:
     samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]

@@ -11,7 +11,7 @@ import pytest
 from evaluation.lips.segmentation import SegmentedRecording, figure, pair, score
 from services.recognizer.alignment import spoken
 from services.synthesizer.lips.ferguson.contour import faps_of
-from services.synthesizer.lips.ferguson.endpoints import Piece
+from services.synthesizer.lips.ferguson.endpoints import pieces_of
 from services.synthesizer.lips.ferguson.openings import key_frames_of
 from services.synthesizer.lips.ferguson.table import load_table
 from shared.errors import UserError
@@ -103,21 +103,27 @@ def test_a_segmentation_is_scored_and_drawn(tmp_path: Path) -> None:
         for number in range(1, 71)
     ]
     phones = [
-        replace(phone, onset_s=0.4 + phone.onset_s)
+        replace(phone, onset_s=0.42 + phone.onset_s)
         for phone in aligned([("m", 0.1), ("a", 0.2), ("m", 0.1), ("a", 0.2), ("sil", 0.2)])
     ]
     recording = SegmentedRecording(
         name="made-up",
         samples=np.zeros(22_400, np.float32),
         slices=slices,
-        pieces=[Piece(0.42, 1.0)],
+        pieces=pieces_of(slices),
         syllables=[("m", "a"), ("m", "a")],
         aligned=spoken(phones, INVENTORY),
     )
     found = score([recording], TABLE)
-    assert (found.num_syllables, found.num_pieces, found.mean_count_error) == (2, 1, 0.5)
-    assert (found.recall, found.precision) == (0.5, 1.0)
-    assert found.mean_boundary_error_ms == pytest.approx(20.0)
+    as_recorded = found.pieces["as recorded"]
+    assert (found.num_syllables, as_recorded.num_pieces, as_recorded.mean_count_error) == (
+        2,
+        1,
+        0.5,
+    )
+    assert (as_recorded.recall, as_recorded.precision) == (0.5, 1.0)
+    assert as_recorded.mean_boundary_error_ms == pytest.approx(20.0)
+    assert found.pieces["noise 5 dB below"].num_pieces == 0  # of a sound of zeros
     assert found.by_text.mean_ms < 30.0
     assert found.by_text.within_50_ms == 1.0
     figure(recording).savefig(tmp_path / "pieces.png")

@@ -17,8 +17,10 @@ Z_n      zero crossings, each as a share of the samples, 0 to 1           ``zero
 
 Deviations: the paper finds the short gaps between words. Real syllables seldom have one, so a piece
 also ends at a dip of the *sonority*: the level, less what zero crossings above their low threshold
-take away, so that an unvoiced consonant is a dip too. The thresholds of the energy stand above a
-noise floor that follows the quietest sound: it falls at once and rises slowly.
+take away, so that an unvoiced consonant is a dip too. The thresholds of the level stand above the
+noise floor, the quietest slice of the last 3 s (as in minimum statistics: Martin, "Noise power
+spectral density estimation based on optimal smoothing and minimum statistics", 2001), in proportion
+to the range from there to the loudest: in noise, speech rises less above the floor.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ SLICE_S = 0.02
 
 # Chosen on recordings of the training split, by boundaries found within 50 ms; none of these
 # numbers matters much.
-HIGH_LEVEL_DB, LOW_LEVEL_DB = 10.0, 6.0  # above the noise floor
+HIGH_SHARE = 0.4  # height of the high threshold, as a share of the range of recent levels
+MIN_HIGH_DB = 4.0  # more than steady noise varies
+LOW_SHARE = 0.5  # height of the low threshold, as a share of the high one's
 HIGH_ZERO_CROSSINGS, LOW_ZERO_CROSSINGS = 0.3, 0.1
 HANGOVER_S = 0.06
 DIP_DB = 3.0  # fall and rise that part two pieces
@@ -41,9 +45,9 @@ MIN_PIECE_S = 0.1
 _HISS_DB = 30.0  # of sonority that a slice loses for each zero crossing a sample
 _DESCENT = 0.5  # a piece ends this far above the dip, relative to its peak
 _ONSET_S = 0.1  # by which speech may begin before it is loud
-_LOWEST_FLOOR_DB, _FIRST_FLOOR_DB, _HIGHEST_FLOOR_DB = -75.0, -30.0, -25.0
-_FLOOR_RISE_DB_S = 8.0  # in silence
-_FLOOR_RISE_IN_SPEECH_DB_S = 2.0
+_RANGE_SLICES = 150  # 3 s, in which speech has gaps that show the noise floor
+_LOWEST_LEVEL_DB = -75.0
+_FIRST_LEVEL_DB = -30.0  # before anything is known
 _MEMORY_SLICES = 50
 _MAX_GAP_S = 0.1
 
@@ -80,7 +84,7 @@ class SyllableCutter:
 
     def __init__(self) -> None:
         self.start_s: float | None = None
-        self._floor_db = _FIRST_FLOOR_DB
+        self._levels_db = deque([_FIRST_LEVEL_DB] * _RANGE_SLICES, maxlen=_RANGE_SLICES)
         self._before: Progress | None = None
         self._recent: deque[_Loudness] = deque(maxlen=_MEMORY_SLICES)
         self._loud_until_s = 0.0
@@ -98,12 +102,12 @@ class SyllableCutter:
         now = _average(self._before or one, one)
         self._before = one
         self._recent.append(now)
-        floor_db = self._follow_floor(now.level_db)
-        is_low = now.level_db > floor_db + LOW_LEVEL_DB
-        is_high = now.level_db > floor_db + HIGH_LEVEL_DB
+        low_db, high_db = self._thresholds(now.level_db)
+        is_low = now.level_db > low_db
         if self.start_s is None:
+            is_high = now.level_db > high_db
             if is_high or (is_low and now.crossings > HIGH_ZERO_CROSSINGS):
-                self._begin(floor_db + LOW_LEVEL_DB)
+                self._begin(low_db)
             return pieces
         if is_low:
             self._loud_until_s = now.end_s
@@ -117,11 +121,12 @@ class SyllableCutter:
         self._recent.clear()
         return self._end()
 
-    def _follow_floor(self, level_db: float) -> float:
-        rise_db_s = _FLOOR_RISE_DB_S if self.start_s is None else _FLOOR_RISE_IN_SPEECH_DB_S
-        risen_db = min(self._floor_db + rise_db_s * SLICE_S, _HIGHEST_FLOOR_DB)
-        self._floor_db = max(min(level_db, risen_db), _LOWEST_FLOOR_DB)
-        return self._floor_db
+    def _thresholds(self, level_db: float) -> tuple[float, float]:
+        """Return the low and the high threshold of the level, dB of full scale."""
+        self._levels_db.append(max(level_db, _LOWEST_LEVEL_DB))
+        floor_db = min(self._levels_db)
+        high_db = max(HIGH_SHARE * (max(self._levels_db) - floor_db), MIN_HIGH_DB)
+        return floor_db + LOW_SHARE * high_db, floor_db + high_db
 
     def _begin(self, low_db: float) -> None:
         """Begin where the low threshold was passed, at most ``_ONSET_S`` before."""
