@@ -5,18 +5,22 @@ displacements ``V`` of the lips' feature points from the closed mouth,
 
     accuracy = 1 - sum |V_made - V_real| / sum |V_real|
 
-over all vertical displacements of lip points and all frames. Two deviations: the paper divides by
-the mean of several speakers; here each speaker's displacements, and those of each method, are
-scaled so that the widest opening (98th percentile) is that of R = 5. And other rates are the same
-recording, time-scaled with its pitch kept, so that the real lips are known: they move as much
-faster.
+over all vertical displacements of lip points. It is taken twice: over all frames, and over the mean
+mouths of the phones. The paper's ``V_real`` is the mean of several people who say the same;
+here no two clips share a sentence, but the phones return: the mean mouth of a phone is that of all
+moments at which it begins.
+
+Two deviations: each speaker's displacements are scaled so that the widest opening (98th percentile)
+is that of R = 5. And other rates are the same recording, time-scaled with its pitch kept, so that
+the real lips are known: they move as much faster.
 
 Where a clip's words are not known, its recognised syllables are the text, as in the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +59,7 @@ Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_m
 
 RATES = (0.8, 1.0, 1.25, 1.5, 2.0)
 _FULL_PERCENTILE = 98.0
+_MIN_MOUTHS = 3
 _LIP_COLUMNS = [
     column
     for column, fap in enumerate(MOUTH_FAPS)
@@ -62,7 +67,7 @@ _LIP_COLUMNS = [
     if fap != 3
 ]
 _MIDDLES = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
-BEST_OPENING, STILL = "best R of each frame", "still mouth"
+BEST_OPENING, STILL = "best R of each mouth", "still mouth"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +76,8 @@ class RateScore:
 
     rate: float  # relative to the recording
     syllables_per_s: float
-    accuracy: dict[str, float]
+    of_frames: dict[str, float]  # accuracy by method
+    of_phones: dict[str, float]  # accuracy of the phones' mean mouths
 
 
 def accuracy_of(made: Array, real: Array) -> float:
@@ -94,45 +100,79 @@ def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list
         raise UserError(f"{folder} has no {part} clips in sync")
     real = scaled([clip.speaker for clip in clips], [clip.faps for clip in clips])
     model = load_live_model()
-    scores = []
-    for rate in rates:
-        made: dict[str, list[Array]] = {}
-        num_syllables, seconds = 0, 0.0
-        for clip in track(clips, description=f"{rate:g} times the rate"):
-            samples = clip.samples if rate == 1.0 else faster(clip.samples, rate)
-            syllables, phones = _text(model, clip, samples)
-            num_syllables += len(syllables)
-            seconds += sum(phone.duration_s for phone in phones)
-            for name, curves in _methods(model, samples, syllables, phones):
-                made.setdefault(name, []).append(curves(clip.time_s / rate))
-        accuracy = {
-            name: accuracy_of(
-                np.concatenate(scaled([name] * len(clips), mouths)), np.concatenate(real)
-            )
-            for name, mouths in made.items()
-        }
-        accuracy |= limits(np.concatenate(real))
-        scores.append(
-            RateScore(
-                rate=rate,
-                syllables_per_s=num_syllables / max(seconds, 1e-9),
-                accuracy=accuracy,
-            )
-        )
-    return scores
+    return [_score_rate(model, clips, real, rate) for rate in rates]
 
 
-def scaled(mouths_of: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
-    """Scale FAPs (num_frames, num_mouth_faps): the widest opening of everyone is that of R = 5."""
+def _score_rate(
+    model: AcousticModel, clips: Sequence[LipClip], real: Sequence[Array], rate: float
+) -> RateScore:
+    num_syllables, seconds = 0, 0.0
+    symbols: list[str] = []
+    real_onsets: list[Array] = []
+    frames: dict[str, list[Array]] = defaultdict(list)
+    onsets: dict[str, list[Array]] = defaultdict(list)
+    shown = track(clips, description=f"{rate:g} times the rate")
+    for clip, faps in zip(shown, real, strict=True):
+        samples = clip.samples if rate == 1.0 else faster(clip.samples, rate)
+        times_s = clip.time_s / rate
+        syllables, phones = _text(model, clip, samples)
+        num_syllables += len(syllables)
+        seconds += sum(phone.duration_s for phone in phones)
+        onsets_s = np.array([phone.onset_s for phone in phones])
+        symbols += [phone.symbol for phone in phones]
+        real_onsets.append(_interpolated(onsets_s, times_s, faps))
+        for name, curves in _methods(model, samples, syllables, phones):
+            frames[name].append(curves(times_s))
+            onsets[name].append(curves(onsets_s))
+    return RateScore(
+        rate=rate,
+        syllables_per_s=num_syllables / max(seconds, 1e-9),
+        of_frames=_accuracies(
+            {name: np.concatenate(mouths) for name, mouths in frames.items()}, np.concatenate(real)
+        ),
+        of_phones=_accuracies(
+            {name: mean_mouths(symbols, np.concatenate(each)) for name, each in onsets.items()},
+            mean_mouths(symbols, np.concatenate(real_onsets)),
+        ),
+    )
+
+
+def _accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
+    accuracy = {name: accuracy_of(mouths, real) for name, mouths in made.items()}
+    return accuracy | limits(real)
+
+
+def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
+    """Return the mean mouth of each phone, NaN where never measured.
+
+    Parameters
+    ----------
+    symbols
+        Of each mouth; those that come fewer than 3 times are left out.
+    mouths
+        FAPs (num_mouths, num_mouth_faps), NaN where not measured.
+    """
+    means = []
+    for symbol in sorted(set(symbols)):
+        of_symbol = mouths[[one == symbol for one in symbols]]
+        if len(of_symbol) >= _MIN_MOUTHS:
+            num_measured = np.isfinite(of_symbol).sum(axis=0)
+            total = np.nansum(of_symbol, axis=0)
+            means.append(np.where(num_measured, total / np.maximum(num_measured, 1), np.nan))
+    return np.array(means).reshape(-1, mouths.shape[1])
+
+
+def scaled(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
+    """Scale FAPs (num_frames, num_mouth_faps): every speaker's widest opening is that of R = 5."""
     whole = -float(faps_of([MAX_OPENING])[0, _MIDDLES].sum())
-    openings: dict[str, list[Array]] = {}
-    for owner, faps in zip(mouths_of, mouths, strict=True):
-        openings.setdefault(owner, []).append(-faps[:, _MIDDLES].sum(axis=1))
+    openings: dict[str, list[Array]] = defaultdict(list)
+    for speaker, faps in zip(speakers, mouths, strict=True):
+        openings[speaker].append(-faps[:, _MIDDLES].sum(axis=1))
     widest = {
-        owner: max(float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE)), 1.0)
-        for owner, group in openings.items()
+        speaker: max(float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE)), 1.0)
+        for speaker, group in openings.items()
     }
-    return [faps * whole / widest[owner] for owner, faps in zip(mouths_of, mouths, strict=True)]
+    return [faps * whole / widest[speaker] for speaker, faps in zip(speakers, mouths, strict=True)]
 
 
 def _text(
@@ -171,9 +211,12 @@ def _curves_of(motion: KeyFrames) -> Curves:
 def _between(mouth: Array) -> Curves:
     """Interpolate between frames (num_frames, num_mouth_faps)."""
     frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
-    return lambda times_s: np.stack(
-        [np.interp(times_s, frame_s, column) for column in mouth.T], axis=1
-    )
+    return lambda times_s: _interpolated(times_s, frame_s, mouth)
+
+
+def _interpolated(times_s: Array, frame_s: Array, mouths: Array) -> Array:
+    """Return FAPs (n, num_mouth_faps) at times (n,) from frames (num_frames, num_mouth_faps)."""
+    return np.stack([np.interp(times_s, frame_s, column) for column in mouths.T], axis=1)
 
 
 def limits(real: Array) -> dict[str, float]:
@@ -194,28 +237,38 @@ def limits(real: Array) -> dict[str, float]:
 
 def print_rates(scores: Sequence[RateScore], console: Console) -> None:
     """Print accuracies by speaking rate as the paper's table 3, a row for each method."""
-    table = Table("accuracy at the rate", *(f"{score.rate:g}" for score in scores))
-    table.add_row("syllables a second", *(f"{score.syllables_per_s:.1f}" for score in scores))
-    for name in scores[0].accuracy:
-        table.add_row(name, *(f"{100 * score.accuracy[name]:.0f} %" for score in scores))
-    console.print(table)
+    for title, accuracies in _MEASURES.items():
+        table = Table(title, *(f"{score.rate:g}" for score in scores))
+        table.add_row("syllables a second", *(f"{score.syllables_per_s:.1f}" for score in scores))
+        for name in accuracies(scores[0]):
+            table.add_row(name, *(f"{100 * accuracies(score)[name]:.0f} %" for score in scores))
+        console.print(table)
 
 
 def rates_figure(scores: Sequence[RateScore]) -> Any:
     """Draw the accuracies over the speaking rate."""
-    figure = new_figure(8.0, 4.5)
-    axis = figure.subplots()
+    figure = new_figure(11.0, 4.5)
     rates = [score.rate for score in scores]
-    for name in scores[0].accuracy:
-        is_limit = name in (BEST_OPENING, STILL)
-        axis.plot(
-            rates,
-            [100 * score.accuracy[name] for score in scores],
-            "--" if is_limit else "o-",
-            color="0.6" if is_limit else None,
-            label=name,
-        )
-    axis.set_xlabel("speaking rate, relative to the recording")
+    for axis, (title, accuracies) in zip(
+        figure.subplots(1, 2, sharey=True), _MEASURES.items(), strict=True
+    ):
+        for name in accuracies(scores[0]):
+            is_limit = name in (BEST_OPENING, STILL)
+            axis.plot(
+                rates,
+                [100 * accuracies(score)[name] for score in scores],
+                "--" if is_limit else "o-",
+                color="0.6" if is_limit else None,
+                label=name,
+            )
+        axis.set_title(title)
+        axis.set_xlabel("speaking rate, relative to the recording")
     axis.set_ylabel("accuracy, %")
     axis.legend(fontsize=8)
     return figure
+
+
+_MEASURES: dict[str, Callable[[RateScore], dict[str, float]]] = {
+    "accuracy of all frames": lambda score: score.of_frames,
+    "accuracy of the phones' mean mouths": lambda score: score.of_phones,
+}

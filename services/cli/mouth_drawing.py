@@ -15,11 +15,11 @@ from rich.progress import Progress
 
 from services.cli.offline import Timing
 from services.cli.sound_file import read_mono_16k
-from services.cli.spoken_text import text_of
+from services.cli.spoken_text import does_not_fit, read_text
 from services.cli.terminal import CONSOLE, check_output, print_message, write_text
 from services.driver.video.writer import VideoWriter, write_picture
 from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.alignment import align_text, spoken
+from services.recognizer.alignment import align_syllables, spoken, timed_syllables
 from services.recognizer.front_end.pcm import progress_of
 from services.recognizer.offline import recognize
 from services.recognizer.transcriber import SherpaTranscriber
@@ -33,6 +33,9 @@ from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
 from shared.phones.events import Phone
 from shared.phones.inventory import PhoneInventory, load_inventory
+from shared.phones.transcript import TimedSyllable, Transcript
+
+Span = tuple[float, float, str]  # from, to (seconds): what is said
 
 FRAME_RATE_HZ = 25.0
 SUFFIXES = (".svg", ".png", ".mp4", ".csv")
@@ -87,26 +90,32 @@ def draw_mouth(
         raise UserError("--timing is for a text; give what is said, before the output's name")
     check_output(output)
     samples = read_mono_16k(source)
-    if speech_to_text is not None:
-        text = SherpaTranscriber(speech_to_text).transcribe(samples)
-        print_message(f"{source}: {text or 'no words were recognised'}")
-    elif text is not None:
-        text = text_of(text)
     inventory = load_inventory()
+    if speech_to_text is not None:
+        text = _recognised_text(source, samples, speech_to_text)
+    transcript = None if text is None else read_text(text, inventory)
     with CONSOLE.status(f"timing {len(samples) / MEDIA_RATE_HZ:.0f} s"):
-        phones = timed_phones(samples, text, timing or Timing.ENDPOINTS)
-    phones = spoken(phones, inventory)
+        phones = spoken(
+            _timed_phones(source, samples, transcript, timing or Timing.ENDPOINTS), inventory
+        )
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
     motion = key_frames_of(phones, load_table(inventory), inventory.silence)
     if kind == ".csv":
         num_frames = _write_csv(output, motion, len(samples), num_points, smooth=smooth)
         print_message(f"wrote {output}: {num_frames} frames")
-    elif kind == ".mp4":
-        num_frames = _write_video(output, motion, phones, inventory, samples, smooth=smooth)
+        return
+    syllables = (
+        timed_syllables(phones, transcript, inventory)
+        if transcript is not None
+        else _recognised_syllables(phones, inventory)
+    )
+    labels = _labels(syllables, are_pixels=kind != ".svg")
+    if kind == ".mp4":
+        num_frames = _write_video(output, motion, phones, labels, samples, smooth=smooth)
         print_message(f"wrote {output}: {num_frames} images, {len(phones)} phones")
     else:
-        moments = key_moments(motion, phones, inventory)
+        moments = key_moments(motion, phones, labels, inventory.silence)
         if len(moments) > _MAX_MOUTHS:
             raise UserError(
                 f"{source} needs {len(moments)} mouths, one picture holds {_MAX_MOUTHS}; cut it,"
@@ -120,45 +129,38 @@ def draw_mouth(
         print_message(f"wrote {output}: {len(moments)} key frames, {len(phones)} phones")
 
 
-def timed_phones(
-    samples: NDArray[np.float32], text: str | None, timing: Timing = Timing.ENDPOINTS
+def _recognised_text(source: Path, samples: NDArray[np.float32], model: Path) -> str | None:
+    text = SherpaTranscriber(model).transcribe(samples)
+    print_message(f"{source}: {text or 'no words were recognised'}")
+    return text or None
+
+
+def _timed_phones(
+    source: Path, samples: NDArray[np.float32], transcript: Transcript | None, timing: Timing
 ) -> list[Phone]:
-    """Return the phones of a sound with their times, 16 kHz mono, shape (n,).
-
-    Parameters
-    ----------
-    samples
-        The sound.
-    text
-        What is said; None: the phones are recognised.
-    timing
-        What tells when a text's phones are spoken.
-
-    Raises
-    ------
-    UserError
-        If the text cannot be read or cannot be that of the sound.
-    """
-    if text is not None and timing is Timing.ENDPOINTS:
-        inventory = load_inventory()
-        return time_text(progress_of(samples), inventory.pronounce(text), load_table(inventory))
+    """Return the phones of a sound, 16 kHz mono, shape (n,); recognise them without a text."""
+    if transcript is not None and timing is Timing.ENDPOINTS:
+        return time_text(progress_of(samples), transcript.phones, load_table(load_inventory()))
     model = load_live_model()
-    if text is None:
+    if transcript is None:
         return recognize(model, samples, MEDIA_RATE_HZ)
-    return align_text(model, samples, MEDIA_RATE_HZ, text)
+    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
+    if not alignment.fits:
+        print_message(does_not_fit(source, alignment))
+    return alignment.phones
 
 
 def key_moments(
-    motion: KeyFrames, phones: Sequence[Phone], inventory: PhoneInventory
+    motion: KeyFrames, phones: Sequence[Phone], labels: Sequence[Span], silence: str
 ) -> list[drawing.Moment]:
     """Return the key frames of phones; closed mouths before and after speech have no phone."""
-    syllables = {onset_s: spelling for onset_s, _, spelling in _spelled(phones, inventory)}
-    anchors = anchors_of(phones, inventory.silence) or [(0.0, inventory.silence)]
+    syllables = {onset_s: label for onset_s, _, label in labels}
+    anchors = anchors_of(phones, silence) or [(0.0, silence)]
     return [
         drawing.Moment(
             time_s,
             float(opening),
-            "" if phone == inventory.silence else phone,
+            "" if phone == silence else phone,
             syllables.get(time_s, ""),
         )
         for (time_s, phone), opening in zip(anchors, motion.openings, strict=True)
@@ -178,15 +180,40 @@ def syllables_of(phones: Sequence[Phone], inventory: PhoneInventory) -> list[lis
     return syllables
 
 
-def _spelled(phones: Sequence[Phone], inventory: PhoneInventory) -> list[tuple[float, float, str]]:
-    """Return onset, end and spelling of each syllable."""
+def _recognised_syllables(
+    phones: Sequence[Phone], inventory: PhoneInventory
+) -> list[TimedSyllable]:
+    """Return the syllables of recognised phones, which have no tones."""
+    timed = []
+    for syllable in syllables_of(phones, inventory):
+        spelling = inventory.spell(tuple(phone.symbol for phone in syllable))
+        end_s = syllable[-1].onset_s + syllable[-1].duration_s
+        onset_s = syllable[0].onset_s
+        timed.append(TimedSyllable(spelling, spelling, onset_s, end_s - onset_s))
+    return timed
+
+
+def _labels(syllables: Sequence[TimedSyllable], *, are_pixels: bool) -> list[Span]:
+    """Return onset, end and label of each syllable: what is written, and its spelling.
+
+    A picture of pixels needs a font for characters; without one, the spelling stands alone.
+    """
+    texts = [one.text for one in syllables if one.text != one.spelling]
+    shows_text = not are_pixels or drawing.can_draw("".join(texts))
+    if not shows_text:
+        print_message(
+            "labels are pinyin alone: no font with Chinese characters was found (Debian: "
+            "fonts-noto-cjk)"
+        )
     return [
         (
-            syllable[0].onset_s,
-            syllable[-1].onset_s + syllable[-1].duration_s,
-            inventory.spell(tuple(phone.symbol for phone in syllable)),
+            one.onset_s,
+            one.onset_s + one.duration_s,
+            f"{one.text} {one.spelling}"
+            if shows_text and one.text != one.spelling
+            else one.spelling,
         )
-        for syllable in syllables_of(phones, inventory)
+        for one in syllables
     ]
 
 
@@ -194,13 +221,12 @@ def _write_video(
     output: Path,
     motion: KeyFrames,
     phones: Sequence[Phone],
-    inventory: PhoneInventory,
+    labels: Sequence[Span],
     samples: NDArray[np.float32],
     *,
     smooth: bool,
 ) -> int:
     symbols = [(phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in phones]
-    syllables = _spelled(phones, inventory)
     times_s = _frame_times(len(samples))
     openings = motion.openings_at(times_s, smooth=smooth)
     with (
@@ -212,13 +238,13 @@ def _write_video(
             list(zip(times_s.tolist(), openings.tolist(), strict=True)), description="drawing"
         ):
             moment = drawing.Moment(
-                time_s, opening, _spoken_at(time_s, symbols), _spoken_at(time_s, syllables)
+                time_s, opening, _spoken_at(time_s, symbols), _spoken_at(time_s, labels)
             )
             writer.write_image(drawing.rasterize(drawing.image(moment, *_VIDEO_SIZE_PX)))
     return len(times_s)
 
 
-def _spoken_at(time_s: float, spans: Sequence[tuple[float, float, str]]) -> str:
+def _spoken_at(time_s: float, spans: Sequence[Span]) -> str:
     return next((text for start_s, end_s, text in spans if start_s <= time_s < end_s), "")
 
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.lips.contour_accuracy import BEST_OPENING, STILL, accuracy_of, limits, scaled
+from evaluation.lips.contour_accuracy import (
+    BEST_OPENING,
+    STILL,
+    accuracy_of,
+    limits,
+    mean_mouths,
+    scaled,
+)
 from evaluation.lips.contour_shapes import check_shapes
 from services.synthesizer.lips.ferguson.contour import faps_of
 from shared.face.faps import MOUTH_FAPS
@@ -39,6 +46,14 @@ def test_everyone_opens_as_wide() -> None:
     assert np.nanmax(of_two[0][:, MOUTH_FAPS.index(52)]) == pytest.approx(0.0)
     np.testing.assert_allclose(of_two[0], 2.0 * of_two[2])
     assert of_two[1][4] == pytest.approx(real[4], rel=0.1)
+
+
+def test_phones_have_the_mean_of_their_mouths_where_they_are_measured() -> None:
+    mouths = np.array([[1.0, 2.0], [9.0, 9.0], [3.0, np.nan], [5.0, np.nan], [0.0, np.nan]])
+    np.testing.assert_array_equal(mean_mouths(["a", "b", "a", "a", "i"], mouths), [[3.0, 2.0]])
+    unmeasured = np.where([True, False], mouths, np.nan)
+    np.testing.assert_array_equal(mean_mouths(["a"] * 5, unmeasured), [[3.6, np.nan]])
+    assert mean_mouths([], mouths[:0]).shape == (0, 2)
 
 
 def test_limits_of_one_opening_and_of_none() -> None:

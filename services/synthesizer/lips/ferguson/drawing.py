@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from html import escape
 from typing import Literal
 
@@ -32,6 +33,19 @@ _LINE_PX_PER_WIDTH = 0.006
 WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
 _ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # as Pillow calls them
 _FINER = 3  # pictures are drawn so much larger, then averaged
+# files of fonts with Chinese characters, on Linux, macOS and Windows
+_CHINESE_FONTS = (
+    "NotoSansCJK-Regular.ttc",
+    "NotoSansSC-Regular.otf",
+    "SourceHanSansSC-Regular.otf",
+    "wqy-zenhei.ttc",
+    "wqy-microhei.ttc",
+    "DroidSansFallbackFull.ttf",
+    "PingFang.ttc",
+    "Hiragino Sans GB.ttc",
+    "msyh.ttc",
+    "simsun.ttc",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +226,27 @@ def svg(drawing: Drawing) -> str:
     return "\n".join([*lines, "</svg>", ""])
 
 
+def can_draw(text: str) -> bool:
+    """Whether ``rasterize`` has a font for a text."""
+    return text.isascii() or _chinese_font(1.0) is not None
+
+
+@lru_cache
+def _chinese_font(size_px: float) -> ImageFont.FreeTypeFont | None:
+    """Return the first of ``_CHINESE_FONTS`` that is installed; None if there is none."""
+    for name in _CHINESE_FONTS:
+        try:
+            return ImageFont.truetype(name, size_px)
+        except OSError:
+            continue
+    return None
+
+
+def _font(text: str, size_px: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    chinese = None if text.isascii() else _chinese_font(size_px)
+    return chinese or ImageFont.load_default(size_px)
+
+
 def rasterize(drawing: Drawing) -> UInt8:
     """Return a drawing as a picture (height_px, width_px, 3), sRGB."""
     fine = Image.new("RGB", (drawing.width_px * _FINER, drawing.height_px * _FINER), PAPER)
@@ -226,7 +261,7 @@ def rasterize(drawing: Drawing) -> UInt8:
             width = max(1, round(outline.line_px * _FINER))
             pen.line(points, fill=outline.color, width=width, joint="curve")
     for label in drawing.labels:
-        font = ImageFont.load_default(max(label.size_px * _FINER, 1.0))
+        font = _font(label.text, max(label.size_px * _FINER, 1.0))
         pen.text(
             (label.x * _FINER, label.y * _FINER),
             label.text,
