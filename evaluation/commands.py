@@ -339,11 +339,12 @@ def plot_visemes(
 def plot_lip_line(
     output: Annotated[Path, typer.Argument(help="Picture to write (.png).")],
 ) -> None:
-    """Draw the head's lips beside lips that plain zones of influence move."""
+    """Draw the head's lips beside lips that plain zones of influence move; print their bumps."""
     from corpora.figures import save_figure
-    from evaluation.lips.lip_line import lip_line_figure
+    from evaluation.lips.lip_line import lip_line_figure, print_lip_lines
 
     check_output(output)
+    print_lip_lines(Console())
     save_figure(lip_line_figure(), output)
     print_message(f"wrote {output}")
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from corpora.feature_cache import read_audio
 from corpora.lip_clips import label_clip, read_clips
 from corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
@@ -12,6 +15,7 @@ from services.recognizer.acoustic.acoustic_model import AcousticModel
 from services.recognizer.acoustic.load import load_model
 from services.recognizer.alignment import align_phones, spoken
 from services.recognizer.front_end.pcm import progress_of
+from services.synthesizer.lips.ferguson.contour import lip_points
 from services.synthesizer.lips.ferguson.table import PhoneTable, format_table
 from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
@@ -52,8 +56,7 @@ def train_ferguson(
     rows = training_rows(corpora, inventory, errors, any_licence=any_licence)
     times = usual_times(aligned_speech(model, rows, errors), inventory)
     errors.print_to(report)
-    for fap, travel in zip(MOUTH_FAPS, travel_of(used), strict=True):
-        report(f"FAP {fap} travels {travel:.1f} FAP units to the widest mouth (lip_points.tsv)")
+    _report_travels(travel_of(used), report)
     licences = sorted({clip.licence for clip in used} | {row.licence for row in rows})
     table = PhoneTable(
         opening=openings,
@@ -72,6 +75,16 @@ def train_ferguson(
         output.write_text(format_table(table, inventory, about), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{output}: cannot be written: {error.strerror}") from None
+
+
+def _report_travels(travels: NDArray[np.float64], report: Report) -> None:
+    """Tell the travels that belong into ``lip_points.tsv``, and which of them are not measured."""
+    of_fap = dict(zip(MOUTH_FAPS, travels, strict=True))
+    for name, point in lip_points().items():
+        if point.fap is not None:
+            travel = of_fap[point.fap]
+            told = f"travel {travel:.1f} FAP units" if travel else "not measured, keep what it has"
+            report(f"lip_points.tsv: point {name}, FAP {point.fap}: {told}")
 
 
 def training_rows(

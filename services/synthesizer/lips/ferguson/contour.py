@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from shared.errors import UserError
 from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
 
 Array = NDArray[np.float64]
@@ -48,6 +49,7 @@ LINES = {
 }
 _ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without a travel
 _MOUTH_WIDTHS_PER_MNS = 0.39  # of the head "woman"
+_MAX_TRAVEL = 1500.0  # FAP units
 _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
 
 
@@ -59,6 +61,14 @@ class LipPoint:
     y: float
     fap: int | None  # that moves it vertically
     travel: float  # FAP units at R = 5
+
+    @property
+    def rise(self) -> float:
+        """Travel up for R = 1, mouth widths; 0 without a FAP."""
+        if self.fap is None:
+            return 0.0
+        sign = 1.0 if FAPS[self.fap - 1].direction == "up" else -1.0
+        return sign * self.travel * _FAP_UNIT / MAX_OPENING
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,17 +93,45 @@ class LipLine:
 @lru_cache
 def lip_points() -> dict[str, LipPoint]:
     """Return the points of ``lip_points.tsv`` by their names."""
-    file = resources.files(__package__) / "lip_points.tsv"
-    lines = [line for line in file.read_text("utf-8").splitlines() if not line.startswith("#")]
-    return {
-        row["point"]: LipPoint(
-            float(row["x"]),
-            float(row["y"]),
-            int(row["fap"]) if row["fap"] else None,
-            float(row["travel"] or 0.0),
-        )
-        for row in csv.DictReader(lines, delimiter="\t")
-    }
+    return parse_lip_points((resources.files(__package__) / "lip_points.tsv").read_text("utf-8"))
+
+
+def parse_lip_points(text: str) -> dict[str, LipPoint]:
+    """Read points from the text of a table.
+
+    Raises
+    ------
+    UserError
+        If a point is missing, stands on the wrong side of its neighbour or is moved by a FAP of
+        another point, or a travel is no number or larger than a mouth can open.
+    """
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    points = {}
+    for row in csv.DictReader(lines, delimiter="\t"):
+        try:
+            points[row["point"]] = LipPoint(
+                float(row["x"]),
+                float(row["y"]),
+                int(row["fap"]) if row["fap"] else None,
+                float(row["travel"] or 0.0),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(f"the lips' feature points are damaged: {row}: {error!r}") from None
+    for name, point in points.items():
+        if point.fap is not None and (
+            point.fap not in MOUTH_FAPS or name not in FAPS[point.fap - 1].feature_points
+        ):
+            raise UserError(f"the lips' feature points are damaged: FAP {point.fap} moves {name}")
+        if not (abs(point.travel) <= _MAX_TRAVEL and np.isfinite([point.x, point.y]).all()):
+            raise UserError(f"the lips' feature points are damaged: {name} is out of range")
+    for line, members in LINES.items():
+        x = [points[name].x for name in members if name in points and points[name].fap]
+        if len(x) < len(members) or not (np.diff(x) > 0.0).all():
+            raise UserError(
+                f"the lips' feature points are damaged: the {line} line needs {', '.join(members)}"
+                " from right to left, each with its FAP"
+            )
+    return points
 
 
 @lru_cache
@@ -109,19 +147,12 @@ def _line(name: str) -> LipLine:
     closed = sorted((points[point] for point in all_points), key=lambda point: point.x)
     return LipLine(
         _ferguson([point.x for point in closed], [point.y for point in closed]),
-        _ferguson([point.x for point in moving], [_rise(point) for point in moving]),
+        _ferguson([point.x for point in moving], [point.rise for point in moving]),
     )
 
 
 def _ferguson(x: list[float], y: list[float]) -> CubicSpline:
     return CubicSpline(x, y, bc_type="natural")
-
-
-def _rise(point: LipPoint) -> float:
-    """Travel up for R = 1, mouth widths."""
-    assert point.fap is not None  # noqa: S101 - all points of LINES have one
-    sign = 1.0 if FAPS[point.fap - 1].direction == "up" else -1.0
-    return sign * point.travel * _FAP_UNIT / MAX_OPENING
 
 
 def contour(openings: ArrayLike, num_points: int = 41) -> Array:
