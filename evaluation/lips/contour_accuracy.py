@@ -33,7 +33,7 @@ from rich.table import Table
 
 from corpora.figures import new_figure
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
-from evaluation.lips.schemes import DEFAULT_DELAY_S, FRAME_RATE_HZ, live_events, live_frames
+from evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
 from evaluation.recognizer.disturbances import faster
 from services.cli.mouth_drawing import syllables_of
 from services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -42,6 +42,7 @@ from services.recognizer.alignment import align_phones, spoken
 from services.recognizer.front_end.pcm import progress_of
 from services.recognizer.lips import lips_for
 from services.recognizer.offline import recognize
+from services.synthesizer.config import DELAYS_MS
 from services.synthesizer.lips.ferguson.contour import faps_of
 from services.synthesizer.lips.ferguson.motion import MAX_OPENING, KeyFrames
 from services.synthesizer.lips.ferguson.openings import key_frames_of
@@ -197,10 +198,11 @@ def _methods(
     by_endpoints = time_text(progress_of(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
         yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
-    events = live_events(model, samples, lips_for(model), [DEFAULT_DELAY_S])[DEFAULT_DELAY_S]
-    for name in LIP_MODELS:
+    delays_s = {name: DELAYS_MS[name] / 1e3 for name in LIP_MODELS}
+    events = live_events(model, samples, lips_for(model), sorted(set(delays_s.values())))
+    for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)
-        frames = live_frames(lips, events, DEFAULT_DELAY_S, FRAME_RATE_HZ)
+        frames = live_frames(lips, events[delay_s], delay_s, FRAME_RATE_HZ)
         yield f"{name}, live", _between(frames[:, np.array(MOUTH_FAPS) - 1])
 
 

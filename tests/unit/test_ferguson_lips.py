@@ -87,6 +87,20 @@ def test_the_energy_moves_the_mouth_before_a_phone_is_known() -> None:
     assert made[50:].max() < 0.05  # and what no phone explains is no speech
 
 
+def test_a_vowel_lasts_as_long_as_its_sound_while_its_end_is_an_estimate() -> None:
+    made = openings(
+        [
+            replace(event, duration_s=0.15, final=False)
+            if isinstance(event, Phone) and event.symbol == "a"
+            else event
+            for event in SAID
+        ]
+    )
+    assert made[42] > 1.5
+    assert np.diff(made[33:]).max() < 0.05  # falls once, and stays closed
+    assert made[62:].max() < 0.05
+
+
 def test_revisions_and_interruptions_leave_no_jump() -> None:
     revised: list[SoundEvent] = [
         replace(event, symbol="u") if isinstance(event, Phone) and event.index else event

@@ -184,7 +184,10 @@ class FergusonStream:
         return Syllables(np.array([one.onset_s for one in phones if one.symbol in vowels]))
 
     def _snapped_phones(self) -> list[Phone]:
-        """Return the phones known, those that begin a syllable at the beginning of its piece."""
+        """Return the phones known, those that begin a syllable at the beginning of its piece.
+
+        The last one, while its end is an estimate, lasts as long as its piece.
+        """
         inventory = self._model.inventory
         starts_s = np.array([piece.start_s for piece in self._pieces])
         if self._cutter.start_s is not None:
@@ -201,8 +204,17 @@ class FergusonStream:
             if snapped:
                 onset_s = max(onset_s, snapped[-1].onset_s)
             end_s = max(phone.onset_s + phone.duration_s, onset_s)
+            if number == len(phones) - 1 and not phone.final:
+                end_s = max(end_s, self._sound_end_s)
             snapped.append(replace(phone, onset_s=onset_s, duration_s=end_s - onset_s))
         return snapped
+
+    @property
+    def _sound_end_s(self) -> float:
+        """When the last piece ends, as far as the sound is known."""
+        if self._cutter.start_s is not None:
+            return self._heard_s
+        return self._pieces[-1].end_s if self._pieces else -np.inf
 
     def _key_frames(self, phones: Sequence[Phone]) -> KeyFrames:
         """Return the course of the mouth as far as the sound tells, and what is usual after it."""
