@@ -58,7 +58,7 @@ Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
 Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
-RATES = (0.8, 1.0, 1.25, 1.5, 2.0)
+RATES = (1.0, 1.5, 2.0)
 _FULL_PERCENTILE = 98.0
 _MIN_MOUTHS = 3
 _LIP_COLUMNS = [
@@ -69,6 +69,7 @@ _LIP_COLUMNS = [
 ]
 _MIDDLES = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
 BEST_OPENING, STILL = "best R of each mouth", "still mouth"
+_LIMIT_STYLES = {BEST_OPENING: "--", STILL: ":"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,22 +252,20 @@ def rates_figure(scores: Sequence[RateScore]) -> Any:
     """Draw the accuracies over the speaking rate."""
     figure = new_figure(11.0, 4.5)
     rates = [score.rate for score in scores]
-    for axis, (title, accuracies) in zip(
-        figure.subplots(1, 2, sharey=True), _MEASURES.items(), strict=True
-    ):
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, (title, accuracies) in zip(axes, _MEASURES.items(), strict=True):
         for name in accuracies(scores[0]):
-            is_limit = name in (BEST_OPENING, STILL)
             axis.plot(
                 rates,
                 [100 * accuracies(score)[name] for score in scores],
-                "--" if is_limit else "o-",
-                color="0.6" if is_limit else None,
+                _LIMIT_STYLES.get(name, "o-"),
+                color="0.6" if name in _LIMIT_STYLES else None,
                 label=name,
             )
         axis.set_title(title)
         axis.set_xlabel("speaking rate, relative to the recording")
-    axis.set_ylabel("accuracy, %")
-    axis.legend(fontsize=8)
+    axes[0].set_ylabel("accuracy, %")
+    axes[1].legend(fontsize=8)
     return figure
 
 
