@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from evaluation.commands import bench_app
-from tests.system import DEMO
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.bench
 
@@ -19,7 +19,7 @@ def test_it_prints_a_table_and_writes_the_same_figures(
 ) -> None:
     monkeypatch.setattr("evaluation.system.rendering.NUM_IMAGES", 10)
     figures = tmp_path / "latency.json"
-    arguments = [str(DEMO / "vowels-male.wav"), "--repeats", "1", "--json", str(figures)]
+    arguments = [str(VOWELS_FILE), "--repeats", "1", "--json", str(figures)]
     result = CliRunner().invoke(bench_app, arguments)
     assert result.exit_code == 0, result.output
     latency = json.loads(figures.read_text(encoding="utf-8"))

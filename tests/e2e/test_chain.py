@@ -15,7 +15,7 @@ from shared.client import Client, Subscription
 from shared.phones.inventory import load_inventory
 from shared.wire.face import FapFrame
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
-from tests.system import DEMO, System
+from tests.system import DEMO, VOWELS_FILE, System
 
 pytestmark = pytest.mark.e2e
 DELAY = round(SynthesizerConfig().delay_ms * 16)  # samples
@@ -78,7 +78,7 @@ def test_frames_do_not_depend_on_the_chunks(
 
 
 def test_real_time_gives_the_frames_of_as_fast_as_possible(system: System) -> None:
-    samples = samples_of_file(DEMO / "vowels-male.wav")
+    samples = samples_of_file(VOWELS_FILE)
     fast = stream(system.control, samples)
     end_s = time.monotonic() + 90
     while True:
@@ -177,7 +177,7 @@ def _frames_until(output: Subscription, last: Callable[[FapFrame], bool]) -> lis
 
 
 def test_the_driver_records_picture_and_sound_in_sync(system: System) -> None:
-    samples = samples_of_file(DEMO / "vowels-male.wav")
+    samples = samples_of_file(VOWELS_FILE)
     stream(system.control, samples, session="film", record=True)
     path = system.folder / "film.mp4"
     end_s = time.monotonic() + 60

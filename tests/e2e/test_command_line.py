@@ -21,10 +21,10 @@ from shared.face.fap_file import read_fap
 from shared.face.faps import FAP_NUMBER
 from shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file, stream_into
-from tests.system import DEMO, ROOT, System, free_port, kouxing
+from tests.system import ROOT, VOWELS_FILE, System, free_port, kouxing
 
 pytestmark = pytest.mark.e2e
-SENTENCE = DEMO / "vowels-male.wav"
+SENTENCE = VOWELS_FILE
 
 
 def empty(path: Path) -> None:

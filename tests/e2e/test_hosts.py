@@ -18,7 +18,7 @@ import pytest
 import zmq
 
 from tests.e2e.following import samples_of_file
-from tests.system import DEMO, ROOT, System
+from tests.system import ROOT, VOWELS_FILE, System
 
 pytestmark = pytest.mark.e2e
 DOCUMENT = ROOT / "proto" / "PROTOCOL.md"
@@ -78,7 +78,7 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> 
         faps.setsockopt(zmq.SUBSCRIBE, f"{wanted}/stranger/".encode())
     assert receive(faps)[0] == "joined"
 
-    samples = samples_of_file(DEMO / "vowels-male.wav")
+    samples = samples_of_file(VOWELS_FILE)
     pcm = (samples * 32767).astype("<i2").tobytes()
     audio = speaker.socket(zmq.DEALER, opened["audio"])
     for number, begin in enumerate(range(0, len(pcm), 1280), start=1):
@@ -207,7 +207,7 @@ def test_the_examples_in_the_document_run(
     script.write_text(example.replace(address, spread.control), encoding="utf-8")
     (tmp_path / "node_modules").symlink_to(DOCUMENT.parent / "node" / "node_modules")
     result = subprocess.run(
-        [program, script, DEMO / "vowels-male.wav"],
+        [program, script, VOWELS_FILE],
         capture_output=True,
         text=True,
         timeout=60,

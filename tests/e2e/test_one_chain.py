@@ -30,7 +30,7 @@ from shared.wire.speech import Lips
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.lips import LIPS, clip_of
 from tests.made_up_lips import JAW, LoudLips
-from tests.system import DEMO, System
+from tests.system import DEMO, VOWELS_FILE, System
 
 pytestmark = pytest.mark.e2e
 MOUTH = np.array(MOUTH_FAPS) - 1
@@ -48,7 +48,7 @@ def at_rate(samples: NDArray[np.float32], rate_hz: int) -> NDArray[np.float32]:
     ("name", "rate_hz", "chunk"),
     [
         ("hello-female", 16000, 320),
-        ("vowels-male", 16000, 97),
+        ("lake-male", 16000, 97),
         ("bilabials-female", 44100, 1021),
         ("hello-male", 48000, 128),
     ],
@@ -92,7 +92,7 @@ def test_services_send_the_frames_of_the_chain(
 def test_services_send_the_frames_of_the_chain_with_chosen_lips(
     tmp_path: Path, lips: LipModelName, rate_hz: int
 ) -> None:
-    samples = at_rate(samples_of_file(DEMO / "vowels-male.wav"), rate_hz)
+    samples = at_rate(samples_of_file(VOWELS_FILE), rate_hz)
     services = ("control", "recognizer", "synthesizer")
     with System(services, tmp_path, settings={"KOUXING_SYNTHESIZER_LIPS": lips}) as running:
         sent = stream(running.control, samples, chunk=997, sample_rate_hz=rate_hz)
@@ -193,7 +193,7 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
 
 
 def test_evaluation_scores_the_mouth_of_the_chain() -> None:
-    samples = samples_of_file(DEMO / "vowels-male.wav")
+    samples = samples_of_file(VOWELS_FILE)
     chain = LiveChain(load_live_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
     frames = chain.accept_waveform(samples) + chain.input_finished()
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)

@@ -34,10 +34,10 @@ from shared.face.fap_file import FapAnimation, read_fap, write_fap
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from tests.glb_writer import write_glb
 from tests.meshes import meshes
-from tests.system import DEMO, ROOT, free_port, kouxing
+from tests.system import ROOT, VOWELS_FILE, free_port, kouxing
 
 pytestmark = pytest.mark.e2e
-SENTENCE = DEMO / "vowels-male.wav"
+SENTENCE = VOWELS_FILE
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from pathlib import Path
 import av
 import pytest
 
-from tests.system import DEMO, ONE_THREAD, ROOT, kouxing, own_environment
+from tests.system import ONE_THREAD, ROOT, VOWELS_FILE, kouxing, own_environment
 
 pytestmark = pytest.mark.e2e
-SENTENCE = DEMO / "vowels-male.wav"
+SENTENCE = VOWELS_FILE
 
 
 def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:

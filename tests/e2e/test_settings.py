@@ -12,7 +12,7 @@ from shared.client import Client
 from shared.wire.control import Event
 from shared.wire.session import Error
 from tests.e2e.following import samples_of_file, stream
-from tests.system import DEMO, System
+from tests.system import VOWELS_FILE, System
 
 pytestmark = pytest.mark.e2e
 SETTINGS = {
@@ -32,13 +32,13 @@ def tuned(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 def test_the_frame_rate_is_the_one_that_was_set(tuned: System) -> None:
-    heard = stream(tuned.control, samples_of_file(DEMO / "vowels-male.wav"))
+    heard = stream(tuned.control, samples_of_file(VOWELS_FILE))
     times_s = np.array([frame.media_time for frame in heard.frames]) / 16000
     np.testing.assert_allclose(np.diff(times_s), 1 / 30, atol=1e-4)
 
 
 def test_without_gestures_the_mouth_alone_moves(tuned: System) -> None:
-    heard = stream(tuned.control, samples_of_file(DEMO / "vowels-male.wav"))
+    heard = stream(tuned.control, samples_of_file(VOWELS_FILE))
     assert np.abs(heard.faps[:, 2]).max() > 100
     assert np.abs(heard.faps[:, 18:42]).max() == 0
     assert np.abs(heard.faps[:, 47:50]).max() == 0

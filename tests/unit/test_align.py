@@ -16,6 +16,7 @@ from shared.errors import UserError
 from shared.phones.events import Phone
 from shared.phones.inventory import load_inventory
 from shared.phones.phone_files import format_phones
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
@@ -24,7 +25,7 @@ DEMO = Path(__file__).parents[2] / "shared" / "demo"
 
 @pytest.fixture(scope="module")
 def vowels() -> list[Phone]:
-    samples, rate_hz = read_audio(DEMO / "vowels-male.wav")
+    samples, rate_hz = read_audio(VOWELS_FILE)
     return align_text(load_model(), samples, rate_hz, "啊，喔，鹅，衣，乌，迂。")
 
 
@@ -37,7 +38,7 @@ def test_all_phones_in_order_without_gaps(vowels: list[Phone]) -> None:
 
 
 def test_vowels_are_where_the_sound_is(vowels: list[Phone]) -> None:
-    samples, rate_hz = read_audio(DEMO / "vowels-male.wav")
+    samples, rate_hz = read_audio(VOWELS_FILE)
     loud = np.square(samples[:, 0]).mean()
     for phone in spoken(vowels, load_inventory()):
         first = int(phone.onset_s * rate_hz)
@@ -174,7 +175,7 @@ def test_a_known_text_has_tiers_for_characters_syllables_and_phones() -> None:
 
 def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"ends in \.txt, \.csv, \.json, \.textgrid"):
-        align(DEMO / "vowels-male.wav", "啊", output=tmp_path / "said.xml")
+        align(VOWELS_FILE, "啊", output=tmp_path / "said.xml")
 
 
 def test_unknown_style() -> None:

@@ -30,12 +30,12 @@ from shared.audio_file import read_audio
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
 from tests.lips import INVENTORY, clip_of
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
 Array = NDArray[np.float64]
 VOWEL_SHAPES = ("a", "o", "e", "i", "u", "v")
-VOWELS = Path(__file__).parents[2] / "shared" / "demo" / "vowels-male.wav"
 
 
 def clip_with(samples: NDArray[np.float32], name: str = "made_up") -> LipClip:
@@ -57,7 +57,7 @@ def heard(clip: LipClip) -> HeardClip:
 
 @pytest.fixture(scope="module")
 def vowels() -> LipClip:
-    samples, rate_hz = read_audio(VOWELS)
+    samples, rate_hz = read_audio(VOWELS_FILE)
     assert rate_hz == SAMPLE_RATE_HZ
     return replace(clip_with(samples[:, 0]), transcript="啊喔鹅衣乌迂")
 

@@ -48,6 +48,7 @@ from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import INVENTORY, LIPS, clip_of, utterance
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
@@ -303,7 +304,7 @@ def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: s
 @pytest.mark.slow
 def test_one_run_of_the_recognizer_serves_faces_of_all_delays() -> None:
     model = load_model()
-    samples = read_audio(DEMO / "vowels-male.wav")[0][:, 0]
+    samples = read_audio(VOWELS_FILE)[0][:, 0]
     lips = lips_for(model)
     found = live_events(model, samples, lips, DELAYS_S)
     assert list(found) == DELAYS_S
@@ -402,7 +403,7 @@ def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_sentence_is_drawn_with_the_parameters_given() -> None:
     model = load_model()
-    samples, _ = read_audio(DEMO / "vowels-male.wav")
+    samples, _ = read_audio(VOWELS_FILE)
     still = replace(START, target=np.zeros_like(START.target))
     for parameters, moves in ((START, True), (still, False)):
         lips = DynamicVisemes(parameters, INVENTORY)

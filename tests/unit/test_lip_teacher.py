@@ -18,7 +18,7 @@ from services.recognizer.lip_positions import POSITION_S
 from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS
 from shared.errors import UserError
 from tests.lips import clip_of
-from tests.system import DEMO
+from tests.system import VOWELS_FILE
 from training.lips import teacher
 from training.lips.positions import Speech, speech_of
 from training.lips.recipe import DELAYS_S
@@ -78,7 +78,7 @@ def test_labels_are_of_the_moment_of_the_mouth(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = load_model()
     assert isinstance(model, NeuralModel)
-    path, silent = DEMO / "vowels-male.wav", tmp_path / "silent.wav"
+    path, silent = VOWELS_FILE, tmp_path / "silent.wav"
     soundfile.write(silent, np.zeros(16_000), 16_000)
     one = np.ones(1, np.float32)
     known = 0.25  # is added to the time

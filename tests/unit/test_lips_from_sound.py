@@ -26,11 +26,11 @@ from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import LipFrame
 from tests.e2e.following import samples_of_file
 from tests.lip_predictors import DELAYS_S, HISTORY, NUM_FEATURES, UNITS, made_up_model
-from tests.system import DEMO
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
-SAMPLES = samples_of_file(DEMO / "vowels-male.wav")[:32_000]
+SAMPLES = samples_of_file(VOWELS_FILE)[:32_000]
 
 
 MODEL = made_up_model()

@@ -19,7 +19,7 @@ from shared.face.faps import MOUTH_FAPS
 from shared.phones.events import Phone
 from tests.e2e.following import samples_of_file
 from tests.lips import clip_of
-from tests.system import DEMO
+from tests.system import VOWELS_FILE
 from training.lips import recipe, recurrent
 from training.lips.card import lips_of
 from training.lips.positions import Speech
@@ -207,7 +207,7 @@ def test_closures_that_are_met_missed_and_made_up() -> None:
 
 
 def write_clip(folder: Path, name: str, speaker: str, licence: str) -> None:
-    samples = samples_of_file(DEMO / "vowels-male.wav")[: 2 * SAMPLE_RATE_HZ]
+    samples = samples_of_file(VOWELS_FILE)[: 2 * SAMPLE_RATE_HZ]
     soundfile.write(folder / f"{name}.flac", samples, SAMPLE_RATE_HZ)
     about = {"speaker": speaker, "licence": licence, "language": "en"}
     (folder / f"{name}.json").write_text(json.dumps(about))

@@ -18,6 +18,7 @@ from services.driver import picture
 from services.synthesizer.lips.ferguson import drawing
 from services.synthesizer.lips.ferguson.contour import LINES, contour
 from shared.errors import UserError
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
@@ -76,7 +77,7 @@ def test_pixels_show_characters_if_a_font_has_them(
 
 
 def test_video_has_sound_and_an_image_for_every_frame(tmp_path: Path) -> None:
-    draw_mouth(SOUND.with_name("vowels-male.wav"), "a1 o1 e2 yi1 wu1 yu1", tmp_path / "mouth.mp4")
+    draw_mouth(VOWELS_FILE, "a1 o1 e2 yi1 wu1 yu1", tmp_path / "mouth.mp4")
     with av.open(str(tmp_path / "mouth.mp4")) as container:
         assert container.streams.audio
         images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]

@@ -18,6 +18,7 @@ from services.recognizer.acoustic.load import load_model
 from shared.errors import UserError
 from shared.phones.events import Phone, SpeechChange
 from tests.languages import MANDARIN
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
@@ -128,7 +129,7 @@ def test_consonants_at_the_lips_have_recall_and_precision() -> None:
 
 @pytest.mark.slow
 def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
-    vowels = DEMO / "vowels-male.wav"
+    vowels = VOWELS_FILE
     (tmp_path / "noise.wav").write_bytes(b"no sound")
     rows = [
         f"v\t{vowels}\tm\ttest\t2.2\t啊喔鹅衣乌迂\t",

@@ -19,7 +19,7 @@ from shared.wire.audio import AudioChunk
 from shared.wire.control import StartSession
 from shared.wire.message import MAX_AUDIO_BYTES
 from tests.e2e.following import samples_of_file
-from tests.system import DEMO, free_port
+from tests.system import VOWELS_FILE, free_port
 
 pytestmark = pytest.mark.unit
 RATE_HZ = 8000
@@ -118,7 +118,7 @@ def test_a_session_has_the_lips_of_its_voice(service: Watched) -> None:
     start = start_of(voice.to_profile(lips.digest))
     service.start_session(start)
     stream = service._sessions["s"].stream
-    events = stream.accept_waveform(samples_of_file(DEMO / "vowels-male.wav")[:16_000])
+    events = stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
     frames = [event for event in events if isinstance(event, LipFrame)]
     assert len(frames) > 5
     assert {frame.faps[0] for frame in frames} == {77.0}
@@ -160,7 +160,7 @@ def test_the_shipped_lips_are_used_with_the_network_that_they_were_trained_on(
     lips = lips_for(neural, path)
     assert lips is not None
     stream = SpeechStream(neural, lips=lips, face_delay_s=0.2)
-    events = stream.accept_waveform(samples_of_file(DEMO / "vowels-male.wav"))
+    events = stream.accept_waveform(samples_of_file(VOWELS_FILE))
     frames = [event for event in events if isinstance(event, LipFrame)]
     assert len(frames) > 50
     assert {frame.delay_s for frame in frames} == {0.1}

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from corpora.lip_clips import level_track
-from services.recognizer.acoustic.load import load_model
+from services.recognizer.acoustic.load import load_live_model, load_model
 from services.recognizer.alignment import align_text
 from services.recognizer.lips import lips_for
 from services.recording_chain import HeardRecording, animate, hear_recording
@@ -21,6 +21,7 @@ from services.synthesizer.lips.load import load_lip_model
 from services.synthesizer.offline import synthesize
 from shared.audio_file import read_audio
 from shared.phones.events import Phone, SpeechChange
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
@@ -47,7 +48,7 @@ def openings(heard: HeardRecording) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def test_dynamic_visemes_are_the_full_model() -> None:
-    samples = read_audio(DEMO / "vowels-male.wav")[0][:, 0]
+    samples = read_audio(VOWELS_FILE)[0][:, 0]
     heard = hear_recording(load_model(), samples)
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
@@ -82,6 +83,15 @@ def test_recognised_phones_err_where_the_text_does_not() -> None:
         and opening[np.abs(times_s - phone.onset_s - 0.04) < 0.041].min() > 100
     ]
     assert missed
+
+
+def test_every_phone_of_a_sentence_with_many_rounded_vowels_is_right() -> None:
+    samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
+    model = load_live_model()
+    heard = hear_recording(model, samples)
+    spoken = [phone.symbol for phone in heard.phones if phone.symbol != model.inventory.silence]
+    text = model.inventory.pronounce("五月的湖边，我和女儿读书、画鱼。")
+    assert spoken == [phone for syllable in text for phone in syllable]
 
 
 def test_the_face_knows_of_speech_when_it_is_due() -> None:

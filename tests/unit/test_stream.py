@@ -26,12 +26,12 @@ from shared.wire.events import message_of
 from shared.wire.message import Message
 from tests.e2e.following import samples_of_file
 from tests.made_up_lips import JAW, LoudLips
-from tests.system import DEMO
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
 MODEL = load_model()
-SAMPLES = samples_of_file(DEMO / "vowels-male.wav")
+SAMPLES = samples_of_file(VOWELS_FILE)
 RATE_HZ = 16_000
 
 

@@ -38,10 +38,10 @@ from shared.face.lip_models import LipModelName
 from shared.phones.events import Phone, Progress
 from shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import flat_language, install_language
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
-VOWELS = Path(__file__).parents[2] / "shared" / "demo" / "vowels-male.wav"
 STATES = 3  # of each phone
 HALF_WIDTH = 2
 
@@ -59,7 +59,7 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[PhoneInvent
 @cache
 def vowels() -> tuple[NDArray[np.float32], tuple[tuple[str, float, float], ...]]:
     """Samples at 16 kHz; symbol, onset and end of all vowels and pauses in seconds."""
-    samples, rate_hz = read_audio(VOWELS)
+    samples, rate_hz = read_audio(VOWELS_FILE)
     assert rate_hz == 16_000
     aligned = align_text(load_model(), samples, rate_hz, "啊喔鹅衣乌迂")
     labels = (

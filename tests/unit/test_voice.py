@@ -25,12 +25,12 @@ from services.recognizer.voice_learning import (
 from shared.errors import UserError
 from tests.e2e.following import samples_of_file
 from tests.lip_predictors import made_up_model
-from tests.system import DEMO
+from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 MODEL = made_up_model()
 NEURAL = load_model()
-VOWELS = samples_of_file(DEMO / "vowels-male.wav")[:80_000]
+VOWELS = samples_of_file(VOWELS_FILE)[:80_000]
 SHAPE = MODEL.residual_shape
 DELAYS = SHAPE[1]
 NUM_FAPS = len(LIP_FAPS)
