@@ -202,6 +202,20 @@ def test_sound_and_phone_decide_a_closure_together(
     assert height < 10.0 if shuts else height > 190.0
 
 
+def test_no_closure_flutters() -> None:
+    face = make_face()
+    speak(face)
+
+    def make(time_s: float) -> LipFrame:
+        return lip_frame(time_s, closure=0.99 if abs(time_s - 0.51) < 0.01 else 0.01)
+
+    frames = run(face, 0.0, 1.0, make)
+    # Lips meet at 0.51 and 0.53 s, between two frames each.
+    assert np.abs(at(frames, 0.52)[HEIGHTS]).max() < 40.0
+    assert np.abs(at(frames, 0.54)[HEIGHTS]).max() < 100.0
+    assert np.abs(at(frames, 0.58)[HEIGHTS]).min() == pytest.approx(200.0, abs=1.0)
+
+
 def test_a_phone_that_comes_after_its_onset_shuts_the_lips_all_the_same() -> None:
     face = make_face(delay_s=0.06)
     speak(face)

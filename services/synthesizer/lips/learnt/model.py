@@ -5,8 +5,9 @@
 
 The recognizer makes lip frames of the sound itself (``LipFrame``), 50 a second while somebody
 speaks. Trembling is steadied: a change fades the more, the smaller it is. Closures are decided with
-the recognised phones (`closures`). What no camera tracks, tongue and jaw thrust, comes from the
-dynamic visemes. The sound tells how far the mouth opens, so no amplitude is applied.
+the recognised phones (`closures`); each lasts for two lip frames at least, so that none flutters.
+What no camera tracks, tongue and jaw thrust, comes from the dynamic visemes. The sound tells how
+far the mouth opens, so no amplitude is applied.
 
 A lip frame is shaped once, when its face is due, by what is known then; none waits for the next.
 Where frames are late, a *transition* leads the mouth to them, continuous in position and velocity.
@@ -104,6 +105,7 @@ class LearntStream:
         self._waiting: deque[LipFrame] = deque()  # not yet due
         self._newest_s = -np.inf  # time of the newest lip frame
         self._steady = self._neutral  # the last lip frame, steadied
+        self._shares = (0.0, 0.0)  # how far the last two lip frames are shut
         self._has_lips = False  # a lip frame has come
         self._is_speaking = False
         self._deaf_until_s = -np.inf  # lip frames of the sound up to here were interrupted
@@ -207,6 +209,8 @@ class LearntStream:
         if frame.time_s - self._track.end_s <= MAX_GAP_S:
             change = faps - self._steady
             faps = self._steady + change**3 / (change**2 + _TREMBLING_POWER)
+        else:
+            self._shares = (0.0, 0.0)
         self._steady = faps
         faps = faps.copy()
         part_lips(faps)
@@ -216,7 +220,12 @@ class LearntStream:
             faps, log_odds_of(frame.closure), self._bilabials.log_odds(frame.time_s)
         )
         lip_to_teeth(faps, shut_share(teeth, rule.doubt))
-        close_lips(faps, shut_share(closure, rule.doubt))
+        share = shut_share(closure, rule.doubt)
+        before, newest = self._shares
+        if newest > before:  # it has just begun, and lasts for two frames at least
+            share = max(share, newest)
+        self._shares = (newest, share)
+        close_lips(faps, share)
         return faps
 
     def _frame(self, articulation: Articulation) -> MouthFrame:
