@@ -132,8 +132,17 @@ class Browser:
 
     def wait_for(self, condition: str, limit_s: float = 60) -> None:
         """Wait until an expression becomes true."""
+
+        def holds() -> bool:
+            try:
+                return bool(self.evaluate(condition))
+            except RuntimeError as error:
+                if "navigated" in str(error):  # another page is just taking its place
+                    return False
+                raise
+
         try:
-            wait_until(lambda: bool(self.evaluate(condition)), limit_s)
+            wait_until(holds, limit_s)
         except TimeoutError:
             state = self.evaluate("JSON.stringify(window.kouxing?.state)")
             raise TimeoutError(f"{condition}; state {state}; {self.complaints}") from None
