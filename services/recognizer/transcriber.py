@@ -37,11 +37,14 @@ class SherpaTranscriber:
     Raises
     ------
     UserError
-        If sherpa-onnx is not installed, or the folder holds no such model.
+        If sherpa-onnx is not installed, or the folder holds no such model, or a damaged one.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._recognizer = _recognizer_in(folder)
+        try:
+            self._recognizer = _recognizer_in(folder)
+        except (IndexError, RuntimeError, ValueError) as error:
+            raise UserError(f"{folder}: sherpa-onnx cannot load the model: {error}") from None
 
     def transcribe(self, samples: NDArray[np.float32]) -> str:
         """Return what is said in a sound, 16 kHz mono, shape (n,); empty if nothing is."""
