@@ -58,7 +58,7 @@ Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
 Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
-RATES = (1.0, 1.5, 2.0)
+RATES = (0.8, 1.0, 1.5, 2.0)
 _FULL_PERCENTILE = 98.0
 _MIN_MOUTHS = 3
 _LIP_COLUMNS = [
