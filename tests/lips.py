@@ -33,6 +33,19 @@ def make_face(
     )
 
 
+def phone(
+    index: int, symbol: str, onset_s: float, duration_s: float = 0.15, *, final: bool = True
+) -> Phone:
+    return Phone(
+        index=index,
+        symbol=symbol,
+        onset_s=onset_s,
+        duration_s=duration_s,
+        confidence=1.0,
+        final=final,
+    )
+
+
 def advance(face: Face, time_s: float) -> list[Frame]:
     """Let a silent sound go on up to a time; return the frames that are due."""
     return face.accept(Progress(time_s=time_s, level_db=SILENT_DB))

@@ -74,7 +74,10 @@ def render(
     ] = False,
     text: Annotated[
         str | None,
-        typer.Option(help="What is said (characters, pinyin, or a file with them): better lips."),
+        typer.Option(
+            help="What is said (characters, pinyin, or a file with them): better lips. Recordings "
+            "only: phones of a text are timed in the whole sound, so 'speak' takes none."
+        ),
     ] = None,
     form: Annotated[
         CurveForm, typer.Option("--as", help="Values of a curve file.")

@@ -13,24 +13,13 @@ from services.synthesizer.offline import synthesize
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS
 from shared.face.idle_motion import IdleMotion, State
-from shared.phones.events import EndOfSound, Phone, Progress, SpeechChange
-from tests.lips import DELAY_S, INVENTORY, LIPS, advance, make_face
+from shared.phones.events import EndOfSound, Progress, SpeechChange
+from tests.lips import DELAY_S, INVENTORY, LIPS, advance, make_face, phone
 
 pytestmark = pytest.mark.unit
 
 JAW, LOWER_LIP = 2, 4
 FRAME_S = 0.02
-
-
-def phone(index: int, symbol: str, onset_s: float, duration_s: float, final: bool = True) -> Phone:
-    return Phone(
-        index=index,
-        symbol=symbol,
-        onset_s=onset_s,
-        duration_s=duration_s,
-        confidence=1.0,
-        final=final,
-    )
 
 
 def values(frames: list[Frame]) -> NDArray[np.float32]:

@@ -23,6 +23,7 @@ from shared.face.faps import MOUTH_FAPS
 from shared.face.lip_models import LipModelName
 from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from shared.phones.inventory import load_inventory
+from tests.lips import phone
 from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
@@ -32,17 +33,6 @@ TABLE = load_table(load_inventory())
 LOWER_LIP = 4  # column of FAP 5
 WIDEST = float(faps_of([5.0])[0, MOUTH_FAPS.index(5)])
 DELAY_S = 0.16
-
-
-def phone(index: int, symbol: str, onset_s: float, duration_s: float = 0.15) -> Phone:
-    return Phone(
-        index=index,
-        symbol=symbol,
-        onset_s=onset_s,
-        duration_s=duration_s,
-        confidence=1.0,
-        final=True,
-    )
 
 
 def progress(start_s: float, end_s: float, *, loud: bool) -> list[SoundEvent]:
