@@ -110,7 +110,7 @@ class Builder:
             self._skin_piece(skin, person, face),
             self._garment(vertices),
             *eye_pieces(vertices, self._mesh, fapu),
-            *self._mouth_pieces(skin, fapu),
+            *self._mouth_pieces(skin, fapu, person.raised),
             *self._hair(skin, person),
             self._lashes(skin, face, person.lashes),
         ]
@@ -216,7 +216,7 @@ class Builder:
         )
         return Piece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
 
-    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float]) -> list[Piece]:
+    def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], raised: float) -> list[Piece]:
         """Teeth and tongue, which keep their place behind the lips."""
         lips = ("2.2", "2.3")
         middle, wanted = (
@@ -227,6 +227,8 @@ class Builder:
         pieces = [*teeth_pieces(fapu), tongue_piece(self._tongue, fapu)]
         for piece in pieces:
             piece.part.vertices = (piece.part.vertices - middle) * size + wanted
+            if piece.name != "teeth_upper":
+                piece.part.vertices[:, 1] += raised
         return pieces
 
     def _hair(self, skin: Skin, person: Person) -> list[Piece]:

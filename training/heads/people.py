@@ -19,6 +19,7 @@ class Person:
     look: Look
     hair: Hair
     lashes: float = 1.0  # length
+    raised: float = 0.0  # tongue and lower teeth, beside where the lips put them, decimetres
 
 
 def _both(name: str, amount: float) -> Shape:
@@ -264,6 +265,7 @@ PEOPLE = {
             lift=0.06,
         ),
         lashes=0.55,
+        raised=0.007,
     ),
     "rosa": Person(
         targets=(
@@ -288,6 +290,7 @@ PEOPLE = {
         ),
         hair=Bob(parting=-20.0, length=0.72, turn_in=0.24),
         lashes=0.70,
+        raised=0.010,
     ),
     "mika": Person(
         targets=(

@@ -16,7 +16,7 @@ _MIN_ASPECT = 0.7  # narrower pictures show more above and below, so that the fa
 class Camera:
     """Where a head is seen from; lengths in m, in the head's axes."""
 
-    position: tuple[float, float, float] = (0.0, 0.030, 1.05)
+    position: tuple[float, float, float] = (0.0, 0.030, 1.015)
     target: tuple[float, float, float] = (0.0, 0.018, 0.0)
     field_of_view_deg: float = 15.0  # vertical
 
