@@ -56,6 +56,7 @@ _REST_S = 0.15  # to rest when no sound comes
 _FLUSHED_S = 0.3  # of sound, whose lip frames may still be on their way after an interruption
 _MEMORY_S = 0.5
 _TEETH_LOG_ODDS = 1.0  # that a phone f needs: the sound tells lip to teeth too badly
+_SHUT_SHARE = 0.5  # of the way to a closure, from which on lips count as shut
 _TREMBLING = 10.0  # FAP units: changes of this size are halved, smaller ones fade, larger ones stay
 _MAX_FAP = 4000.0  # FAP units; more is no mouth
 _SAME = 1e-6  # FAP units, and FAP units per second
@@ -222,7 +223,7 @@ class LearntStream:
         lip_to_teeth(faps, shut_share(teeth, rule.doubt))
         share = shut_share(closure, rule.doubt)
         before, newest = self._shares
-        if newest > before:  # it has just begun, and lasts for two frames at least
+        if before < _SHUT_SHARE <= newest:  # it has just begun, and lasts for two frames at least
             share = max(share, newest)
         self._shares = (newest, share)
         close_lips(faps, share)
