@@ -66,6 +66,11 @@ export class Head {
   async load(url) {
     const gltf = await new GLTFLoader().loadAsync(url);
     this.#model?.removeFromParent();
+    this.#model?.traverse(({ geometry, material }) => {
+      geometry?.dispose();
+      material?.map?.dispose();
+      material?.dispose();
+    });
     this.#meshes = [];
     this.#inMouth = [];
     this.#joints = [];
