@@ -1,8 +1,7 @@
 // What is spoken, below the face: syllables, or phones on request.
 
+import { element } from "./elements.js";
 import { PhoneTrack } from "./phones.js";
-
-const element = (id) => document.getElementById(id);
 
 export class Caption {
   #syllables = new PhoneTrack();

@@ -2,7 +2,7 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
-import { dim, drawsInSoftware, physicalMaterial, plainMaterial, studio } from "./materials.js";
+import { dim, drawsInSoftware, physicalMaterial, plainMaterial, release, studio } from "./materials.js";
 import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
@@ -68,8 +68,7 @@ export class Head {
     this.#model?.removeFromParent();
     this.#model?.traverse(({ geometry, material }) => {
       geometry?.dispose();
-      material?.map?.dispose();
-      material?.dispose();
+      if (material) release(material);
     });
     this.#meshes = [];
     this.#inMouth = [];

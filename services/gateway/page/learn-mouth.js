@@ -3,6 +3,7 @@
 
 import { pathOf } from "./address.js";
 import { capture, openCaptureContext } from "./capture.js";
+import { element } from "./elements.js";
 import { FaceTracker } from "./face-tracker.js";
 import { say } from "./language.js";
 import { curvePath, extent, figures, verdict } from "./lip-curves.js";
@@ -33,7 +34,6 @@ const NO_ANSWER = {
   zh: "网关没有应答：kouxing run 在运行吗？",
 };
 
-const element = (id) => document.getElementById(id);
 const dialog = element("learn-mouth");
 
 export class MouthLesson {

@@ -2,6 +2,7 @@
 
 import { Caption } from "./caption.js";
 import { Choices } from "./choices.js";
+import { element, setText } from "./elements.js";
 import { Head } from "./head.js";
 import { say } from "./language.js";
 import { LevelMeter, SILENT_DB } from "./level.js";
@@ -22,7 +23,6 @@ import { VoiceStore } from "./voice.js";
 const LABEL_EVERY_MS = 250;
 const DELAY_MS = 2000; // over which the delay is measured
 
-const element = (id) => document.getElementById(id);
 const playout = new Playout();
 const track = new FapTrack();
 const meter = new LevelMeter();
@@ -252,10 +252,6 @@ function storage() {
   }
 }
 
-function setText(target, text) {
-  if (target.textContent !== text) target.textContent = text;
-}
-
 // --- buttons -------------------------------------------------------------------------------------
 
 function onSoundState() {
@@ -404,8 +400,15 @@ showVoice();
 
 // --- begin ---------------------------------------------------------------------------------------
 
-/** Load a head by its name; "" for the one that the gateway was started with. */
-async function showHead(name) {
+let headLoaded = Promise.resolve(); // when the head that was chosen last is there
+
+/** Show a head by its name; "" for the one that the gateway was started with. */
+function showHead(name) {
+  headLoaded = headLoaded.then(() => loadHead(name)); // one after another: the last one stays
+  return headLoaded;
+}
+
+async function loadHead(name) {
   element("loading").hidden = false;
   const file = name === "" ? "head.glb" : `head-${name}.glb`;
   try {

@@ -160,6 +160,12 @@ export function dim(material, share) {
   else material.color.setScalar(share);
 }
 
+/** Give back the memory of a material and its texture. */
+export function release(material) {
+  (material.map ?? material.uniforms?.map.value)?.dispose();
+  material.dispose();
+}
+
 /** A studio about the head, as an environment map: soft boxes before dim walls. */
 export function studio(renderer) {
   const room = new THREE.Scene();

@@ -1,8 +1,10 @@
 // The notice: what went wrong or happened, for a while, and otherwise what does not work.
 
+import { element, setText } from "./elements.js";
+
 const NEWS_MS = 8000; // for which an error, or what happened, stays to be read
 
-const box = document.getElementById("notice");
+const box = element("notice");
 
 export class Notice {
   #timer = null;
@@ -23,5 +25,5 @@ export class Notice {
 function show(text, kind) {
   box.dataset.kind = kind;
   box.hidden = text === "";
-  if (box.textContent !== text) box.textContent = text;
+  setText(box, text);
 }

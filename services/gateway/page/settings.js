@@ -1,11 +1,10 @@
 // The panel of what can be chosen: head, lips, expressiveness, expressions, language.
 
+import { element } from "./elements.js";
 import { languageFor, say, setLanguage } from "./language.js";
 import { EXPRESSIONS, HEADS, LIPS } from "./offers.js";
 
 const STRENGTH = 0.8; // of an expression
-
-const element = (id) => document.getElementById(id);
 
 export class Settings {
   #choices;
