@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import Self
 
 from rich.console import Console
 
@@ -26,11 +27,18 @@ class Watched:
         console = Console(file=self.shown, width=200)
         self.supervisor = Supervisor([], folder, console, environment)
 
-    def start(self) -> None:
-        """Start all services, wait until they are ready, and watch them."""
-        self.supervisor.start()
-        self.supervisor.wait_ready(self.control)
-        self.supervisor.watch()
+    def __enter__(self) -> Self:
+        try:
+            self.supervisor.start()
+            self.supervisor.wait_ready(self.control)
+            self.supervisor.watch()
+        except BaseException:
+            self.supervisor.stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.supervisor.stop()
 
     def instance(self, client: Client, service: str) -> str:
         for state in client.status().services:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from services.cli.heads import HeadName
 from services.cli.running_system import announce, find_control
 from services.cli.services import ConfigFile
 from services.cli.terminal import CONSOLE, command_name, print_message
@@ -34,12 +35,7 @@ def run(
     stop_after: Annotated[
         bool, typer.Option("--stop-after", help="Stop once the file has been played.")
     ] = False,
-    head: Annotated[
-        str,
-        typer.Option(
-            help="woman, man, elder, child, ada, leo, rosa, mika, an .npz, or a .glb with morphs."
-        ),
-    ] = "",
+    head: HeadName = "",
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
     port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port of the page, instead of 8080.")

@@ -226,7 +226,7 @@ class GatewayService(Service):
 
     def on_tick(self, now_s: float) -> None:
         """Ask control which services run, and let the face at rest live."""
-        if now_s >= self._rest_due_s:
+        if self._viewers.is_anybody_there and now_s >= self._rest_due_s:
             self._rest_due_s = max(self._rest_due_s + 1.0 / REST_RATE_HZ, now_s)
             self._viewers.show_rest(self._resting_face.at(now_s).astype("<f4").tobytes())
         answered = self._report_s >= self._request_s

@@ -122,6 +122,11 @@ class Viewers:
             if viewer.shown is not None and viewer.shown[0] == session:
                 self._put(viewer, kind, message)
 
+    @property
+    def is_anybody_there(self) -> bool:
+        """Whether a browser is connected."""
+        return bool(self._viewers)
+
     def show_rest(self, faps: bytes) -> None:
         """Send every viewer the face at rest, which is seen while no session moves it."""
         message = wire.binary(wire.REST_TYPE, 0, 0, faps)

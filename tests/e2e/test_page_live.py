@@ -18,12 +18,8 @@ IS_LIVE = f"{STATUS}.includes('live') && window.kouxing.state.voiceToPictureMs !
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
-    made = Watched(tmp_path_factory.mktemp("logs"))
-    try:
-        made.start()
-        yield made
-    finally:
-        made.supervisor.stop()
+    with Watched(tmp_path_factory.mktemp("logs")) as watched:
+        yield watched
 
 
 @pytest.fixture(scope="module")

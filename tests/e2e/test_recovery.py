@@ -25,12 +25,8 @@ pytestmark = pytest.mark.e2e
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
-    made = Watched(tmp_path_factory.mktemp("logs"))
-    try:
-        made.start()
-        yield made
-    finally:
-        made.supervisor.stop()
+    with Watched(tmp_path_factory.mktemp("logs")) as watched:
+        yield watched
 
 
 def moves(session: Session, samples: NDArray[np.float32]) -> bool:
