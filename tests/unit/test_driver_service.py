@@ -157,6 +157,19 @@ def test_a_video_goes_on_through_a_restart(stage: Stage) -> None:
     assert stage.recorded[0].num_images == 26
 
 
+def test_a_session_name_used_again_overwrites_no_video(stage: Stage) -> None:
+    for epoch in (1, 2, 3):
+        stage.start("film", epoch=epoch, record=True)
+        stage.publish("film", 0, 100.0, epoch=epoch)
+        stage.step_until(partial(all_in, stage, epoch))
+        stage.faps.send(EndOfFaps(session="film", epoch=epoch))
+        stage.stop("film")
+        stage.step_until(lambda epoch=epoch: len(stage.recorded) == epoch)
+    paths = [Path(recorded.path) for recorded in stage.recorded]
+    assert [path.name for path in paths] == ["film.mp4", "film-2.mp4", "film-3.mp4"]
+    assert all(path.stat().st_size > 0 for path in paths)
+
+
 def test_a_video_that_cannot_be_written_is_told_to_control(tmp_path: Path, stage: Stage) -> None:
     (tmp_path / "film.mp4").mkdir()
     stage.start("film", record=True)

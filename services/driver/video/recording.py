@@ -35,6 +35,8 @@ class Recording:
         Images a second.
     sound
         Whether there will be sound.
+    overwrite
+        Whether a video of that name is replaced; if not, ``close`` adds a number to ``path``.
 
     Raises
     ------
@@ -49,6 +51,7 @@ class Recording:
         frame_rate_hz: float,
         *,
         sound: bool = True,
+        overwrite: bool = True,
     ) -> None:
         self.path = path
         self.num_images = 0
@@ -63,6 +66,7 @@ class Recording:
             frame_rate_hz,
             MEDIA_RATE_HZ if sound else None,
             transparent=renderer.transparent,
+            overwrite=overwrite,
         )
 
     @property
@@ -110,7 +114,7 @@ class Recording:
 
     def close(self) -> None:
         """Finish the file."""
-        self._writer.close()
+        self.path = self._writer.close()
 
     def discard(self) -> None:
         """Give the unfinished file up."""

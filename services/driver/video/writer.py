@@ -90,8 +90,8 @@ class Writer(Protocol):
     def write_sound(self, samples: Float32) -> None:
         """Append mono sound (N,), -1 to 1."""
 
-    def close(self) -> None:
-        """Finish what was written."""
+    def close(self) -> Path:
+        """Finish what was written; return its name."""
 
     def discard(self) -> None:
         """Give up what was written."""
@@ -104,8 +104,11 @@ def open_writer(
     sample_rate_hz: int | None,
     *,
     transparent: bool = False,
+    overwrite: bool = True,
 ) -> Writer:
     """Open what the name stands for: a video, or for a folder or ``name%05d.png`` pictures.
+
+    The parameters are those of ``VideoWriter``; pictures are always overwritten.
 
     Raises
     ------
@@ -114,7 +117,14 @@ def open_writer(
     """
     check_name(path)
     if path.suffix in _FORMATS:
-        return VideoWriter(path, *size, frame_rate_hz, sample_rate_hz, transparent=transparent)
+        return VideoWriter(
+            path,
+            *size,
+            frame_rate_hz,
+            sample_rate_hz,
+            transparent=transparent,
+            overwrite=overwrite,
+        )
     return PictureSequence(path)
 
 
@@ -148,7 +158,7 @@ class VideoWriter:
     Parameters
     ----------
     path
-        File to write, of ``VIDEO_SUFFIXES``; an existing one is replaced on ``close``.
+        File to write, of ``VIDEO_SUFFIXES``.
     width_px, height_px
         Even numbers.
     frame_rate_hz
@@ -158,6 +168,8 @@ class VideoWriter:
         has none.
     transparent
         The pictures have an alpha channel.
+    overwrite
+        Whether ``close`` replaces a file of that name; if not, a number is added to the name.
 
     Raises
     ------
@@ -174,8 +186,10 @@ class VideoWriter:
         sample_rate_hz: int | None,
         *,
         transparent: bool = False,
+        overwrite: bool = True,
     ) -> None:
         self._path = Path(path)
+        self._overwrite = overwrite
         form = _FORMATS.get(self._path.suffix, _FORMATS[".mp4"])
         codec = form.transparent if transparent else form.opaque
         if codec is None:
@@ -276,14 +290,15 @@ class VideoWriter:
             self.discard()
             raise _unwritable(self._path, error) from error
 
-    def close(self) -> None:
-        """Finish the file and give it its name."""
+    def close(self) -> Path:
+        """Finish the file and give it its name, which is returned."""
         self._mux(self._video.encode(None))
         if self._num_samples:
             self._mux(self._sound.encode(None))
         try:
             self._container.close()
-            self._unfinished.replace(self._path)
+            path = self._path if self._overwrite else _reserve(self._path)
+            return self._unfinished.replace(path)
         except OSError as error:
             self._unfinished.unlink(missing_ok=True)
             raise _unwritable(self._path, error) from error
@@ -329,8 +344,9 @@ class PictureSequence:
     def write_sound(self, samples: Float32) -> None:
         """Leave the sound out."""
 
-    def close(self) -> None:
-        """Nothing is left to do."""
+    def close(self) -> Path:
+        """Return the name that the numbers are filled into."""
+        return self._pattern
 
     def discard(self) -> None:
         """Keep the pictures that are there."""
@@ -348,6 +364,19 @@ def write_picture(path: Path, image: UInt8) -> None:
         path.write_bytes(picture.encode(image))
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+def _reserve(path: Path) -> Path:
+    """Create an empty file of this name or, if there is one, of the next free one; return it."""
+    free, number = path, 1
+    while True:
+        try:
+            free.touch(exist_ok=False)
+        except FileExistsError:
+            number += 1
+            free = path.with_stem(f"{path.stem}-{number}")
+        else:
+            return free
 
 
 def _unwritable(path: Path, error: OSError) -> UserError:
