@@ -25,6 +25,15 @@ def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
     return match["host"], match["port"]
 
 
+def is_address(host: str) -> bool:
+    """Return whether a host is given by its IP address, not by a name."""
+    try:
+        ipaddress.ip_address(host.strip("[]"))
+    except ValueError:
+        return False
+    return True
+
+
 def is_loopback(host: str) -> bool:
     """Return whether a host name or address can only be reached from this machine."""
     try:

@@ -44,7 +44,8 @@ def speak(
     ],
     session: Annotated[str, typer.Option(help="Name of the session.")] = "",
     record: Annotated[
-        bool, typer.Option("--record", help="The driver writes <session>.mp4, or the next free number.")
+        bool,
+        typer.Option("--record", help="The driver writes <session>.mp4, or <session>-2.mp4."),
     ] = False,
     fast: Annotated[
         bool, typer.Option("--fast", help="As fast as possible, not in real time.")

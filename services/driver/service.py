@@ -170,9 +170,7 @@ class DriverService(Service):
     def _make_recording(self, session: str) -> Recording:
         path = Path(self._config.out) / f"{session}.mp4"
         path.parent.mkdir(parents=True, exist_ok=True)
-        return Recording(
-            path, self.view.renderer(), self._config.frame_rate_hz, overwrite=False
-        )
+        return Recording(path, self.view.renderer(), self._config.frame_rate_hz, overwrite=False)
 
     def _report_written(self, session: str, recording: Recording) -> None:
         self.metrics.count("videos")

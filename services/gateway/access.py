@@ -10,14 +10,15 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from aiohttp.typedefs import Handler, Middleware
 
+from shared.endpoints import is_loopback
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
     """What a request must show."""
 
-    is_loopback: Callable[[str], bool] | None = None
-    """Tells whether a host name is this machine's alone; then no other may be asked for. None where
-    any host name may be."""
+    is_own_host: Callable[[str], bool] = is_loopback
+    """Tells whether a host name or address, as a browser shows it, is the gateway's own."""
     token: str = ""
     """Secret that sessions and uploads need in their query; empty: none."""
     allowed_origins: Collection[str] = ()
@@ -32,11 +33,7 @@ class Access:
             if request.path in private:
                 self._check_origin(request)
                 self._check_token(request)
-            response = await handler(request)
-            if not response.prepared:
-                response.headers["X-Content-Type-Options"] = "nosniff"
-                response.headers["Cache-Control"] = "no-cache"
-            return response
+            return await handler(request)
 
         return guard
 
@@ -47,8 +44,9 @@ class Access:
             host = urlsplit(f"//{request.headers.get('Host', '')}").hostname or ""
         except ValueError:
             host = ""
-        if self.is_loopback is not None and not self.is_loopback(host):
-            raise web.HTTPForbidden(text="this gateway only answers as localhost\n")
+        if not self.is_own_host(host):
+            text = "this is not the gateway's name; gateway.names says which others it has\n"
+            raise web.HTTPForbidden(text=text)
 
     def _check_origin(self, request: web.Request) -> None:
         origin = request.headers.get("Origin")

@@ -44,6 +44,8 @@ class GatewayConfig(ServiceConfig):
     self-signed certificate is written there."""
     token: str = ""
     """Secret that the page's address carries; with a certificate one is made if this is empty."""
+    names: str = ""
+    """Other names by which browsers reach the page, as through a proxy, separated by spaces."""
     allowed_origins: Origins = ""
     """Other pages that may connect to the page's sessions."""
     frame_ancestors: Origins = ""

@@ -5,20 +5,14 @@ from __future__ import annotations
 import asyncio
 import base64
 import contextlib
-import errno
 import hashlib
-import logging
 import re
-import socket
-import ssl
-from collections.abc import AsyncIterator, Callable, Collection
+from collections.abc import AsyncIterator, Collection
 from pathlib import Path
 
 from aiohttp import WSCloseCode, web
-from aiohttp.http import HttpProcessingError
 
 from services.gateway.access import Access
-from shared.errors import UserError
 from shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
@@ -33,6 +27,12 @@ PING_S = 20.0  # a browser that has vanished is noticed within this
 MAX_MESSAGE_BYTES = 128 * 1024  # the most that one message of a session may carry
 MAX_UPLOAD_BYTES = 8 * 1024 * 1024
 FACE_MESH_FRAME = "face-mesh.html"
+_HEADERS = {  # of every answer
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-cache",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+}
 # WebAssembly's own glue makes functions from text, so it runs in a frame of its own, which is
 # allowed that and is denied the camera and the microphone.
 _FACE_MESH_POLICIES = {
@@ -43,30 +43,6 @@ _FACE_MESH_POLICIES = {
     "Permissions-Policy": "camera=(), microphone=()",
 }
 _IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
-
-
-def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket.
-
-    Raises
-    ------
-    UserError
-        If the address cannot be had, naming the configuration key.
-    """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            raise UserError(
-                f"gateway.port: {port} is in use on {host}; choose another (0: any free one)"
-            ) from None
-        if error.errno == errno.EACCES:
-            raise UserError(f"gateway.port: {port} needs privileges; choose 1024 or more") from None
-        raise UserError(
-            f"gateway.host: cannot listen on {host!r}: {error.strerror}; "
-            "use 127.0.0.1, or an address of this host"
-        ) from None
 
 
 class WebSockets:
@@ -129,6 +105,7 @@ def make_application(
         middlewares=[access.guard({route.path for route in routes})],
         client_max_size=MAX_UPLOAD_BYTES,
     )
+    application.on_response_prepare.append(_add_headers)
 
     async def serve_page(request: web.Request) -> web.StreamResponse:
         return _page_file(request.match_info.get("name", "index.html"), page_asset, frame_ancestors)
@@ -148,27 +125,8 @@ def make_application(
     return application
 
 
-async def start(
-    application: web.Application,
-    listener: socket.socket,
-    tls: ssl.SSLContext | None,
-    on_bad_request: Callable[[], None],
-) -> web.AppRunner:
-    """Serve an application; ``on_bad_request`` is called when something that is no HTTP arrives."""
-
-    def is_worth_logging(record: logging.LogRecord) -> bool:
-        """Keep bytes that are no HTTP, and were answered so, from filling the log."""
-        if record.exc_info and isinstance(record.exc_info[1], HttpProcessingError):
-            on_bad_request()
-            return False
-        return True
-
-    log = LOG.getChild("http")
-    log.addFilter(is_worth_logging)
-    runner = web.AppRunner(application, access_log=None, logger=log, shutdown_timeout=0.5)
-    await runner.setup()
-    await web.SockSite(runner, listener, ssl_context=tls).start()
-    return runner
+async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(_HEADERS)
 
 
 def _has_modules() -> bool:

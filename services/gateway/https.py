@@ -54,6 +54,12 @@ def own_address() -> str:
     return address
 
 
+def own_names() -> tuple[str, str]:
+    """Return the names that this machine goes by in its own network."""
+    name = socket.gethostname()
+    return name, f"{name}.local"
+
+
 def _self_signed(hosts: Iterable[str]) -> bytes:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "kouxing")])

@@ -18,6 +18,7 @@ from aiohttp import WSMsgType, web
 
 from services.gateway import wire
 from services.gateway.http import WebSockets
+from services.gateway.pace import Pace
 from shared.audio_file import open_audio
 from shared.client import Client, Refused, Session
 from shared.errors import UserError
@@ -29,6 +30,8 @@ MAX_MICROPHONES = 16
 HELLO_LIMIT_S = 10.0
 LAST_FRAME_LIMIT_S = 1.5  # for the last frames, when a microphone ends
 CONTROL_LIMIT_S = 3.0  # for control's answers
+AUDIO_BURST_S = 5.0  # of audio that may come faster than in real time
+COMMAND_S = 0.05  # a command counts as much as so much audio
 
 Warn = Callable[[str, str, str], None]  # reason, text, session
 
@@ -167,12 +170,14 @@ class Microphones:
     async def _forward_audio(
         self, browser: web.WebSocketResponse, session: Session, hello: wire.Hello
     ) -> None:
+        pace = Pace(AUDIO_BURST_S)
         async for message in browser:
             if message.type is WSMsgType.BINARY:
                 num_frames, rest = divmod(len(message.data), hello.frame_bytes)
                 if rest:
                     raise UserError(f"a chunk must be a multiple of {hello.frame_bytes} bytes")
                 self._own_sessions.send(session, message.data, num_frames)
+                await pace.keep(num_frames / hello.sample_rate_hz)
             elif message.type is WSMsgType.TEXT:
                 command = wire.parse_command(message.data)
                 session.skip(command.num_skipped)
@@ -180,6 +185,7 @@ class Microphones:
                     await asyncio.to_thread(session.flush)
                 if command.lips:
                     await asyncio.to_thread(session.choose_lips, command.lips)
+                await pace.keep(COMMAND_S)
             for error in session.errors():
                 await browser.send_str(wire.error_text(error.text, error.code))
 

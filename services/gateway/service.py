@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-import socket
 import time
 from collections.abc import Coroutine
 from dataclasses import dataclass, replace
@@ -22,8 +21,9 @@ from aiohttp import web
 from services.gateway import http, wire
 from services.gateway.access import Access
 from services.gateway.config import GatewayConfig
-from services.gateway.https import own_address, tls_context
+from services.gateway.https import own_address, own_names, tls_context
 from services.gateway.learn_mouth import MouthLearner
+from services.gateway.listener import Listener, bind
 from services.gateway.microphone import (
     SAMPLE_TEXT,
     Microphones,
@@ -35,7 +35,7 @@ from services.gateway.outbox import Kind
 from services.gateway.viewers import Viewers
 from shared.bus import Socket
 from shared.clock import to_samples
-from shared.endpoints import WILDCARDS, is_loopback
+from shared.endpoints import WILDCARDS, is_address, is_loopback
 from shared.errors import UserError
 from shared.face.idle_motion import REST_RATE_HZ, RestingFace
 from shared.follower import SessionFollower
@@ -75,21 +75,29 @@ class GatewayService(Service):
     needs = ("phones", "faps")
 
     def __init__(self, config: GatewayConfig) -> None:
-        self._listener = http.bind(config.host, config.port)
+        listening = bind(config.host, config.port)
         self._runner = asyncio.Runner()
         self._loop = self._runner.get_loop()
         self._is_waiting = False
         super().__init__(config)
         host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
-        port = self._listener.getsockname()[1]
+        port = listening.getsockname()[1]
         token = config.token or (secrets.token_urlsafe(16) if config.certificate else "")
-        self._tls = None
+        names = {host, *own_names(), *config.names.split()}
+        tls = None
         if config.certificate:
-            names = (host, socket.gethostname(), "localhost", "127.0.0.1")
-            self._tls = tls_context(Path(config.certificate), names)
+            tls = tls_context(Path(config.certificate), [*sorted(names), "localhost", "127.0.0.1"])
+        self._listener = Listener(
+            listening,
+            tls,
+            on_refused=lambda address: self.warn(
+                "connections", f"refused a connection of {address}: there are too many"
+            ),
+            on_bad_request=lambda: self.warn("bad-http", "dropped a request: it is no HTTP"),
+        )
         address = f"{f'[{host}]' if ':' in host else host}:{port}"
         secret = f"#token={quote(token)}" if token else ""
-        self.endpoints = {"page": f"{'https' if self._tls else 'http'}://{address}/{secret}"}
+        self.endpoints = {"page": f"{'https' if tls else 'http'}://{address}/{secret}"}
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
         self._viewers = Viewers(
@@ -103,19 +111,24 @@ class GatewayService(Service):
         self._own_sessions = OwnSessions(config.control, self.warn)
         self._microphones = Microphones(self._web_sockets, self._own_sessions)
         self._mouth_learner = MouthLearner()
+        self._routes = (
+            web.get("/viewer", self._viewers.serve),
+            web.get("/microphone", self._microphones.serve),
+            web.post("/learn-mouth", self._mouth_learner.serve),
+        )
         self._application = http.make_application(
             page_asset=config.head,
             access=Access(
-                is_loopback=is_loopback if is_loopback(config.host) else None,
+                is_own_host=lambda name: (
+                    is_loopback(name)
+                    or name in names
+                    or (not is_loopback(config.host) and is_address(name))
+                ),
                 token=token,
                 allowed_origins=config.allowed_origins.split(),
             ),
             frame_ancestors=config.frame_ancestors,
-            routes=[
-                web.get("/viewer", self._viewers.serve),
-                web.get("/microphone", self._microphones.serve),
-                web.post("/learn-mouth", self._mouth_learner.serve),
-            ],
+            routes=self._routes,
         )
         self._tasks: set[asyncio.Task[None]] = set()
         self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is spoken
@@ -139,13 +152,8 @@ class GatewayService(Service):
 
     def on_start(self) -> None:
         """Serve HTTP."""
-        server = http.start(
-            self._application,
-            self._listener,
-            self._tls,
-            lambda: self.warn("bad-http", "dropped a request: it is no HTTP"),
-        )
-        self._server = self._loop.run_until_complete(server)
+        start = self._listener.start(self._application, {route.path for route in self._routes})
+        self._loop.run_until_complete(start)
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Run HTTP until messages arrive or the time is over."""
@@ -179,7 +187,7 @@ class GatewayService(Service):
 
     def on_stopped(self) -> None:
         """End HTTP."""
-        self._loop.run_until_complete(self._server.cleanup())
+        self._loop.run_until_complete(self._listener.stop())
         self._runner.close()
 
     def _on_input(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import ssl
 import stat
 import subprocess
@@ -37,6 +38,7 @@ def gateway(certificate: Path) -> Iterator[Gateway]:
         host="0.0.0.0",  # noqa: S104 - with https and a token
         certificate=str(certificate),
         token="secret",
+        names="face.example",
         allowed_origins="https://tool.example",
         frame_ancestors="https://tool.example https://other.example:8443",
     )
@@ -96,6 +98,27 @@ def test_only_pages_that_are_named_may_connect(
 ) -> None:
     headers = {**UPGRADE, "Origin": origin}
     assert get(gateway, certificate, "viewer?token=secret", headers).status == status
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("evil.example", 403),  # resolves to this machine: DNS rebinding
+        ("face.example", 200),
+        (f"{socket.gethostname()}:8080", 200),
+        ("192.0.2.7:8080", 200),
+        ("localhost", 200),
+    ],
+)
+def test_only_its_own_names_are_answered(
+    gateway: Gateway, certificate: Path, host: str, status: int
+) -> None:
+    page = get(gateway, certificate, "", {"Host": host})
+    assert page.status == status
+    assert page.headers["X-Content-Type-Options"] == "nosniff"
+    assert page.headers["Referrer-Policy"] == "no-referrer"
+    assert page.headers["Cross-Origin-Opener-Policy"] == "same-origin"
+    assert "Set-Cookie" not in page.headers
 
 
 def test_the_made_certificate_is_for_its_owner_alone(gateway: Gateway, certificate: Path) -> None:

@@ -140,6 +140,10 @@ def test_one_of_two_sessions_is_shown_and_the_other_goes_on_being_recorded(stage
     assert stage.errors == []
 
 
+def has_recorded(stage: Stage, num_videos: int) -> bool:
+    return len(stage.recorded) == num_videos
+
+
 def all_in(stage: Stage, num_frames: int) -> bool:
     return stage.driver.metrics.snapshot(time.monotonic()).get("in_fap_frame", 0) >= num_frames
 
@@ -164,7 +168,7 @@ def test_a_session_name_used_again_overwrites_no_video(stage: Stage) -> None:
         stage.step_until(partial(all_in, stage, epoch))
         stage.faps.send(EndOfFaps(session="film", epoch=epoch))
         stage.stop("film")
-        stage.step_until(lambda epoch=epoch: len(stage.recorded) == epoch)
+        stage.step_until(partial(has_recorded, stage, epoch))
     paths = [Path(recorded.path) for recorded in stage.recorded]
     assert [path.name for path in paths] == ["film.mp4", "film-2.mp4", "film-3.mp4"]
     assert all(path.stat().st_size > 0 for path in paths)

@@ -1,0 +1,167 @@
+"""What the gateway's port bears: half requests, too many connections, floods of commands."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+
+import aiohttp
+import pytest
+from aiohttp import web
+
+from services.gateway import listener
+from services.gateway.listener import Listener
+from services.gateway.pace import Pace
+
+pytestmark = pytest.mark.process
+
+
+@dataclass
+class Served:
+    """A listener with an application of one short and one endless answer."""
+
+    address: tuple[str, int]
+    refused: list[str] = field(default_factory=list)
+    writers: list[asyncio.StreamWriter] = field(default_factory=list)
+
+    async def connect(self, request: bytes = b"") -> asyncio.StreamReader:
+        reader, writer = await asyncio.open_connection(*self.address)
+        writer.write(request)
+        self.writers.append(writer)
+        return reader
+
+    async def answers(self) -> bool:
+        try:
+            async with (
+                aiohttp.ClientSession() as http,
+                http.get("http://{}:{}/".format(*self.address)) as response,
+            ):
+                return response.status == 200
+        except aiohttp.ClientConnectionError:
+            return False
+
+
+async def answer(_request: web.Request) -> web.StreamResponse:
+    return web.Response(text="here")
+
+
+async def never_end(request: web.Request) -> web.StreamResponse:
+    response = web.StreamResponse()
+    await response.prepare(request)
+    await response.write(b"begun")
+    await asyncio.sleep(3600)
+    return response
+
+
+@asynccontextmanager
+async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[Served]:
+    """Serve with other limits; ``/long`` may take its time."""
+    for name, limit in {"_CHECK_S": 0.02, **limits}.items():
+        monkeypatch.setattr(listener, name, limit)
+    bound = listener.bind("127.0.0.1", 0)
+    served = Served(bound.getsockname())
+    port = Listener(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
+    application = web.Application()
+    application.add_routes(
+        [web.get("/", answer), web.get("/slow", never_end), web.get("/long", never_end)]
+    )
+    await port.start(application, {"/long"})
+    try:
+        yield served
+    finally:
+        await port.stop()
+        for writer in served.writers:
+            writer.close()
+
+
+@pytest.mark.parametrize("half", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
+def test_who_asks_for_nothing_is_sent_away(monkeypatch: pytest.MonkeyPatch, half: bytes) -> None:
+    async def wait() -> None:
+        async with serve(monkeypatch, IDLE_LIMIT_S=0.2) as served:
+            assert await asyncio.wait_for((await served.connect(half)).read(), 20) == b""
+            assert await served.answers()
+
+    asyncio.run(wait())
+
+
+def test_who_has_asked_once_is_sent_away_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def wait() -> None:
+        async with serve(monkeypatch, IDLE_LIMIT_S=0.2) as served:
+            reader = await served.connect(b"GET / HTTP/1.1\r\nHost: a\r\n\r\nGET / HT")
+            received = await asyncio.wait_for(reader.read(), 20)
+            assert received.endswith(b"here")
+
+    asyncio.run(wait())
+
+
+def test_an_answer_that_is_never_taken_ends_unless_it_may_take_its_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def wait() -> None:
+        async with serve(monkeypatch, IDLE_LIMIT_S=0.2, ANSWER_LIMIT_S=0.5) as served:
+            long = await served.connect(b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n")
+            slow = await served.connect(b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n")
+            assert b"begun" in await asyncio.wait_for(slow.read(), 20)
+            assert b"200 OK" in await long.readline()
+            assert not long.at_eof()
+
+    asyncio.run(wait())
+
+
+def test_one_connection_too_many_is_refused_and_room_returns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def fill() -> None:
+        limits = {"IDLE_LIMIT_S": 0.5, "MAX_CONNECTIONS_OF_ADDRESS": 5}
+        async with serve(monkeypatch, **limits) as served:
+            held = [await served.connect() for _ in range(5)]
+            with contextlib.suppress(ConnectionResetError):
+                assert await (await served.connect()).read() == b""
+            assert served.refused == ["127.0.0.1"]
+            for reader in held:
+                assert await asyncio.wait_for(reader.read(), 20) == b""
+            async with asyncio.timeout(20):
+                while not await served.answers():
+                    await asyncio.sleep(0.02)
+
+    asyncio.run(fill())
+
+
+def test_no_descriptor_left_is_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Exhausted(socket.socket):
+        def accept(self) -> tuple[socket.socket, object]:
+            if failures:
+                raise OSError(24, failures.pop())
+            return super().accept()
+
+    failures = ["Too many open files"]
+
+    async def wait() -> None:
+        monkeypatch.setattr(listener, "_RETRY_S", 0.05)
+        bound = listener.bind("127.0.0.1", 0)
+        exhausted = Exhausted(fileno=bound.detach())
+        port = Listener(exhausted, None, on_refused=lambda _: None, on_bad_request=lambda: None)
+        application = web.Application()
+        application.add_routes([web.get("/", answer)])
+        await port.start(application, set())
+        assert await Served(exhausted.getsockname()).answers()
+        assert not failures
+        await port.stop()
+
+    asyncio.run(wait())
+
+
+def test_a_flood_is_slowed_down_to_real_time() -> None:
+    async def flood() -> None:
+        loop = asyncio.get_running_loop()
+        pace = Pace(burst_s=5.0)
+        begin_s = loop.time()
+        for _ in range(106):
+            await pace.keep(0.05)
+        assert loop.time() - begin_s >= 0.25
+
+    asyncio.run(flood())
