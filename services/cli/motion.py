@@ -124,9 +124,7 @@ def motion_of_sound(
         progress.add_task("recognising", total=None)
         aligned = None if text is None else _aligned(model, samples, source, text)
         heard = hear_recording(model, samples, lips_from_sound, aligned)
-        faces = [
-            animate(heard, load_lip_model(name=name), SynthesizerConfig(lips=name)) for name in lips
-        ]
+        faces = [animate(heard, load_lip_model(name=name), settings[name]) for name in lips]
         events = heard.events
     silence = model.inventory.silence
     phones = (each for each in events if isinstance(each, Phone) and each.symbol != silence)

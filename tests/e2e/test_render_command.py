@@ -145,6 +145,14 @@ def test_a_sound_becomes_curves(tmp_path: Path) -> None:
         render(SENTENCE, paths[".csv"], live=True, text="啊")
 
 
+def test_expressiveness_makes_a_recordings_movements_larger(tmp_path: Path) -> None:
+    movements = []
+    for expressiveness in (0.5, 2.0):
+        render(SENTENCE, tmp_path / "a.fap", expressiveness=expressiveness)
+        movements.append(np.ptp(read_fap(tmp_path / "a.fap").faps[:, 2]))
+    assert movements[1] > 1.5 * movements[0]
+
+
 def test_live_shows_what_the_stream_would_have(tmp_path: Path) -> None:
     render(SENTENCE, tmp_path / "live.fap", live=True)
     chain = LiveChain(load_live_model(), load_lip_model())
