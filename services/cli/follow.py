@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from services.cli.clients import Shown
 from services.cli.curves import json_line
-from services.cli.terminal import check_output, print_message
+from services.cli.terminal import CONSOLE, check_output, print_message
 from shared.client import Client
 from shared.clock import to_seconds
 from shared.errors import UserError
@@ -33,7 +33,7 @@ from shared.wire.speech import Phone
 OPEN_POLL_S = 0.2
 SILENT_S = 2.0  # without messages, control is asked where the session is
 SHOWN_FAPS = (3, 4, 5, 6, 16, 17)  # of a printed frame: jaw, lips, corner, protrusion
-LEGEND = "the columns: " + ", ".join(f"FAP {n} {FAPS[n - 1].name}" for n in SHOWN_FAPS)
+LEGEND = "the columns, FAPs: " + ", ".join(f"{n} {FAPS[n - 1].name}" for n in SHOWN_FAPS)
 
 Followed = TypeVar("Followed", bound=Message)
 Line = TypeVar("Line")
@@ -68,7 +68,7 @@ def follow(session: str, output: Path | None, shown: Shown, control: str) -> Non
                 rows = _phone_rows(_messages(Phone, state, client), shown, inventory)
                 num_lines = _print(rows, sys.stdout, str)
             elif output is None:
-                print_message(LEGEND)
+                CONSOLE.print(LEGEND, markup=False, highlight=False)
                 num_lines = _print(_messages(FapFrame, state, client), sys.stdout, _as_row)
             elif output.suffix == ".jsonl":
                 with output.open("w", encoding="utf-8") as file:

@@ -60,9 +60,10 @@ class SyllableTrack:
             self._syllables.pop(oldest[0].index, None)
             for each in oldest:
                 del self._phones[each.index]
+        after: list[list[Phone]] = [*groups[1:], []]
         syllables = {
-            group[0].index: self._syllable(group, place)
-            for group, place in zip(groups, places, strict=True)
+            group[0].index: self._syllable(group, place, following)
+            for group, place, following in zip(groups, places, after, strict=True)
         }
         withdrawn = [
             Syllable(index=index, text=old.text, onset_s=old.onset_s, duration_s=0.0, final=True)
@@ -97,13 +98,17 @@ class SyllableTrack:
         places = (None if each == (self._inventory.silence,) else next(found) for each in heard)
         return [None if place is None else place + self._num_said for place in places]
 
-    def _syllable(self, phones: list[Phone], place: int | None) -> Syllable:
+    def _syllable(self, phones: list[Phone], place: int | None, following: list[Phone]) -> Syllable:
         first, last = phones[0], phones[-1]
+        # The vowel of an initial may still come, or prove to be one.
+        is_complete = last.symbol not in self._inventory.initials or any(
+            phone.final for phone in following[:1]
+        )
         spelling = self._inventory.spell(tuple(phone.symbol for phone in phones))
         return Syllable(
             index=first.index,
             text=spelling if place is None else self._characters[place][0],
             onset_s=first.onset_s,
             duration_s=max(0.0, last.onset_s + last.duration_s - first.onset_s),
-            final=all(phone.final for phone in phones),
+            final=is_complete and all(phone.final for phone in phones),
         )

@@ -196,8 +196,8 @@ def test_render_into_a_missing_folder_is_named(tmp_path: Path) -> None:
     assert "nowhere" in result.stderr
 
 
-def listening(control: str, *arguments: object) -> subprocess.Popen[str]:
-    """Start ``kouxing listen`` and return once it says that it waits."""
+def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[str]:
+    """Start ``kouxing listen`` and return once it says what is expected first."""
     listener = subprocess.Popen(
         [sys.executable, "-m", "services", "listen", *map(str, arguments)],
         env={**os.environ, "KOUXING_CONTROL": control},
@@ -207,15 +207,16 @@ def listening(control: str, *arguments: object) -> subprocess.Popen[str]:
         text=True,
     )
     assert listener.stderr is not None
-    assert "waiting for" in listener.stderr.readline()
+    assert says in listener.stderr.readline()
     return listener
 
 
 def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: Path) -> None:
     recorded = tmp_path / "face.fap"
     samples = samples_of_file(SENTENCE)
-    recorder = listening(system.control, "heard", "--output", recorded)
-    printer = listening(system.control, "heard", "--show", "syllables")
+    waits = "waiting for session heard to open, as with kouxing speak my.wav --session heard"
+    recorder = listening(system.control, "heard", "--output", recorded, says=waits)
+    printer = listening(system.control, "heard", "--show", "syllables", says=waits)
     with Client(system.control) as client:
         session = client.open_session(session="heard", encoding="f32le", paced=False)
         for listener in (recorder, printer):
@@ -233,6 +234,23 @@ def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: P
     spoken = [line.split()[-1] for line in printed.splitlines()]
     assert "sil" not in spoken
     assert set(spoken) & {"a", "e", "yi", "wu", "yu"}, printed
+
+
+def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> None:
+    services = ("control", "recognizer", "synthesizer")
+    with System(services, tmp_path) as own, Client(own.control) as client:
+        phones = ("--show", "phones")
+        first = listening(own.control, *phones, says="waiting for a session to open")
+        older = client.open_session(session="older", encoding="f32le")
+        assert first.stderr is not None
+        assert first.stderr.readline() == "following session older\n"
+        newer = client.open_session(session="newer", encoding="f32le")
+        second = listening(own.control, *phones, says="following session newer")
+        for session, listener in ((newer, second), (older, first)):
+            session.close()
+            _, log = listener.communicate(timeout=100)
+            assert log == f"session {session.name} ended: 0 phones\n"
+            assert listener.returncode == 0
 
 
 @pytest.mark.parametrize(

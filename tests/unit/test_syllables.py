@@ -74,6 +74,15 @@ def test_an_initial_is_shown_at_once_and_completed_by_its_vowel() -> None:
     assert final.final
 
 
+def test_an_initial_alone_is_final_only_once_no_vowel_can_follow() -> None:
+    track = SyllableTrack(MANDARIN)
+    assert not track.accept(phone(0, "d"))[0].final
+    (pause,) = track.accept(phone(1, "sil", final=False))  # it may prove to be a vowel
+    assert pause.text == "sil"
+    initial, _ = track.accept(phone(1, "sil"))
+    assert (initial.text, initial.final) == ("d", True)
+
+
 def test_what_proves_to_be_one_syllable_is_withdrawn_as_two() -> None:
     track = SyllableTrack(MANDARIN)
     for index, symbol in enumerate(("a", "ou", "sil")):
