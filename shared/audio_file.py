@@ -181,7 +181,7 @@ def microphone(sample_rate_hz: int = 16_000) -> AudioSource:
         import sounddevice  # noqa: PLC0415 - fails to import where PortAudio is missing
     except OSError:
         raise UserError(
-            "the microphone needs the PortAudio library: apt-get install libportaudio2"
+            "the microphone needs the PortAudio library; type: sudo apt install libportaudio2"
         ) from None
     recorded: queue.SimpleQueue[Samples] = queue.SimpleQueue()
     try:

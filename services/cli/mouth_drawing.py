@@ -231,7 +231,7 @@ def _write_video(
     openings = motion.openings_at(times_s, smooth=smooth)
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
-        Progress(console=CONSOLE, transient=True) as progress,
+        Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive) as progress,
     ):
         writer.write_sound(samples)
         for time_s, opening in progress.track(

@@ -130,7 +130,7 @@ def render(
             raise UserError(f"--as {form} is for curves; write .csv, .jsonl or .glb")
         check_pictures(output, shot)
         renderer = make_renderer(shot, output, faces)
-    with Progress(console=CONSOLE, transient=True) as progress:
+    with Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive) as progress:
         motion = (
             read_motion(source, sound)
             if is_fap(source)

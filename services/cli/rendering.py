@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.progress import Progress
 
+from services.cli.curves import CURVE_SUFFIXES
 from services.cli.motion import Motion
 from services.driver.config import Framing
 from services.driver.render import scene
@@ -48,7 +49,7 @@ def check_pictures(output: Path, shot: Shot) -> None:
     if shot.at_s is not None and not is_picture(output):
         raise UserError("--at says when one picture is taken; give the name of one (.png)")
     if not is_picture(output):
-        check_name(output)
+        check_name(output, (".png", *CURVE_SUFFIXES))
 
 
 def draw(

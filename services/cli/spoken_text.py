@@ -49,6 +49,8 @@ def text_of(text: str) -> str:
     try:
         path = Path(text)
         if not path.is_file():
+            if path.suffix.lower() == ".txt":
+                raise UserError(f"{path}: there is no such file")
             return text
     except (OSError, ValueError):  # too long for a name
         return text

@@ -120,7 +120,8 @@ class _Face:
 
 def _progress(console: Console) -> Progress:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True)
+    is_shown = console.is_interactive
+    return Progress(*columns, console=console, transient=True, disable=not is_shown)
 
 
 def _send_all(

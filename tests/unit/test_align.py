@@ -133,6 +133,11 @@ def test_a_text_that_does_not_fit_is_told_and_fails(
     assert output.is_file()
 
 
+def test_a_missing_file_of_text_is_not_taken_for_the_text() -> None:
+    with pytest.raises(UserError, match=r"nowhere\.txt: there is no such file"):
+        align(DEMO / "hello-female.wav", "nowhere.txt")
+
+
 @pytest.mark.parametrize(
     ("text", "fits"),
     [

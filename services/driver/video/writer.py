@@ -20,6 +20,7 @@ import contextlib
 import errno
 import re
 import secrets
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -128,8 +129,15 @@ def open_writer(
     return PictureSequence(path)
 
 
-def check_name(path: Path) -> None:
+def check_name(path: Path, others: Iterable[str] = ()) -> None:
     """See whether a name stands for a video or for pictures, in a folder that exists.
+
+    Parameters
+    ----------
+    path
+        The name.
+    others
+        Further suffixes that the user may choose instead.
 
     Raises
     ------
@@ -138,8 +146,8 @@ def check_name(path: Path) -> None:
     """
     if path.suffix not in _FORMATS and not is_sequence(path):
         raise UserError(
-            f"{path}: give a name that ends in {', '.join(VIDEO_SUFFIXES)}, a folder, or a name"
-            " with a number such as face%05d.png"
+            f"{path}: give a name that ends in {', '.join((*VIDEO_SUFFIXES, *others))}, a folder,"
+            " or a name with a number such as face%05d.png"
         )
     if not path.parent.is_dir():
         raise _unwritable(path, FileNotFoundError(errno.ENOENT, "no such folder"))
