@@ -67,13 +67,7 @@ class Browser:
         self._loop.run_until_complete(self._connect())
         self.command("Runtime.enable")
         self.command("Log.enable")
-        self.command(
-            "Emulation.setDeviceMetricsOverride",
-            width=SIZE_PX[0],
-            height=SIZE_PX[1],
-            deviceScaleFactor=1,
-            mobile=False,
-        )
+        self.resize(*SIZE_PX)
 
     async def _connect(self) -> None:
         self._http = aiohttp.ClientSession()
@@ -109,6 +103,16 @@ class Browser:
                     raise RuntimeError(answer["error"])
                 result: dict[str, Any] = answer["result"]
                 return result
+
+    def resize(self, width_px: int, height_px: int, *, mobile: bool = False) -> None:
+        """Give the window another size, as a phone's if ``mobile``."""
+        self.command(
+            "Emulation.setDeviceMetricsOverride",
+            width=width_px,
+            height=height_px,
+            deviceScaleFactor=1,
+            mobile=mobile,
+        )
 
     def evaluate(self, script: str) -> Any:
         """Return the value of an expression of the page."""

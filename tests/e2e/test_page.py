@@ -160,6 +160,30 @@ def test_the_mouth_on_the_screen_follows_the_faps(
     assert not [text for text in browser.complaints if any(mark in text for mark in wrong)]
 
 
+@pytest.mark.parametrize("size", [(320, 568), (844, 390)], ids=["upright", "on its side"])
+def test_nothing_covers_the_mouth_on_a_phone(
+    system: System, session: Session, browser: Browser, gateway: Gateway, size: tuple[int, int]
+) -> None:
+    width, height = size
+    browser.resize(width, height, mobile=True)
+    browser.command("Page.navigate", url=gateway.page)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    browser.evaluate(
+        "for (const name of ['header', 'footer']) document.querySelector(name).style.opacity = 0"
+    )
+    pictures = []
+    for shown, jaw in ((B_FACE, 0), (A_FACE, 450)):
+        system.talk(session.name, shown, "a")
+        browser.wait_for(f"Math.abs(window.kouxing.state.faps[2] - {jaw}) < 1")
+        pictures.append(browser.steady_image()[:, width // 3 : -width // 3])
+    closed, opened = pictures
+    caption_top = browser.evaluate("document.getElementById('caption').getBoundingClientRect().top")
+    rows, _ = np.nonzero(teeth(opened) & (colour(closed) > 50))
+    browser.resize(*SIZE_PX)
+    assert len(rows) > 20
+    assert np.percentile(rows, 90) < caption_top
+
+
 def test_the_caption_shows_syllables_and_phones_on_request(
     system: System, session: Session, browser: Browser, gateway: Gateway
 ) -> None:
