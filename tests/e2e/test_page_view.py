@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import functools
+import http.server
 import io
+import socket
+import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -77,6 +81,60 @@ def test_the_bare_view_is_the_face_alone_on_a_transparent_background(
     assert alpha[height // 2, width // 2] == 255
     assert 0.1 < (alpha == 255).mean() < 0.8
     assert browser.evaluate("document.body.innerText.trim()") == ""
+
+
+@pytest.fixture(scope="module")
+def other_pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """Serve pages that show a green face in a frame; return the port."""
+    folder = tmp_path_factory.mktemp("other")
+    port, own_port = free_port(), free_port()
+    gateway = Gateway("tcp://127.0.0.1:9", own_port, frame_ancestors=f"http://localhost:{port}")
+    (folder / "index.html").write_text(
+        "<!doctype html><style>body { margin: 0 } iframe { width: 100vw; height: 100vh; border: 0 }"
+        f"</style><iframe src='{gateway.page}?view=bare&background=%2300ff00'></iframe>",
+        encoding="utf-8",
+    )
+    handler = functools.partial(QuietFiles, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("", port), handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        wait_until(lambda: answers(own_port), 60)
+        yield port
+        server.shutdown()
+    assert gateway.stop() == 0
+
+
+class QuietFiles(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def answers(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_the_face_is_framed_by_a_page_that_is_named(browser: Browser, other_pages: int) -> None:
+    visit(browser, f"http://localhost:{other_pages}/")
+    browser.wait_for("document.readyState === 'complete'")
+
+    def has_face_on_green() -> bool:
+        image = browser.image().astype(int)
+        height, width, _ = image.shape
+        is_green = (image[0, 0] == (0, 255, 0)).all()
+        red, green, _ = image[height // 2, width // 2]
+        return bool(is_green and red > green)
+
+    wait_until(has_face_on_green, 60)
+
+
+def test_no_other_page_can_frame_it(browser: Browser, other_pages: int) -> None:
+    browser.complaints.clear()
+    visit(browser, f"http://127.0.0.1:{other_pages}/")
+    browser.wait_for("document.readyState === 'complete'")
+    wait_until(
+        lambda: browser.image().any() and "frame-ancestors" in "".join(browser.complaints), 60
+    )
+    assert not (browser.image() == (0, 255, 0)).all(axis=2).any()
 
 
 def press(browser: Browser, key: str) -> None:
