@@ -338,6 +338,22 @@ def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser)
     assert np.sqrt((samples**2).mean()) > 300
 
 
+def test_a_microphone_turned_off_while_it_starts_stays_off(
+    system: System, browser: Browser
+) -> None:
+    recognizer = system.recognizer
+    assert recognizer is not None
+    before = set(recognizer.starts)
+    browser.complaints.clear()
+    browser.evaluate("for (let i = 0; i < 3; i++) document.getElementById('microphone').click()")
+    browser.wait_for("window.kouxing.state.microphone")
+    (name,) = set(recognizer.starts) - before
+    browser.click("microphone")
+    wait_until(lambda: name in recognizer.finished, 60)
+    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    assert not [text for text in browser.complaints if "exceptionDetails" in text]
+
+
 def choose(browser: Browser, name: str, value: object) -> None:
     """Choose in the panel, as its list or slider does."""
     browser.evaluate(

@@ -12,6 +12,7 @@ const GIVE_UP_MS = 30000; // a crashed service is started again within this
 
 export class Microphone {
   #handlers;
+  #turn = null; // from one start to its stop
   #socket = null;
   #stream = null;
   #speech = null; // of a file
@@ -29,8 +30,9 @@ export class Microphone {
     this.#handlers = handlers;
   }
 
+  /** Whether it streams, or is to. */
   get active() {
-    return this.#socket !== null || this.#stream !== null;
+    return this.#turn !== null;
   }
 
   /** Whether a file is spoken instead. */
@@ -48,49 +50,54 @@ export class Microphone {
     if (this.#uplink) this.#socket.send(JSON.stringify({ lips: name }));
   }
 
-  async start() {
-    this.#handlers.state("starting");
-    if (!navigator.mediaDevices) {
-      this.#fail({
-        en: "A microphone needs https, or this page at http://localhost.",
-        zh: "使用麦克风需要 https 或 localhost。",
-      });
-      return;
-    }
-    try {
-      this.#stream = await navigator.mediaDevices.getUserMedia({
+  start() {
+    return this.#take(async (source) => {
+      if (!navigator.mediaDevices) {
+        throw {
+          en: "A microphone needs https, or this page at http://localhost.",
+          zh: "使用麦克风需要 https 或 localhost。",
+        };
+      }
+      source.stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
       });
-      this.#context = await openCaptureContext();
-    } catch (error) {
-      const denied = { en: "The microphone was not allowed.", zh: "未允许使用麦克风。" };
-      const none = { en: `No microphone: ${error.message}`, zh: `没有麦克风：${error.message}` };
-      this.#fail(error.name === "NotAllowedError" ? denied : none);
-      return;
-    }
-    for (const track of this.#stream.getTracks()) {
-      track.onended = () =>
-        this.#fail({ en: "The microphone was unplugged.", zh: "麦克风断开了。" });
-    }
-    this.#open();
+      for (const track of source.stream.getTracks()) {
+        track.onended = () =>
+          this.#fail({ en: "The microphone was unplugged.", zh: "麦克风断开了。" });
+      }
+      source.context = await openCaptureContext();
+    });
   }
 
   /** Speak a file, as if it were the microphone. */
-  async speak(file) {
-    this.#release();
-    this.#handlers.state("starting");
-    try {
-      this.#context = await openCaptureContext();
-      this.#speech = await fileSpeech(this.#context, file);
-    } catch (error) {
-      this.#fail(error.zh ? error : { en: error.message, zh: error.message });
-      return;
-    }
-    this.#stream = this.#speech.stream;
-    this.#open();
+  speak(file) {
+    return this.#take(async (source) => {
+      source.context = await openCaptureContext();
+      source.speech = await fileSpeech(source.context, file);
+      source.stream = source.speech.stream;
+    });
   }
 
-  #open() {
+  /** Stream from what open(source) puts into a source, unless it is stopped meanwhile. */
+  async #take(open) {
+    this.#release();
+    const turn = {};
+    this.#turn = turn;
+    this.#handlers.state("starting");
+    const source = { stream: null, context: null, speech: null };
+    let problem = null;
+    try {
+      await open(source);
+    } catch (error) {
+      problem = reason(error);
+    }
+    if (this.#turn !== turn || problem !== null) letGo(source);
+    if (this.#turn !== turn) return;
+    if (problem !== null) {
+      this.#fail(problem);
+      return;
+    }
+    ({ stream: this.#stream, context: this.#context, speech: this.#speech } = source);
     capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
       this.#uplink?.send(performance.now(), recordedMs, chunk);
@@ -161,11 +168,25 @@ export class Microphone {
   #release() {
     const socket = this.#socket;
     clearTimeout(this.#retry);
-    for (const track of this.#stream?.getTracks() ?? []) track.stop();
-    this.#context?.close();
+    letGo({ stream: this.#stream, context: this.#context });
     this.#socket = this.#stream = this.#speech = this.#context = this.#uplink = this.#giveUpMs = null;
+    this.#turn = null;
     socket?.close();
     this.#handlers.level(0);
     this.#handlers.state("off");
   }
+}
+
+/** Return why there is no sound, { en, zh }, of what was thrown. */
+function reason(error) {
+  if (error.zh) return error;
+  if (error.name === "NotAllowedError") {
+    return { en: "The microphone was not allowed.", zh: "未允许使用麦克风。" };
+  }
+  return { en: `No microphone: ${error.message}`, zh: `没有麦克风：${error.message}` };
+}
+
+function letGo({ stream, context }) {
+  for (const track of stream?.getTracks() ?? []) track.stop();
+  context?.close();
 }
