@@ -460,6 +460,35 @@ def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
     assert pictures[-1][2, 2].min() > 200  # its own background, not black
 
 
+def write_m4a(path: Path) -> None:
+    """Write two seconds of a tone as a phone records them."""
+    tone = (0.4 * np.sin(2 * np.pi * 300 * np.arange(2 * 48000) / 48000)).astype(np.float32)
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("aac", rate=48000, layout="mono")
+        sound = av.AudioFrame.from_ndarray(tone[None], format="fltp", layout="mono")
+        sound.sample_rate = 48000
+        for packet in (*stream.encode(sound), *stream.encode(None)):
+            container.mux(packet)
+
+
+def test_a_file_that_is_dropped_on_the_page_is_spoken(
+    system: System, browser: Browser, tmp_path: Path
+) -> None:
+    recognizer = system.recognizer
+    assert recognizer is not None
+    before = set(recognizer.starts)
+    write_m4a(tmp_path / "tone.m4a")
+    dropped = {"items": [], "files": [str(tmp_path / "tone.m4a")], "dragOperationsMask": 1}
+    for kind in ("dragEnter", "dragOver", "drop"):
+        browser.command("Input.dispatchDragEvent", type=kind, x=320, y=200, data=dropped)
+    wait_until(lambda: set(recognizer.starts) > before, 60)
+    (name,) = set(recognizer.starts) - before
+    wait_until(lambda: name in recognizer.finished, 60)
+    samples = np.frombuffer(recognizer.pcm[name], "<i2").astype(float)
+    assert np.sqrt((samples**2).mean()) > 1000
+    browser.wait_for("window.kouxing.state.session === 'seen'")
+
+
 def test_a_file_without_sound_is_refused(browser: Browser, tmp_path: Path) -> None:
     (tmp_path / "not.wav").write_text("no sound")
     document = browser.command("DOM.getDocument")["root"]["nodeId"]
@@ -488,6 +517,20 @@ def test_the_page_speaks_one_language(browser: Browser) -> None:
     assert browser.evaluate(label) == "level"
 
 
+@pytest.mark.parametrize(("languages", "shown"), [("zh-TW,en", "zh"), ("fr,en-GB,zh", "en")])
+def test_the_language_is_that_of_the_browser(
+    browser: Browser, gateway: Gateway, languages: str, shown: str
+) -> None:
+    browser.evaluate("localStorage.clear()")
+    agent = browser.evaluate("navigator.userAgent")
+    command = "Emulation.setUserAgentOverride"
+    browser.command(command, userAgent=agent, acceptLanguage=languages)
+    browser.command("Page.navigate", url=gateway.page)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    browser.command(command, userAgent=agent)
+    assert browser.evaluate("document.documentElement.lang") == shown
+
+
 def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None:
     browser.wait_for("document.getElementById('notice').textContent === ''")
     system.lose_recognizer()
@@ -496,6 +539,12 @@ def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None
     browser.click("microphone")
     browser.wait_for(f"{notice}.includes('kouxing recognizer')")
     browser.wait_for("!window.kouxing.state.microphone")
+    choose(browser, "language", "zh")
+    browser.wait_for("document.getElementById('microphone').ariaBusy === 'false'")
+    browser.click("microphone")
+    browser.wait_for(f"{notice}.includes('缺少服务')")  # what a service refuses, too
+    browser.wait_for(f"{notice}.includes('没有运行')")
+    choose(browser, "language", "en")
 
 
 def test_the_page_connects_again_by_itself(
