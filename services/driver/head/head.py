@@ -23,8 +23,6 @@ Axes: x to the subject's left, y up, z to the front; the origin is the pivot of 
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,6 +32,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from services.driver.head.shading import Shading
+from shared.array_file import read_arrays
 from shared.errors import UserError
 from shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 
@@ -139,14 +138,9 @@ class Head:
             known = ", ".join(sorted(asset.stem for asset in ASSETS.glob("*.npz")))
             raise UserError(f"there is no head {str(path)!r}; give the path of an .npz or: {known}")
         try:
-            with file.open("rb") as stream, np.load(stream, allow_pickle=False) as asset:
-                if sum(entry.file_size for entry in asset.zip.infolist()) > MAX_BYTES:
-                    raise ValueError(f"more than {MAX_BYTES // 2**20} MiB unpacked")
-                arrays = {key: asset[key] for key in asset.files}
-            return assemble(file.stem, arrays, detail)
+            return assemble(file.stem, read_arrays(file, MAX_BYTES), detail)
         except (
-            OSError, EOFError, ValueError, TypeError, AttributeError, KeyError, IndexError,
-            MemoryError, RuntimeError, zlib.error, zipfile.BadZipFile,
+            OSError, ValueError, TypeError, AttributeError, KeyError, IndexError, MemoryError,
         ) as error:  # fmt: skip
             raise UserError(
                 f"{file} is no intact head ({error}); make one with kouxing head import"

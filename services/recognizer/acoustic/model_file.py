@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -16,12 +14,14 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
 from services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
+from shared.array_file import read_arrays
 from shared.errors import UserError
 from shared.phones.inventory import PhoneInventory, load_inventory
 
 # Of the models whose files have no phone language model.
 PHONE_LM_PATH = Path(__file__).parents[1] / "models" / "phone_lm.npz"
 
+MAX_BYTES = 256 * 1024 * 1024  # of a file, packed or not
 _MAX_STATES = 10_000
 _MAX_NODES = 10_000_000
 _MAX_WEIGHT = 10.0
@@ -64,15 +64,12 @@ def read_archive(path: Path) -> Archive:
         If the file is missing or no model file.
     """
     try:
-        content = io.BytesIO(path.read_bytes())
+        return Archive(read_arrays(path, MAX_BYTES))
     except OSError as error:
         raise UserError(
             f"no acoustic model at {path}; write neural, blocks, gmm, or a model file's name"
         ) from error
-    try:
-        with np.lib.npyio.NpzFile(content, allow_pickle=False) as archive:
-            return Archive({name: archive[name] for name in archive.files})
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except ValueError as error:
         raise UserError(f"{path} is no acoustic model ({error}); train one or reinstall") from error
 
 
