@@ -14,14 +14,26 @@ from typing import Self
 
 import zmq
 
+from shared.connections import KIB, Bounds, Connection, Guard, Guarded
 from shared.endpoints import split_endpoint
 from shared.errors import UserError
 from shared.wire.codec import BadMessage, decode, encode, topic
-from shared.wire.message import MAX_MESSAGE_BYTES, Message
-from shared.wire.session import Joined
+from shared.wire.message import (
+    MAX_AUDIO_BYTES,
+    MAX_COMMAND_BYTES,
+    MAX_MESSAGE_BYTES,
+    Message,
+)
+from shared.wire.session import Error, Joined
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
 AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
+# What a bound socket takes in: the largest message, and how many of a connection wait.
+AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4)
+COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=4, cost=5.0)
+PHONES = Bounds(message_bytes=4 * KIB, queue_length=128)
+SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=512, cost=1.0)  # a handshake takes most
+REFUSAL_COST = 4.0  # that an answered error takes, and 1 more for each KiB it answers
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 1000)
@@ -31,19 +43,33 @@ _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message, or why the parts were none, and its sender (ROUTER sockets only)."""
+    """One message, or why the parts were none, and its sender (ROUTER sockets only).
+
+    ``connection`` is the number of the TCP connection that it came through, 0 if that has ended.
+    """
 
     message: Message | BadMessage
     sender: bytes = b""
+    connection: int = 0
 
 
 class Socket:
     """One ZeroMQ socket that sends and receives messages, never blocking."""
 
-    def __init__(self, raw: zmq.Socket[bytes], *, routes: bool, publishes: bool) -> None:
+    def __init__(
+        self,
+        raw: zmq.Socket[bytes],
+        guarded: Guarded | None = None,
+        *,
+        routes: bool = False,
+        publishes: bool = False,
+    ) -> None:
         self._raw = raw
+        self._guarded = guarded  # where it is bound
         self._routes = routes
         self._publishes = publishes
+        self._connection: Connection | None = None  # that the last message came through
+        self._cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
     @property
@@ -57,10 +83,15 @@ class Socket:
         return int(self._raw.getsockopt(zmq.FD))
 
     def send(self, message: Message, *, to: bytes = b"") -> bool:
-        """Send a message, on a ROUTER to one peer; return whether it could be queued."""
+        """Send a message, on a ROUTER to one peer; return whether it could be queued.
+
+        An error is charged to the peer whose message it answers.
+        """
         parts = encode(message)
         if self._routes:
             parts.insert(0, to)
+            if isinstance(message, Error) and self._connection is not None:
+                self._connection.charge(self._cost)
         try:
             self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
         except zmq.Again:
@@ -90,20 +121,24 @@ class Socket:
             if self._raw.closed:  # by the handler of the last message
                 return
             try:
-                parts = self._raw.recv_multipart(flags=zmq.DONTWAIT)
+                parts = self._take()
             except zmq.Again:
+                self.drained()
                 return
             if self._publishes:
                 self._confirm_subscription(parts)
                 continue
             sender = parts.pop(0) if self._routes else b""
-            if len(parts) > MAX_PARTS:
-                yield Received(BadMessage("parts", "too many parts"), sender)
-                continue
+            number = self._connection.inode if self._connection is not None else 0
             try:
-                yield Received(decode(parts), sender)
+                yield Received(decode(parts), sender, number)
             except BadMessage as error:
-                yield Received(error, sender)
+                yield Received(error, sender, number)
+
+    def drained(self) -> None:
+        """Note that nothing more has arrived."""
+        if self._guarded is not None:
+            self._guarded.drained()
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether something arrived within the time."""
@@ -130,11 +165,45 @@ class Socket:
         """For the poller of this module only."""
         return self._raw
 
+    def _take(self) -> list[bytes]:
+        """Return the parts of a message; of too many, the first few.
+
+        Raises
+        ------
+        zmq.Again
+            If no message has arrived.
+        """
+        frame = self._raw.recv(zmq.DONTWAIT, copy=False)
+        parts, num_bytes, num_parts = [frame.bytes], len(frame), 1
+        descriptor = _descriptor(frame)
+        while frame.more:
+            frame = self._raw.recv(zmq.DONTWAIT, copy=False)
+            num_bytes += len(frame)
+            num_parts += 1
+            if num_parts <= MAX_PARTS:
+                parts.append(frame.bytes)
+        if self._guarded is not None:
+            self._connection = self._guarded.delivered(descriptor, num_bytes)
+            self._cost = REFUSAL_COST + num_bytes / KIB
+            if num_parts > MAX_PARTS and self._connection is not None:
+                self._connection.cut("its message has too many parts")
+        return parts
+
     def _confirm_subscription(self, parts: list[bytes]) -> None:
+        if self._connection is not None and self._guarded is not None and len(parts) == 1:
+            self._guarded.subscribed(self._connection, parts[0])
         prefix = f"\x01{Joined.kind}/".encode()
         session = parts[0].removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
         if parts[0].startswith(prefix) and _SESSION.match(session):
             self.send(Joined(session=session, publisher=self._name))
+
+
+def _descriptor(frame: zmq.Frame) -> int:
+    """Return the descriptor of the connection that a frame came through, -1 if it has ended."""
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except zmq.ZMQError:
+        return -1
 
 
 def _filter(kind: type[Message], session: str | None) -> bytes:
@@ -146,6 +215,7 @@ class Bus:
 
     def __init__(self) -> None:
         self._context = zmq.Context()
+        self._guard = Guard()
         self._sockets: list[Socket] = []
 
     def __enter__(self) -> Self:
@@ -154,13 +224,13 @@ class Bus:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def bind_router(self, endpoint: str, key: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
+    def bind_router(self, endpoint: str, key: str, bounds: Bounds = AUDIO) -> Socket:
         """Bind a socket that many peers send commands or data to."""
-        return self._bind(zmq.ROUTER, endpoint, key, queue_length)
+        return self._bind(zmq.ROUTER, endpoint, key, bounds)
 
     def bind_publisher(self, endpoint: str, key: str) -> Socket:
         """Bind a socket that many peers subscribe to."""
-        return self._bind(zmq.XPUB, endpoint, key, QUEUE_LENGTH)
+        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS)
 
     def connect_dealer(self, endpoint: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
         """Connect to a router; messages queue until it is there."""
@@ -181,13 +251,17 @@ class Bus:
 
     def close(self) -> None:
         """Close every socket and the context."""
+        self._guard.close()
         for socket in self._sockets:
             socket.close()
         self._sockets.clear()
         self._context.term()
 
     def _open(self, kind: int, queue_length: int) -> zmq.Socket[bytes]:
-        raw = self._context.socket(kind)
+        try:
+            raw = self._context.socket(kind)
+        except zmq.ZMQError as error:  # out of files
+            raise OSError(error.errno, error.strerror) from None
         raw.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         raw.setsockopt(zmq.SNDHWM, queue_length)
         raw.setsockopt(zmq.RCVHWM, queue_length)
@@ -197,14 +271,15 @@ class Bus:
         raw.setsockopt(zmq.LINGER, 0)
         return raw
 
-    def _bind(self, kind: int, endpoint: str, key: str, queue_length: int) -> Socket:
+    def _bind(self, kind: int, endpoint: str, key: str, bounds: Bounds) -> Socket:
         split_endpoint(endpoint, key)
-        raw = self._open(kind, queue_length)
+        raw = self._open(kind, QUEUE_LENGTH)
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
         if kind == zmq.XPUB:
-            raw.setsockopt(zmq.XPUB_VERBOSE, 1)
+            raw.setsockopt(zmq.XPUB_VERBOSER, 1)
         if kind == zmq.ROUTER:
             raw.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        guarded = self._guard.watch(raw, bounds)
         try:
             raw.bind(endpoint)
         except zmq.ZMQError as error:
@@ -213,7 +288,7 @@ class Bus:
                 f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
                 "is another system running, or the address not this host's?"
             ) from None
-        socket = Socket(raw, routes=kind == zmq.ROUTER, publishes=kind == zmq.XPUB)
+        socket = Socket(raw, guarded, routes=kind == zmq.ROUTER, publishes=kind == zmq.XPUB)
         self._sockets.append(socket)
         return socket
 
@@ -221,7 +296,7 @@ class Bus:
         raw = self._open(kind, queue_length)
         if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))
-        socket = Socket(raw, routes=False, publishes=False)
+        socket = Socket(raw)
         self._sockets.append(socket)
         for endpoint in endpoints:
             socket.connect(endpoint)
@@ -248,4 +323,7 @@ class Poller:
     def wait(self, timeout_s: float) -> list[Socket]:
         """Return the sockets that have something, in the order they were added."""
         ready = dict(self._poller.poll(max(0, int(timeout_s * 1000))))
+        for raw, socket in self._sockets.items():
+            if raw not in ready:
+                socket.drained()
         return [socket for raw, socket in self._sockets.items() if raw in ready]

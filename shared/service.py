@@ -7,6 +7,7 @@ Heartbeats are sent from this loop, so control sees a hung loop as a lost servic
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import secrets
@@ -19,6 +20,7 @@ from typing import Any, ClassVar
 from shared.bus import Bus, Received, Socket
 from shared.clock import ClockOffset, now_ns
 from shared.config import ServiceConfig
+from shared.connections import raise_file_limit
 from shared.errors import UserError
 from shared.logs import LOG, RateLimit, configure
 from shared.metrics import Metrics
@@ -263,7 +265,12 @@ class Service:
                 socket.send(Error(code=ErrorCode.BAD_MESSAGE, text=text), to=received.sender)
             return
         self.metrics.count(f"in_{message.kind.replace('-', '_')}")
-        handler(message, received.sender)
+        try:
+            handler(message, received.sender)
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE):
+                raise
+            self.warn("files", f"{message.kind}: {error.strerror}", message.session)
 
     def _beat(self) -> None:
         self.on_heartbeat_due(
@@ -314,6 +321,7 @@ def run_service(make: Callable[[], Service], section: str, log_level: str) -> in
     A user's mistake gives one line and status 2, an internal error a traceback and status 1.
     """
     configure(section, log_level)
+    raise_file_limit()
     try:
         service = make()
     except UserError as error:

@@ -16,7 +16,7 @@ class ControlConfig(ServiceConfig):
     """Where control takes commands."""
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
     """Where control publishes events."""
-    max_sessions: Annotated[int, Field(ge=1, le=10000)] = 64
+    max_sessions: Annotated[int, Field(ge=1, le=2000)] = 64
     """Sessions that may be open at once."""
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which a session is closed."""

@@ -22,6 +22,7 @@ from typing import Any
 from services.control.config import ControlConfig
 from services.control.registry import Refusal, Registry
 from services.control.sessions import SessionRecord, Sessions
+from shared.bus import COMMANDS
 from shared.clock import now_ns
 from shared.endpoints import reachable, split_endpoint
 from shared.errors import UserError
@@ -82,7 +83,7 @@ class ControlService(Service):
         self._idle_limit_s = config.idle_limit_s
         self._answers: OrderedDict[tuple[bytes, str], Message] = OrderedDict()
         self._num_events = 0
-        self._commands = self.bus.bind_router(config.commands, "control.commands")
+        self._commands = self.bus.bind_router(config.commands, "control.commands", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         self.endpoints = {
             "commands": reachable(self._commands.endpoint, config.advertise, "control.commands"),

@@ -21,7 +21,7 @@ from services.recognizer.lip_source import LipsFromSound
 from services.recognizer.lips import lips_for
 from services.recognizer.recognizer import warm_up
 from services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Waveform
-from shared.bus import AUDIO_QUEUE_LENGTH, Socket
+from shared.bus import Socket
 from shared.clock import MEDIA_RATE_HZ, to_samples
 from shared.endpoints import reachable
 from shared.errors import UserError
@@ -73,9 +73,7 @@ class RecognizerService(Service):
         self._queued: dict[str, list[Chunk]] = {}  # by session, not yet processed
         self._queued_s = 0.0
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
-        self._audio = self.bus.bind_router(
-            config.audio, "recognizer.audio", queue_length=AUDIO_QUEUE_LENGTH
-        )
+        self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
         self.endpoints = {
             "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),

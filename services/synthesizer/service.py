@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.face import REST_S, Face, Frame
 from services.synthesizer.lips.load import load_lip_model
+from shared.bus import PHONES
 from shared.clock import to_samples, to_seconds
 from shared.endpoints import reachable
 from shared.face.faps import MASK_BYTES, NUM_FAPS
@@ -63,7 +64,7 @@ class SynthesizerService(Service):
         self.delay_ms = config.delay_ms
         self.lips = config.lips
         self._sessions: dict[str, _Session] = {}
-        self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input")
+        self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input", PHONES)
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps")
         self.endpoints = {
             "phone_input": reachable(

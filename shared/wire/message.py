@@ -26,6 +26,7 @@ from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 VERSION = 2
 DOCUMENT = "proto/PROTOCOL.md"
 MAX_AUDIO_BYTES = 64 * 1024
+MAX_COMMAND_BYTES = 256 * 1024  # to control: a heartbeat with 2000 sessions
 MAX_MESSAGE_BYTES = 1024 * 1024
 
 Version = Annotated[int, Meta(ge=1, le=65535)]

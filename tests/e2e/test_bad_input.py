@@ -21,33 +21,10 @@ from shared.wire.face import FapFrame
 from shared.wire.message import Message
 from shared.wire.session import Error, OpenSession
 from shared.wire.speech import Phone, Progress
-from tests.e2e.following import samples_of_file, stream
-from tests.system import DEMO, System
+from tests.e2e.following import stream
+from tests.system import System
 
 pytestmark = pytest.mark.e2e
-
-
-@pytest.fixture
-def client(system: System) -> Iterator[Client]:
-    with Client(system.control) as made:
-        yield made
-
-
-@pytest.fixture
-def witness(system: System, client: Client) -> Iterator[Session]:
-    """Another session, which must go on whatever happens to the tested one."""
-    opened = client.open_session(encoding="f32le", paced=False)
-    output = opened.subscribe(FapFrame)
-    yield opened
-    opened.send(samples_of_file(DEMO / "hello-female.wav")[:16000])
-    end_s = time.monotonic() + 60
-    num_frames = 0
-    while num_frames < 40:
-        assert time.monotonic() < end_s, "the other session does not go on"
-        output.wait(0.1)
-        num_frames += sum(isinstance(r.message, FapFrame) for r in output.receive())
-    opened.close()
-    system.assert_all_alive()
 
 
 def answers(socket: Socket, deadline_s: float = 60.0) -> Iterator[Error]:

@@ -1,0 +1,102 @@
+"""Hostile peers of a socket, as ZeroMQ's wire protocol (ZMTP 3) lets them be.
+
+None needs a key or knows a session; each stops by itself, at the latest after the given time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Iterator
+
+MORE, LONG, COMMAND = 1, 2, 4  # flags of a frame
+BLOCK_BYTES = 64 * 1024
+
+
+def connected(port: int, kind: str = "DEALER") -> socket.socket:
+    """Return a connection that shook hands as a socket of some kind, without any key.
+
+    Raises
+    ------
+    OSError
+        If the other end refuses.
+    """
+    connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
+    ready = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind.encode()
+    connection.sendall(greeting + bytes([COMMAND, len(ready)]) + ready)
+    answer = b""
+    while len(answer) < len(greeting) + 2:  # and the beginning of its READY
+        received = connection.recv(1024)
+        if not received:
+            raise ConnectionResetError("the handshake is refused")
+        answer += received
+    return connection
+
+
+def frame(body: bytes, *, more: bool = False) -> bytes:
+    """Return one part of a message as it is on the wire."""
+    flags = MORE if more else 0
+    if len(body) < 256:
+        return bytes([flags, len(body)]) + body
+    return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
+
+
+def flood(connection: socket.socket, block: bytes, seconds: float) -> int:
+    """Send a block again and again until the other end has had enough; return how many bytes."""
+    num_bytes, end_s = 0, time.monotonic() + seconds
+    connection.settimeout(seconds)
+    with contextlib.suppress(OSError):
+        while time.monotonic() < end_s:
+            num_bytes += connection.send(block)
+    return num_bytes
+
+
+def endless_message(port: int, kind: str, part: bytes, seconds: float) -> int:
+    """Send a message that does not end."""
+    one = frame(part, more=True)
+    with connected(port, kind) as connection:
+        return flood(connection, one * max(1, BLOCK_BYTES // len(one)), seconds)
+
+
+def many_messages(port: int, kind: str, body: bytes, seconds: float) -> int:
+    """Send messages that say nothing, as fast as they are taken."""
+    one = frame(body)
+    with connected(port, kind) as connection:
+        return flood(connection, one * max(1, BLOCK_BYTES // len(one)), seconds)
+
+
+def many_parts(port: int, kind: str, num_parts: int) -> int:
+    """Send a message of very many empty parts that does end."""
+    with connected(port, kind) as connection:
+        return flood(connection, frame(b"", more=True) * num_parts + frame(b""), 1.0)
+
+
+def many_subscriptions(port: int, num_bytes: int, seconds: float) -> int:
+    """Subscribe to ever new topics of some length."""
+    sent, number, end_s = 0, 0, time.monotonic() + seconds
+    with connected(port, "SUB") as connection:
+        connection.settimeout(seconds)
+        with contextlib.suppress(OSError):
+            while time.monotonic() < end_s:
+                block = b"".join(
+                    frame(b"\x01" + str(n).encode().rjust(num_bytes, b"x")[::-1])
+                    for n in range(number, number + max(1, BLOCK_BYTES // num_bytes))
+                )
+                number += max(1, BLOCK_BYTES // num_bytes)
+                connection.sendall(block)
+                sent += len(block)
+    return sent
+
+
+@contextlib.contextmanager
+def many_connections(port: int, num: int) -> Iterator[list[socket.socket]]:
+    """Hold very many connections that never say anything."""
+    with contextlib.ExitStack() as held:
+        connections = []
+        with contextlib.suppress(OSError):  # the own limit of open files, or refused
+            for _ in range(num):
+                connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+                connections.append(held.enter_context(connection))
+        yield connections

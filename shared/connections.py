@@ -1,0 +1,427 @@
+"""The bounds of a process's connections, kept before ZeroMQ delivers anything.
+
+libzmq bounds the size of a part and the number of messages in a queue. It bounds neither the parts
+of a message, which it holds until the last one is there, nor subscriptions, nor connections. A
+thread here sees how many bytes each connection has brought (Linux's ``TCP_INFO``) and how many of
+them were delivered. What waits in between is bounded, or the connection is cut, which frees all it
+held. An honest peer is never cut: its queue fills, ZeroMQ stops reading, and it waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import resource
+import select
+import socket
+import stat
+import struct
+import sys
+import termios
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from shared.logs import LOG, RateLimit
+
+KIB, MIB = 1024, 1024 * 1024
+RECEIVE_BUFFER = 64 * KIB  # of the kernel, a connection
+LOOK_S = 0.02  # between looks while bytes arrive
+NEAR_LOOK_S = 0.005  # while much waits: a flood brings some 5 MB in that time
+MUCH = 128 * KIB  # more than honest peers' messages take as a rule
+SWEEP_S = 1.0  # between looks for connections that have ended
+STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
+MAX_STUCK = 1 * MIB  # of all connections: an empty part takes 2 bytes on the wire, 64 in memory
+MAX_WAITING = 24 * MIB  # of all connections
+MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
+MAX_SHARE = 0.75  # of them that may come from one address
+RESERVED_FILES = 256  # for the process itself: models, pages, its own connections
+MAX_SUBSCRIPTION = 128  # bytes of a topic's beginning
+MAX_SUBSCRIBED = 256 * KIB  # of a connection; in memory up to 60 times that
+MAX_ALL_SUBSCRIBED = 512 * KIB  # of all connections
+HANDSHAKE = 1 * KIB  # more than a handshake takes on the wire
+OVERHEAD = 128  # more than a message's frames, keys and heartbeats take on the wire
+CREDIT = 5000.0  # that a connection may spend at once
+CREDIT_S = 500.0  # that it gets back in a second
+_RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
+_BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
+_SEES_BYTES = sys.platform == "linux"
+_ONCE = select.EPOLLIN | select.EPOLLONESHOT if _SEES_BYTES else 0
+_WARNINGS = RateLimit()
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a bound socket takes; ``cost`` is the credit that each of its messages takes."""
+
+    message_bytes: int  # the largest part
+    queue_length: int  # messages of a connection that wait for delivery
+    cost: float = 0.0
+
+    @property
+    def one_message(self) -> int:
+        """Bytes of a connection in the midst of its largest message."""
+        return self.message_bytes + 16 * KIB  # and what libzmq reads at once
+
+    @property
+    def full_queue(self) -> int:
+        """Bytes of a connection whose queue is full of the largest messages."""
+        return self.queue_length * (self.message_bytes + OVERHEAD) + self.one_message
+
+
+class Connection:
+    """One connection to a bound socket."""
+
+    def __init__(self, descriptor: int, inode: int) -> None:
+        self.descriptor = descriptor
+        self.inode = inode  # of the TCP socket: the descriptor's number is used again
+        self.guarded: Guarded | None = None  # once the guard has seen it
+        self.address = ""
+        self.delivered = HANDSHAKE  # bytes; only the socket's thread writes it
+        self.waiting = 0  # bytes that libzmq holds; the guard's, as all that follows
+        self.stuck = 0  # of them, those that waited while all complete messages were delivered
+        self.subscribed_bytes = 0
+        self._subscriptions: set[bytes] = set()
+        self.is_cut = False
+        self._surplus = 0  # by which delivered is too high, as overhead is estimated
+        self._credit = CREDIT
+        self._credit_s = time.monotonic()
+        self._mark = (0, 0, 0, 0.0)  # delivered, waiting, turns and time at an earlier look
+
+    def charge(self, cost: float) -> None:
+        """Take credit for what the connection makes this process do; without any it is cut."""
+        now_s = time.monotonic()
+        self._credit = min(CREDIT, self._credit + (now_s - self._credit_s) * CREDIT_S) - cost
+        self._credit_s = now_s
+        if self._credit < 0:
+            self.cut("it sends too much that is of no use")
+
+    def subscribe(self, topic: bytes) -> None:
+        """Note a subscription."""
+        if topic not in self._subscriptions:
+            self._subscriptions.add(topic)
+            self.subscribed_bytes += len(topic)
+
+    def unsubscribe(self, topic: bytes) -> None:
+        """Note the end of a subscription."""
+        if topic in self._subscriptions:
+            self._subscriptions.remove(topic)
+            self.subscribed_bytes -= len(topic)
+
+    def exists(self) -> bool:
+        """Return whether it is not closed yet."""
+        return _inode(self.descriptor) == self.inode
+
+    def look(self, now_s: float) -> None:
+        """Find what waits, and what of that is stuck; cut the connection if it is too much.
+
+        Two turns and a while after bytes came, their message was delivered if it is complete.
+        """
+        if self.guarded is None:
+            return
+        delivered, turns, bounds = self.delivered, self.guarded.turns, self.guarded.bounds
+        received = _bytes_read(self.descriptor)
+        self._surplus = max(self._surplus, delivered - received)
+        self.waiting = received - delivered + self._surplus
+        before, waiting, turn, time_s = self._mark
+        if delivered != before:
+            self.stuck = 0
+            self._mark = (delivered, self.waiting, turns, now_s)
+        elif turns >= turn + 2 and now_s >= time_s + STUCK_S:
+            self.stuck = waiting
+            self._mark = (delivered, self.waiting, turns, now_s)
+        if self.waiting > bounds.full_queue:
+            self.cut("more waits than a queue holds")
+        elif self.stuck > bounds.one_message:
+            self.cut("its message does not end")
+
+    def cut(self, reason: str) -> None:
+        """End the connection; libzmq then frees what it holds. Any thread may call this."""
+        if self.is_cut:
+            return
+        self.is_cut = True
+        with contextlib.suppress(OSError):  # it may have ended by itself
+            own = os.dup(self.descriptor)  # which nobody else closes
+            try:
+                if _inode(own) == self.inode:
+                    with _borrowed(own) as connection:  # reset when libzmq closes it
+                        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+                        connection.shutdown(socket.SHUT_RDWR)
+            finally:
+                os.close(own)
+        if _WARNINGS.allows(reason):
+            LOG.warning("cut a connection from %s: %s", self.address or "a peer", reason)
+
+
+class Guarded:
+    """The connections of one bound socket; its thread says what was delivered."""
+
+    def __init__(self, guard: Guard, bounds: Bounds, monitor: zmq.Socket[bytes]) -> None:
+        self.bounds = bounds
+        self.turns = 0  # times that every connection's next complete message was delivered
+        self._guard = guard
+        self._monitor = monitor
+        self._num_delivered = 0  # in this turn
+
+    def delivered(self, descriptor: int, num_bytes: int) -> Connection | None:
+        """Note a message that came through a descriptor; return its connection if it lasts."""
+        connection = self._guard.connection(descriptor)
+        if connection is None:
+            return None
+        connection.delivered += num_bytes + OVERHEAD
+        self._num_delivered += 1
+        if self._num_delivered > self._guard.num_connections:  # ZeroMQ takes them one by one
+            self.drained()
+        connection.charge(self.bounds.cost)
+        return connection
+
+    def drained(self) -> None:
+        """Note that every complete message was delivered."""
+        self.turns += 1
+        self._num_delivered = 0
+
+    def subscribed(self, connection: Connection, message: bytes) -> None:
+        """Note that a connection begins (1) or ends (0) a subscription to a topic's beginning."""
+        begins, topic = message[:1] == b"\x01", message[1:]
+        if len(topic) > MAX_SUBSCRIPTION:
+            connection.cut("a subscription is too long")
+        elif begins:
+            connection.subscribe(topic)
+            self._guard.bound_subscriptions(connection, len(topic))
+        else:
+            connection.unsubscribe(topic)
+
+    @property
+    def descriptor(self) -> int:
+        """Readable when connections may have come (edge-triggered)."""
+        return int(self._monitor.getsockopt(zmq.FD))
+
+    def accepted(self) -> Iterator[tuple[int, Guarded]]:
+        """Yield the descriptors of new connections, each with this socket."""
+        with contextlib.suppress(zmq.Again):
+            while True:
+                yield recv_monitor_message(self._monitor, zmq.DONTWAIT)["value"], self
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._monitor.close(linger=0)
+
+
+class Guard:
+    """Watches the connections of all bound sockets of a process."""
+
+    def __init__(self) -> None:
+        self._connections: dict[int, Connection] = {}  # by inode; both threads add
+        self._descriptors: dict[int, Connection] = {}  # the thread's, as all that follows
+        self._pending: set[Connection] = set()  # something of theirs waits
+        self._guarded: list[Guarded] = []
+        self._swept_s = 0.0
+        self._subscribed = 0  # bytes, since they were counted; the sockets' thread's
+        self._max_connections = 0
+        self._is_stopping = False
+        self._thread = threading.Thread(target=self._run, name="guard", daemon=True)
+        self._events = select.epoll() if _SEES_BYTES else None
+        self._stop = os.eventfd(0) if _SEES_BYTES else -1
+
+    @property
+    def num_connections(self) -> int:
+        """How many connections there are, or were a moment ago."""
+        return len(self._connections)
+
+    def watch(self, raw: zmq.Socket[bytes], bounds: Bounds) -> Guarded:
+        """Set the bounds of a socket that is not bound yet, and watch its connections."""
+        raw.setsockopt(zmq.MAXMSGSIZE, bounds.message_bytes)
+        raw.setsockopt(zmq.RCVHWM, bounds.queue_length)
+        raw.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
+        guarded = Guarded(self, bounds, raw.get_monitor_socket(zmq.EVENT_ACCEPTED))
+        self._guarded.append(guarded)
+        if self._events is not None:
+            self._events.register(guarded.descriptor, select.EPOLLIN | select.EPOLLET)
+        if not self._thread.is_alive():
+            if self._events is not None:
+                self._events.register(self._stop, select.EPOLLIN)
+            max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+            self._max_connections = max(1, min(MAX_CONNECTIONS, max_files - RESERVED_FILES))
+            self._thread.start()
+        return guarded
+
+    def connection(self, descriptor: int) -> Connection | None:
+        """Return the connection of a descriptor, None if it is closed."""
+        inode = _inode(descriptor)
+        if inode is None:
+            return None
+        known = self._connections.get(inode)
+        return known or self._connections.setdefault(inode, Connection(descriptor, inode))
+
+    def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
+        """Keep the subscriptions of one connection, and of all, within their bounds."""
+        if connection.subscribed_bytes > MAX_SUBSCRIBED:
+            connection.cut("it has too many subscriptions")
+        self._subscribed += num_bytes
+        if self._subscribed > MAX_ALL_SUBSCRIBED:
+            self._subscribed = self._shed(
+                "subscribed_bytes", MAX_ALL_SUBSCRIBED, "there are too many subscriptions"
+            )
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._is_stopping = True
+        if self._thread.is_alive():
+            if self._events is not None:
+                os.eventfd_write(self._stop, 1)
+            self._thread.join()
+        for guarded in self._guarded:
+            guarded.close()
+        if self._events is not None:
+            self._events.close()
+            os.close(self._stop)
+
+    def _run(self) -> None:
+        while not self._is_stopping:
+            ready = self._wait()
+            now_s = time.monotonic()
+            self._admit([pair for guarded in self._guarded for pair in guarded.accepted()])
+            if now_s > self._swept_s + SWEEP_S:
+                self._sweep()
+            self._look(ready, now_s)
+            much = any(connection.waiting > MUCH for connection in self._pending)
+            time.sleep(NEAR_LOOK_S if much else LOOK_S)
+
+    def _wait(self) -> list[Connection]:
+        """Wait until bytes arrive or something is due; return the connections that have some."""
+        timeout_s = STUCK_S if self._pending else SWEEP_S
+        if self._events is None:
+            time.sleep(STUCK_S)
+            return []
+        descriptors = [descriptor for descriptor, _ in self._events.poll(timeout_s)]
+        return [self._descriptors[each] for each in descriptors if each in self._descriptors]
+
+    def _admit(self, accepted: Iterable[tuple[int, Guarded]]) -> None:
+        """Begin to watch connections; cut the newest where there are too many."""
+        admitted = []
+        for descriptor, guarded in accepted:
+            connection = self.connection(descriptor)
+            if connection is None:
+                continue
+            connection.address = _address(descriptor)
+            connection.guarded = guarded
+            self._descriptors[descriptor] = connection
+            self._pending.add(connection)  # bytes may have come before
+            admitted.append(connection)
+            if self._events is not None:
+                with contextlib.suppress(OSError):  # it has just ended
+                    self._events.register(descriptor, _ONCE)
+        if admitted and self.num_connections > MAX_SHARE * self._max_connections:
+            self._bound_number(admitted)
+
+    def _bound_number(self, admitted: list[Connection]) -> None:
+        """Keep the number of connections, of each address and of all.
+
+        Those that never said anything go first, the oldest of them before newer ones.
+        """
+        self._sweep()
+        uncut = [each for each in list(self._connections.values()) if not each.is_cut]
+        silent = [connection for connection in uncut if connection.delivered == HANDSHAKE]
+        shares = Counter(connection.address for connection in uncut)
+        for connection in (*silent, *reversed(admitted)):
+            if connection.is_cut:
+                continue
+            if shares.total() > self._max_connections:
+                connection.cut("there are too many connections")
+            elif shares[connection.address] > MAX_SHARE * self._max_connections:
+                connection.cut("its address has too many connections")
+            shares[connection.address] -= connection.is_cut
+
+    def _sweep(self) -> None:
+        """Forget the connections that have ended, and return what those took that were cut."""
+        self._swept_s = time.monotonic()
+        ended = [each for each in list(self._connections.values()) if not each.exists()]
+        for connection in ended:
+            del self._connections[connection.inode]
+            self._pending.discard(connection)
+        if any(connection.is_cut for connection in ended):
+            with contextlib.suppress(AttributeError):  # only glibc's keeps so much
+                ctypes.CDLL(None).malloc_trim(0)
+
+    def _look(self, ready: Iterable[Connection], now_s: float) -> None:
+        """Keep the bounds of what waits, of each connection and of all."""
+        if self._events is None:
+            return
+        self._pending.update(ready)
+        for connection in list(self._pending):
+            if not connection.is_cut:
+                connection.look(now_s)
+            if connection.is_cut or not connection.waiting:
+                self._pending.discard(connection)
+        for connection in ready:
+            with contextlib.suppress(OSError):  # it has just ended
+                self._events.modify(connection.descriptor, _ONCE)
+        self._shed("stuck", MAX_STUCK, "the messages of all connections do not end")
+        self._shed("waiting", MAX_WAITING, "too much waits")
+
+    def _shed(self, measure: str, limit: int, reason: str) -> int:
+        """Cut the connections with the most of something until all together keep the limit.
+
+        Returns what is left.
+        """
+        shares: dict[Connection, int] = {
+            connection: share
+            for connection in list(self._connections.values())
+            if not connection.is_cut and (share := getattr(connection, measure)) > 0
+        }
+        total = sum(shares.values())
+        while total > limit:
+            largest = max(shares, key=lambda connection: shares[connection])
+            largest.cut(reason)
+            total -= shares.pop(largest)
+        return total
+
+
+def raise_file_limit() -> None:
+    """Let this process open as many files as it may."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with contextlib.suppress(ValueError, OSError):  # macOS takes no more than it has
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+
+def _inode(descriptor: int) -> int | None:
+    """Return the number of the socket that a descriptor stands for, None if it is no socket."""
+    try:
+        status = os.fstat(descriptor)
+    except OSError:
+        return None
+    return status.st_ino if stat.S_ISSOCK(status.st_mode) else None
+
+
+def _address(descriptor: int) -> str:
+    """Return the other end's address, empty if it is gone."""
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        return str(connection.getpeername()[0])
+    return ""
+
+
+def _bytes_read(descriptor: int) -> int:
+    """Return how many bytes libzmq has read from a connection; the kernel has others still."""
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _BYTES_RECEIVED + 8)
+        (unread,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))
+        (received,) = struct.unpack_from("Q", info, _BYTES_RECEIVED)
+        return int(received - unread)
+    return 0
+
+
+@contextlib.contextmanager
+def _borrowed(descriptor: int) -> Iterator[socket.socket]:
+    """Yield a socket of Python for a descriptor that stays libzmq's."""
+    connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fileno=descriptor)
+    try:
+        yield connection
+    finally:
+        connection.detach()

@@ -1,0 +1,210 @@
+"""Bounds of connections: hostile ones are cut, honest ones never, however slow."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from evaluation.system.attackers import connected, frame
+from shared import connections
+from shared.bus import Bus, Received, Socket
+from shared.connections import MAX_SUBSCRIBED, MAX_SUBSCRIPTION, Connection
+from shared.wire.audio import AudioChunk
+from shared.wire.codec import encode
+from shared.wire.face import FapFrame
+from shared.wire.message import MAX_AUDIO_BYTES, Message
+from shared.wire.session import Error
+from shared.wire.speech import Progress
+
+pytestmark = pytest.mark.unit
+
+LOCAL = "tcp://127.0.0.1:*"
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with Bus() as made:
+        yield made
+
+
+def port_of(bound: Socket) -> int:
+    return int(bound.endpoint.rpartition(":")[2])
+
+
+def collect(bus: Bus, bound: Socket, is_enough: Callable[[list[Received]], bool]) -> list[Received]:
+    """Receive as a service's loop does, until it is enough."""
+    received: list[Received] = []
+    poller, end_s = bus.poller(), time.monotonic() + 30
+    poller.add(bound)
+    while not is_enough(received):
+        assert time.monotonic() < end_s
+        for ready in poller.wait(0.01):
+            received += ready.receive()
+    return received
+
+
+def chunk(sequence: int, num_bytes: int = MAX_AUDIO_BYTES, session: str = "s") -> Message:
+    return AudioChunk(session=session, token="t", sequence=sequence, pcm=bytes(num_bytes))
+
+
+def wire_bytes(message: Message) -> bytes:
+    topic, body = encode(message)
+    return frame(topic, more=True) + frame(body)
+
+
+def test_many_fast_senders_wait_while_nothing_is_received(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    senders = [bus.connect_dealer(audio.endpoint) for _ in range(16)]
+    num_chunks = 30
+    for name, sender in enumerate(senders):
+        for number in range(num_chunks):
+            assert sender.send(chunk(number, session=str(name)))
+    time.sleep(0.5)  # as when a service pauses a socket
+    received = collect(bus, audio, lambda all_: len(all_) == len(senders) * num_chunks)
+    numbers: dict[str, list[int]] = {}
+    for each in received:
+        assert isinstance(each.message, Message)
+        numbers.setdefault(each.message.session, []).append(each.message.sequence)
+    assert numbers == {str(name): [*range(num_chunks)] for name in range(len(senders))}
+
+
+def test_a_message_that_comes_in_pieces_arrives(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    data = wire_bytes(chunk(1))
+    taken: list[Received] = []
+    with connected(port_of(audio)) as slow:
+        other = bus.connect_dealer(audio.endpoint)
+        for begin in range(0, len(data), len(data) // 4):
+            slow.sendall(data[begin : begin + len(data) // 4])
+            for number in range(20):  # others' messages are delivered meanwhile
+                other.send(Progress(sequence=number, level_db=0.0))
+                time.sleep(0.005)
+                taken += audio.receive()
+        slow.sendall(wire_bytes(chunk(2, 10)))
+        taken += collect(bus, audio, lambda all_: chunk(2, 10) in [r.message for r in all_])
+    assert chunk(1) in [each.message for each in taken]
+
+
+def test_a_subscriber_may_follow_one_session_after_another_for_hours(bus: Bus) -> None:
+    faps = bus.bind_publisher(LOCAL, "faps")
+    num_topics = MAX_SUBSCRIBED // MAX_SUBSCRIPTION + 100
+    with connected(port_of(faps), "SUB") as subscriber:
+        for number in range(num_topics):
+            topic = str(number).rjust(MAX_SUBSCRIPTION, "x").encode()
+            subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
+        subscriber.sendall(frame(b"\x01fap-frame/") + frame(b"\x01joined/s/"))
+        subscriber.settimeout(0.05)
+        answer, end_s = b"", time.monotonic() + 20
+        while b"joined/s/" not in answer:
+            assert time.monotonic() < end_s
+            list(faps.receive())
+            try:
+                answer += subscriber.recv(1000)
+            except TimeoutError:
+                continue
+
+
+def test_one_that_subscribes_to_too_much_is_cut(bus: Bus) -> None:
+    faps = bus.bind_publisher(LOCAL, "faps")
+    honest = bus.connect_subscriber(faps.endpoint)
+    honest.subscribe(FapFrame, "s")
+    with connected(port_of(faps), "SUB") as hostile:
+        for number in range(MAX_SUBSCRIBED // MAX_SUBSCRIPTION + 1):
+            hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_SUBSCRIPTION, "x").encode()))
+        assert is_cut(hostile, faps)
+    with connected(port_of(faps), "SUB") as hostile:
+        hostile.sendall(frame(b"\x01" + bytes(MAX_SUBSCRIPTION + 1)))
+        assert is_cut(hostile, faps)
+    frame_ = FapFrame(session="s", values=b"\0" * 272, mask=b"\0" * 9)
+    faps.send(frame_)
+    assert honest.wait(20.0)
+
+
+def is_cut(connection: socket.socket, bound: Socket) -> bool:
+    """Whether a connection ends soon, while its other end's messages are received."""
+    connection.settimeout(0.02)
+    for _ in range(500):
+        list(bound.receive())
+        try:
+            if not connection.recv(65_536):
+                return True
+        except TimeoutError:
+            continue
+        except OSError:
+            return True
+    return False
+
+
+def test_one_whose_message_does_not_end_is_cut_though_little_waits(bus: Bus) -> None:
+    phones = bus.bind_router(LOCAL, "phones")
+    with connected(port_of(phones)) as hostile:
+        hostile.sendall(frame(b"", more=True) * 50_000)
+        assert is_cut(hostile, phones)
+
+
+def test_one_that_sends_only_what_is_refused_is_cut(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    with connected(port_of(audio)) as hostile:
+        hostile.settimeout(0.001)
+        bad = frame(b"nothing/s/", more=True) + frame(b"\x80")
+        for _ in range(10_000):
+            try:
+                hostile.sendall(bad)
+            except TimeoutError:
+                pass
+            except OSError:
+                return
+            for received in audio.receive():
+                audio.send(Error(code="bad-message", text="no"), to=received.sender)
+    raise AssertionError("it was not cut")
+
+
+def test_a_message_of_another_connection_has_another_number(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    port = port_of(audio)
+    with connected(port) as first, connected(port) as second:
+        numbers = []
+        for sequence, connection in enumerate((first, second, first, second)):
+            connection.sendall(wire_bytes(chunk(sequence, 10)))
+            (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
+            numbers.append(received.connection)
+    assert numbers[:2] == numbers[2:]
+    assert len({*numbers, 0}) == 3
+
+
+def test_a_descriptor_that_is_used_again_is_not_cut() -> None:
+    before, other = socket.socketpair()
+    gone = Connection(before.fileno(), os.fstat(before.fileno()).st_ino)
+    descriptor = before.detach()
+    left, right = socket.socketpair()
+    with left, right, other:
+        os.dup2(left.fileno(), descriptor)
+        gone.cut("it has gone")
+        right.sendall(b"still there")
+        assert left.recv(20) == b"still there"
+        assert not gone.exists()
+        os.close(descriptor)
+
+
+def test_silent_connections_make_room_for_new_ones(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 40)
+    audio = bus.bind_router(LOCAL, "audio")
+    talker = bus.connect_dealer(audio.endpoint)
+    talker.send(chunk(1, 10))
+    collect(bus, audio, lambda all_: len(all_) == 1)
+    silent = [connected(port_of(audio)) for _ in range(60)]
+    late = bus.connect_dealer(audio.endpoint)
+    late.send(chunk(2, 10))
+    collect(bus, audio, lambda all_: len(all_) == 1)
+    talker.send(chunk(3, 10))
+    (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
+    assert received.message == chunk(3, 10)
+    assert all(is_cut(each, audio) for each in silent[: 60 - 40])
+    for each in silent:
+        each.close()
