@@ -1,7 +1,10 @@
-"""ZeroMQ sockets that carry messages; the only module that imports zmq.
+"""ZeroMQ sockets that carry messages.
 
 Services bind, clients connect. Every socket has explicit limits on message size, queue length and
 linger. Parts that are no message are returned as ``BadMessage``; nobody else notices them.
+
+Connections are encrypted and both ends know each other's key (CURVE), unless the whole bus is
+plain. Where a socket is bound with a key, that follows its address: ``tcp://HOST:PORT KEY``.
 """
 
 from __future__ import annotations
@@ -13,10 +16,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import zmq
+from zmq.utils.monitor import recv_monitor_message
 
 from shared.connections import KIB, Bounds, Connection, Guard, Guarded
 from shared.endpoints import split_endpoint
 from shared.errors import UserError
+from shared.keys import NOBODY, Key, Peer, may_follow
 from shared.wire.codec import BadMessage, decode, encode, topic
 from shared.wire.message import (
     MAX_AUDIO_BYTES,
@@ -25,6 +30,7 @@ from shared.wire.message import (
     Message,
 )
 from shared.wire.session import Error, Joined
+from shared.zap import Zap
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
 AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
@@ -49,7 +55,7 @@ class Received:
     """
 
     message: Message | BadMessage
-    sender: bytes = b""
+    sender: Peer = NOBODY
     connection: int = 0
 
 
@@ -59,12 +65,16 @@ class Socket:
     def __init__(
         self,
         raw: zmq.Socket[bytes],
+        key: Key | None,
+        zap: Zap | None = None,
         guarded: Guarded | None = None,
         *,
         routes: bool = False,
         publishes: bool = False,
     ) -> None:
         self._raw = raw
+        self._key = key
+        self._zap = zap  # of a socket that is bound with a key
         self._guarded = guarded  # where it is bound
         self._routes = routes
         self._publishes = publishes
@@ -82,14 +92,14 @@ class Socket:
         """Readable when something may have happened (edge-triggered)."""
         return int(self._raw.getsockopt(zmq.FD))
 
-    def send(self, message: Message, *, to: bytes = b"") -> bool:
+    def send(self, message: Message, *, to: Peer = NOBODY) -> bool:
         """Send a message, on a ROUTER to one peer; return whether it could be queued.
 
         An error is charged to the peer whose message it answers.
         """
         parts = encode(message)
         if self._routes:
-            parts.insert(0, to)
+            parts.insert(0, to.address)
             if isinstance(message, Error) and self._connection is not None:
                 self._connection.charge(self._cost)
         try:
@@ -121,14 +131,16 @@ class Socket:
             if self._raw.closed:  # by the handler of the last message
                 return
             try:
-                parts = self._take()
+                parts, key = self._take()
             except zmq.Again:
                 self.drained()
                 return
-            if self._publishes:
-                self._confirm_subscription(parts)
+            if self._zap is not None and key not in self._zap.guests:  # gone or revoked
                 continue
-            sender = parts.pop(0) if self._routes else b""
+            if self._publishes:
+                self._on_subscription(parts, key)
+                continue
+            sender = Peer(parts.pop(0), key) if self._routes else NOBODY
             number = self._connection.inode if self._connection is not None else 0
             try:
                 yield Received(decode(parts), sender, number)
@@ -150,11 +162,24 @@ class Socket:
         Raises
         ------
         UserError
-            If the endpoint is malformed.
+            If the endpoint is malformed, or has a key where all is plain, or the other way round.
         """
-        split_endpoint(endpoint, "endpoint")
-        self._raw.setsockopt(zmq.IPV6, "[" in endpoint)
-        self._raw.connect(endpoint)
+        address, _, server_key = endpoint.partition(" ")
+        split_endpoint(address, "endpoint")
+        if bool(server_key) != (self._key is not None):
+            problem = "has a key, but here" if server_key else "has no key; not here, but there"
+            raise UserError(
+                f"{address} {problem} insecure = true is set; it must be the same everywhere"
+            )
+        try:
+            if self._key is not None:
+                self._raw.setsockopt_string(zmq.CURVE_SERVERKEY, server_key)
+                self._raw.setsockopt_string(zmq.CURVE_PUBLICKEY, self._key.public)
+                self._raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
+            self._raw.setsockopt(zmq.IPV6, "[" in address)
+            self._raw.connect(address)
+        except zmq.ZMQError as error:
+            raise UserError(f"cannot connect to {endpoint}: {error.strerror}") from None
 
     def close(self, *, linger_s: float = 1.0) -> None:
         """Close; queued messages have some time to leave, then they are dropped."""
@@ -165,8 +190,8 @@ class Socket:
         """For the poller of this module only."""
         return self._raw
 
-    def _take(self) -> list[bytes]:
-        """Return the parts of a message; of too many, the first few.
+    def _take(self) -> tuple[list[bytes], str]:
+        """Return the parts of a message, of too many the first few, and its sender's key.
 
         Raises
         ------
@@ -187,14 +212,23 @@ class Socket:
             self._cost = REFUSAL_COST + num_bytes / KIB
             if num_parts > MAX_PARTS and self._connection is not None:
                 self._connection.cut("its message has too many parts")
-        return parts
+        return parts, "" if self._zap is None else _key(frame)
 
-    def _confirm_subscription(self, parts: list[bytes]) -> None:
+    def _on_subscription(self, parts: list[bytes], key: str) -> None:
         if self._connection is not None and self._guarded is not None and len(parts) == 1:
             self._guarded.subscribed(self._connection, parts[0])
-        prefix = f"\x01{Joined.kind}/".encode()
-        session = parts[0].removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
-        if parts[0].startswith(prefix) and _SESSION.match(session):
+        verb, wanted = parts[0][:1], parts[0][1:]
+        may = self._zap is None or may_follow(self._zap.guests[key], wanted)
+        if verb == b"\x00":
+            self._raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
+        elif verb == b"\x01" and may:
+            self._raw.setsockopt(zmq.SUBSCRIBE, wanted)
+            self._confirm_subscription(wanted)
+
+    def _confirm_subscription(self, wanted: bytes) -> None:
+        prefix = f"{Joined.kind}/".encode()
+        session = wanted.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
+        if wanted.startswith(prefix) and _SESSION.match(session):
             self.send(Joined(session=session, publisher=self._name))
 
 
@@ -206,16 +240,43 @@ def _descriptor(frame: zmq.Frame) -> int:
         return -1
 
 
+def _key(frame: zmq.Frame) -> str:
+    """Return the key of a frame's sender; empty at the end of a subscription whose peer is gone."""
+    try:
+        return str(frame.get("User-Id"))
+    except zmq.ZMQError:
+        return ""
+
+
 def _filter(kind: type[Message], session: str | None) -> bytes:
     return f"{kind.kind}/".encode() if session is None else topic(kind, session)
 
 
 class Bus:
-    """The sockets of one process."""
+    """The sockets of one process.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    key
+        Proves who this process is; its sockets accept only keys that are allowed. None: all is
+        plain, to anybody.
+
+    Attributes
+    ----------
+    zap
+        Who may connect; None on a plain bus.
+
+    Raises
+    ------
+    UserError
+        If the allowed keys cannot be read.
+    """
+
+    def __init__(self, key: Key | None = None) -> None:
         self._context = zmq.Context()
         self._guard = Guard()
+        self._key = key
+        self.zap = None if key is None else Zap(self._context)
         self._sockets: list[Socket] = []
 
     def __enter__(self) -> Self:
@@ -239,6 +300,20 @@ class Bus:
     def connect_subscriber(self, *endpoints: str) -> Socket:
         """Connect to publishers; nothing arrives before ``subscribe``."""
         return self._connect(zmq.SUB, *endpoints, queue_length=QUEUE_LENGTH)
+
+    def is_refused(self, endpoint: str) -> bool:
+        """Return whether somebody listens there who does not accept this key, or has another."""
+        probe = self._connect(zmq.DEALER, queue_length=1)
+        ends = {zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_CONNECT_RETRIED}
+        monitor = probe.raw.get_monitor_socket(sum({zmq.EVENT_CONNECTED, *ends}))
+        probe.connect(endpoint)
+        events: set[int] = set()
+        while not events & ends and monitor.poll(HANDSHAKE_MS):
+            events.add(recv_monitor_message(monitor)["event"])
+        probe.raw.disable_monitor()
+        monitor.close()
+        self.drop(probe, linger_s=0.0)
+        return zmq.EVENT_CONNECTED in events and zmq.EVENT_HANDSHAKE_SUCCEEDED not in events
 
     def poller(self) -> Poller:
         """Return a poller for sockets of this bus."""
@@ -275,8 +350,13 @@ class Bus:
         split_endpoint(endpoint, key)
         raw = self._open(kind, QUEUE_LENGTH)
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
+        raw.setsockopt_string(zmq.ZAP_DOMAIN, key)  # with one, libzmq refuses ZMTP 1 and 2
+        if self._key is not None:
+            raw.setsockopt(zmq.CURVE_SERVER, 1)
+            raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
+            raw.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
         if kind == zmq.XPUB:
-            raw.setsockopt(zmq.XPUB_VERBOSER, 1)
+            raw.setsockopt(zmq.XPUB_MANUAL, 1)
         if kind == zmq.ROUTER:
             raw.setsockopt(zmq.ROUTER_HANDOVER, 1)
         guarded = self._guard.watch(raw, bounds)
@@ -288,7 +368,9 @@ class Bus:
                 f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
                 "is another system running, or the address not this host's?"
             ) from None
-        socket = Socket(raw, guarded, routes=kind == zmq.ROUTER, publishes=kind == zmq.XPUB)
+        socket = Socket(
+            raw, self._key, self.zap, guarded, routes=kind == zmq.ROUTER, publishes=kind == zmq.XPUB
+        )
         self._sockets.append(socket)
         return socket
 
@@ -296,7 +378,7 @@ class Bus:
         raw = self._open(kind, queue_length)
         if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
             raw.setsockopt(zmq.ROUTING_ID, secrets.token_bytes(16).replace(b"\0", b"\1"))
-        socket = Socket(raw)
+        socket = Socket(raw, self._key)
         self._sockets.append(socket)
         for endpoint in endpoints:
             socket.connect(endpoint)

@@ -17,6 +17,7 @@ from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
 from shared.face.expressions import DEFAULT_HOLD_S
 from shared.follower import PollingLoop, SessionFollower
+from shared.keys import CLIENT, Key, refusal, user_key
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.codec import BadMessage
 from shared.wire.control import StatusReport, StatusRequest
@@ -50,10 +51,21 @@ class Refused(UserError):
 
 
 class Client:
-    """Sends requests to control over one socket; each has an id and a deadline."""
+    """Sends requests to control over one socket; each has an id and a deadline.
 
-    def __init__(self, control: str, *, deadline_s: float = 10.0) -> None:
-        self.bus = Bus()
+    Parameters
+    ----------
+    control
+        Where it takes commands, as ``shared.service.control_endpoint`` returns: address and key.
+    key
+        Who asks; none: the user. Without a key in ``control`` nothing is encrypted.
+    deadline_s
+        Time for an answer.
+    """
+
+    def __init__(self, control: str, *, key: Key | None = None, deadline_s: float = 10.0) -> None:
+        is_plain = " " not in control
+        self.bus = Bus(None if is_plain else key or user_key())
         self._control = control
         self._deadline_s = deadline_s
         self._commands = self.bus.connect_dealer(control)
@@ -189,8 +201,11 @@ class Client:
                         raise Refused(answer.code, answer.text)
                     if isinstance(answer, Message):
                         return answer
+            if self.bus.is_refused(self._control):
+                raise UserError(refusal(self._control, CLIENT, ("client",)))
+        address = self._control.partition(" ")[0]
         raise UserError(
-            f"control at {self._control} does not answer; is it running? to start it: kouxing run"
+            f"control at {address} does not answer; is it running? to start it: kouxing run"
         )
 
 

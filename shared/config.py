@@ -88,7 +88,8 @@ class ServiceConfig(BaseModel):
     advertise: str = ""
     """Host name or address by which other machines reach this service."""
     insecure: Switch = False
-    """Allow unencrypted sockets that other machines can reach."""
+    """Let services and clients talk unencrypted, to anybody; docs/security.md says what that gives
+    away."""
     log_level: LogLevel = "info"
     """Least level of the log lines that are written."""
     instance: str = ""
@@ -349,14 +350,14 @@ def _check_addresses(table: str, config: ServiceConfig) -> None:
             continue
         name = f"{table}.{key}"
         host = getattr(config, key)
-        if kind is Bound.ENDPOINT:
+        if kind is Bound.ENDPOINT:  # encrypted, or not by choice
             host, _ = split_endpoint(host, name)
             if host in WILDCARDS and not config.advertise:
                 raise UserError(
                     f"{table}.advertise: name the host by which others reach {name} "
                     f"({host} is every address of this host), for example {socket.gethostname()}"
                 )
-        if not is_loopback(host) and not config.insecure and not config.is_encrypted:
+        elif not is_loopback(host) and not config.insecure and not config.is_encrypted:
             raise UserError(
                 f"{name}: {host} can be reached from other machines and nothing is encrypted; "
                 f"{config.safer}, or accept the risk on a trusted network with insecure = true"

@@ -46,3 +46,8 @@ def reachable(endpoint: str, advertise: str, key: str) -> str:
     """Return the endpoint that others connect to for one that was bound."""
     host, port = split_endpoint(endpoint, key)
     return f"tcp://{advertise or host}:{port}"
+
+
+def with_key(endpoint: str, public_key: str) -> str:
+    """Return an endpoint as sockets take it: with the key of whom is bound there, if it has one."""
+    return f"{endpoint} {public_key}" if public_key else endpoint

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from shared.bus import Bus, Socket
 from shared.errors import UserError
+from shared.keys import Peer
 from shared.metrics import Metrics
 from shared.wire.codec import BadMessage
 from shared.wire.face import EndOfFaps, FapFrame
@@ -18,7 +19,7 @@ from shared.wire.kinds import PUBLISHER_OF
 from shared.wire.message import Message
 from shared.wire.session import Joined
 
-SocketHandlers = dict[type[Message], Callable[[Any, bytes], None]]
+SocketHandlers = dict[type[Message], Callable[[Any, Peer], None]]
 
 
 class MessageLoop(Protocol):

@@ -10,6 +10,7 @@ import dataclasses
 from collections import deque
 
 from shared.bus import Socket
+from shared.keys import NOBODY, Peer
 from shared.wire.message import Message
 from shared.wire.speech import Acknowledge
 
@@ -75,9 +76,9 @@ class ReliableReceiver:
         self._epoch = -1
         self._last = 0
         self._acknowledged = 0
-        self._peer = b""
+        self._peer = NOBODY
 
-    def accept(self, message: Message, sender: bytes) -> bool:
+    def accept(self, message: Message, sender: Peer) -> bool:
         """Return whether this message is the next one; ignore it if not.
 
         The first message of a greater epoch starts again at whatever number it carries.

@@ -21,11 +21,14 @@ from shared.bus import Bus, Received, Socket
 from shared.clock import ClockOffset, now_ns
 from shared.config import ServiceConfig
 from shared.connections import raise_file_limit
+from shared.endpoints import is_loopback, split_endpoint, with_key
 from shared.errors import UserError
+from shared.keys import Guest, Peer, own_key, refusal, save_guests
 from shared.logs import LOG, RateLimit, configure
 from shared.metrics import Metrics
 from shared.wire.codec import BadMessage
 from shared.wire.control import (
+    AllowedKeys,
     FlushNow,
     Heartbeat,
     HeartbeatSeen,
@@ -40,10 +43,11 @@ from shared.wire.session import ChooseExpressiveness, Done, Error, ErrorCode, Ex
 HEARTBEAT_S = 0.5
 TICK_S = 0.01
 TURN_S = 0.05  # for one socket's messages, before other sockets, ticks and heartbeats
+UNANSWERED_S = 5.0  # without an answer to heartbeats it is worth asking why
 DRAIN_LIMIT_S = 5.0
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # its process number; the underscore: no setting
 
-Handler = Callable[[Any, bytes], None]
+Handler = Callable[[Any, Peer], None]
 
 
 class Service:
@@ -58,11 +62,15 @@ class Service:
     name: ClassVar[str]
     role: ClassVar[str]  # worker: placed in sessions; observer: takes part in all of them
     needs: ClassVar[tuple[str, ...]] = ()  # names of the endpoints it must be told
+    client_roles: ClassVar[tuple[str, ...]] = ()  # of its key, beside that of the service
 
     def __init__(self, config: ServiceConfig, *, control: bool = True) -> None:
         self.config = config
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
-        self.bus = Bus()
+        self.roles = (f"service:{self.name}", *self.client_roles)
+        self.key = None if config.insecure else own_key(self.name, self.roles)
+        self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
+        self.bus = Bus(self.key)
         self.metrics = Metrics()
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # what it provides, by name
@@ -76,14 +84,16 @@ class Service:
         self._paused: set[Socket] = set()
         self._stop_requested = False
         self._beat_due_s = 0.0
+        self._answered_s = time.monotonic()
         self._tick_due_s = 0.0
         self.control: Socket | None = None
         if control:
-            self.control = self.bus.connect_dealer(config.control)
+            self.control = self.bus.connect_dealer(self.control_endpoint)
             self.register(
                 self.control,
                 {
                     HeartbeatSeen: self._on_heartbeat_seen,
+                    AllowedKeys: self._on_allowed_keys,
                     StartSession: self._on_start,
                     StopSession: lambda message, _: self.stop_session(message.session),
                     FlushNow: lambda message, _: self.flush_session(message.session),
@@ -198,6 +208,7 @@ class Service:
         if now_s >= self._beat_due_s:
             self._beat_due_s = now_s + HEARTBEAT_S
             self._beat()
+            self._ask_why_unanswered(now_s)
 
     @property
     def stopping(self) -> bool:
@@ -218,6 +229,11 @@ class Service:
 
     def announce_ready(self) -> None:
         """Register with control and log it."""
+        bound = [each for each in self.endpoints.values() if each.startswith("tcp://")]
+        if self.config.insecure and not all(
+            is_loopback(split_endpoint(each, "")[0]) for each in bound
+        ):
+            LOG.warning("insecure = true: whoever reaches %s may do anything", " ".join(bound))
         self._beat()
         LOG.info("ready %s", " ".join(f"{k}={v}" for k, v in self.endpoints.items()))
 
@@ -249,7 +265,7 @@ class Service:
         message = received.message
         if isinstance(message, BadMessage):
             self.warn(message.reason, f"dropped a message: {message}")
-            if received.sender:
+            if received.sender.address:
                 answer = Error(
                     version=message.version,  # so that a client of another version can read it
                     code=ErrorCode.BAD_MESSAGE,
@@ -260,7 +276,7 @@ class Service:
         handler = handlers.get(type(message))
         if handler is None:
             self.warn("unexpected", f"dropped a {message.kind} message: not expected here")
-            if received.sender:
+            if received.sender.address:
                 text = f"{message.kind} is not understood on this socket"
                 socket.send(Error(code=ErrorCode.BAD_MESSAGE, text=text), to=received.sender)
             return
@@ -295,10 +311,23 @@ class Service:
             )
         )
 
-    def _on_heartbeat_seen(self, seen: HeartbeatSeen, _sender: bytes) -> None:
+    def _ask_why_unanswered(self, now_s: float) -> None:
+        if self.control is not None and now_s - self._answered_s > UNANSWERED_S:
+            self._answered_s = now_s
+            if self.bus.is_refused(self.control_endpoint):
+                self.warn("refused", refusal(self.control_endpoint, self.name, self.roles))
+
+    def _on_heartbeat_seen(self, seen: HeartbeatSeen, _sender: Peer) -> None:
+        self._answered_s = time.monotonic()
         self.clock_offset.update(seen.sent_ns, seen.received_ns, seen.replied_ns, now_ns())
 
-    def _on_start(self, start: StartSession, _sender: bytes) -> None:
+    def _on_allowed_keys(self, allowed: AllowedKeys, _sender: Peer) -> None:
+        guests = {key: Guest(each.name, tuple(each.roles)) for key, each in allowed.keys.items()}
+        save_guests(guests)
+        if self.bus.zap is not None:
+            self.bus.zap.refresh()
+
+    def _on_start(self, start: StartSession, _sender: Peer) -> None:
         if self._stop_requested:
             return
         try:
@@ -311,7 +340,7 @@ class Service:
                     Error(session=start.session, code=ErrorCode.TIMEOUT, text=str(error))
                 )
 
-    def _on_error(self, error: Error, _sender: bytes) -> None:
+    def _on_error(self, error: Error, _sender: Peer) -> None:
         self.warn(error.code, f"control: {error.text}", error.session)
 
 

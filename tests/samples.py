@@ -6,6 +6,8 @@ import numpy as np
 
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import (
+    AllowedKey,
+    AllowedKeys,
     Event,
     FlushNow,
     Heartbeat,
@@ -146,4 +148,9 @@ SAMPLES: tuple[Message, ...] = (
     Joined(session="demo", publisher="p1"),
     Express(session="demo", request="r5", expressions={"joy": 0.5, "squint": 1.0}, hold_s=2.5),
     ChooseExpressiveness(session="demo", request="r6", expressiveness=1.25),
+    AllowedKeys(
+        keys={
+            "D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs": AllowedKey(name="laptop", roles=["client"])
+        }
+    ),
 )

@@ -18,6 +18,7 @@ from services.recognizer.config import RecognizerConfig
 from services.synthesizer.config import SynthesizerConfig
 from shared.config import variable
 from shared.face.faps import MASK_BYTES
+from shared.keys import Peer
 from shared.service import Service
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import StartSession
@@ -59,7 +60,7 @@ class ScriptedRecognizer(Service):
         self.starts[start.session] = start
         return True
 
-    def _on_audio(self, chunk: AudioChunk, _sender: bytes) -> None:
+    def _on_audio(self, chunk: AudioChunk, _sender: Peer) -> None:
         self.pcm[chunk.session] = self.pcm.get(chunk.session, b"") + chunk.pcm
 
 
@@ -99,8 +100,9 @@ class System:
         local = "tcp://127.0.0.1:*"
         self.control = ControlService(ControlConfig(commands=local, events=local))
         self.address = self.control.endpoints["commands"]
-        self.synthesizer = ScriptedSynthesizer(self.address)
-        self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(self.address)
+        control = self.address.partition(" ")[0]
+        self.synthesizer = ScriptedSynthesizer(control)
+        self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(control)
         self.shown: NDArray[np.float32] | None = None  # the face that is published; None: nothing
         self.symbol = "a"
         self.session = ""
@@ -189,7 +191,7 @@ class Gateway:
             cwd=ROOT,
             env={
                 **os.environ,
-                "KOUXING_CONTROL": control,
+                "KOUXING_CONTROL": control.partition(" ")[0],
                 "KOUXING_GATEWAY_PORT": str(port),
                 "KOUXING_LOG_LEVEL": "error",
                 **{variable("gateway", key): value for key, value in settings.items()},

@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Self
 
+import zmq
+
 from services.kinds import free_addresses
 from shared.client import Client
 from shared.config import variable
 from shared.errors import UserError
+from shared.keys import Key, control_endpoint
 from shared.wire.control import StatusReport
 
 ROOT = Path(__file__).parents[1]
@@ -58,7 +61,7 @@ def kouxing(
     """Run the command line to its end; no input may bring a traceback."""
     environment = {**os.environ, **ONE_THREAD, "COLUMNS": "200", **(environment or {})}
     if control:
-        environment["KOUXING_CONTROL"] = control
+        environment["KOUXING_CONTROL"] = control.partition(" ")[0]
     result = subprocess.run(
         [sys.executable, "-m", "services", *map(str, arguments)],
         env=environment,
@@ -71,6 +74,13 @@ def kouxing(
     texts = (result.stdout.decode(), result.stderr.decode())
     assert "Traceback" not in texts[1], texts[1]
     return subprocess.CompletedProcess(result.args, result.returncode, *texts)
+
+
+def connect(raw: zmq.Socket[bytes], endpoint: str, key: Key) -> None:
+    """Connect a socket as any program does that has a key."""
+    address, raw.curve_serverkey = endpoint.encode().split()
+    raw.curve_publickey, raw.curve_secretkey = key.public.encode(), key.secret.encode()
+    raw.connect(address.decode())
 
 
 class System:
@@ -96,7 +106,7 @@ class System:
             **addresses,
             **(settings or {}),
         }
-        self.control = self.environment["KOUXING_CONTROL"]
+        self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=False)
 
     def __enter__(self) -> Self:
         try:
@@ -159,6 +169,12 @@ class System:
                         return
                 time.sleep(0.05)
         raise AssertionError("the services did not become ready")
+
+    def endpoints(self) -> dict[str, str]:
+        """Return where every socket of the services is bound, with its key, by name."""
+        with Client(self.control) as client:
+            services = client.status().services
+        return {name: each for state in services for name, each in state.endpoints.items()}
 
     def assert_all_alive(self) -> None:
         for service, process in self.processes.items():

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from services.cli.supervisor import Supervisor
 from shared.client import Client
+from shared.keys import control_endpoint
 from tests.system import own_environment
 
 
@@ -21,7 +22,7 @@ class Watched:
 
     def __init__(self, folder: Path) -> None:
         environment = own_environment(folder)
-        self.control = environment["KOUXING_CONTROL"]
+        self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
         self.page = f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/"
         self.shown = io.StringIO()
         console = Console(file=self.shown, width=200)

@@ -31,6 +31,7 @@ from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
 from shared.errors import UserError
+from shared.keys import control_endpoint
 from shared.wire.face import EndOfFaps, FapFrame
 
 CHUNK_S = 0.02
@@ -60,15 +61,17 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
     environment = {
         **free_addresses(),
         "KOUXING_DRIVER_VIEW": "none",
+        "KOUXING_INSECURE": "false",
         "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
     }
+    control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
     delay_s = SynthesizerConfig().delay_ms / 1e3
     with tempfile.TemporaryDirectory() as folder:
         supervisor = Supervisor([], Path(folder), console, environment)
         try:
             supervisor.start()
-            supervisor.wait_ready(environment["KOUXING_CONTROL"])
-            with Client(environment["KOUXING_CONTROL"]) as client:
+            supervisor.wait_ready(control)
+            with Client(control) as client:
                 before = _cpu_s(client)
                 delays = [
                     _stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)

@@ -21,6 +21,7 @@ from services.kinds import read_settings
 from shared.config import ServiceConfig
 from shared.errors import UserError
 from shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
+from shared.keys import control_endpoint
 
 SHOWN_FIGURES = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
@@ -188,8 +189,14 @@ def _is_drop(name: str) -> bool:
 
 
 def control_address(given: str) -> str:
-    """Return where control is: as told, else the user's newest system, else the default."""
-    settings = read_settings().describe(ServiceConfig, {"control": given} if given else {})
-    control = next(each for each in settings if each.key == "control")
-    found = find_control() if control.origin == "default" else ""
-    return found or str(control.value)
+    """Return where control is: as told, else the user's newest system, else the default.
+
+    Its public key follows the address, unless all is plain.
+    """
+    settings, overrides = read_settings(), {"control": given} if given else {}
+    (origin,) = (
+        each.origin for each in settings.describe(ServiceConfig, overrides) if each.key == "control"
+    )
+    config = settings.load(ServiceConfig, overrides)
+    found = find_control() if origin == "default" else ""
+    return found or control_endpoint(config.control, insecure=config.insecure)

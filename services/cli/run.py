@@ -22,6 +22,7 @@ from services.kinds import KINDS, available_addresses, read_settings
 from shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
 from shared.endpoints import WILDCARDS, split_endpoint
 from shared.errors import UserError
+from shared.keys import control_endpoint
 
 if TYPE_CHECKING:
     from shared.audio_file import AudioSource
@@ -69,6 +70,8 @@ def run(
         **addresses,
         variable(COMMON, "control"): control,
     }
+    insecure = settings.load(ControlConfig).insecure
+    client_control = control_endpoint(control, insecure=insecure)
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
@@ -77,16 +80,16 @@ def run(
     try:
         with CONSOLE.status(f"starting {', '.join(KINDS)}"):
             supervisor.start()
-            supervisor.wait_ready(control)
+            supervisor.wait_ready(client_control)
         supervisor.watch()
-        page = supervisor.page_address(control)
-        with announce(control):
+        page = supervisor.page_address(client_control)
+        with announce(client_control):
             print_message(f"the face is at {page}")
             has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
             if browser and not stop_after and (has_display or sys.platform == "darwin"):
                 webbrowser.open(page)
             if sample is not None:
-                _play_sample(sample, control)
+                _play_sample(sample, client_control)
             if stop_after:
                 return
             print_message(
@@ -163,7 +166,8 @@ def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str
         yield f"taken by other programs: {', '.join(taken)}; free ports are used instead"
     if variable("control", "commands") in moved:
         if running := find_control():
-            yield f"kouxing runs already, with control at {running}; this is one more"
+            where, _, _ = running.partition(" ")
+            yield f"kouxing runs already, with control at {where}; this is one more"
         yield f"your kouxing commands find this one; other programs: KOUXING_CONTROL={control}"
 
 

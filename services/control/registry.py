@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from shared.keys import Peer
 from shared.wire.control import Heartbeat
 from shared.wire.session import ErrorCode
 
@@ -30,7 +31,7 @@ class Refusal(Exception):
 class ServiceRecord:
     """One running service."""
 
-    address: bytes  # its identity on control's socket; empty for control itself
+    peer: Peer  # on control's socket; nobody for control itself
     heartbeat: Heartbeat  # the newest
     received_s: float  # when it came
 
@@ -52,9 +53,9 @@ class Registry:
         """Return all services in the order of their names."""
         return sorted(self._services.items())
 
-    def add(self, heartbeat: Heartbeat, address: bytes, now_s: float) -> None:
+    def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float) -> None:
         """Add a service, or note its newest heartbeat."""
-        self._services[heartbeat.instance] = ServiceRecord(address, heartbeat, now_s)
+        self._services[heartbeat.instance] = ServiceRecord(peer, heartbeat, now_s)
 
     def remove(self, instance: str) -> None:
         """Forget a service."""
@@ -83,7 +84,7 @@ class Registry:
         return [
             instance
             for instance, record in self._services.items()
-            if record.address and now_s - record.received_s > self._lost_after_s
+            if record.peer.address and now_s - record.received_s > self._lost_after_s
         ]
 
     def observers(self) -> set[str]:

@@ -7,8 +7,8 @@ Reacts to: open-session, close-session, flush-session, choose-lips, express,
 choose-expressiveness, status-request (clients), heartbeat, done, speech, recorded, error
 (services).
 Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
-start-session, stop-session, flush-now, use-lips, express, choose-expressiveness (services), event,
-session-moved (subscribers).
+allowed-keys, start-session, stop-session, flush-now, use-lips, express, choose-expressiveness
+(services), event, session-moved (subscribers).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from services.control.config import ControlConfig
@@ -24,11 +25,14 @@ from services.control.registry import Refusal, Registry
 from services.control.sessions import SessionRecord, Sessions
 from shared.bus import COMMANDS
 from shared.clock import now_ns
-from shared.endpoints import reachable, split_endpoint
+from shared.endpoints import reachable, split_endpoint, with_key
 from shared.errors import UserError
+from shared.keys import NOBODY, Peer
 from shared.logs import LOG
 from shared.service import Handler, Service
 from shared.wire.control import (
+    AllowedKey,
+    AllowedKeys,
     Event,
     EventName,
     FlushNow,
@@ -54,6 +58,7 @@ from shared.wire.session import (
     OpenSession,
 )
 from shared.wire.speech import Speech
+from shared.zap import Zap
 
 STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session
@@ -81,13 +86,15 @@ class ControlService(Service):
         self._registry = Registry(config.lost_after_s)
         self._sessions = Sessions(self._registry, config.max_sessions)
         self._idle_limit_s = config.idle_limit_s
-        self._answers: OrderedDict[tuple[bytes, str], Message] = OrderedDict()
+        self._answers: OrderedDict[tuple[Peer, str], Message] = OrderedDict()
         self._num_events = 0
+        self._told_version = (0, 0)  # of the allowed keys
         self._commands = self.bus.bind_router(config.commands, "control.commands", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
+        own = self.key.public if self.key else ""
         self.endpoints = {
-            "commands": reachable(self._commands.endpoint, config.advertise, "control.commands"),
-            "events": reachable(self._events.endpoint, config.advertise, "control.events"),
+            name: with_key(reachable(socket.endpoint, config.advertise, f"control.{name}"), own)
+            for name, socket in (("commands", self._commands), ("events", self._events))
         }
         self.register(
             self._commands,
@@ -110,10 +117,12 @@ class ControlService(Service):
 
     def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
         """Register control itself like any other service."""
-        self._registry.add(heartbeat, b"", time.monotonic())
+        self._registry.add(heartbeat, NOBODY, time.monotonic())
 
     def on_tick(self, now_s: float) -> None:
-        """Look for services without heartbeat and sessions that hang."""
+        """Look for services without heartbeat, sessions that hang, and keys that changed."""
+        if self.bus.zap is not None:
+            self._tell_new_keys(self.bus.zap)
         for instance in self._registry.silent(now_s):
             self._service_lost(instance, "no heartbeat")
         for record in self._sessions:
@@ -131,12 +140,28 @@ class ControlService(Service):
             self._end(record, "control stops")
         return True
 
+    def _tell_new_keys(self, zap: Zap) -> None:
+        """Tell every service who may connect, when that has changed."""
+        zap.refresh()
+        if zap.version != self._told_version:
+            self._told_version = zap.version
+            for _, record in self._registry.sorted():
+                if record.heartbeat.role == "worker":
+                    self._tell_keys(zap, record.peer)
+
+    def _tell_keys(self, zap: Zap, service: Peer) -> None:
+        keys = {
+            public: AllowedKey(name=guest.name, roles=list(guest.roles))
+            for public, guest in zap.guests.items()
+        }
+        self._commands.send(AllowedKeys(keys=keys), to=service)
+
     # --- requests ------------------------------------------------------------------------------
 
-    def _request_handler(self, handle: Callable[[Any, bytes], Message | None]) -> Handler:
+    def _request_handler(self, handle: Callable[[Any, Peer], Message | None]) -> Handler:
         """Return a handler that repeats its answer when a request is repeated."""
 
-        def on_request(message: Request, sender: bytes) -> None:
+        def on_request(message: Request, sender: Peer) -> None:
             remembered = self._answers.get((sender, message.request))
             if remembered is not None:
                 self._commands.send(remembered, to=sender)
@@ -157,42 +182,42 @@ class ControlService(Service):
 
         return on_request
 
-    def _reply(self, sender: bytes, request: str, reply: Message) -> None:
+    def _reply(self, sender: Peer, request: str, reply: Message) -> None:
         if not isinstance(reply, StatusReport):
             self._answers[sender, request] = reply
             if len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
         self._commands.send(reply, to=sender)
 
-    def _open(self, message: OpenSession, sender: bytes) -> None:
+    def _open(self, message: OpenSession, sender: Peer) -> None:
         if any((record.client, record.opening) == (sender, message) for record in self._sessions):
             return  # the same request again while the services start
         record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
         self._start(record)
 
-    def _close(self, message: CloseSession, _sender: bytes) -> Message:
+    def _close(self, message: CloseSession, _sender: Peer) -> Message:
         self._end(self._sessions.owned(message.session, message.token), "closed by its client")
         return Done(session=message.session, request=message.request)
 
-    def _flush(self, message: FlushSession, _sender: bytes) -> Message:
+    def _flush(self, message: FlushSession, _sender: Peer) -> Message:
         record = self._sessions.owned(message.session, message.token)
         self._send_to_participants(record, FlushNow(session=record.name, epoch=record.epoch))
         self._publish(EventName.SESSION_FLUSHED, record.name)
         return Done(session=message.session, request=message.request)
 
-    def _choose_lips(self, message: ChooseLips, _sender: bytes) -> Message:
+    def _choose_lips(self, message: ChooseLips, _sender: Peer) -> Message:
         record = self._sessions.owned(message.session, message.token)
         record.lips = message.lips
         use = UseLips(session=record.name, epoch=record.epoch, lips=message.lips)
         self._send_to_participants(record, use)
         return Done(session=message.session, request=message.request)
 
-    def _pass_on(self, message: Express | ChooseExpressiveness, _sender: bytes) -> Message:
+    def _pass_on(self, message: Express | ChooseExpressiveness, _sender: Peer) -> Message:
         self._send_to_participants(self._sessions.find(message.session), message)
         return Done(session=message.session, request=message.request)
 
-    def _status(self, message: StatusRequest, _sender: bytes) -> Message:
+    def _status(self, message: StatusRequest, _sender: Peer) -> Message:
         now_s = time.monotonic()
         return StatusReport(
             request=message.request,
@@ -214,13 +239,16 @@ class ControlService(Service):
 
     # --- from the services ---------------------------------------------------------------------
 
-    def _on_heartbeat(self, heartbeat: Heartbeat, sender: bytes) -> None:
+    def _on_heartbeat(self, heartbeat: Heartbeat, sender: Peer) -> None:
         received_ns = now_ns()
         problem = _wrong_endpoints(heartbeat)
         if problem:
             self.warn("endpoints", f"{heartbeat.instance}: {problem}")
             self._commands.send(Error(code=ErrorCode.BAD_MESSAGE, text=problem), to=sender)
             return
+        if heartbeat.role == "worker":
+            keyed = {name: with_key(each, sender.key) for name, each in heartbeat.endpoints.items()}
+            heartbeat = replace(heartbeat, endpoints=keyed)
         if self._registry.differs(heartbeat):
             self._service_lost(heartbeat.instance, "it started again")
         is_new = heartbeat.instance not in self._registry
@@ -232,6 +260,8 @@ class ControlService(Service):
             to=sender,
         )
         if is_new:
+            if self.bus.zap is not None and heartbeat.role == "worker":
+                self._tell_keys(self.bus.zap, sender)
             self._on_new_service(heartbeat)
         for session in heartbeat.sessions:
             self._check_session(session, heartbeat, sender)
@@ -248,9 +278,9 @@ class ControlService(Service):
                 self._replace(record)
             elif heartbeat.role == "observer":
                 start = self._sessions.start_message(record)
-                self._commands.send(start, to=self._registry[heartbeat.instance].address)
+                self._commands.send(start, to=self._registry[heartbeat.instance].peer)
 
-    def _check_session(self, session: str, heartbeat: Heartbeat, sender: bytes) -> None:
+    def _check_session(self, session: str, heartbeat: Heartbeat, sender: Peer) -> None:
         """Stop a session that a service should not serve, and end one without input."""
         record = self._sessions.get(session)
         if record is None or heartbeat.instance not in self._sessions.participants(record):
@@ -259,28 +289,28 @@ class ControlService(Service):
         elif self._sessions.take_input(record, heartbeat) > self._idle_limit_s:
             self._end(record, f"no audio for {self._idle_limit_s:g} s")
 
-    def _on_started(self, done: Done, sender: bytes) -> None:
+    def _on_started(self, done: Done, sender: Peer) -> None:
         record = self._sessions.get(done.session)
         if record is None or done.request != record.start_request:
             return
         record.waiting_for -= {
             instance
             for instance in record.waiting_for
-            if instance in self._registry and self._registry[instance].address == sender
+            if instance in self._registry and self._registry[instance].peer == sender
         }
         self._announce_if_started(record)
 
-    def _on_speech(self, speech: Speech, _sender: bytes) -> None:
+    def _on_speech(self, speech: Speech, _sender: Peer) -> None:
         record = self._sessions.get(speech.session)
         if record is not None and record.epoch == speech.epoch:
             record.speaking = speech.active
             name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
             self._publish(name, record.name, media_time=speech.media_time)
 
-    def _on_recorded(self, recorded: Recorded, _sender: bytes) -> None:
+    def _on_recorded(self, recorded: Recorded, _sender: Peer) -> None:
         self._publish(EventName.RECORDED, recorded.session, detail=recorded.path)
 
-    def _on_service_error(self, error: Error, _sender: bytes) -> None:
+    def _on_service_error(self, error: Error, _sender: Peer) -> None:
         self._publish(EventName.ERROR, error.session, detail=f"{error.code}: {error.text}")
 
     # --- sessions ------------------------------------------------------------------------------
@@ -290,7 +320,7 @@ class ControlService(Service):
 
     def _send_to_participants(self, record: SessionRecord, message: Message) -> None:
         for instance in self._sessions.participants(record):
-            self._commands.send(message, to=self._registry[instance].address)
+            self._commands.send(message, to=self._registry[instance].peer)
 
     def _announce_if_started(self, record: SessionRecord) -> None:
         """Tell the client that its session is open, or that it moved, once its services serve it.

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from services.control.registry import Refusal, Registry
+from shared.keys import Peer
 from shared.wire.control import Heartbeat, SessionState, StartSession
 from shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
 
@@ -19,7 +20,7 @@ class SessionRecord:
     name: str
     token: str
     opening: OpenSession
-    client: bytes  # its identity on control's socket
+    client: Peer  # on control's socket
     opened_s: float
     started_s: float  # when its services were last told to start it, or one was lost
     workers: dict[str, str]  # instance by endpoint
@@ -56,7 +57,7 @@ class Sessions:
         """Return a session, None if there is none of that name."""
         return self._records.get(name)
 
-    def open(self, opening: OpenSession, client: bytes, now_s: float) -> SessionRecord:
+    def open(self, opening: OpenSession, client: Peer, now_s: float) -> SessionRecord:
         """Place a new session.
 
         Raises

@@ -22,6 +22,7 @@ from services.gateway.pace import Pace
 from shared.audio_file import open_audio
 from shared.client import Client, Refused, Session
 from shared.errors import UserError
+from shared.keys import Key
 from shared.logs import LOG
 
 SAMPLE = Path(str(resources.files("shared") / "demo" / "hello-female.wav"))
@@ -53,8 +54,9 @@ class OwnSessions:
         Counts and logs a problem.
     """
 
-    def __init__(self, control: str, warn: Warn) -> None:
+    def __init__(self, control: str, key: Key | None, warn: Warn) -> None:
         self._control = control
+        self._key = key
         self._warn = warn
         self._open: dict[str, _OwnSession] = {}
 
@@ -67,7 +69,7 @@ class OwnSessions:
         UserError
             If control refuses or does not answer.
         """
-        client = Client(self._control, deadline_s=CONTROL_LIMIT_S)
+        client = Client(self._control, key=self._key, deadline_s=CONTROL_LIMIT_S)
         try:
             session = await asyncio.to_thread(client.open_session, **options)
             own = self._open[session.name] = _OwnSession()

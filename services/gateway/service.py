@@ -73,6 +73,7 @@ class GatewayService(Service):
     name = "gateway"
     role = "observer"
     needs = ("phones", "faps")
+    client_roles = ("client",)
 
     def __init__(self, config: GatewayConfig) -> None:
         listening = bind(config.host, config.port)
@@ -108,7 +109,7 @@ class GatewayService(Service):
             self._express,
             self._choose_expressiveness,
         )
-        self._own_sessions = OwnSessions(config.control, self.warn)
+        self._own_sessions = OwnSessions(self.control_endpoint, self.key, self.warn)
         self._microphones = Microphones(self._web_sockets, self._own_sessions)
         self._mouth_learner = MouthLearner()
         self._routes = (
@@ -138,7 +139,7 @@ class GatewayService(Service):
         self._rest_due_s = 0.0
         self._report_s = 0.0
         self._request_s = 0.0
-        self._commands = self.bus.connect_dealer(config.control)
+        self._commands = self.bus.connect_dealer(self.control_endpoint)
         self.register(
             self._commands,
             {

@@ -25,6 +25,7 @@ from shared.bus import Socket
 from shared.clock import MEDIA_RATE_HZ, to_samples
 from shared.endpoints import reachable
 from shared.errors import UserError
+from shared.keys import Peer
 from shared.logs import LOG
 from shared.phones.events import LipFrame, Phone, SpeechChange
 from shared.reliable import ReliableSender
@@ -182,7 +183,7 @@ class RecognizerService(Service):
 
     # --- from clients ----------------------------------------------------------------------------
 
-    def _on_audio(self, chunk: AudioChunk, sender: bytes) -> None:
+    def _on_audio(self, chunk: AudioChunk, sender: Peer) -> None:
         session = self._admit(chunk, sender)
         if session is None:
             return
@@ -223,13 +224,13 @@ class RecognizerService(Service):
             session.num_gaps = session.stream.num_gaps
         self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
 
-    def _on_end(self, end: EndOfAudio, sender: bytes) -> None:
+    def _on_end(self, end: EndOfAudio, sender: Peer) -> None:
         self._process_queued()
         session = self._admit(end, sender)
         if session is not None:
             self._finish(session)
 
-    def _admit(self, message: AudioChunk | EndOfAudio, sender: bytes) -> _Session | None:
+    def _admit(self, message: AudioChunk | EndOfAudio, sender: Peer) -> _Session | None:
         """Return the session if the sender may write to it, in order."""
         session = self._sessions.get(message.session)
         if session is None:
@@ -255,7 +256,7 @@ class RecognizerService(Service):
             return session
         return None
 
-    def _refuse(self, message: Message, sender: bytes, code: ErrorCode, text: str) -> None:
+    def _refuse(self, message: Message, sender: Peer, code: ErrorCode, text: str) -> None:
         self.warn(code, text, message.session)
         self._audio.send(
             Error(session=message.session, media_time=message.media_time, code=code, text=text),
@@ -289,7 +290,7 @@ class RecognizerService(Service):
             self.register(socket, {Acknowledge: self._on_acknowledge, Error: self._on_error})
         return self._synthesizers[endpoint]
 
-    def _on_acknowledge(self, ack: Acknowledge, _sender: bytes) -> None:
+    def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
         session = self._sessions.get(ack.session)
         if session is not None and session.link is not None and ack.epoch == session.start.epoch:
             session.link.acknowledge(ack.sequence, time.monotonic())

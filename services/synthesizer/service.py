@@ -21,6 +21,7 @@ from shared.bus import PHONES
 from shared.clock import to_samples, to_seconds
 from shared.endpoints import reachable
 from shared.face.faps import MASK_BYTES, NUM_FAPS
+from shared.keys import Peer
 from shared.logs import LOG
 from shared.phones.events import EndOfSound, Phone, Progress
 from shared.phones.inventory import load_inventory
@@ -156,7 +157,7 @@ class SynthesizerService(Service):
 
     # --- from the recognizer ---------------------------------------------------------------------
 
-    def _on_input(self, message: SpeechMessage, sender: bytes) -> None:
+    def _on_input(self, message: SpeechMessage, sender: Peer) -> None:
         session = self._sessions.get(message.session)
         if session is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)

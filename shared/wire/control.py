@@ -132,6 +132,21 @@ class HeartbeatSeen(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AllowedKey:
+    """Whose key it is and what its owner may do."""
+
+    name: Name
+    roles: Annotated[list[Name], Meta(max_length=16)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AllowedKeys(Message):
+    """Control tells a service who may connect to its sockets; again when that changes."""
+
+    keys: Annotated[dict[Name, AllowedKey], Meta(max_length=1000)]  # by public key
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StartSession(Message):
     """Control tells a service to serve a session (again, with a greater epoch, after a crash)."""
 

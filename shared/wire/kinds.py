@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import (
+    AllowedKeys,
     Event,
     FlushNow,
     Heartbeat,
@@ -67,6 +68,7 @@ MESSAGES: dict[str, type[Message]] = {
         Joined,
         Express,
         ChooseExpressiveness,
+        AllowedKeys,
     )
 }
 

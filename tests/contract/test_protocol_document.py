@@ -17,7 +17,7 @@ from services.synthesizer.service import LOW_LEVEL_FAPS
 from shared.face.faps import FAPS, MOUTH_FAPS
 from shared.phones.inventory import load_inventory
 from shared.wire.audio import AudioChunk, EndOfAudio
-from shared.wire.control import EventName, ServiceState, SessionInput, SessionState
+from shared.wire.control import AllowedKey, EventName, ServiceState, SessionInput, SessionState
 from shared.wire.events import SPEECH_MESSAGES
 from shared.wire.kinds import MESSAGES, PUBLISHER_OF
 from shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
@@ -34,6 +34,7 @@ STRUCTURES: dict[str, type[Any]] = {
     "service-state": ServiceState,
     "session-state": SessionState,
     "session-input": SessionInput,
+    "allowed-key": AllowedKey,
 }
 WIRE_NAME = {cls: name for name, cls in STRUCTURES.items()}
 

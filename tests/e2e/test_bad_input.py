@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import socket
 import time
@@ -15,6 +16,7 @@ import zmq
 
 from shared.bus import Bus, Socket
 from shared.client import Client, Refused, Session
+from shared.keys import own_key, user_key
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import Heartbeat, SessionInput
 from shared.wire.face import FapFrame
@@ -22,7 +24,7 @@ from shared.wire.message import Message
 from shared.wire.session import Error, OpenSession
 from shared.wire.speech import Phone, Progress
 from tests.e2e.following import stream
-from tests.system import System
+from tests.system import System, connect
 
 pytestmark = pytest.mark.e2e
 
@@ -171,21 +173,27 @@ GARBAGE: list[list[bytes]] = [
 
 
 def test_garbage_on_every_port_harms_nobody(system: System, witness: Session) -> None:
+    kinds = (zmq.DEALER, zmq.SUB, zmq.XSUB, zmq.PUSH)
     with zmq.Context() as context:
-        for port in system.ports:
-            for kind in (zmq.DEALER, zmq.SUB, zmq.XSUB, zmq.PUSH):
+        for endpoint, kind in itertools.product(system.endpoints().values(), kinds):
+            for key in (user_key(), own_key("driver", ())):
                 with context.socket(kind) as raw:
-                    throw_garbage(raw, kind, f"tcp://127.0.0.1:{port}")
+                    connect(raw, endpoint, key)
+                    throw_garbage(raw, kind)
+        for port in system.ports:
+            for kind in kinds:
+                with context.socket(kind) as raw:
+                    raw.connect(f"tcp://127.0.0.1:{port}")
+                    throw_garbage(raw, kind)
             with socket.create_connection(("127.0.0.1", port)) as plain:
                 plain.sendall(b"GET / HTTP/1.1\r\n\r\n" + os.urandom(500))
     system.assert_all_alive()
 
 
-def throw_garbage(raw: zmq.Socket[bytes], kind: int, endpoint: str) -> None:
+def throw_garbage(raw: zmq.Socket[bytes], kind: int) -> None:
     """Send all garbage this kind of socket can; one whose handshake is refused cannot send."""
     raw.setsockopt(zmq.LINGER, 200)
     raw.setsockopt(zmq.SNDTIMEO, 200)
-    raw.connect(endpoint)
     if kind == zmq.SUB:
         for topic in (b"\xff\x00garbage", b"joined/\xff\xfe/", b"joined//"):
             raw.setsockopt(zmq.SUBSCRIBE, topic)
@@ -206,9 +214,9 @@ def test_messages_of_other_sockets_are_refused_kindly(system: System, witness: S
         ),
         FapFrame(session=witness.name, values=b"\0" * 272, mask=b"\0" * 9),
     ]
-    with Bus() as bus:
-        for port in system.ports:
-            dealer = bus.connect_dealer(f"tcp://127.0.0.1:{port}")
+    with Bus(user_key()) as bus:
+        for endpoint in system.endpoints().values():
+            dealer = bus.connect_dealer(endpoint)
             for message in misplaced:
                 dealer.send(message)
             dealer.wait(0.2)
@@ -282,8 +290,8 @@ def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
 
 
 def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) -> None:
-    with Bus() as bus:
-        stranger = bus.connect_dealer(system.environment["KOUXING_SYNTHESIZER_PHONE_INPUT"])
+    with Bus(own_key("recognizer", ())) as bus:
+        stranger = bus.connect_dealer(system.endpoints()["phone_input"])
         for epoch in (0, 2, 2**53):
             stranger.send(
                 Progress(
@@ -301,7 +309,7 @@ def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) 
 def test_a_false_recognizer_is_not_given_sessions(
     system: System, client: Client, witness: Session, endpoints: dict[str, str]
 ) -> None:
-    with Bus() as bus:
+    with Bus(own_key("recognizer", ())) as bus:
         stranger = bus.connect_dealer(system.control)
         stranger.send(
             Heartbeat(
@@ -321,7 +329,7 @@ def test_a_false_recognizer_is_not_given_sessions(
 def test_an_observer_that_never_answers_delays_no_session(
     system: System, client: Client, witness: Session
 ) -> None:
-    with Bus() as bus:
+    with Bus(own_key("gateway", ("service:gateway",))) as bus:
         mute = bus.connect_dealer(system.control)
         heartbeat = Heartbeat(
             service="gateway", instance="mute", role="observer", state="ready", sent_ns=0

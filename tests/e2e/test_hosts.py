@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 import zmq
 
+from shared.keys import Key, key_folder, own_key, user_key
 from tests.e2e.following import samples_of_file
-from tests.system import ROOT, VOWELS_FILE, System
+from tests.system import ROOT, VOWELS_FILE, System, connect
 
 pytestmark = pytest.mark.e2e
 DOCUMENT = ROOT / "proto" / "PROTOCOL.md"
 NODE = str(Path(sys.executable).with_name("node"))
+KEY_FILE = "~/.local/state/kouxing/client.key"
 HOSTS = {
     "control": "127.0.0.11",
     "recognizer": "127.0.0.12",
@@ -43,11 +45,11 @@ class Stranger:
     def __init__(self) -> None:
         self.context = zmq.Context()
 
-    def socket(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+    def socket(self, kind: int, endpoint: str, key: Key | None = None) -> zmq.Socket[bytes]:
         made = self.context.socket(kind)
         made.setsockopt(zmq.LINGER, 1000)
         made.setsockopt(zmq.RCVTIMEO, 60000)
-        made.connect(endpoint)
+        connect(made, endpoint, key or user_key())
         return made
 
     def close(self) -> None:
@@ -139,7 +141,7 @@ def test_the_same_request_twice_is_carried_out_once(spread: System) -> None:
 
 def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: System) -> None:
     stranger = Stranger()
-    lamp = stranger.socket(zmq.DEALER, spread.control)
+    lamp = stranger.socket(zmq.DEALER, spread.control, own_key("lamp", ("service:lamp",)))
     heartbeat: dict[str, Any] = {
         "service": "lamp",
         "instance": "lamp-1",
@@ -203,8 +205,10 @@ def test_the_examples_in_the_document_run(
     (example,) = re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
     address = "tcp://127.0.0.1:5550"
     assert address in example
+    assert KEY_FILE in example
     script = tmp_path / "client.mjs"  # a name that Python takes, too
-    script.write_text(example.replace(address, spread.control), encoding="utf-8")
+    example = example.replace(address, spread.control.partition(" ")[0])
+    script.write_text(example.replace(KEY_FILE, str(key_folder() / "client.key")), encoding="utf-8")
     (tmp_path / "node_modules").symlink_to(DOCUMENT.parent / "node" / "node_modules")
     result = subprocess.run(
         [program, script, VOWELS_FILE],

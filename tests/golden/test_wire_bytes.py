@@ -26,6 +26,7 @@ DIGESTS = {
     "version2-status.json": "76082bd28da61ec5ab45bf74abb2c610126af722c0af8ca6bcdbfd83f4e4442e",
     "version2-pitch.json": "31891c9db98db7a19deb2198869a4f42b05d2b41e1f0f7e885f2e82538d8b66a",
     "version2-voice.json": "1a748175ef62d82ae6c0be096aaaaf969ef9b9b309e68571e4dbaececb2d7289",
+    "version2-keys.json": "9432071c81e53ca44db189787bb29affd77f3877cfb2fdb67a57f1ca721d6dbe",
 }
 
 

@@ -30,6 +30,7 @@ from services.gateway.wire import REST_TYPE
 from shared.bus import AUDIO_QUEUE_LENGTH, Bus
 from shared.clock import now_ns
 from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
+from shared.keys import Peer
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import (
     Heartbeat,
@@ -83,7 +84,7 @@ class ScriptedSystem:
         self.faps = self.bus.bind_publisher(LOCAL, "faps")
         self.audio_endpoint = self.audio.endpoint  # that clients are given
         self.page = ""
-        self.gateway = b""
+        self.gateway = Peer()
         self.started: list[str] = []  # sessions that the gateway has confirmed
         self.closed: list[str] = []
         self.flushed: list[str] = []
@@ -93,7 +94,7 @@ class ScriptedSystem:
         self.voices: list[bytes] = []  # of the sessions opened
         self.audio_messages: list[Message] = []
         self.forget()
-        self._openings: dict[str, tuple[OpenSession, bytes]] = {}
+        self._openings: dict[str, tuple[OpenSession, Peer]] = {}
         self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._stop = False
         self._thread = threading.Thread(target=self._run)
@@ -180,7 +181,7 @@ class ScriptedSystem:
                     elif isinstance(received.message, Message):
                         self.audio_messages.append(received.message)
 
-    def _on_command(self, message: object, sender: bytes) -> None:
+    def _on_command(self, message: object, sender: Peer) -> None:
         answer: Message | None = None
         match message:
             case Heartbeat():
@@ -235,7 +236,7 @@ class ScriptedSystem:
         if answer is not None:
             self.commands.send(answer, to=sender)
 
-    def _opened(self, opening: OpenSession, client: bytes, session: str) -> None:
+    def _opened(self, opening: OpenSession, client: Peer, session: str) -> None:
         self.commands.send(
             SessionOpened(
                 session=session,
@@ -273,7 +274,7 @@ def spawn(*program: str, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, *(program or ("-m", "services.gateway"))],
         cwd=ROOT,
-        env={**os.environ, "KOUXING_GATEWAY_PORT": "0", **environment},
+        env={**os.environ, "KOUXING_INSECURE": "1", "KOUXING_GATEWAY_PORT": "0", **environment},
         stderr=subprocess.PIPE,
         text=True,
     )

@@ -13,6 +13,7 @@ import pytest
 from shared import client as client_module
 from shared.bus import Bus, Socket
 from shared.client import RESEND_S, Client, Session
+from shared.keys import Peer
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.message import Message
 from shared.wire.session import Error, ErrorCode, OpenSession, SessionMoved, SessionOpened
@@ -24,7 +25,7 @@ CHUNK = np.zeros(1600, np.int16)  # 100 ms
 M = TypeVar("M", bound=Message)
 
 
-def next_of(kind: type[M], socket: Socket) -> tuple[M, bytes]:
+def next_of(kind: type[M], socket: Socket) -> tuple[M, Peer]:
     """Return the next message, which must be of a kind, and its sender."""
     assert socket.wait(5.0)
     received = next(socket.receive())

@@ -14,6 +14,7 @@ from services.driver.config import DriverConfig
 from services.driver.service import DriverService
 from shared.bus import Bus
 from shared.face.faps import MASK_BYTES, NUM_FAPS
+from shared.keys import Peer
 from shared.wire.control import Heartbeat, Recorded, SessionInput, StartSession, StopSession
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.session import Done, Error
@@ -35,17 +36,18 @@ class Stage:
         self.driver = DriverService(
             DriverConfig(
                 control=self.commands.endpoint,
+                insecure=True,
                 view="none",
                 out=str(folder),
                 width_px=64,
                 height_px=48,
             )
         )
-        self.address = b""
+        self.address = Peer()
         self.started: list[str] = []
         self.recorded: list[Recorded] = []
         self.errors: list[Error] = []
-        self.step_until(lambda: bool(self.address))
+        self.step_until(lambda: bool(self.address.address))
 
     def close(self) -> None:
         self.driver.bus.close()

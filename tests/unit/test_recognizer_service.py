@@ -14,6 +14,7 @@ from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_l
 from services.recognizer.service import MAX_QUEUED_S, RecognizerService
 from services.recognizer.stream import SpeechStream
 from services.recognizer.voice import Voice
+from shared.keys import Peer
 from shared.phones.events import LipFrame
 from shared.wire.audio import AudioChunk
 from shared.wire.control import StartSession
@@ -69,7 +70,7 @@ def start_of(voice: bytes = b"") -> StartSession:
 def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(service: Watched) -> None:
     service.start_session(start_of())
     pcm = bytes(MAX_AUDIO_BYTES)
-    service._on_audio(AudioChunk(session="s", token="t", sequence=1, pcm=pcm), b"")
+    service._on_audio(AudioChunk(session="s", token="t", sequence=1, pcm=pcm), Peer())
     service._process_queued()
     service.beat_if_due()
     steps = [
@@ -99,7 +100,7 @@ def test_a_voice_that_does_not_fit_is_refused_once_and_the_session_goes_on(
     service.start_session(start_of(voice))
     for sequence in (1, 2):
         service._on_audio(
-            AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)), b""
+            AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)), Peer()
         )
     service._process_queued()
     service.beat_if_due()

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from shared.bus import Bus, Socket
+from shared.keys import Peer
 from shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
 from shared.wire.message import Message
 from shared.wire.speech import Acknowledge, Progress
@@ -38,7 +39,7 @@ class Link:
                 self.sender.acknowledge(received.message.sequence, now_s)
 
 
-def arriving(socket: Socket, num_expected: int) -> Iterator[tuple[Message, bytes]]:
+def arriving(socket: Socket, num_expected: int) -> Iterator[tuple[Message, Peer]]:
     count = 0
     while count < num_expected:
         assert socket.wait(2.0), f"only {count} of {num_expected} messages arrived"

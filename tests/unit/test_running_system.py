@@ -10,6 +10,7 @@ import pytest
 
 from services.cli.clients import control_address
 from services.cli.running_system import announce, find_control
+from shared.keys import user_key
 from tests.system import ROOT
 
 pytestmark = pytest.mark.unit
@@ -58,9 +59,13 @@ def test_an_address_that_is_told_counts_more(monkeypatch: pytest.MonkeyPatch) ->
     default = control_address("")
     with announce("tcp://127.0.0.1:1"):
         assert control_address("") == "tcp://127.0.0.1:1"
-        assert control_address("tcp://127.0.0.1:4") == "tcp://127.0.0.1:4"
+        key = user_key().control
+        assert control_address("tcp://127.0.0.1:4") == f"tcp://127.0.0.1:4 {key}"
         monkeypatch.setenv("KOUXING_CONTROL", "tcp://127.0.0.1:5")
+        assert control_address("") == f"tcp://127.0.0.1:5 {key}"
+        monkeypatch.setenv("KOUXING_INSECURE", "true")
         assert control_address("") == "tcp://127.0.0.1:5"
+        monkeypatch.delenv("KOUXING_INSECURE")
     monkeypatch.delenv("KOUXING_CONTROL")
     assert control_address("") == default
 

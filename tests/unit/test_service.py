@@ -9,6 +9,7 @@ import pytest
 
 from shared.bus import Bus
 from shared.config import ServiceConfig
+from shared.keys import Peer
 from shared.service import Service
 from shared.wire.control import Heartbeat
 from shared.wire.session import Done
@@ -24,7 +25,7 @@ class Slow(Service):
     role = "worker"
 
     def __init__(self) -> None:
-        super().__init__(ServiceConfig(), control=False)
+        super().__init__(ServiceConfig(insecure=True), control=False)
         self.num_ticks = self.num_beats = self.num_handled = 0
         self.input = self.bus.bind_router("tcp://127.0.0.1:*", "slow.input")
         self.register(self.input, {Progress: self._on_progress})
@@ -35,7 +36,7 @@ class Slow(Service):
     def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
         self.num_beats += 1
 
-    def _on_progress(self, _progress: Progress, _sender: bytes) -> None:
+    def _on_progress(self, _progress: Progress, _sender: Peer) -> None:
         self.num_handled += 1
         time.sleep(0.005)
 

@@ -8,6 +8,7 @@ import pytest
 
 from services.control.registry import Refusal, Registry
 from services.control.sessions import SessionRecord, Sessions
+from shared.keys import Peer
 from shared.wire.control import Heartbeat, SessionInput
 from shared.wire.session import OpenSession
 
@@ -49,10 +50,10 @@ class Made:
             self.add(worker(service, f"{service}-1"))
 
     def add(self, heartbeat: Heartbeat, now_s: float = 0.0) -> None:
-        self.registry.add(heartbeat, heartbeat.instance.encode(), now_s)
+        self.registry.add(heartbeat, Peer(heartbeat.instance.encode()), now_s)
 
     def open(self, name: str = "") -> SessionRecord:
-        return self.sessions.open(OpenSession(session=name, request="r"), b"client", 0.0)
+        return self.sessions.open(OpenSession(session=name, request="r"), Peer(b"client"), 0.0)
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def test_the_services_are_told_the_delay_of_the_face_and_its_lips(
 
 def test_the_services_are_told_the_voice_of_the_speaker(made: Made) -> None:
     opening = OpenSession(request="r", voice=b"a voice")
-    record = made.sessions.open(opening, b"client", 0.0)
+    record = made.sessions.open(opening, Peer(b"client"), 0.0)
     assert made.sessions.start_message(record).voice == b"a voice"
 
 

@@ -1,0 +1,296 @@
+"""Who a process is, and who may talk to it: CURVE keys in a folder of the user's own.
+
+The folder is ``$XDG_STATE_HOME/kouxing``, else ``~/.local/state/kouxing``, and belongs to one
+system. Whatever starts first makes it. It has
+
+- ``NAME.key``: a key pair of one service or client, with control's public key;
+- ``allowed``: who may connect, a line ``PUBLIC-KEY NAME ROLE...`` each.
+
+Roles are ``client`` (opens sessions), ``operator`` (changes the faces of others' sessions),
+``service:KIND`` and ``subscriber:SESSION`` (or ``subscriber:*``); each may ask for the status.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import zmq
+
+from shared.endpoints import with_key
+from shared.errors import UserError
+
+CONTROL = "control"
+CLIENT = "client"
+CLIENT_ROLES = ("client", "operator")  # of whoever uses control's machine
+_SUBSCRIBER = "subscriber:"
+_PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_ROLE = re.compile(r"client|operator|service:[a-z-]{1,64}|subscriber:([A-Za-z0-9_-]{1,64}|\*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A key pair, and the public key of control; Z85, 40 characters each."""
+
+    public: str
+    secret: str
+    control: str
+
+
+class Peer(NamedTuple):
+    """Who sent something to a ROUTER socket."""
+
+    address: bytes = b""  # what the peer calls itself, or a name made by the socket
+    key: str = ""  # its public key, proved; empty where all is plain
+
+
+NOBODY = Peer()
+
+
+class Guest(NamedTuple):
+    """Whose key it is, and what its owner may do."""
+
+    name: str
+    roles: tuple[str, ...]
+
+
+Guests = Mapping[str, Guest]  # by public key
+
+
+def key_folder() -> Path:
+    """Return where the keys are; it need not exist yet."""
+    state = os.environ.get("XDG_STATE_HOME")
+    return (Path(state) if state else Path.home() / ".local" / "state") / "kouxing"
+
+
+def own_key(name: str, roles: Collection[str]) -> Key:
+    """Return a key of this machine; on control's, one that does not exist is made and allowed.
+
+    Raises
+    ------
+    UserError
+        If the key cannot be read or made, or others could read it, too.
+    """
+    with _locked_folder() as folder:
+        path = folder / f"{name}.key"
+        if not path.exists():
+            if not (folder / "control.key").exists():
+                if any(folder.glob("*.key")):
+                    raise UserError(
+                        f"{path} is missing, and control's key is not here to allow a new one; "
+                        f"on control's machine: {how_to_add(roles)}"
+                    )
+                _write(folder / "control.key", _new_key())
+            if name != CONTROL:
+                _write(path, _allow(folder, name, roles))
+        return _read_key(path)
+
+
+def user_key() -> Key:
+    """Return the key of the user's own commands and clients; raises as ``own_key``."""
+    return own_key(CLIENT, CLIENT_ROLES)
+
+
+def control_endpoint(address: str, *, insecure: bool) -> str:
+    """Return where a client finds control: address and, unless all is plain, public key.
+
+    Raises
+    ------
+    UserError
+        As ``own_key``.
+    """
+    return with_key(address, "" if insecure else user_key().control)
+
+
+def refusal(control: str, name: str, roles: Collection[str]) -> str:
+    """Return what to say when control does not accept a key of this machine."""
+    return (
+        f"control at {control.partition(' ')[0]} does not accept {key_folder() / name}.key; if it"
+        f" runs on this machine, start it again, else make a key there: {how_to_add(roles)}"
+    )
+
+
+def how_to_add(roles: Collection[str]) -> str:
+    """Return what makes a key with some roles, for messages about a key that is missing."""
+    options = "".join(f" --role {role}" for role in roles)
+    return f"kouxing keys add NAME{options}; then copy the file here"
+
+
+def read_guests() -> dict[str, Guest]:
+    """Return who may connect, by public key; nobody if that was never said.
+
+    Raises
+    ------
+    UserError
+        If the list cannot be read, or others could change it.
+    """
+    with _locked_folder() as folder:
+        return _read_guests(folder)
+
+
+def guests_version() -> tuple[int, int]:
+    """Return what differs once ``read_guests`` returns something else."""
+    try:
+        about = (key_folder() / "allowed").stat()
+    except OSError:
+        return 0, 0
+    return about.st_ino, about.st_mtime_ns
+
+
+def add_guest(name: str, roles: Collection[str], path: Path) -> None:
+    """Make a key with some roles, allow it, and write it to a file for another machine.
+
+    Raises
+    ------
+    UserError
+        If the name is taken, a role is none, or this is not control's machine.
+    """
+    own_key(CONTROL, ())
+    with _locked_folder() as folder:
+        try:
+            _write(path, _allow(folder, name, roles))
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def revoke_guest(name: str) -> None:
+    """Allow a key no longer.
+
+    Raises
+    ------
+    UserError
+        If there is no key of that name.
+    """
+    with _locked_folder() as folder:
+        guests = _read_guests(folder)
+        kept = {public: guest for public, guest in guests.items() if guest.name != name}
+        if len(kept) == len(guests):
+            raise UserError(f"no key is called {name!r}; 'kouxing keys list' shows all")
+        _write(folder / "allowed", _lines(kept))
+
+
+def save_guests(guests: Guests) -> None:
+    """Keep what control has told, so that a service knows its guests when it starts again.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    with _locked_folder() as folder:
+        if _read_guests(folder) != guests:
+            _write(folder / "allowed", _lines(guests))
+
+
+def may_follow(guest: Guest, topic: bytes) -> bool:
+    """Return whether somebody may subscribe to the messages whose topic begins so."""
+    sessions = {role.removeprefix(_SUBSCRIBER) for role in guest.roles if _SUBSCRIBER in role}
+    if "*" in sessions or len(sessions) < len(guest.roles):
+        return True
+    _kind, *rest = topic.decode("ascii", "replace").split("/")
+    return len(rest) == 2 and rest[0] in sessions
+
+
+def _new_key(control: str = "") -> str:
+    public, secret = (part.decode() for part in zmq.curve_keypair())
+    return json.dumps(asdict(Key(public, secret, control or public)), indent=1) + "\n"
+
+
+def _allow(folder: Path, name: str, roles: Collection[str]) -> str:
+    """Add a new key to the list; return its file's text."""
+    if not _NAME.fullmatch(name):
+        raise UserError(f"no key can be called {name!r}; use letters, digits, '-' and '_'")
+    for role in roles:
+        if not _ROLE.fullmatch(role):
+            raise UserError(
+                f"{role!r} is no role; use client, operator, service:KIND or subscriber:SESSION"
+            )
+    guests = _read_guests(folder)
+    if any(guest.name == name for guest in guests.values()):
+        raise UserError(f"a key is called {name!r}; first 'kouxing keys revoke {name}'")
+    text = _new_key(_read_key(folder / "control.key").public)
+    guests[json.loads(text)["public"]] = Guest(name, tuple(roles))
+    _write(folder / "allowed", _lines(guests))
+    return text
+
+
+def _read_key(path: Path) -> Key:
+    try:
+        key = Key(**json.loads(_read(path)))
+        if all(_PUBLIC.fullmatch(part) for part in (key.public, key.secret, key.control)):
+            return key
+    except (ValueError, TypeError):
+        pass
+    raise UserError(f"{path} is no key file; without it a new key is made on control's machine")
+
+
+def _read_guests(folder: Path) -> dict[str, Guest]:
+    path = folder / "allowed"
+    if not path.exists():
+        return {}
+    guests = {}
+    for line in _read(path).splitlines():
+        public, *named = line.split() or [""]
+        if not (named and _PUBLIC.fullmatch(public) and all(map(_ROLE.fullmatch, named[1:]))):
+            raise UserError(f"{path}: {line!r} is not PUBLIC-KEY NAME ROLE...")
+        guests[public] = Guest(named[0], tuple(named[1:]))
+    return guests
+
+
+def _lines(guests: Guests) -> str:
+    return "".join(
+        f"{public} {' '.join((name, *roles))}\n" for public, (name, roles) in guests.items()
+    )
+
+
+@contextlib.contextmanager
+def _locked_folder() -> Iterator[Path]:
+    folder = key_folder()
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot keep keys here: {error.strerror}; name another folder by"
+            " XDG_STATE_HOME"
+        ) from None
+    try:
+        _check_private(folder, 0o700)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield folder
+    finally:
+        os.close(descriptor)
+
+
+def _check_private(path: Path, mode: int) -> None:
+    about = path.stat()
+    if about.st_uid != os.geteuid():
+        raise UserError(f"{path} belongs to another user; keys must be your own")
+    if about.st_mode & 0o077:
+        raise UserError(f"others can read {path}; 'chmod {mode:o} {path}', then start again")
+
+
+def _read(path: Path) -> str:
+    _check_private(path, 0o600)
+    try:
+        return path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read: {error}") from None
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a file that nobody else can read, whole or not at all."""
+    new = path.with_name(f"{path.name}.new")
+    new.unlink(missing_ok=True)
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(text)
+    new.replace(path)

@@ -1,0 +1,74 @@
+"""Says which keys may connect to this process's sockets: the ZAP handler (ZeroMQ RFC 27)."""
+
+from __future__ import annotations
+
+import threading
+
+import zmq
+from zmq.utils import z85
+
+from shared.errors import UserError
+from shared.keys import Guests, guests_version, read_guests
+from shared.logs import LOG
+
+# Who may connect to a socket, by its setting; to the others every key that is allowed at all.
+ROLES_AT = {"recognizer.audio": "client", "synthesizer.phone_input": "service"}
+
+
+class Zap:
+    """Answers libzmq on a thread of its own, until its context ends.
+
+    A refusal is a temporary one (status 300): who is refused tries again, for the key may be
+    allowed any moment.
+
+    Attributes
+    ----------
+    guests
+        Who may connect, by public key; read again whenever the list has changed.
+    version
+        Of the list.
+
+    Raises
+    ------
+    UserError
+        As ``read_guests``.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self.version = guests_version()
+        self.guests: Guests = read_guests()
+        self._socket = context.socket(zmq.REP)
+        self._socket.bind("inproc://zeromq.zap.01")
+        threading.Thread(target=self._answer, name="zap", daemon=True).start()
+
+    def refresh(self) -> None:
+        """Let changes of the list take effect."""
+        version = guests_version()
+        if version == self.version:
+            return
+        self.version = version
+        try:
+            self.guests = read_guests()
+        except UserError as error:
+            LOG.error("the allowed keys stay as they were: %s", error)
+
+    def _answer(self) -> None:
+        with self._socket as socket:
+            while True:
+                try:
+                    parts = socket.recv_multipart()
+                except zmq.ContextTerminated:
+                    return
+                _version, request, domain, _address, _identity, _mechanism, key = parts
+                public = z85.encode(key)
+                self.refresh()
+                is_guest = self._may_connect(public.decode(), domain.decode())
+                answer = (b"200", b"", public) if is_guest else (b"300", b"not allowed", b"")
+                socket.send_multipart([b"1.0", request, *answer, b""])
+
+    def _may_connect(self, public: str, domain: str) -> bool:
+        guest = self.guests.get(public)
+        if guest is None:
+            return False
+        wanted = ROLES_AT.get(domain)
+        return wanted is None or any(role.partition(":")[0] == wanted for role in guest.roles)

@@ -1,0 +1,201 @@
+"""Who may connect to a socket that is bound with a key, and what they may do there."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shared.bus import Bus, Socket
+from shared.endpoints import split_endpoint, with_key
+from shared.errors import UserError
+from shared.keys import Key, add_guest, key_folder, own_key, revoke_guest
+from shared.wire.control import StatusRequest
+from shared.wire.face import FapFrame
+from shared.wire.message import Message
+from shared.wire.session import Joined
+
+pytestmark = pytest.mark.unit
+LOCAL = "tcp://127.0.0.1:*"
+
+
+@pytest.fixture(autouse=True)
+def _new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+class Server:
+    """Sockets that are bound with control's key."""
+
+    def __init__(self) -> None:
+        self.key = own_key("control", ())
+        self.bus = Bus(self.key)
+
+    def router(self, name: str) -> tuple[Socket, str]:
+        router = self.bus.bind_router(LOCAL, name)
+        return router, with_key(router.endpoint, self.key.public)
+
+    def publisher(self) -> tuple[Socket, str]:
+        publisher = self.bus.bind_publisher(LOCAL, "synthesizer.faps")
+        return publisher, with_key(publisher.endpoint, self.key.public)
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    made = Server()
+    yield made
+    made.bus.close()
+
+
+def key_of(name: str, *roles: str) -> Key:
+    return own_key(name, roles)
+
+
+def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
+    found = []
+    while there.wait(timeout_s):
+        found += [each.message for each in there.receive() if isinstance(each.message, Message)]
+    return found
+
+
+def test_a_message_comes_with_the_key_of_its_sender(server: Server) -> None:
+    router, endpoint = server.router("control.commands")
+    key = key_of("laptop", "client")
+    with Bus(key) as bus:
+        dealer = bus.connect_dealer(endpoint)
+        dealer.send(StatusRequest(request="1"))
+        assert router.wait(5.0)
+        (received,) = router.receive()
+        assert received.sender.key == key.public
+        router.send(StatusRequest(request="2"), to=received.sender)
+        assert dealer.wait(5.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "roles", "gets_in"),
+    [
+        ("control.commands", ("subscriber:*",), True),
+        ("recognizer.audio", ("client",), True),
+        ("recognizer.audio", ("subscriber:*", "service:driver"), False),
+        ("synthesizer.phone_input", ("service:recognizer",), True),
+        ("synthesizer.phone_input", ("client", "operator"), False),
+    ],
+)
+def test_a_socket_takes_keys_of_its_roles_only(
+    server: Server, name: str, roles: tuple[str, ...], gets_in: bool
+) -> None:
+    router, endpoint = server.router(name)
+    with Bus(key_of("guest", *roles)) as bus:
+        dealer = bus.connect_dealer(endpoint)
+        dealer.send(StatusRequest(request="1"))
+        assert router.wait(5.0 if gets_in else 0.5) == gets_in
+        assert bus.is_refused(endpoint) != gets_in
+
+
+def test_a_key_of_another_system_does_not_get_in(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    router, endpoint = server.router("control.commands")
+    with monkeypatch.context() as there:
+        there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+        key, control = key_of("guest", "client"), key_of("control")
+    with Bus(key) as bus:
+        bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
+        assert not router.wait(0.5)
+        assert bus.is_refused(endpoint)
+        assert bus.is_refused(with_key(router.endpoint, control.public))
+
+
+def test_nobody_is_refused_where_nobody_listens(server: Server) -> None:
+    with Bus(server.key) as bus:
+        assert not bus.is_refused(with_key("tcp://127.0.0.1:1", server.key.public))
+
+
+@pytest.mark.parametrize("with_keys", [True, False])
+@pytest.mark.parametrize(
+    "greeting",
+    [
+        b"\x01\x00" + b"\x03\x00hi",  # ZMTP 1
+        b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00",  # ZMTP 2
+        b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n\x01\x00" + b"\x03\x00hi",
+    ],
+)
+def test_old_zeromq_and_browsers_are_cut(greeting: bytes, with_keys: bool) -> None:
+    with Bus(own_key("control", ()) if with_keys else None) as bus:
+        router = bus.bind_router(LOCAL, "control.commands")
+        _, port = split_endpoint(router.endpoint, "")
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=5.0) as browser:
+            browser.sendall(greeting + bytes(64))
+            try:
+                while browser.recv(1000):
+                    pass
+            except ConnectionResetError:
+                pass
+        assert not router.wait(0.1)
+
+
+def test_a_subscriber_gets_the_sessions_of_its_role_only(server: Server) -> None:
+    publisher, endpoint = server.publisher()
+    with Bus(key_of("screen", "subscriber:mine")) as bus:
+        subscriber = bus.connect_subscriber(endpoint)
+        for session in (None, "theirs"):
+            subscriber.subscribe(FapFrame, session)
+        subscriber.subscribe_session([FapFrame], "mine")
+        assert publisher.wait(5.0)
+        while publisher.wait(0.2):
+            list(publisher.receive())
+        for session in ("theirs", "mine"):
+            publisher.send(FapFrame(session=session, values=bytes(272), mask=bytes(9)))
+        kinds = [(type(each), each.session) for each in messages_of(subscriber)]
+        assert kinds == [(Joined, "mine"), (FapFrame, "mine")]
+
+
+def test_a_key_is_allowed_and_revoked_while_the_socket_is_bound(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    router, endpoint = server.router("control.commands")
+    add_guest("laptop", ("client",), tmp_path / "laptop.key")
+    (tmp_path / "other" / "kouxing").mkdir(parents=True, mode=0o700)
+    (tmp_path / "other" / "kouxing").chmod(0o700)
+    (tmp_path / "laptop.key").rename(tmp_path / "other" / "kouxing" / "client.key")
+    with monkeypatch.context() as there:
+        there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+        key = own_key("client", ())
+    with Bus(key) as bus:
+        dealer = bus.connect_dealer(endpoint)
+        dealer.send(StatusRequest(request="1"))
+        assert len(messages_of(router, 2.0)) == 1
+        revoke_guest("laptop")
+        assert server.bus.zap is not None
+        server.bus.zap.refresh()
+        dealer.send(StatusRequest(request="2"))
+        assert messages_of(router) == []
+        assert bus.is_refused(endpoint)
+
+
+def test_a_list_that_is_broken_changes_nothing(server: Server) -> None:
+    router, endpoint = server.router("control.commands")
+    with Bus(key_of("laptop", "client")) as bus:
+        assert not bus.is_refused(endpoint)
+        (key_folder() / "allowed").write_text("nonsense\n", encoding="ascii")
+        assert not bus.is_refused(endpoint)
+        assert router.endpoint
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "is_plain", "said"),
+    [
+        ("tcp://127.0.0.1:1", False, "has no key"),
+        ("tcp://127.0.0.1:1 " + "a" * 40, True, "has a key"),
+        ("tcp://-:1", True, "cannot connect"),
+        ("tcp://127.0.0.1:0 short", False, "cannot connect"),
+        ("udp://127.0.0.1:1", True, "is no endpoint"),
+    ],
+)
+def test_an_endpoint_that_cannot_be_connected_to_is_an_error(
+    server: Server, endpoint: str, is_plain: bool, said: str
+) -> None:
+    with Bus(None if is_plain else server.key) as bus, pytest.raises(UserError, match=said):
+        bus.connect_dealer(endpoint)

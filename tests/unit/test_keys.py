@@ -1,0 +1,133 @@
+"""Keys in files: made once, private, allowed and revoked."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shared.errors import UserError
+from shared.keys import (
+    Guest,
+    add_guest,
+    key_folder,
+    may_follow,
+    own_key,
+    read_guests,
+    revoke_guest,
+    save_guests,
+    user_key,
+)
+
+pytestmark = pytest.mark.unit
+
+
+@pytest.fixture(autouse=True)
+def _new_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+def test_the_first_use_makes_keys_that_only_their_owner_can_read() -> None:
+    key = own_key("lamp", ("service:lamp",))
+    assert own_key("lamp", ("service:lamp",)) == key
+    assert key.control == own_key("control", ()).public != key.public
+    assert read_guests() == {key.public: Guest("lamp", ("service:lamp",))}
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in key_folder().iterdir()}
+    assert modes == dict.fromkeys(("control.key", "lamp.key", "allowed"), 0o600)
+    assert stat.S_IMODE(key_folder().stat().st_mode) == 0o700
+
+
+def test_processes_that_start_together_make_one_key() -> None:
+    program = "from shared.keys import user_key; print(user_key())"
+    started = [
+        subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(4)
+    ]
+    assert len({process.communicate()[0] for process in started}) == 1
+    assert [guest.name for guest in read_guests().values()] == ["client"]
+
+
+@pytest.mark.parametrize("name", ["", "client.key", "allowed"])
+def test_what_others_can_read_or_own_is_refused(name: str) -> None:
+    user_key()
+    path = key_folder() / name
+    path.chmod(0o750)
+    with pytest.raises(UserError, match=f"others can read {path}; 'chmod [67]00 "):
+        (user_key(), read_guests())
+    path.chmod(0o700)
+    os.chown(path, os.geteuid() + 1, -1)
+    with pytest.raises(UserError, match=f"{path} belongs to another user"):
+        (user_key(), read_guests())
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"public": 1, "secret": 2, "control": 3}', "é"])
+def test_a_file_that_is_no_key_is_named(text: str) -> None:
+    user_key()
+    (key_folder() / "client.key").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=r"client\.key"):
+        user_key()
+
+
+def test_a_folder_without_a_home_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    with pytest.raises(UserError, match="XDG_STATE_HOME"):
+        user_key()
+
+
+def test_an_added_key_works_on_another_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = tmp_path / "given.key"
+    add_guest("laptop", ("client",), given)
+    (public,) = read_guests()
+    control = own_key("control", ())
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    key_folder().mkdir(parents=True, mode=0o700)
+    given.rename(key_folder() / "client.key")
+    assert (user_key().public, user_key().control) == (public, control.public)
+    with pytest.raises(UserError, match="kouxing keys add NAME --role service:lamp"):
+        own_key("lamp", ("service:lamp",))
+    save_guests({public: Guest("laptop", ("client",))})
+    assert read_guests() == {public: Guest("laptop", ("client",))}
+
+
+def test_a_revoked_key_is_allowed_no_longer_and_its_name_is_free(tmp_path: Path) -> None:
+    add_guest("laptop", ("client",), tmp_path / "1")
+    with pytest.raises(UserError, match="kouxing keys revoke laptop"):
+        add_guest("laptop", ("client",), tmp_path / "2")
+    revoke_guest("laptop")
+    assert read_guests() == {}
+    with pytest.raises(UserError, match="no key is called 'laptop'"):
+        revoke_guest("laptop")
+    add_guest("laptop", ("client",), tmp_path / "2")
+
+
+@pytest.mark.parametrize(("name", "role"), [("a b", "client"), ("a", "root"), ("a", "service:")])
+def test_a_wrong_name_or_role_is_refused(tmp_path: Path, name: str, role: str) -> None:
+    with pytest.raises(UserError, match=role if name == "a" else name):
+        add_guest(name, (role,), tmp_path / "new")
+
+
+@pytest.mark.parametrize(
+    ("roles", "topic", "may"),
+    [
+        (("client",), b"", True),
+        (("service:lamp",), b"fap-frame/", True),
+        (("subscriber:*",), b"fap-frame/", True),
+        (("subscriber:a",), b"fap-frame/a/", True),
+        (("subscriber:a", "subscriber:b"), b"sound/b/", True),
+        (("subscriber:a",), b"fap-frame/ab/", False),
+        (("subscriber:a",), b"fap-frame/a", False),
+        (("subscriber:a",), b"fap-frame/", False),
+        (("subscriber:a",), b"", False),
+        (("subscriber:a",), b"\xff/a/", True),  # matches no message
+    ],
+)
+def test_a_subscriber_follows_the_sessions_of_its_roles(
+    roles: tuple[str, ...], topic: bytes, may: bool
+) -> None:
+    assert may_follow(Guest("name", roles), topic) == may
