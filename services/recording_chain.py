@@ -30,8 +30,9 @@ from services.synthesizer.lips.lip_model import LipModel
 from shared.clock import MEDIA_RATE_HZ
 from shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent, SpeechChange
 
-# Chosen on clips for choices, as those of the live chain.
-_RECOGNISED = ClosureRule(other=1.0)
+# Chosen on clips for choices, as those of the live chain. Where the sound tells one closure and the
+# phones two, the vowel between them counts; no clip has such a place.
+_RECOGNISED = ClosureRule(other=1.0, vowel=3.0)
 _CERTAIN = ClosureRule(phone=6.0, other=6.0)  # of a known text: its phones decide
 
 

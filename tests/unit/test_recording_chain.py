@@ -85,6 +85,22 @@ def test_recognised_phones_err_where_the_text_does_not() -> None:
     assert missed
 
 
+def test_lips_part_in_a_recognised_vowel_between_two_closures() -> None:
+    samples = read_audio(DEMO / "bilabials-female.wav")[0][:, 0]
+    model = load_live_model()
+    heard = hear_recording(model, samples, lips_for(model))
+    times_s, opening = openings(heard)
+    (vowel,) = [
+        phone
+        for before, phone, after in zip(
+            heard.phones, heard.phones[1:], heard.phones[2:], strict=False
+        )
+        if (before.symbol, phone.symbol, after.symbol) == ("b", "o", "b")
+    ]
+    during = (times_s >= vowel.onset_s) & (times_s < vowel.onset_s + vowel.duration_s)
+    assert opening[during].max() > 50
+
+
 def test_every_phone_of_a_sentence_with_many_rounded_vowels_is_right() -> None:
     samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
     model = load_live_model()

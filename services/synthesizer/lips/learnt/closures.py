@@ -5,7 +5,9 @@ added as log odds: a recognised b, p, m raises the odds of a closure, and a prob
 that is high enough needs no phone. Without a phone, lips are shut the less, the wider apart the
 sound tells them to be, so that they part in time, and the more it rounds them: in u and w they
 nearly meet. Phones are no evidence against a closure, so a p that is taken for a t cannot open lips
-that the sound has shut; and no phone alone can shut lips that the sound tells to be wide open.
+that the sound has shut; and no phone alone can shut lips that the sound tells to be wide open. Of a
+whole recording the phones are known better: there they part lips, too, and a vowel between two
+closing phones parts them in its middle.
 
 Lower lip to upper teeth, as in f, is the phone's to decide: the sound tells it too badly.
 """
@@ -29,6 +31,7 @@ _HELD_S = 0.08  # after its onset a phone's lips are shut for so long at most,
 _DECIDED_S = 0.04  # and for so long after the phone is known, if it comes late,
 _LATEST_S = 0.1  # but not this long after its onset
 _EDGE_S = 0.02  # in which a phone's evidence rises and falls
+_MIDDLE = 0.3  # of a vowel's duration on either side of its middle, where it counts
 _PARTED, _WIDE_APART = 100.0, 300.0  # FAP units of opening
 _ROUNDED = -100.0  # FAP units of width
 _INNER_LIPS, _CORNERS = ([MOUTH_FAPS.index(fap) for fap in pair] for pair in ((4, 5), (6, 7)))
@@ -45,6 +48,7 @@ class ClosureRule:
     sound: float = 2.0  # added to the sound's log odds: it rather misses a closure than invents one
     phone: float = 2.2  # log odds that a phone adds at most
     other: float = 0.0  # log odds that a phone which closes nothing takes away at most
+    vowel: float = 0.0  # times its log odds that a vowel between two closing phones takes away
     doubt: float = 0.8  # log odds around 0 within which lips are led part of the way
     # log odds lost, unless a phone tells the closure, for each FAP unit
     parted: float = 0.02  # of an opening above 100, up to 300
@@ -90,6 +94,7 @@ class ClosingPhones:
     def __init__(self, inventory: PhoneInventory, viseme: str, rule: ClosureRule) -> None:
         self._rule = rule
         self._silence = inventory.silence
+        self._vowels = inventory.vowels
         self._symbols = {
             symbol for symbol, shares in inventory.visemes.items() if shares[0][0] == viseme
         }
@@ -122,13 +127,27 @@ class ClosingPhones:
             return added
         return -max(
             (
-                min(log_odds_of(max(phone.confidence, 0.5)), self._rule.other)
+                self._against(phone, time_s)
                 for phone, _ in self._phones.values()
                 if phone.symbol not in self._symbols
                 and phone.onset_s <= time_s < phone.onset_s + phone.duration_s
             ),
             default=0.0,
         )
+
+    def _against(self, phone: Phone, time_s: float) -> float:
+        """Return what a phone that closes nothing takes away during it."""
+        log_odds = log_odds_of(max(phone.confidence, 0.5))
+        taken = min(log_odds, self._rule.other)
+        if phone.symbol in self._vowels and self._is_between_closures(phone):
+            from_middle = abs((time_s - phone.onset_s) / phone.duration_s - 0.5)
+            share = max(0.0, 1.0 - from_middle / _MIDDLE)
+            taken = max(taken, self._rule.vowel * log_odds * share)
+        return taken
+
+    def _is_between_closures(self, phone: Phone) -> bool:
+        neighbours = (self._phones.get(phone.index + step) for step in (-1, 1))
+        return all(each is not None and each[0].symbol in self._symbols for each in neighbours)
 
     def _of(self, phone: Phone, known_s: float, time_s: float) -> float:
         most = min(log_odds_of(max(phone.confidence, 0.5)), self._rule.phone)
