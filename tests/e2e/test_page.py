@@ -517,6 +517,17 @@ def test_the_page_speaks_one_language(browser: Browser) -> None:
     assert browser.evaluate(label) == "level"
 
 
+def test_a_browser_without_3d_is_told_so(browser: Browser, gateway: Gateway) -> None:
+    blind = "HTMLCanvasElement.prototype.getContext = () => null"
+    browser.command("Page.enable")
+    script = browser.command("Page.addScriptToEvaluateOnNewDocument", source=blind)
+    browser.command("Page.navigate", url=gateway.page)
+    browser.wait_for("document.getElementById('no-head')?.textContent.includes('WebGL')")
+    assert "WebGL" in browser.evaluate("document.getElementById('notice').textContent")
+    browser.command("Page.removeScriptToEvaluateOnNewDocument", **script)
+    browser.command("Page.disable")
+
+
 @pytest.mark.parametrize(("languages", "shown"), [("zh-TW,en", "zh"), ("fr,en-GB,zh", "en")])
 def test_the_language_is_that_of_the_browser(
     browser: Browser, gateway: Gateway, languages: str, shown: str

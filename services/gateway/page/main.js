@@ -410,18 +410,36 @@ function showHead(name) {
 
 async function loadHead(name) {
   element("loading").hidden = false;
+  setText(element("no-head"), "");
   const file = name === "" ? "head.glb" : `head-${name}.glb`;
   try {
-    const loading = head ?? new Head(element("head"), document.querySelector("footer"));
+    const loading = head ?? makeHead();
     await loading.load(file);
     head = loading;
     head.pose(faps);
     head.draw(performance.now()); // the first time takes long, which says nothing about the stream
     playout.reset();
   } catch (error) {
-    showError({ text: `no head (is there a ${file}? see 'kouxing head export'): ${error.message}` });
+    const { message } = error;
+    const text = say({
+      en: error.en ?? `No head (is there a ${file}? see kouxing head export): ${message}`,
+      zh: error.zh ?? `没有头像（缺少 ${file}？见 kouxing head export）：${message}`,
+    });
+    showError({ text });
+    setText(element("no-head"), text); // for as long as there is none
   }
   element("loading").hidden = true;
+}
+
+function makeHead() {
+  try {
+    return new Head(element("head"), document.querySelector("footer"));
+  } catch {
+    throw {
+      en: "This browser draws nothing in 3-D (WebGL): turn on hardware acceleration in its settings, or try another browser.",
+      zh: "浏览器无法绘制 3-D 图像（WebGL）：请在浏览器设置中打开硬件加速，或换一个浏览器。",
+    };
+  }
 }
 
 const view = new URLSearchParams(location.search);
