@@ -195,7 +195,9 @@ def _read_clip(
         )
     except KeyError as error:
         raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
-    except (OSError, ValueError, AttributeError, csv.Error) as error:
+    except OSError as error:
+        raise UserError(f"{error.filename}: cannot be read: {error.strerror}") from error
+    except (ValueError, AttributeError, csv.Error) as error:
         raise UserError(f"cannot read the clip {path.stem}: {error}") from error
 
 

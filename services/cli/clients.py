@@ -109,7 +109,7 @@ def express(
     expressions: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME=STRENGTH]...",
+            metavar="NAME=STRENGTH",
             help=f"Strengths from 0 to 1 of {', '.join(ExpressionName)}.",
         ),
     ] = None,

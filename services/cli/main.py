@@ -18,6 +18,7 @@ from services.cli.terminal import CONSOLE
 from services.kinds import KINDS
 from shared.errors import UserError
 
+SERVICES = "One service alone (run starts them all)"
 ENTRY_POINTS = "kouxing.commands"  # each a typer.Typer, such as those of training and evaluation
 
 
@@ -73,14 +74,14 @@ def kouxing(
     """Live Mandarin speech in, a talking 3-D face out."""
 
 
-for kind in KINDS.values():
-    app.command(kind.name, help=kind.summary)(service_command(kind))
 for command in (
-    run.run, clients.speak, clients.listen, clients.express, clients.status, configuration.config,
-    offline.render, offline.phones, offline.align, offline.lips,
+    run.run, clients.speak, offline.render, offline.lips, clients.listen, clients.express,
+    offline.phones, offline.align, clients.status, configuration.config,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(head_app, name="head")
+for kind in KINDS.values():
+    app.command(kind.name, help=kind.summary, rich_help_panel=SERVICES)(service_command(kind))
 
 
 def main() -> None:

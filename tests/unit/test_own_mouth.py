@@ -137,5 +137,5 @@ def test_what_a_camera_saw_becomes_a_voice(tmp_path: Path) -> None:
 
 
 def test_clips_that_are_missing_are_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cannot read the clip nobody"):
+    with pytest.raises(UserError, match=r"nobody\.json: cannot be read: No such file"):
         run(adapt_app, tmp_path / "nobody.json", "-o", tmp_path / "me.voice")
