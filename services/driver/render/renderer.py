@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes.util
+import sys
 import time
 from typing import Any
 
@@ -35,7 +36,8 @@ def standalone_context() -> moderngl.Context:
         If the GL libraries are missing or give no context.
     """
     try:
-        settings: dict[str, Any] = {"backend": "egl"}
+        # macOS has no EGL; its own OpenGL needs no display.
+        settings: dict[str, Any] = {} if sys.platform == "darwin" else {"backend": "egl"}
         return moderngl.create_standalone_context(require=330, **settings)
     except Exception as error:  # moderngl raises bare Exception
         missing = [name for name in ("EGL", "GL") if ctypes.util.find_library(name) is None]
