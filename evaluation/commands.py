@@ -304,17 +304,27 @@ def bench(
     repeats: Annotated[int, typer.Option(min=1, help="How often to stream it.")] = 3,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure latency, CPU and images per second of the whole chain on this machine."""
-    from evaluation.system import latency, rendering, sessions
+    """Measure latency, CPU and images per second of the whole chain on this machine.
+
+    The page is measured where Chromium is installed.
+    """
+    from evaluation.system import chromium, latency, page, rendering, sessions
 
     delays = latency.measure(audio, repeats, CONSOLE)
     costs = sessions.measure(audio)
     pictures = rendering.measure()
+    drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
     out = Console()
     latency.show(delays, out)
     sessions.show(costs, out)
     rendering.show(pictures, out)
-    write_json(json_file, asdict(delays) | {"sessions": costs, "rendering": asdict(pictures)})
+    page.show(drawings, out)
+    write_json(
+        json_file,
+        asdict(delays)
+        | {"sessions": costs, "rendering": asdict(pictures)}
+        | {"page": {name: asdict(drawing) for name, drawing in drawings.items()}},
+    )
 
 
 @plot_app.callback()

@@ -18,11 +18,12 @@ from PIL import Image
 
 from corpora.face_landmarks import LANDMARKS
 from corpora.landmark_file import landmark_file
+from evaluation.system.chromium import wait_until
 from services.driver.head.head import neutral_faps
 from services.driver.render.renderer import Renderer
 from shared.client import Client
 from tests import heads
-from tests.browser import Browser, wait_until
+from tests.browser import Browser
 from tests.scripted_system import Gateway, System
 from tests.system import DEMO, free_port
 

@@ -20,9 +20,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from evaluation.system.chromium import wait_until
 from shared.client import Client, Session
 from shared.face.faps import FAP_NUMBER, NUM_FAPS
-from tests.browser import SIZE_PX, Browser, wait_until
+from tests.browser import SIZE_PX, Browser
 from tests.scripted_system import LOOK_AHEAD_MS, Gateway, System
 from tests.system import ROOT, free_port
 

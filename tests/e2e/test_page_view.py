@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser import Browser, wait_until
+from evaluation.system.chromium import wait_until
+from tests.browser import Browser
 from tests.scripted_system import Gateway, System
 from tests.system import DEMO, free_port
 

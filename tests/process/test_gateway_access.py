@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.browser import wait_until
+from evaluation.system.chromium import wait_until
 from tests.scripted_system import Gateway
 from tests.system import ROOT, free_port
 

@@ -54,6 +54,18 @@ def test_trimesh_reads_it(glb: Path) -> None:
     assert {"skin", "eye_left", "teeth_lower", "tongue", "hair"} <= set(scene.geometry)
 
 
+def test_opaque_parts_have_coarser_triangles(document: dict[str, Any]) -> None:
+    coarse = heads.load("woman", "coarse")
+    of_mesh = {mesh["name"]: mesh["extras"].get("coarse") for mesh in document["meshes"]}
+    assert {name for name, index in of_mesh.items() if index is not None} == {"skin", "tongue"}
+    for name in ("skin", "tongue"):
+        part = coarse.part(name)
+        triangles = coarse.triangles[part.triangles] - part.vertices.start
+        view = document["bufferViews"][document["accessors"][of_mesh[name]]["bufferView"]]
+        stored = np.frombuffer(document["binary"], np.uint16, triangles.size, view["byteOffset"])
+        assert np.array_equal(stored, triangles.ravel())
+
+
 def test_accessors_fit_their_views(document: dict[str, Any]) -> None:
     views = document["bufferViews"]
     for view in views:

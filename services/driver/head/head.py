@@ -72,6 +72,8 @@ class Head:
         Neutral face (V, 3), m.
     triangles
         Vertex numbers (F, 3), counter-clockwise seen from outside.
+    coarse_triangles
+        Each part's triangles (C, 3) in the coarse head, on the same vertices.
     uv
         Texture coordinates (V, 2), v downwards.
     colors
@@ -98,6 +100,7 @@ class Head:
     parts: tuple[Part, ...]
     vertices: Float32
     triangles: NDArray[np.uint32]
+    coarse_triangles: tuple[NDArray[np.uint32], ...]
     uv: Float32
     colors: Float32
     head_weight: Float32
@@ -223,15 +226,19 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
     place = np.full(int(after[-1]), -1, dtype=np.int64)
     place[kept] = np.arange(len(kept))
 
-    parts, triangles = [], []
+    parts, triangles, coarse_triangles = [], [], []
     num_triangles = 0
     bounds = arrays["part_triangles"].astype(np.int64)  # fine first, fine end, coarse first, end
     for row, part_name in enumerate(arrays["part_names"].astype(str)):
-        start, end = bounds[row, 2:] if coarse else bounds[row, :2]
-        own = place[arrays["triangles"][start:end].astype(np.int64)]
-        if len(own) == 0 or own.min() < 0:
+        fine_own, coarse_own = (
+            place[arrays["triangles"][start:end].astype(np.int64)]
+            for start, end in (bounds[row, :2], bounds[row, 2:])
+        )
+        own = coarse_own if coarse else fine_own
+        if len(own) == 0 or len(coarse_own) == 0 or own.min() < 0:
             raise ValueError(f"part {part_name} refers to missing vertices")
         triangles.append(own.astype(np.uint32))
+        coarse_triangles.append(coarse_own.astype(np.uint32))
         from_vertex = int(place[first[row]])
         parts.append(
             Part(
@@ -258,6 +265,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
         vertices=vertices,
         shading=shading,
         triangles=faces,
+        coarse_triangles=tuple(coarse_triangles),
         uv=arrays["uv"].astype(np.float32)[kept] / np.float32(65535),
         colors=(arrays["colors"].astype(np.float32)[kept] / np.float32(255)) ** 2,
         head_weight=arrays["head_weight"].astype(np.float32)[kept] / np.float32(255),

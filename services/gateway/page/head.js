@@ -2,19 +2,17 @@
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { coarsen } from "./coarse.js";
 import { dim, drawsInSoftware, physicalMaterial, plainMaterial, release, studio } from "./materials.js";
 import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
+import { Pace } from "./pace.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const RADIANS_PER_UNIT = 1e-5;
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
 const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
-const SLOW_MS = 34; // for a picture: with a rest, 20 of them a second
-const MAX_REST_MS = 16;
-const JUDGE_EVERY_MS = 1500;
-const COARSER = 0.7;
-const MIN_PIXEL_RATIO = 0.35;
+const LOOK_EVERY_MS = 2; // whether a picture is done
 const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
@@ -32,12 +30,9 @@ export class Head {
   #fovYDegrees = 22;
   #stale = true;
   #software; // the processor draws
-  #pixelRatio;
-  #fence = null; // passed when the picture before is done
-  #pictureMs = 0; // that a picture takes, smoothed
-  #restUntilMs = 0;
-  #drawnMs = 0;
-  #judgedMs = 0;
+  #pace;
+  #isDrawing = false;
+  #numPictures = 0;
   #turn = new THREE.Quaternion();
 
   /** @param canvas to draw into; @param overlay the element that covers its lower edge */
@@ -47,7 +42,8 @@ export class Head {
     // triangles are as small as pixels.
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
     this.#software = drawsInSoftware(this.#renderer.getContext());
-    this.#pixelRatio = this.#software ? 0.7 : Math.min(2, Math.max(1.5, devicePixelRatio));
+    const full = Math.min(2, Math.max(1.5, devicePixelRatio));
+    this.#pace = this.#software ? new Pace(0.5, 1, true) : new Pace(full, full, false);
     if (!this.#software) this.#light();
     this.#controls = new OrbitControls(this.#camera, canvas);
     this.#controls.enablePan = false;
@@ -65,6 +61,7 @@ export class Head {
   /** Load a head, in place of the one before. */
   async load(url) {
     const gltf = await new GLTFLoader().loadAsync(url);
+    if (this.#software) await coarsen(gltf);
     this.#model?.removeFromParent();
     this.#model?.traverse(({ geometry, material }) => {
       geometry?.dispose();
@@ -84,7 +81,7 @@ export class Head {
       if (!node.isMesh) return;
       node.frustumCulled = false; // bounds do not follow the face
       node.material = plain
-        ? plainMaterial(node.name, node.material, about.cel)
+        ? plainMaterial(node.name, node.material, gltf.scene.getObjectByName("head"), about.cel)
         : physicalMaterial(node.name, node.material);
       if (IN_MOUTH.includes(node.name)) this.#inMouth.push(node.material);
       if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
@@ -121,53 +118,58 @@ export class Head {
 
   /**
    * Draw, if anything has changed, and if the picture before is done: a slow machine is to have
-   * fewer pictures rather than a queue of late ones that block the page. Where the processor draws,
-   * it rests as long as a picture took, for sound and messages are its work, too.
+   * fewer pictures rather than a queue of late ones that block the page.
+   *
+   * @param drawn called when this picture is done, if it is drawn
    */
-  draw(nowMs) {
-    if (!this.#stale || !this.#isDone(nowMs) || nowMs < this.#restUntilMs) return;
+  draw(nowMs, drawn) {
+    if (!this.#stale || this.#isDrawing || !this.#pace.isDue(nowMs)) return;
     this.#stale = false;
-    this.#drawnMs = nowMs;
-    if (nowMs - this.#judgedMs > JUDGE_EVERY_MS) {
-      this.#judgedMs = nowMs;
-      if (this.#pictureMs > SLOW_MS && this.#pixelRatio > MIN_PIXEL_RATIO) {
-        this.#pixelRatio = Math.max(MIN_PIXEL_RATIO, COARSER * this.#pixelRatio);
-        this.#pictureMs = 0; // judged anew
-        this.#resize();
-      }
-      this.#renderer.domElement.title = this.#description();
-    }
     if (this.#faps !== null) this.#apply(this.#faps);
     this.#faps = null;
+    this.#isDrawing = true;
+    const begunMs = performance.now();
     this.#render();
+    this.#whenDone(() => {
+      this.#isDrawing = false;
+      this.#numPictures++;
+      drawn();
+      if (this.#pace.drew(begunMs, performance.now())) this.#resize();
+    });
   }
 
-  /** Say how the head is drawn, if it is less than it could be. */
-  #description() {
+  /**
+   * How it is drawn: { isCoarse: as the processor draws it, width, height: in pixels, numPictures:
+   * until now, pictureMs: that one takes }.
+   */
+  get drawing() {
     const { width, height } = this.#renderer.domElement;
-    return this.#software
-      ? `Drawn without a graphics card: ${width} x ${height} pixels`
-      : "";
-  }
-
-  #isDone(nowMs) {
-    const gl = this.#renderer.getContext();
-    if (this.#fence !== null) {
-      if (gl.clientWaitSync(this.#fence, 0, 0) === gl.TIMEOUT_EXPIRED) return false;
-      gl.deleteSync(this.#fence);
-      this.#fence = null;
-      const tookMs = nowMs - this.#drawnMs;
-      this.#pictureMs += 0.2 * (tookMs - this.#pictureMs);
-      if (this.#software) this.#restUntilMs = nowMs + Math.min(tookMs, MAX_REST_MS);
-    }
-    return true;
+    return {
+      isCoarse: this.#software,
+      width,
+      height,
+      numPictures: this.#numPictures,
+      pictureMs: this.#pace.pictureMs,
+    };
   }
 
   #render() {
     this.#renderer.render(this.#scene, this.#camera);
+  }
+
+  #whenDone(act) {
     const gl = this.#renderer.getContext();
-    this.#fence ??= gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
+    const look = () => {
+      if (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) {
+        setTimeout(look, LOOK_EVERY_MS);
+      } else {
+        gl.deleteSync(fence);
+        act();
+      }
+    };
+    setTimeout(look);
   }
 
   #findJoints(scene, faps) {
@@ -223,7 +225,7 @@ export class Head {
     this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
     this.#camera.aspect = width / height;
     this.#camera.setViewOffset(width, height, 0, (height - free) / 2, width, height);
-    this.#renderer.setPixelRatio(this.#pixelRatio);
+    this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
     this.#stale = true;
   }

@@ -16,7 +16,7 @@ import { Presence } from "./presence.js";
 import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
 import { Settings } from "./settings.js";
-import { delayText, errorText, hint, stateKind, stateText } from "./status.js";
+import { delayText, drawingText, errorText, hint, stateKind, stateText } from "./status.js";
 import { BACKGROUND, VideoRecorder } from "./video.js";
 import { VoiceStore } from "./voice.js";
 
@@ -28,6 +28,7 @@ const track = new FapTrack();
 const meter = new LevelMeter();
 const presence = new Presence();
 const delays = new Recent(DELAY_MS); // ms, from the own voice to the picture
+const frameDelays = new Recent(DELAY_MS); // ms, from the own voice to the arrival of its frame
 const sound = new Sound(onSoundState);
 const voices = new VoiceStore(storage());
 const choices = new Choices(storage());
@@ -65,6 +66,7 @@ window.kouxing = {
       faps: Array.from(faps),
       mediaTime: playout.mediaAt(nowMs),
       playoutDelayMs: playout.delayMs,
+      voiceToFrameMs: frameDelays.percentile(0.5),
       voiceToPictureMs: delays.percentile(0.5),
       sound: sound.state,
       soundSamplesPlayed: sound.numPlayed,
@@ -73,6 +75,7 @@ window.kouxing = {
       lips,
       caption: caption.text,
       voice: voices.voice?.profile ?? "",
+      drawing: head?.drawing ?? null,
       recording: video.isRecording,
       lesson: lesson.step,
     };
@@ -87,6 +90,7 @@ function forget() {
   caption.reset();
   meter.reset();
   delays.reset();
+  frameDelays.reset();
 }
 
 const link = new Link(new URLSearchParams(location.search).get("session") ?? "", {
@@ -102,6 +106,7 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
     const offsetMs = playout.offsetMs;
     if (track.push(mediaTime, values)) playout.frameArrived(nowMs, mediaTime);
     presence.frameArrived(nowMs);
+    if (isLiveVoice(nowMs)) addAge(frameDelays, nowMs, mediaTime);
     numFrames++;
     if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
   },
@@ -164,17 +169,18 @@ let shownDb = SILENT_DB; // of the meter
 
 function draw(nowMs) {
   requestAnimationFrame(draw);
+  playout.isHeard = sound.isPlaying;
   playout.outputLatencyMs = sound.outputLatencyMs;
+  playout.pictureMs = head?.drawing.pictureMs ?? 0;
   const heardMs = sound.offsetMs(nowMs);
   if (heardMs !== null) playout.follow(heardMs);
   if (playout.adjust(nowMs)) sound.align(nowMs, playout.offsetMs);
 
-  const mediaTime = playout.mediaAt(nowMs);
+  const mediaTime = playout.mediaAt(nowMs + playout.pictureMs); // when the picture is done
   const shownTime = mediaTime === null ? null : track.sample(mediaTime, wanted);
   const hasChanged = mixFace(presence.update(nowMs, shownTime !== null));
   if (hasChanged && lesson.step === "closed") head?.pose(faps); // else the lesson has the machine
-  head?.draw(nowMs);
-  measureDelay(shownTime);
+  head?.draw(nowMs, () => requestAnimationFrame(() => measureDelay(shownTime)));
 
   showLevel(mediaTime);
   if (mediaTime !== null) caption.show(mediaTime);
@@ -184,13 +190,20 @@ function draw(nowMs) {
   }
 }
 
-/** Measure how long ago the picture's sound was spoken, where that was here. */
+/** Measure how long ago the sound of a picture that is seen now was spoken, where that was here. */
 function measureDelay(shownTime) {
   const nowMs = performance.now();
-  delays.forget(nowMs);
-  if (shownTime === null || session !== ownSession || !presence.isLive(nowMs)) return;
-  const ageMs = microphone.ageMs(nowMs, shownTime);
-  if (ageMs !== null) delays.add(nowMs, ageMs);
+  if (shownTime !== null && isLiveVoice(nowMs)) addAge(delays, nowMs, shownTime);
+}
+
+/** Whether what is shown is this browser's voice. */
+function isLiveVoice(nowMs) {
+  return session === ownSession && presence.isLive(nowMs);
+}
+
+function addAge(ages, nowMs, mediaTime) {
+  const ageMs = microphone.ageMs(nowMs, mediaTime);
+  if (ageMs !== null) ages.add(nowMs, ageMs);
 }
 
 /** Set the face to a share of what is wanted, and else to rest; return whether it changed. */
@@ -212,14 +225,24 @@ function showState() {
   wasLive ||= isLive;
   const isInterrupted =
     microphoneState === "interrupted" || (wasLive && session !== null && session === ownSession);
+  delays.forget(nowMs);
+  frameDelays.forget(nowMs);
   const delayMs = delays.percentile(0.5);
   element("status").dataset.state = stateKind({ connected, isLive });
   setText(element("state"), stateText({ connected, isLive, isInterrupted }));
   setText(element("delay"), connected && isLive ? delayText(delayMs) : "");
+  showDrawing();
   element("status").title = session === null ? "" : `session ${session}`;
   const isMicrophoneInterrupted = microphoneState === "interrupted";
   notice.hint(hint({ connected, wasConnected, isRefused, isMicrophoneInterrupted, missing }));
   element("meter").setAttribute("aria-valuenow", Math.round(shownDb));
+}
+
+function showDrawing() {
+  if (head === null) return;
+  const text = drawingText(head.drawing);
+  element("head").title = text;
+  setText(element("drawing"), text);
 }
 
 function showError(error) {
@@ -417,7 +440,7 @@ async function loadHead(name) {
     await loading.load(file);
     head = loading;
     head.pose(faps);
-    head.draw(performance.now()); // the first time takes long, which says nothing about the stream
+    head.draw(performance.now(), () => {}); // the first time takes long: nothing is measured
     playout.reset();
   } catch (error) {
     const { message } = error;

@@ -27,21 +27,23 @@ varying vec2 vUv;
 varying vec3 vLight;
 varying float vHigh;
 varying vec3 vNormal;
-#include <common>
-#include <skinning_pars_vertex>
+#ifdef USE_SKINNING
+  uniform mat4 turn;
+#endif
 
 const vec3 KEY = vec3(-0.4067, 0.4842, 0.7747);
 const vec3 FILL = vec3(0.7767, 0.1036, 0.6213);
 const vec3 RIM = vec3(0.5518, 0.4515, -0.7023);
 
 void main() {
-  #include <beginnormal_vertex>
-  #include <begin_vertex>
-  #include <skinbase_vertex>
-  #include <skinnormal_vertex>
-  #include <skinning_vertex>
-  vec4 place = modelMatrix * vec4(transformed, 1.0);
-  vec3 n = normalize(mat3(modelMatrix) * objectNormal);
+  vec3 turned = position;
+  vec3 n = normal;
+  #ifdef USE_SKINNING // the neck follows the head by a share, and the shoulders do not
+    turned = mix(position, (turn * vec4(position, 1.0)).xyz, skinWeight.y);
+    n = mix(normal, mat3(turn) * normal, skinWeight.y);
+  #endif
+  vec4 place = modelMatrix * vec4(turned, 1.0);
+  n = normalize(mat3(modelMatrix) * n);
   vec3 v = normalize(cameraPosition - place.xyz);
   float facing = dot(n, v);
   #ifdef TWO_SIDED
@@ -71,6 +73,7 @@ varying vec3 vNormal;
 
 void main() {
   vec4 texel = texture2D(map, vUv);
+  texel.rgb *= texel.rgb; // close to sRGB, as the root below
   vec3 lit = vLight;
   float high = vHigh;
   #ifdef CEL
@@ -85,8 +88,13 @@ void main() {
   gl_FragColor = vec4(sqrt(min(texel.rgb * lit + high, 1.0)), texel.a);
 }`;
 
-/** The driver's shading for a part; `gltf` is its material in the file. */
-export function plainMaterial(name, gltf, cel) {
+/**
+ * The driver's shading for a part; `gltf` is its material in the file, `head` the node that the skin
+ * turns with. Textures are read as cheaply as the processor can.
+ */
+export function plainMaterial(name, gltf, head, cel) {
+  gltf.map.colorSpace = THREE.NoColorSpace;
+  gltf.map.minFilter = THREE.LinearMipmapNearestFilter;
   const { wrap, gloss, shine } = gltf.userData.kouxing ?? UNKNOWN;
   const defines = {};
   if (cel && !EYES.includes(name)) defines.CEL = 1;
@@ -100,6 +108,7 @@ export function plainMaterial(name, gltf, cel) {
       gloss: { value: gloss },
       shine: { value: shine },
       share: { value: 1 },
+      turn: { value: head.matrixWorld },
     },
     vertexShader: PLAIN_VERTEX,
     fragmentShader: PLAIN_FRAGMENT,

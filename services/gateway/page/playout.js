@@ -6,7 +6,11 @@ import { Recent } from "./recent.js";
 export const SAMPLES_PER_MS = 16;
 const FRAME_MS = 20; // between two FAP frames: a face between them needs both
 const FIRST_DELAY_MS = 120; // before anything has been measured
-const DEAD_ZONE_MS = 30;
+// The arrival that is waited for, of a hundred, the frames that a face between them needs, and the
+// error that is left alone: where sound is heard, which must never run dry or be heard to leap; and
+// where it is not, and a face that is a frame too old is seen by nobody.
+const HEARD = { percentile: 0.95, marginMs: FRAME_MS, deadZoneMs: 30 };
+const MUTE = { percentile: 0.8, marginMs: 0, deadZoneMs: 5 };
 const ADJUST_EVERY_MS = 500;
 const WINDOW_MS = 10000; // that the percentiles are taken over: a single hiccup must not count
 const ENOUGH = 20; // frames before the percentile is believed
@@ -20,15 +24,18 @@ const MAX_FRAMES = 1000;
  *
  * Media time m is shown at m + offset on the page's clock. Sound reaches us as soon as it was
  * heard, its FAP frame some 60 to 100 ms later, so sound has to wait: the target of the offset is
- * the 95th percentile of (frame arrival - media time) plus one FAP frame. The difference
- * between the page's clock and the sender's is in every lateness alike and drops out.
+ * the 95th percentile of (frame arrival - media time), plus one FAP frame, plus the time that a
+ * picture takes. The difference between the page's clock and the sender's is in every lateness alike
+ * and drops out. Without sound, as for one's own voice, the face waits less.
  *
  * The network's and the clocks' drift moves the target. Every half second, if the offset is off by
  * more than the dead zone (30 ms, unnoticeable: ITU-R BT.1359 puts detectability at 45 and 125 ms),
  * half of the error is corrected, so that one bad second is not answered by a leap.
  */
 export class Playout {
+  isHeard = true;
   outputLatencyMs = 0; // from the audio thread to the loudspeaker; sound must leave so much earlier
+  pictureMs = 0; // from a face to its picture; it must be drawn so much earlier
   #offsetMs = null;
   #begunMs = 0; // when the first offset was set
   #adjustedMs = 0;
@@ -58,7 +65,7 @@ export class Playout {
     return this.#offsetMs - this.soundEnds.percentile(0.05);
   }
 
-  /** Media time that is due now, samples; null before anything arrived. */
+  /** Media time that is due at a time, samples; null before anything arrived. */
   mediaAt(nowMs) {
     return this.#offsetMs === null ? null : (nowMs - this.#offsetMs) * SAMPLES_PER_MS;
   }
@@ -90,15 +97,15 @@ export class Playout {
       this.reset(); // what was held up on the way has come, and the stream is live again
       return false;
     }
-    const frameMs = this.frames.percentile(0.95);
-    let latestMs = frameMs;
-    if (this.soundStarts.count) {
+    const { percentile, marginMs, deadZoneMs } = this.isHeard ? HEARD : MUTE;
+    let latestMs = this.frames.percentile(percentile) + this.pictureMs;
+    if (this.isHeard && this.soundStarts.count) {
       // A long chunk of sound is as late as its first sample.
-      const soundMs = this.soundStarts.percentile(0.95) + this.outputLatencyMs;
-      latestMs = Math.max(frameMs, soundMs);
+      const soundMs = this.soundStarts.percentile(percentile) + this.outputLatencyMs;
+      latestMs = Math.max(latestMs, soundMs);
     }
-    const errorMs = latestMs + FRAME_MS - this.#offsetMs;
-    if (Math.abs(errorMs) <= DEAD_ZONE_MS) return false;
+    const errorMs = latestMs + marginMs - this.#offsetMs;
+    if (Math.abs(errorMs) <= deadZoneMs) return false;
     this.#offsetMs += errorMs / 2;
     return true;
   }

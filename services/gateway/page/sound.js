@@ -22,10 +22,11 @@ export class Sound {
   /** "off", "blocked" (the browser wants a gesture first) or "on". */
   get state() {
     if (!this.wanted) return "off";
-    return this.#isRunning ? "on" : "blocked";
+    return this.isPlaying ? "on" : "blocked";
   }
 
-  get #isRunning() {
+  /** Whether sound is played, to be heard or to be recorded. */
+  get isPlaying() {
     return this.#node !== null && this.#context.state === "running";
   }
 
@@ -84,24 +85,24 @@ export class Sound {
 
   /** Queue sound, int16, to be played when media time gets there. */
   push(mediaTime, samples) {
-    if (this.#isRunning) this.#node.port.postMessage({ mediaTime, samples });
+    if (this.isPlaying) this.#node.port.postMessage({ mediaTime, samples });
   }
 
   get outputLatencyMs() {
-    if (!this.#isRunning) return 0;
+    if (!this.isPlaying) return 0;
     return 1000 * (this.#context.outputLatency || this.#context.baseLatency || 0);
   }
 
   /** Play such that media time m is heard at m + offset on the page's clock. */
   align(nowMs, offsetMs) {
-    if (!this.#isRunning) return;
+    if (!this.isPlaying) return;
     this.#anchor = Math.round((nowMs - offsetMs) * SAMPLES_PER_MS - this.#heardFrame(nowMs));
     this.#node.port.postMessage({ anchor: this.#anchor });
   }
 
   /** The offset at which sound is really heard now; null while none is aligned. */
   offsetMs(nowMs) {
-    if (!this.#isRunning || this.#anchor === null) return null;
+    if (!this.isPlaying || this.#anchor === null) return null;
     return nowMs - (this.#heardFrame(nowMs) + this.#anchor) / SAMPLES_PER_MS;
   }
 

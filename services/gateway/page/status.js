@@ -20,6 +20,16 @@ export function delayText(delayMs) {
   return delayMs === null ? "" : `${Math.round(delayMs / 10) * 10} ms`;
 }
 
+/** Return the words for how the head is drawn (Head.drawing); "" if as well as it can be. */
+export function drawingText({ isCoarse, width, height }) {
+  if (!isCoarse) return "";
+  const size = `${width} × ${height}`;
+  return say({
+    en: `Drawn without a graphics card, so with fewer triangles and pixels: ${size}`,
+    zh: `没有显卡，画面已简化：${size} 像素`,
+  });
+}
+
 /**
  * Return what does not work and what happens next; "" if all is well. isRefused: it never connected,
  * though the gateway served this page.

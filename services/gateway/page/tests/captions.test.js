@@ -3,7 +3,7 @@ import test from "node:test";
 import { LevelMeter, rms, SILENT_DB } from "../level.js";
 import { PhoneTrack } from "../phones.js";
 import { Presence } from "../presence.js";
-import { delayText, hint, stateKind, stateText } from "../status.js";
+import { delayText, drawingText, hint, stateKind, stateText } from "../status.js";
 
 function track(...symbols) {
   const phones = new PhoneTrack();
@@ -134,4 +134,10 @@ test("what does not work is named with what happens next", () => {
     /recognizer and the synthesizer do not run.*kouxing recognizer; kouxing synthesizer/,
   );
   assert.match(hint({ ...well, isMicrophoneInterrupted: true }), /microphone was interrupted/);
+});
+
+test("it says how coarsely it draws", () => {
+  const drawing = { isCoarse: true, width: 550, height: 400 };
+  assert.match(drawingText(drawing), /without a graphics card.*550 × 400/);
+  assert.equal(drawingText({ ...drawing, isCoarse: false }), "");
 });

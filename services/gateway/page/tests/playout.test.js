@@ -97,3 +97,17 @@ test("a frame of the same media time replaces the last, an older one is left out
   track.sample(320, out);
   assert.equal(out[0], 2);
 });
+
+test("a face without sound waits for most frames and no more", () => {
+  const playout = new Playout();
+  playout.isHeard = false;
+  stream(playout, { forMs: 20000, frameMs: 180 });
+  assert.ok(Math.abs(playout.delayMs - 180) <= 5, `${playout.delayMs}`);
+});
+
+test("what takes long to draw is drawn earlier", () => {
+  const playout = new Playout();
+  playout.pictureMs = 60;
+  stream(playout, { forMs: 20000, frameMs: 180 });
+  assert.ok(Math.abs(playout.delayMs - 260) <= 30, `${playout.delayMs}`);
+});

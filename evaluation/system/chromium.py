@@ -1,0 +1,196 @@
+"""A headless Chromium with one page, driven by the Chrome DevTools Protocol."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+
+from shared.errors import UserError
+
+_PATIENCE_S = 60.0
+
+
+def is_installed() -> bool:
+    """Say whether there is a Chromium."""
+    return _program() is not None
+
+
+class Chromium:
+    """A headless Chromium with one page, which the processor draws.
+
+    Parameters
+    ----------
+    folder
+        For its profile.
+    size_px
+        Of the page.
+    microphone
+        WAV file that is heard again and again.
+    camera
+        MJPEG file that is seen again and again, 30 pictures a second.
+
+    Raises
+    ------
+    UserError
+        If no Chromium is installed.
+    """
+
+    def __init__(
+        self, folder: Path, size_px: tuple[int, int], microphone: Path, camera: Path | None = None
+    ) -> None:
+        program = _program()
+        if program is None:
+            raise UserError("no Chromium is installed")
+        self._process = subprocess.Popen(  # noqa: S603 - found on the path
+            [
+                program,
+                *("--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle"),
+                *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic"),
+                *("--no-first-run", "--disable-background-networking", "--disable-sync"),
+                *(
+                    "--disable-component-update",
+                    "--autoplay-policy=document-user-activation-required",
+                ),
+                *("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"),
+                f"--use-file-for-fake-audio-capture={microphone}",
+                *([f"--use-file-for-fake-video-capture={camera}"] if camera else []),
+                f"--window-size={size_px[0]},{size_px[1]}",
+                f"--user-data-dir={folder}",
+                "--remote-debugging-port=0",
+                "about:blank",
+            ],
+            stderr=subprocess.DEVNULL,
+        )
+        self._loop = asyncio.new_event_loop()
+        self._num_sent = 0
+        self.complaints: list[str] = []
+        port_file = folder / "DevToolsActivePort"
+        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _PATIENCE_S)
+        self._port = int(port_file.read_text().split()[0])
+        self._loop.run_until_complete(self._connect())
+        self.command("Runtime.enable")
+        self.command("Log.enable")
+        self.resize(*size_px)
+
+    async def _connect(self) -> None:
+        self._http = aiohttp.ClientSession()
+        async with self._http.get(f"http://127.0.0.1:{self._port}/json/list") as answer:
+            targets = await answer.json()
+        url = next(target for target in targets if target["type"] == "page")["webSocketDebuggerUrl"]
+        self._socket = await self._http.ws_connect(url, max_msg_size=0)
+
+    def close(self) -> None:
+        """End the program."""
+
+        async def close() -> None:
+            await self._socket.close()
+            await self._http.close()
+
+        self._loop.run_until_complete(close())
+        self._loop.close()
+        self._process.terminate()
+        self._process.wait(_PATIENCE_S)
+
+    def command(self, method: str, **parameters: object) -> dict[str, Any]:
+        """Run a command of the protocol."""
+        return self._loop.run_until_complete(self._command(method, parameters))
+
+    async def _command(self, method: str, parameters: dict[str, object]) -> dict[str, Any]:
+        self._num_sent += 1
+        message = {"id": self._num_sent, "method": method, "params": parameters}
+        await self._socket.send_json(message)
+        while True:
+            answer = await self._socket.receive_json(timeout=_PATIENCE_S)
+            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.complaints.append(json.dumps(answer["params"]))
+            if answer.get("id") == self._num_sent:
+                if "error" in answer:
+                    raise RuntimeError(answer["error"])
+                result: dict[str, Any] = answer["result"]
+                return result
+
+    def resize(self, width_px: int, height_px: int, *, mobile: bool = False) -> None:
+        """Give the window another size, as a phone's if ``mobile``."""
+        self.command(
+            "Emulation.setDeviceMetricsOverride",
+            width=width_px,
+            height=height_px,
+            deviceScaleFactor=1,
+            mobile=mobile,
+        )
+
+    def cpu_s(self) -> float:
+        """Return the processor time of the process that draws, s."""
+        return self._loop.run_until_complete(self._cpu_s())
+
+    async def _cpu_s(self) -> float:
+        async with self._http.get(f"http://127.0.0.1:{self._port}/json/version") as answer:
+            url = (await answer.json())["webSocketDebuggerUrl"]
+        async with self._http.ws_connect(url) as socket:
+            await socket.send_json({"id": 1, "method": "SystemInfo.getProcessInfo"})
+            processes = (await socket.receive_json())["result"]["processInfo"]
+        return float(sum(each["cpuTime"] for each in processes if each["type"] == "GPU"))
+
+    def evaluate(self, script: str) -> Any:
+        """Return the value of an expression of the page."""
+        result = self.command(
+            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
+        )
+        if "exceptionDetails" in result:
+            raise RuntimeError(result["exceptionDetails"])
+        return result["result"].get("value")
+
+    def click(self, name: str) -> None:
+        """Click on an element as a person does, which lets the page play sound."""
+        x, y = self.evaluate(
+            f"(() => {{ const box = document.getElementById('{name}').getBoundingClientRect();"
+            "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+        )
+        for event in ("mousePressed", "mouseReleased"):
+            self.command(
+                "Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", clickCount=1
+            )
+
+    def wait_for(self, condition: str, limit_s: float = _PATIENCE_S) -> None:
+        """Wait until an expression becomes true."""
+
+        def holds() -> bool:
+            try:
+                return bool(self.evaluate(condition))
+            except RuntimeError as error:
+                if "navigated" in str(error):  # another page is just taking its place
+                    return False
+                raise
+
+        try:
+            wait_until(holds, limit_s)
+        except TimeoutError:
+            state = self.evaluate("JSON.stringify(window.kouxing?.state)")
+            raise TimeoutError(f"{condition}; state {state}; {self.complaints}") from None
+
+
+def wait_until(condition: Callable[[], object], limit_s: float) -> None:
+    """Wait until a condition holds.
+
+    Raises
+    ------
+    TimeoutError
+        If it does not in time.
+    """
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        if time.monotonic() > end_s:
+            raise TimeoutError
+        time.sleep(0.03)
+
+
+def _program() -> str | None:
+    return shutil.which("chromium") or shutil.which("google-chrome")

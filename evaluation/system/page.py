@@ -1,0 +1,130 @@
+"""How the page draws, and its delay from the voice to the picture, in a headless Chromium.
+
+The services run as under ``kouxing run``, on ports of their own; the processor draws, with
+SwiftShader. First the face only idles, then a microphone hears a recording again and again. The
+page measures itself (``window.kouxing.state``): the delay ends with the display's tick after a
+picture is drawn.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+import wave
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from evaluation.system.chromium import Chromium
+from services.cli.supervisor import Supervisor
+from services.kinds import free_addresses
+from shared.audio_file import read_audio
+from shared.errors import UserError
+
+SIZE_PX = (1100, 800)
+_SETTLE_S = 12.0  # until the page has found how finely it can draw, and for how long to wait
+_MEASURE_S = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """Figures of one run, ready for a table or JSON."""
+
+    pictures_per_s: float
+    size_px: tuple[int, int]  # that is drawn, for a page of SIZE_PX
+    picture_ms: float  # from its begin to its end
+    picture_cpu_ms: float  # of all cores, with putting it on the screen
+    voice_to_frame_ms: float | None  # until the frame is in the page; None: nobody spoke
+    voice_to_picture_ms: float | None
+    load: float  # average of this machine's processes that run, over a minute
+
+
+def measure(path: Path, console: Console) -> dict[str, Drawing]:
+    """Start the services and a browser; return the figures, idling and speaking.
+
+    Raises
+    ------
+    UserError
+        If the file is no audio, the services cannot start, or no Chromium is installed.
+    """
+    samples, rate_hz = read_audio(path)
+    environment = {
+        **free_addresses(),
+        "KOUXING_DRIVER_VIEW": "none",
+        "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
+    }
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with wave.open(str(folder / "voice.wav"), "wb") as voice:
+            voice.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
+            voice.writeframes((samples * 32767).astype("<i2").tobytes())
+        supervisor = Supervisor([], folder, console, environment)
+        try:
+            supervisor.start()
+            supervisor.wait_ready(environment["KOUXING_CONTROL"])
+            browser = Chromium(folder / "profile", SIZE_PX, folder / "voice.wav")
+            try:
+                return _measure(browser, f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/")
+            except TimeoutError as error:
+                raise UserError(f"the page did not get there: {error}") from None
+            finally:
+                browser.close()
+        finally:
+            supervisor.stop()
+
+
+def show(drawings: dict[str, Drawing], console: Console) -> None:
+    """Print the figures as a table."""
+    columns = ("pictures per s", "size", "ms", "CPU ms", "voice to frame", "to picture", "load")
+    table = Table("page of {} x {}".format(*SIZE_PX), *columns)
+    for name, drawing in drawings.items():
+        delays = (drawing.voice_to_frame_ms, drawing.voice_to_picture_ms)
+        table.add_row(
+            name,
+            f"{drawing.pictures_per_s:.1f}",
+            "{} x {}".format(*drawing.size_px),
+            f"{drawing.picture_ms:.0f}",
+            f"{drawing.picture_cpu_ms:.0f}",
+            *("" if delay is None else f"{delay:.0f} ms" for delay in delays),
+            f"{drawing.load:.1f}",
+        )
+    console.print(table)
+
+
+def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:
+    browser.command("Page.navigate", url=url)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    idle = _drawing(browser)
+    browser.click("microphone")
+    browser.wait_for("window.kouxing.state.voiceToPictureMs !== null")
+    return {"idle": idle, "microphone": _drawing(browser)}
+
+
+def _drawing(browser: Chromium) -> Drawing:
+    time.sleep(_SETTLE_S)
+    begin_s, begin_cpu_s = time.monotonic(), browser.cpu_s()
+    states = [browser.evaluate("window.kouxing.state")]
+    while time.monotonic() < begin_s + _MEASURE_S:
+        time.sleep(1.0)
+        states.append(browser.evaluate("window.kouxing.state"))
+    took_s, cpu_s = time.monotonic() - begin_s, browser.cpu_s() - begin_cpu_s
+    drawn = [state["drawing"] for state in states]
+    num_pictures = drawn[-1]["numPictures"] - drawn[0]["numPictures"]
+
+    def median(key: str) -> float | None:
+        known = [state[key] for state in states if state[key] is not None]
+        return float(np.median(known)) if known else None
+
+    return Drawing(
+        pictures_per_s=num_pictures / took_s,
+        size_px=(drawn[-1]["width"], drawn[-1]["height"]),
+        picture_ms=float(np.median([each["pictureMs"] for each in drawn])),
+        picture_cpu_ms=1e3 * cpu_s / max(1, num_pictures),
+        voice_to_frame_ms=median("voiceToFrameMs"),
+        voice_to_picture_ms=median("voiceToPictureMs"),
+        load=os.getloadavg()[0],
+    )
