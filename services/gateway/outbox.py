@@ -16,6 +16,7 @@ class Kind(Enum):
 
     TEXT = "text"
     FRAME = "frame"
+    REST = "rest"  # the face while no session moves it
     SOUND = "sound"
 
 
@@ -46,7 +47,12 @@ class Outbox:
         # Sound that is seconds late is of no use, and with it the frames that belong to it. Text
         # (which session this is, errors) keeps its order among the frames that remain.
         num_before = len(self._waiting)
-        room = {Kind.SOUND: 0, Kind.FRAME: NUM_FRAMES_KEPT, Kind.TEXT: NUM_TEXTS_KEPT}
+        room = {
+            Kind.SOUND: 0,
+            Kind.FRAME: NUM_FRAMES_KEPT,
+            Kind.REST: 1,
+            Kind.TEXT: NUM_TEXTS_KEPT,
+        }
         kept: deque[tuple[Kind, str | bytes]] = deque()
         for kind, message in reversed(self._waiting):
             if room[kind] > 0:

@@ -134,7 +134,7 @@ class Viewers:
         """Send every viewer the face at rest, which is seen while no session moves it."""
         message = wire.binary(wire.REST_TYPE, 0, 0, faps)
         for viewer in self._viewers:
-            self._put(viewer, Kind.FRAME, message)
+            self._put(viewer, Kind.REST, message)
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one viewer until it leaves."""

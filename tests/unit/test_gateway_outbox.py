@@ -44,6 +44,18 @@ def test_a_slow_viewer_gets_the_newest_frames_and_all_recent_text() -> None:
     assert num_dropped == MAX_WAITING - NUM_FRAMES_KEPT
 
 
+def test_faces_at_rest_take_no_room_from_those_of_a_session() -> None:
+    outbox = Outbox()
+    for number in range(MAX_WAITING // 2):
+        outbox.put(Kind.FRAME, b"frame %d" % number)
+        outbox.put(Kind.REST, b"rest %d" % number)
+    outbox.put(Kind.TEXT, "one too many")
+
+    newest = range(MAX_WAITING // 2 - NUM_FRAMES_KEPT, MAX_WAITING // 2)
+    frames = [b"frame %d" % number for number in newest]
+    assert drain(outbox) == [*frames, b"rest %d" % newest[-1], "one too many"]
+
+
 def test_it_never_grows_without_bound() -> None:
     outbox = Outbox()
     for number in range(10 * MAX_WAITING):
