@@ -91,6 +91,18 @@ def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 
 @pytest.fixture(scope="module")
+def page(browser: Browser, gateway: Gateway) -> Browser:
+    """The browser once it shows the page."""
+    load(browser, gateway)
+    return browser
+
+
+def load(browser: Browser, gateway: Gateway) -> None:
+    browser.command("Page.navigate", url=gateway.page)
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+
+
+@pytest.fixture(scope="module")
 def session(system: System, gateway: Gateway) -> Iterator[Session]:
     with Client(system.address) as client:
         wait_until(lambda: len(client.status().services) == 4, 60)
@@ -104,43 +116,45 @@ def colour(image: NDArray[np.uint8]) -> NDArray[np.int_]:
     return spread
 
 
+def show_controls(page: Browser, share: int) -> None:
+    page.evaluate(
+        "for (const part of document.querySelectorAll('header, footer'))"
+        f" part.style.opacity = {share}"
+    )
+
+
 def teeth(image: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return where an image is bright and has no colour, unlike skin and lips."""
     found: NDArray[np.bool_] = (colour(image) < 35) & (image.mean(axis=2) > 100)
     return found
 
 
-def test_the_face_lives_before_any_session(gateway: Gateway, browser: Browser) -> None:
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    state = browser.evaluate("window.kouxing.state")
+def test_the_face_lives_before_any_session(page: Browser) -> None:
+    state = page.evaluate("window.kouxing.state")
     assert state["session"] is None
     pitch = state["faps"][FAP_NUMBER["head_pitch"] - 1]
-    browser.wait_for(f"Math.abs(window.kouxing.state.faps[47] - {pitch}) > 50")
-    browser.wait_for("window.kouxing.state.faps[18] > 300", 60)  # a blink
-    assert browser.evaluate("window.kouxing.state.faps[2]") == 0
+    page.wait_for(f"Math.abs(window.kouxing.state.faps[47] - {pitch}) > 50")
+    page.wait_for("window.kouxing.state.faps[18] > 300", 60)  # a blink
+    assert page.evaluate("window.kouxing.state.faps[2]") == 0
 
 
 def test_the_mouth_on_the_screen_follows_the_faps(
-    system: System, session: Session, browser: Browser, gateway: Gateway
+    system: System, session: Session, page: Browser
 ) -> None:
     system.talk(session.name, B_FACE, "b")
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    browser.evaluate(
-        "for (const name of ['header', 'footer']) document.querySelector(name).style.opacity = 0"
-    )
+    show_controls(page, 0)
     state = "window.kouxing.state"
     show = f"Math.abs({state}.faps[2] - {{}}) < 1 && {state}.caption === '{{}}'"
 
-    browser.wait_for(show.format(0, "b"))
-    closed = browser.steady_image()
+    page.wait_for(show.format(0, "b"))
+    closed = page.steady_image()
     system.talk(session.name, A_FACE, "a")
-    browser.wait_for(show.format(450, "a"))
-    opened = browser.steady_image()
+    page.wait_for(show.format(450, "a"))
+    opened = page.steady_image()
     system.talk(session.name, B_FACE, "b")
-    browser.wait_for(show.format(0, "b"))
-    closed_again = browser.steady_image()
+    page.wait_for(show.format(0, "b"))
+    closed_again = page.steady_image()
+    show_controls(page, 1)
 
     # The page may draw the second picture at another resolution: then the edges of the hair change
     # too, so only the lower middle of the face counts.
@@ -158,50 +172,47 @@ def test_the_mouth_on_the_screen_follows_the_faps(
     assert teeth(closed)[mouth].mean() < 0.02
     assert teeth(closed_again)[mouth].mean() < 0.02
     wrong = ('"level": "error"', "exceptionDetails")
-    assert not [text for text in browser.complaints if any(mark in text for mark in wrong)]
+    assert not [text for text in page.complaints if any(mark in text for mark in wrong)]
 
 
 @pytest.mark.parametrize("size", [(320, 568), (844, 390)], ids=["upright", "on its side"])
 def test_nothing_covers_the_mouth_on_a_phone(
-    system: System, session: Session, browser: Browser, gateway: Gateway, size: tuple[int, int]
+    system: System, session: Session, page: Browser, gateway: Gateway, size: tuple[int, int]
 ) -> None:
     width, height = size
-    browser.resize(width, height, mobile=True)
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    browser.evaluate(
-        "for (const name of ['header', 'footer']) document.querySelector(name).style.opacity = 0"
-    )
+    page.resize(width, height, mobile=True)
+    load(page, gateway)
+    show_controls(page, 0)
     pictures = []
     for shown, jaw in ((B_FACE, 0), (A_FACE, 450)):
         system.talk(session.name, shown, "a")
-        browser.wait_for(f"Math.abs(window.kouxing.state.faps[2] - {jaw}) < 1")
-        pictures.append(browser.steady_image()[:, width // 3 : -width // 3])
+        page.wait_for(f"Math.abs(window.kouxing.state.faps[2] - {jaw}) < 1")
+        pictures.append(page.steady_image()[:, width // 3 : -width // 3])
     closed, opened = pictures
-    caption_top = browser.evaluate("document.getElementById('caption').getBoundingClientRect().top")
+    show_controls(page, 1)
+    caption_top = page.evaluate("document.getElementById('caption').getBoundingClientRect().top")
     rows, _ = np.nonzero(teeth(opened) & (colour(closed) > 50))
-    browser.resize(*SIZE_PX)
+    page.resize(*SIZE_PX)
     assert len(rows) > 20
     assert np.percentile(rows, 90) < caption_top
 
 
 def test_the_caption_shows_syllables_and_phones_on_request(
-    system: System, session: Session, browser: Browser, gateway: Gateway
+    system: System, session: Session, page: Browser
 ) -> None:
     system.talk(session.name, A_FACE, "iao")
-    browser.command("Page.navigate", url=gateway.page)
     for caption in ("yao", "iao"):
-        browser.wait_for(f"window.kouxing?.state.caption === '{caption}'")
-        browser.evaluate("document.getElementById('show-phones').click()")
+        page.wait_for(f"window.kouxing?.state.caption === '{caption}'")
+        page.evaluate("document.getElementById('show-phones').click()")
 
 
-def simulate(browser: Browser, script: str) -> Any:
+def simulate(page: Browser, script: str) -> Any:
     """Run the page's playout rule on arrivals of the test's own making.
 
     ``frames(from, to, lateness)`` lets a frame arrive every 20 ms with the lateness given by a
     function of time, and sound as soon as it was said; ``pause`` is silence of the sender.
     """
-    return browser.evaluate(
+    return page.evaluate(
         """(async () => {
           const { Playout, FapTrack } = await import("/playout.js");
           const playout = new Playout();
@@ -221,9 +232,9 @@ def simulate(browser: Browser, script: str) -> Any:
     )
 
 
-def test_the_delay_follows_the_frames_by_halves_outside_a_dead_zone(browser: Browser) -> None:
+def test_the_delay_follows_the_frames_by_halves_outside_a_dead_zone(page: Browser) -> None:
     first, changes_first, near, changes_near, far, later = simulate(
-        browser,
+        page,
         """
         const first = frames(200, () => 100), changesFirst = numChanges;
         const near = frames(1000, () => 125), changesNear = numChanges;
@@ -238,9 +249,9 @@ def test_the_delay_follows_the_frames_by_halves_outside_a_dead_zone(browser: Bro
     assert later == pytest.approx(260, abs=30)
 
 
-def test_a_pause_of_the_sender_is_no_delay(browser: Browser) -> None:
+def test_a_pause_of_the_sender_is_no_delay(page: Browser) -> None:
     before, after, media_late = simulate(
-        browser,
+        page,
         """
         const before = frames(200, () => 100);
         now += 5000;
@@ -253,9 +264,9 @@ def test_a_pause_of_the_sender_is_no_delay(browser: Browser) -> None:
     assert media_late == pytest.approx(120 * 16)
 
 
-def test_a_burst_after_a_stalled_network_does_not_leave_a_lasting_delay(browser: Browser) -> None:
+def test_a_burst_after_a_stalled_network_does_not_leave_a_lasting_delay(page: Browser) -> None:
     delay = simulate(
-        browser,
+        page,
         """
         frames(200, () => 100);
         now += 1000;
@@ -267,9 +278,9 @@ def test_a_burst_after_a_stalled_network_does_not_leave_a_lasting_delay(browser:
     assert delay == pytest.approx(120, abs=30)
 
 
-def test_faces_between_two_frames_are_interpolated_by_media_time(browser: Browser) -> None:
+def test_faces_between_two_frames_are_interpolated_by_media_time(page: Browser) -> None:
     assert simulate(
-        browser,
+        page,
         """
         const track = new FapTrack(), out = new Float32Array(1);
         const at = (time) => (track.sample(time, out), out[0]);
@@ -283,19 +294,19 @@ def test_faces_between_two_frames_are_interpolated_by_media_time(browser: Browse
 
 
 def test_sound_waits_for_a_click_where_the_browser_wants_one_and_then_meets_its_picture(
-    system: System, session: Session, browser: Browser
+    system: System, session: Session, page: Browser
 ) -> None:
     system.talk(session.name, A_FACE, "a")
-    browser.wait_for("window.kouxing.state.sound === 'blocked'")
-    browser.wait_for("window.kouxing.state.faps[2] > 440")  # the face does not wait
-    assert "Turn on sound" in browser.evaluate("document.getElementById('sound').textContent")
-    browser.click("sound")
-    browser.wait_for("window.kouxing.state.sound === 'on'")
-    played = browser.evaluate("window.kouxing.state.soundSamplesPlayed")
-    browser.wait_for(f"window.kouxing.state.soundSamplesPlayed > {played + 16000}")
+    page.wait_for("window.kouxing.state.sound === 'blocked'")
+    page.wait_for("window.kouxing.state.faps[2] > 440")  # the face does not wait
+    assert "Turn on sound" in page.evaluate("document.getElementById('sound').textContent")
+    page.click("sound")
+    page.wait_for("window.kouxing.state.sound === 'on'")
+    played = page.evaluate("window.kouxing.state.soundSamplesPlayed")
+    page.wait_for(f"window.kouxing.state.soundSamplesPlayed > {played + 16000}")
 
     def is_in_sync() -> bool:
-        state = browser.evaluate("window.kouxing.state")
+        state = page.evaluate("window.kouxing.state")
         delay_ms, sound_ms = state["playoutDelayMs"], state["soundMinusPictureMs"]
         if delay_ms is None or sound_ms is None:  # the sound waits for more
             return False
@@ -306,29 +317,31 @@ def test_sound_waits_for_a_click_where_the_browser_wants_one_and_then_meets_its_
 
 
 def test_the_face_goes_to_rest_when_the_stream_stalls_and_comes_back(
-    system: System, session: Session, browser: Browser
+    system: System, session: Session, page: Browser
 ) -> None:
     system.talk(session.name, A_FACE, "a")
-    browser.wait_for("window.kouxing.state.faps[2] > 440")
+    page.wait_for("window.kouxing.state.faps[2] > 440")
     system.shown = None
-    browser.wait_for("Math.abs(window.kouxing.state.faps[2]) < 1")
+    page.wait_for("Math.abs(window.kouxing.state.faps[2]) < 1")
     system.shown = A_FACE
-    browser.wait_for("window.kouxing.state.faps[2] > 440")
+    page.wait_for("window.kouxing.state.faps[2] > 440")
 
 
-def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser) -> None:
+def test_the_microphone_reaches_the_recognizer(
+    system: System, session: Session, page: Browser
+) -> None:
     system.shown = None
     recognizer = system.recognizer
     assert recognizer is not None
-    browser.click("microphone")
-    browser.wait_for("window.kouxing.state.microphone")
+    page.click("microphone")
+    page.wait_for("window.kouxing.state.microphone")
     (name,) = set(recognizer.starts) - {"seen"}
     wait_until(lambda: len(recognizer.pcm.get(name, b"")) > 2 * 48000, 60)
-    browser.wait_for(f"window.kouxing.state.session === '{name}'")
-    assert browser.evaluate("window.kouxing.state.sound") == "off"  # one's own voice
-    browser.click("microphone")
+    page.wait_for(f"window.kouxing.state.session === '{name}'")
+    assert page.evaluate("window.kouxing.state.sound") == "off"  # one's own voice
+    page.click("microphone")
     wait_until(lambda: name in recognizer.finished, 60)
-    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
 
     start = recognizer.starts[name]
     assert (start.sample_rate_hz, start.num_channels, start.encoding) in (
@@ -340,75 +353,73 @@ def test_the_microphone_reaches_the_recognizer(system: System, browser: Browser)
 
 
 def test_a_microphone_turned_off_while_it_starts_stays_off(
-    system: System, browser: Browser
+    system: System, session: Session, page: Browser
 ) -> None:
     recognizer = system.recognizer
     assert recognizer is not None
     before = set(recognizer.starts)
-    browser.complaints.clear()
-    browser.evaluate("for (let i = 0; i < 3; i++) document.getElementById('microphone').click()")
-    browser.wait_for("window.kouxing.state.microphone")
+    page.complaints.clear()
+    page.evaluate("for (let i = 0; i < 3; i++) document.getElementById('microphone').click()")
+    page.wait_for("window.kouxing.state.microphone")
     (name,) = set(recognizer.starts) - before
-    browser.click("microphone")
+    page.click("microphone")
     wait_until(lambda: name in recognizer.finished, 60)
-    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
-    assert not [text for text in browser.complaints if "exceptionDetails" in text]
+    page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    assert not [text for text in page.complaints if "exceptionDetails" in text]
 
 
-def choose(browser: Browser, name: str, value: object) -> None:
+def choose(page: Browser, name: str, value: object) -> None:
     """Choose in the panel, as its list or slider does."""
-    browser.evaluate(
+    page.evaluate(
         f"(() => {{ const input = document.getElementById('{name}'); input.value = '{value}';"
         "input.dispatchEvent(new Event('input')); })()"
     )
 
 
 def test_what_is_chosen_counts_at_once_and_for_sessions_to_come(
-    system: System, browser: Browser, gateway: Gateway
+    system: System, session: Session, page: Browser, gateway: Gateway
 ) -> None:
     chosen, amounts = system.synthesizer.chosen, system.synthesizer.amounts
     chosen.clear()
-    browser.click("microphone")
-    browser.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips")
-    assert browser.evaluate("window.kouxing.state.lips") == "dynamic-visemes"
-    choose(browser, "lips", "ferguson")
-    browser.wait_for("window.kouxing.state.lips === 'ferguson'")
-    choose(browser, "expressiveness", 0.7)
+    page.click("microphone")
+    page.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips")
+    assert page.evaluate("window.kouxing.state.lips") == "dynamic-visemes"
+    choose(page, "lips", "ferguson")
+    page.wait_for("window.kouxing.state.lips === 'ferguson'")
+    choose(page, "expressiveness", 0.7)
     wait_until(lambda: len(amounts) == 1, 60)
-    browser.evaluate("document.querySelector('#expressions [value=surprise]').click()")
+    page.evaluate("document.querySelector('#expressions [value=surprise]').click()")
     wait_until(lambda: system.synthesizer.expressions == [{"surprise": 0.8}], 60)
-    browser.click("microphone")
-    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    page.click("microphone")
+    page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
 
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    assert browser.evaluate("document.getElementById('lips').value") == "ferguson"
-    browser.click("microphone")
-    browser.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips === 'ferguson'")
+    load(page, gateway)
+    assert page.evaluate("document.getElementById('lips').value") == "ferguson"
+    page.click("microphone")
+    page.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips === 'ferguson'")
     wait_until(lambda: len(amounts) == 2, 60)
-    choose(browser, "lips", "learnt")
-    browser.wait_for("window.kouxing.state.lips === 'learnt'")
-    browser.click("microphone")
-    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
+    choose(page, "lips", "learnt")
+    page.wait_for("window.kouxing.state.lips === 'learnt'")
+    page.click("microphone")
+    page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
     sessions, lips = zip(*chosen, strict=True)
     assert lips == ("ferguson", "ferguson", "learnt")
     assert sessions[0] != sessions[1] == sessions[2]
     assert amounts == [(sessions[0], 0.7), (sessions[1], 0.7)]
 
 
-def test_another_head_is_shown(system: System, session: Session, browser: Browser) -> None:
+def test_another_head_is_shown(system: System, session: Session, page: Browser) -> None:
     system.talk(session.name, B_FACE, "b")  # idle faces move
-    browser.wait_for("window.kouxing.state.faps[15] > 49")
-    hide = "for (const part of document.querySelectorAll('header, footer')) part.style.opacity = {}"
-    browser.evaluate(hide.format(0))
-    woman = browser.steady_image()
-    choose(browser, "heads", "man")
-    browser.wait_for("document.getElementById('loading').hidden")
-    man = browser.steady_image()
-    choose(browser, "heads", "woman")
-    browser.wait_for("document.getElementById('loading').hidden")
-    woman_again = browser.steady_image()
-    browser.evaluate(hide.format(1))
+    page.wait_for("window.kouxing.state.faps[15] > 49")
+    show_controls(page, 0)
+    woman = page.steady_image()
+    choose(page, "heads", "man")
+    page.wait_for("document.getElementById('loading').hidden")
+    man = page.steady_image()
+    choose(page, "heads", "woman")
+    page.wait_for("document.getElementById('loading').hidden")
+    woman_again = page.steady_image()
+    show_controls(page, 1)
     change, change_back = (
         (np.abs(woman.astype(int) - other).max(axis=2) > 40).mean() for other in (man, woman_again)
     )
@@ -416,25 +427,50 @@ def test_another_head_is_shown(system: System, session: Session, browser: Browse
     assert change_back < change / 2  # it may be drawn at another resolution
 
 
+def test_arrow_keys_turn_the_head_and_say_so(
+    system: System, session: Session, page: Browser
+) -> None:
+    system.talk(session.name, B_FACE, "b")  # idle faces move
+    page.wait_for("window.kouxing.state.faps[15] > 49")
+    show_controls(page, 0)
+    page.evaluate("document.getElementById('head').focus({ focusVisible: false })")
+    front = page.steady_image()
+    said = "document.getElementById('turned').textContent"
+    for key in ("ArrowLeft", "ArrowLeft"):
+        page.command("Input.dispatchKeyEvent", type="keyDown", key=key)
+    page.wait_for(f"{said} === 'turned 20° to the left'")
+    turned = page.steady_image()
+    page.command("Input.dispatchKeyEvent", type="keyDown", key="Home")
+    page.wait_for(f"{said} === 'from the front'")
+    front_again = page.steady_image()
+    show_controls(page, 1)
+    change, change_back = (
+        (np.abs(front.astype(int) - other).max(axis=2) > 40).mean()
+        for other in (turned, front_again)
+    )
+    assert change > 0.02
+    assert change_back < change / 2  # it may be drawn at another resolution
+
+
 def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
-    system: System, session: Session, browser: Browser, tmp_path: Path
+    system: System, session: Session, page: Browser, tmp_path: Path
 ) -> None:
     recognizer = system.recognizer
     assert recognizer is not None
     before = set(recognizer.starts)
     system.talk(session.name, A_FACE, "a")
-    browser.evaluate(
+    page.evaluate(
         "window.saved = null; const make = URL.createObjectURL; URL.createObjectURL = (blob) =>"
         " (blob.type.startsWith('video') && (window.saved = blob), make(blob))"
     )
-    browser.click("record")
-    browser.wait_for("window.kouxing.state.recording")
+    page.click("record")
+    page.wait_for("window.kouxing.state.recording")
 
     write_tone(tmp_path / "tone.wav")  # 2 s
-    document = browser.command("DOM.getDocument")["root"]["nodeId"]
-    field = browser.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
+    document = page.command("DOM.getDocument")["root"]["nodeId"]
+    field = page.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
     files = [str(tmp_path / "tone.wav")]
-    browser.command("DOM.setFileInputFiles", nodeId=field, files=files)
+    page.command("DOM.setFileInputFiles", nodeId=field, files=files)
     wait_until(lambda: set(recognizer.starts) > before, 60)
     (name,) = set(recognizer.starts) - before
     wait_until(lambda: name in recognizer.finished, 60)  # it ends by itself
@@ -443,11 +479,11 @@ def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
     assert len(samples) > rate_hz  # a busy page leaves late chunks out
     assert np.sqrt((samples**2).mean()) > 1000
 
-    browser.wait_for("window.kouxing.state.session === 'seen'")
-    browser.click("record")
-    browser.wait_for("!window.kouxing.state.recording && window.saved !== null")
+    page.wait_for("window.kouxing.state.session === 'seen'")
+    page.click("record")
+    page.wait_for("!window.kouxing.state.recording && window.saved !== null")
     video = base64.b64decode(
-        browser.evaluate(
+        page.evaluate(
             "window.saved.arrayBuffer().then((data) =>"
             " btoa(Array.from(new Uint8Array(data), (byte) => String.fromCharCode(byte)).join('')))"
         )
@@ -473,7 +509,7 @@ def write_m4a(path: Path) -> None:
 
 
 def test_a_file_that_is_dropped_on_the_page_is_spoken(
-    system: System, browser: Browser, tmp_path: Path
+    system: System, session: Session, page: Browser, tmp_path: Path
 ) -> None:
     recognizer = system.recognizer
     assert recognizer is not None
@@ -481,41 +517,41 @@ def test_a_file_that_is_dropped_on_the_page_is_spoken(
     write_m4a(tmp_path / "tone.m4a")
     dropped = {"items": [], "files": [str(tmp_path / "tone.m4a")], "dragOperationsMask": 1}
     for kind in ("dragEnter", "dragOver", "drop"):
-        browser.command("Input.dispatchDragEvent", type=kind, x=320, y=200, data=dropped)
+        page.command("Input.dispatchDragEvent", type=kind, x=320, y=200, data=dropped)
     wait_until(lambda: set(recognizer.starts) > before, 60)
     (name,) = set(recognizer.starts) - before
     wait_until(lambda: name in recognizer.finished, 60)
     samples = np.frombuffer(recognizer.pcm[name], "<i2").astype(float)
     assert np.sqrt((samples**2).mean()) > 1000
-    browser.wait_for("window.kouxing.state.session === 'seen'")
+    page.wait_for("window.kouxing.state.session === 'seen'")
 
 
-def test_a_file_without_sound_is_refused(browser: Browser, tmp_path: Path) -> None:
+def test_a_file_without_sound_is_refused(page: Browser, tmp_path: Path) -> None:
     (tmp_path / "not.wav").write_text("no sound")
-    document = browser.command("DOM.getDocument")["root"]["nodeId"]
-    field = browser.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
+    document = page.command("DOM.getDocument")["root"]["nodeId"]
+    field = page.command("DOM.querySelector", nodeId=document, selector="#file")["nodeId"]
     files = [str(tmp_path / "not.wav")]
-    browser.command("DOM.setFileInputFiles", nodeId=field, files=files)
-    browser.wait_for(
+    page.command("DOM.setFileInputFiles", nodeId=field, files=files)
+    page.wait_for(
         "document.getElementById('notice').textContent.includes('cannot read the sound of not.wav')"
     )
-    assert not browser.evaluate("window.kouxing.state.microphone")
+    assert not page.evaluate("window.kouxing.state.microphone")
 
 
-def test_the_page_speaks_one_language(browser: Browser) -> None:
+def test_the_page_speaks_one_language(page: Browser) -> None:
     shown = "document.body.innerText + document.getElementById('sample').innerText"
-    choose(browser, "language", "zh")
-    assert browser.evaluate("document.documentElement.lang") == "zh"
-    chinese = browser.evaluate(shown)
+    choose(page, "language", "zh")
+    assert page.evaluate("document.documentElement.lang") == "zh"
+    chinese = page.evaluate(shown)
     assert "播放示例" in chinese
     assert "Sample" not in chinese
     label = "document.getElementById('meter').getAttribute('aria-label')"
-    assert browser.evaluate(label) == "音量"
-    choose(browser, "language", "en")
-    english = browser.evaluate(shown)
+    assert page.evaluate(label) == "音量"
+    choose(page, "language", "en")
+    english = page.evaluate(shown)
     assert "Sample" in english
     assert "播放示例" not in english
-    assert browser.evaluate(label) == "level"
+    assert page.evaluate(label) == "level"
 
 
 def test_a_browser_without_3d_is_told_so(browser: Browser, gateway: Gateway) -> None:
@@ -531,40 +567,37 @@ def test_a_browser_without_3d_is_told_so(browser: Browser, gateway: Gateway) -> 
 
 @pytest.mark.parametrize(("languages", "shown"), [("zh-TW,en", "zh"), ("fr,en-GB,zh", "en")])
 def test_the_language_is_that_of_the_browser(
-    browser: Browser, gateway: Gateway, languages: str, shown: str
+    page: Browser, gateway: Gateway, languages: str, shown: str
 ) -> None:
-    browser.evaluate("localStorage.clear()")
-    agent = browser.evaluate("navigator.userAgent")
+    page.evaluate("localStorage.clear()")
+    agent = page.evaluate("navigator.userAgent")
     command = "Emulation.setUserAgentOverride"
-    browser.command(command, userAgent=agent, acceptLanguage=languages)
-    browser.command("Page.navigate", url=gateway.page)
-    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    browser.command(command, userAgent=agent)
-    assert browser.evaluate("document.documentElement.lang") == shown
+    page.command(command, userAgent=agent, acceptLanguage=languages)
+    load(page, gateway)
+    page.command(command, userAgent=agent)
+    assert page.evaluate("document.documentElement.lang") == shown
 
 
-def test_the_page_says_what_is_missing(system: System, browser: Browser) -> None:
-    browser.wait_for("document.getElementById('notice').textContent === ''")
+def test_the_page_says_what_is_missing(system: System, page: Browser) -> None:
+    page.wait_for("document.getElementById('notice').textContent === ''")
     system.lose_recognizer()
     notice = "document.getElementById('notice').textContent"
-    browser.wait_for(f"{notice}.includes('recognizer does not run')")
-    browser.click("microphone")
-    browser.wait_for(f"{notice}.includes('kouxing recognizer')")
-    browser.wait_for("!window.kouxing.state.microphone")
-    choose(browser, "language", "zh")
-    browser.wait_for("document.getElementById('microphone').ariaBusy === 'false'")
-    browser.click("microphone")
-    browser.wait_for(f"{notice}.includes('缺少服务')")  # what a service refuses, too
-    browser.wait_for(f"{notice}.includes('没有运行')")
-    choose(browser, "language", "en")
+    page.wait_for(f"{notice}.includes('recognizer does not run')")
+    page.click("microphone")
+    page.wait_for(f"{notice}.includes('kouxing recognizer')")
+    page.wait_for("!window.kouxing.state.microphone")
+    choose(page, "language", "zh")
+    page.wait_for("document.getElementById('microphone').ariaBusy === 'false'")
+    page.click("microphone")
+    page.wait_for(f"{notice}.includes('缺少服务')")  # what a service refuses, too
+    page.wait_for(f"{notice}.includes('没有运行')")
+    choose(page, "language", "en")
 
 
-def test_the_page_connects_again_by_itself(
-    system: System, gateway: Gateway, browser: Browser
-) -> None:
+def test_the_page_connects_again_by_itself(system: System, gateway: Gateway, page: Browser) -> None:
     port = int(gateway.page.rstrip("/").rsplit(":", 1)[1])
     assert gateway.stop() == 0
-    browser.wait_for("!window.kouxing.state.connected")
-    assert "connecting" in browser.evaluate("document.getElementById('status').textContent")
+    page.wait_for("!window.kouxing.state.connected")
+    assert "connecting" in page.evaluate("document.getElementById('status').textContent")
     gateway.process = Gateway(system.address, port).process
-    browser.wait_for("window.kouxing.state.connected")
+    page.wait_for("window.kouxing.state.connected")

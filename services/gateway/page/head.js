@@ -27,6 +27,7 @@ export class Head {
   #inMouth = []; // materials
   #joints = []; // { node, rest, turns: [[FAP index, axis]] }
   #faps = null; // to be taken on
+  #front = new THREE.Vector3(); // where the camera stands at first
   #fovYDegrees = 22;
   #stale = true;
   #software; // the processor draws
@@ -139,6 +140,25 @@ export class Head {
   }
 
   /**
+   * Turn the head in the picture, to the left and up, degrees; without any: to the front. Return how
+   * far it is turned.
+   */
+  turn(left = null, up = null) {
+    const { target, minAzimuthAngle, maxAzimuthAngle, minPolarAngle, maxPolarAngle } = this.#controls;
+    const [front, place] = [this.#front, this.#camera.position].map((position) =>
+      new THREE.Spherical().setFromVector3(position.clone().sub(target)),
+    );
+    const { clamp, degToRad, radToDeg } = THREE.MathUtils;
+    place.theta = left === null ? front.theta : place.theta + degToRad(left);
+    place.phi = up === null ? front.phi : place.phi + degToRad(up);
+    place.theta = clamp(place.theta, minAzimuthAngle, maxAzimuthAngle);
+    place.phi = clamp(place.phi, minPolarAngle, maxPolarAngle);
+    this.#camera.position.setFromSpherical(place).add(target);
+    this.#controls.update();
+    return { left: radToDeg(place.theta - front.theta), up: radToDeg(place.phi - front.phi) };
+  }
+
+  /**
    * How it is drawn: { isCoarse: as the processor draws it, width, height: in pixels, numPictures:
    * until now, pictureMs: that one takes }.
    */
@@ -191,7 +211,8 @@ export class Head {
 
   #frame({ target, position, fovYDegrees }) {
     this.#fovYDegrees = fovYDegrees;
-    this.#camera.position.set(...position);
+    this.#front.set(...position);
+    this.#camera.position.copy(this.#front);
     this.#controls.target.set(...target);
     const distance = this.#camera.position.distanceTo(this.#controls.target);
     this.#controls.minDistance = 0.5 * distance;

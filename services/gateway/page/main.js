@@ -16,7 +16,7 @@ import { Presence } from "./presence.js";
 import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
 import { Settings } from "./settings.js";
-import { delayText, drawingText, errorText, hint, stateKind, stateText } from "./status.js";
+import { delayText, drawingText, errorText, hint, stateKind, stateText, turnText } from "./status.js";
 import { BACKGROUND, VideoRecorder } from "./video.js";
 import { VoiceStore } from "./voice.js";
 
@@ -419,6 +419,20 @@ function showVoice() {
 }
 
 element("learn").onclick = () => lesson.open();
+
+const TURNS = {
+  ArrowLeft: [10, 0],
+  ArrowRight: [-10, 0],
+  ArrowUp: [0, 10],
+  ArrowDown: [0, -10],
+  Home: [], // to the front
+};
+
+element("head").onkeydown = (event) => {
+  if (head === null || TURNS[event.key] === undefined) return;
+  event.preventDefault();
+  setText(element("turned"), turnText(head.turn(...TURNS[event.key])));
+};
 showVoice();
 
 // --- begin ---------------------------------------------------------------------------------------

@@ -30,6 +30,22 @@ export function drawingText({ isCoarse, width, height }) {
   });
 }
 
+/** Return the words for how far the head is turned in the picture, degrees. */
+export function turnText(turned) {
+  const [left, up] = [turned.left, turned.up].map(Math.round);
+  if (left === 0 && up === 0) return say({ en: "from the front", zh: "正面" });
+  const sides = [
+    [left, { en: "to the left", zh: "向左" }],
+    [-left, { en: "to the right", zh: "向右" }],
+    [up, { en: "up", zh: "向上" }],
+    [-up, { en: "down", zh: "向下" }],
+  ];
+  const parts = sides
+    .filter(([degrees]) => degrees > 0)
+    .map(([degrees, { en, zh }]) => say({ en: `${degrees}° ${en}`, zh: `${zh} ${degrees}°` }));
+  return say({ en: `turned ${parts.join(", ")}`, zh: parts.join("，") });
+}
+
 /**
  * Return what does not work and what happens next; "" if all is well. isRefused: it never connected,
  * though the gateway served this page.

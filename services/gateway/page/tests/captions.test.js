@@ -3,7 +3,7 @@ import test from "node:test";
 import { LevelMeter, rms, SILENT_DB } from "../level.js";
 import { PhoneTrack } from "../phones.js";
 import { Presence } from "../presence.js";
-import { delayText, drawingText, hint, stateKind, stateText } from "../status.js";
+import { delayText, drawingText, hint, stateKind, stateText, turnText } from "../status.js";
 
 function track(...symbols) {
   const phones = new PhoneTrack();
@@ -140,4 +140,10 @@ test("it says how coarsely it draws", () => {
   const drawing = { isCoarse: true, width: 550, height: 400 };
   assert.match(drawingText(drawing), /without a graphics card.*550 × 400/);
   assert.equal(drawingText({ ...drawing, isCoarse: false }), "");
+});
+
+test("it says how far the head is turned", () => {
+  assert.equal(turnText({ left: 0.2, up: -0.3 }), "from the front");
+  assert.equal(turnText({ left: -20, up: 10 }), "turned 20° to the right, 10° up");
+  assert.equal(turnText({ left: 69, up: -9.8 }), "turned 69° to the left, 10° down");
 });
