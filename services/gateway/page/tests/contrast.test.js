@@ -1,0 +1,74 @@
+// Contrast of the style sheet's colours, in both themes: WCAG 2.2, AA. Panels lie over the picture,
+// which may have any colour.
+
+import assert from "node:assert/strict";
+import { readFileSync } from "node:fs";
+import test from "node:test";
+
+const [TEXT, GRAPHICS] = [4.5, 3]; // least contrast (1.4.3, 1.4.11)
+const STYLE = readFileSync(new URL("../style.css", import.meta.url), "utf8");
+const COLOUR = String.raw`#[0-9a-f]{3,6}|rgb\([^)]*\)`;
+
+/** Return a theme's colours by their names: { rgb, share: 1 if nothing shines through }. */
+function theme(which) {
+  const pattern = new RegExp(`--([a-z-]+): (?:light-dark\\((${COLOUR}), (${COLOUR})\\)|(${COLOUR}));`, "g");
+  return Object.fromEntries(
+    [...STYLE.matchAll(pattern)].map(([, name, light, dark, both]) => [
+      name,
+      read(both ?? (which === "light" ? light : dark)),
+    ]),
+  );
+}
+
+function read(colour) {
+  if (colour.startsWith("rgb")) {
+    const [red, green, blue, percent] = colour.match(/\d+/g).map(Number);
+    return { rgb: [red, green, blue], share: percent / 100 };
+  }
+  const digits = colour.length === 4 ? colour.replace(/[0-9a-f]/g, "$&$&") : colour;
+  return { rgb: [1, 3, 5].map((at) => parseInt(digits.slice(at, at + 2), 16)), share: 1 };
+}
+
+function over({ rgb, share }, below) {
+  return { rgb: rgb.map((value, i) => share * value + (1 - share) * below.rgb[i]), share: 1 };
+}
+
+function luminance({ rgb }) {
+  const [red, green, blue] = rgb.map((value) => {
+    const level = value / 255;
+    return level <= 0.04045 ? level / 12.92 : ((level + 0.055) / 1.055) ** 2.4;
+  });
+  return 0.2126 * red + 0.7152 * green + 0.0722 * blue;
+}
+
+function contrast(one, other) {
+  const [low, high] = [luminance(one), luminance(other)].sort((a, b) => a - b);
+  return (high + 0.05) / (low + 0.05);
+}
+
+const [BLACK, WHITE] = [read("#000"), read("#fff")];
+
+test("contrast is computed as by WCAG", () => {
+  assert.equal(contrast(BLACK, WHITE), 21);
+  assert.ok(Math.abs(contrast(read("#767676"), WHITE) - 4.54) < 0.01);
+});
+
+for (const which of ["light", "dark"]) {
+  test(`every colour can be read in the ${which} theme`, () => {
+    const colours = theme(which);
+    const { panel, sheet, line, accent, good, busy, bad } = colours;
+    const panels = [BLACK, WHITE].map((picture) => over(panel, picture));
+    const grounds = [colours["back-center"], colours["back-edge"], sheet, over(line, sheet), ...panels];
+    for (const ground of grounds) {
+      for (const name of ["ink", "faint"]) {
+        const found = contrast(colours[name], ground);
+        assert.ok(found >= TEXT, `${name} on ${ground.rgb}: ${found.toFixed(2)}`);
+      }
+    }
+    assert.ok(contrast(WHITE, accent) >= TEXT);
+    const below = over(panel, colours["back-edge"]); // the state's light is at the edge
+    for (const light of [good, busy, bad]) {
+      assert.ok(contrast(light, below) >= GRAPHICS, `${light.rgb} on ${below.rgb}`);
+    }
+  });
+}
