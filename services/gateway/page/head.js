@@ -125,6 +125,7 @@ export class Head {
    */
   draw(nowMs, drawn) {
     if (!this.#stale || this.#isDrawing || !this.#pace.isDue(nowMs)) return;
+    if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#resize(); // which blanks the canvas
     this.#stale = false;
     if (this.#faps !== null) this.#apply(this.#faps);
     this.#faps = null;
@@ -134,8 +135,8 @@ export class Head {
     this.#whenDone(() => {
       this.#isDrawing = false;
       this.#numPictures++;
+      this.#pace.drew(begunMs, performance.now());
       drawn();
-      if (this.#pace.drew(begunMs, performance.now())) this.#resize();
     });
   }
 

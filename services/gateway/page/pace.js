@@ -38,18 +38,16 @@ export class Pace {
     return nowMs - this.#begunMs >= this.#tookMs + restMs - TOLERANCE_MS;
   }
 
-  /** Take note of a picture; return whether the ratio changed. */
+  /** Take note of a picture: the ratio may change. */
   drew(begunMs, doneMs) {
     this.#begunMs = begunMs;
     this.#tookMs = doneMs - begunMs;
     this.#numPictures++;
     this.pictureMs += Math.max(SMOOTHING, 1 / this.#numPictures) * (this.#tookMs - this.pictureMs);
-    if (this.#numPictures < ENOUGH) return false;
+    if (this.#numPictures < ENOUGH) return;
     const ratio = this.ratio;
     if (this.pictureMs > SLOW_MS) this.ratio = Math.max(MIN_RATIO, STEP * ratio);
     if (this.pictureMs < QUICK_MS) this.ratio = Math.min(this.#maxRatio, ratio / STEP);
-    if (this.ratio === ratio) return false;
-    this.#numPictures = 0;
-    return true;
+    if (this.ratio !== ratio) this.#numPictures = 0;
   }
 }
