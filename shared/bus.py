@@ -36,10 +36,11 @@ QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pau
 AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
 # What a bound socket takes in: the largest message, and how many of a connection wait.
 AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4)
-COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=4, cost=5.0)
-PHONES = Bounds(message_bytes=4 * KIB, queue_length=128)
-SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=512, cost=1.0)  # a handshake takes most
-REFUSAL_COST = 4.0  # that an answered error takes, and 1 more for each KiB it answers
+COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
+PHONES = Bounds(message_bytes=4 * KIB, queue_length=64)
+# ZeroMQ stores a subscription before it is received; a handshake takes most of the size.
+SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, cost=1.0)
+REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 1000)
@@ -79,7 +80,7 @@ class Socket:
         self._routes = routes
         self._publishes = publishes
         self._connection: Connection | None = None  # that the last message came through
-        self._cost = 0.0  # that refusing it takes
+        self._refusal_cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
     @property
@@ -95,13 +96,14 @@ class Socket:
     def send(self, message: Message, *, to: Peer = NOBODY) -> bool:
         """Send a message, on a ROUTER to one peer; return whether it could be queued.
 
-        An error is charged to the peer whose message it answers.
+        What is sent while a message is handled is charged to that one's peer, by its size.
         """
         parts = encode(message)
         if self._routes:
             parts.insert(0, to.address)
-            if isinstance(message, Error) and self._connection is not None:
-                self._connection.charge(self._cost)
+        if self._connection is not None:
+            refusal_cost = self._refusal_cost if isinstance(message, Error) else 0.0
+            self._connection.charge(len(parts[-1]) / KIB + refusal_cost)
         try:
             self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
         except zmq.Again:
@@ -127,25 +129,28 @@ class Socket:
         On a publishing socket a new subscription to ``joined/<session>/`` is answered with a
         ``joined`` message, so that subscribers know from when on they miss nothing.
         """
-        for _ in range(MAX_BATCH):
-            if self._raw.closed:  # by the handler of the last message
-                return
-            try:
-                parts, key = self._take()
-            except zmq.Again:
-                self.drained()
-                return
-            if self._zap is not None and key not in self._zap.guests:  # gone or revoked
-                continue
-            if self._publishes:
-                self._on_subscription(parts, key)
-                continue
-            sender = Peer(parts.pop(0), key) if self._routes else NOBODY
-            number = self._connection.inode if self._connection is not None else 0
-            try:
-                yield Received(decode(parts), sender, number)
-            except BadMessage as error:
-                yield Received(error, sender, number)
+        try:
+            for _ in range(MAX_BATCH):
+                if self._raw.closed:  # by the handler of the last message
+                    return
+                try:
+                    parts, key = self._take()
+                except zmq.Again:
+                    self.drained()
+                    return
+                if self._zap is not None and key not in self._zap.guests:  # gone or revoked
+                    continue
+                if self._publishes:
+                    self._on_subscription(parts, key)
+                    continue
+                sender = Peer(parts.pop(0), key) if self._routes else NOBODY
+                number = self._connection.inode if self._connection is not None else 0
+                try:
+                    yield Received(decode(parts), sender, number)
+                except BadMessage as error:
+                    yield Received(error, sender, number)
+        finally:
+            self._connection = None
 
     def drained(self) -> None:
         """Note that nothing more has arrived."""
@@ -209,9 +214,9 @@ class Socket:
                 parts.append(frame.bytes)
         if self._guarded is not None:
             self._connection = self._guarded.delivered(descriptor, num_bytes)
-            self._cost = REFUSAL_COST + num_bytes / KIB
+            self._refusal_cost = REFUSAL_COST + num_bytes / KIB
             if num_parts > MAX_PARTS and self._connection is not None:
-                self._connection.cut("its message has too many parts")
+                self._connection.cut("its message has too many parts", 1 + num_parts // 10_000)
         return parts, "" if self._zap is None else _key(frame)
 
     def _on_subscription(self, parts: list[bytes], key: str) -> None:

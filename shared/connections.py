@@ -44,12 +44,14 @@ MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
 MAX_SHARE = 0.75  # of them that may come from one address
 RESERVED_FILES = 256  # for the process itself: models, pages, its own connections
 MAX_SUBSCRIPTION = 128  # bytes of a topic's beginning
-MAX_SUBSCRIBED = 256 * KIB  # of a connection; in memory up to 60 times that
-MAX_ALL_SUBSCRIBED = 512 * KIB  # of all connections
+MAX_SUBSCRIBED = 128 * KIB  # of a connection; in memory up to 60 times that, or twice as much
+MAX_ALL_SUBSCRIBED = 192 * KIB  # of all connections
 HANDSHAKE = 1 * KIB  # more than a handshake takes on the wire
 OVERHEAD = 128  # more than a message's frames, keys and heartbeats take on the wire
 CREDIT = 5000.0  # that a connection may spend at once
 CREDIT_S = 500.0  # that it gets back in a second
+MAX_FAULTS = 100  # of an address, whose new connections are cut then
+FAULTS_S = 2  # that an address is forgiven in a second
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
 _BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
 _SEES_BYTES = sys.platform == "linux"
@@ -142,11 +144,16 @@ class Connection:
         elif self.stuck > bounds.one_message:
             self.cut("its message does not end")
 
-    def cut(self, reason: str) -> None:
-        """End the connection; libzmq then frees what it holds. Any thread may call this."""
+    def cut(self, reason: str, num_faults: int = 1) -> None:
+        """End the connection; libzmq then frees what it holds. Any thread may call this.
+
+        Faults count against its address.
+        """
         if self.is_cut:
             return
         self.is_cut = True
+        if self.guarded is not None:
+            self.guarded.blame(self.address, num_faults)
         with contextlib.suppress(OSError):  # it may have ended by itself
             own = os.dup(self.descriptor)  # which nobody else closes
             try:
@@ -175,12 +182,18 @@ class Guarded:
         connection = self._guard.connection(descriptor)
         if connection is None:
             return None
+        if connection.guarded is None:  # the guard has not come to it yet
+            connection.guarded, connection.address = self, _address(descriptor)
         connection.delivered += num_bytes + OVERHEAD
         self._num_delivered += 1
         if self._num_delivered > self._guard.num_connections:  # ZeroMQ takes them one by one
             self.drained()
         connection.charge(self.bounds.cost)
         return connection
+
+    def blame(self, address: str, num_faults: int) -> None:
+        """Count faults against an address."""
+        self._guard.faults[address] += num_faults
 
     def drained(self) -> None:
         """Note that every complete message was delivered."""
@@ -218,6 +231,7 @@ class Guard:
     """Watches the connections of all bound sockets of a process."""
 
     def __init__(self) -> None:
+        self.faults: Counter[str] = Counter()  # by address; both threads add
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._descriptors: dict[int, Connection] = {}  # the thread's, as all that follows
         self._pending: set[Connection] = set()  # something of theirs waits
@@ -292,7 +306,7 @@ class Guard:
                 self._sweep()
             self._look(ready, now_s)
             much = any(connection.waiting > MUCH for connection in self._pending)
-            time.sleep(NEAR_LOOK_S if much else LOOK_S)
+            time.sleep(NEAR_LOOK_S if much or self.faults else LOOK_S)
 
     def _wait(self) -> list[Connection]:
         """Wait until bytes arrive or something is due; return the connections that have some."""
@@ -313,6 +327,8 @@ class Guard:
             connection.address = _address(descriptor)
             connection.guarded = guarded
             self._descriptors[descriptor] = connection
+            if self.faults[connection.address] > MAX_FAULTS:
+                connection.cut("its address sent too much that is of no use", 0)
             self._pending.add(connection)  # bytes may have come before
             admitted.append(connection)
             if self._events is not None:
@@ -334,14 +350,18 @@ class Guard:
             if connection.is_cut:
                 continue
             if shares.total() > self._max_connections:
-                connection.cut("there are too many connections")
+                connection.cut("there are too many connections", 0)
             elif shares[connection.address] > MAX_SHARE * self._max_connections:
-                connection.cut("its address has too many connections")
+                connection.cut("its address has too many connections", 0)
             shares[connection.address] -= connection.is_cut
 
     def _sweep(self) -> None:
         """Forget the connections that have ended, and return what those took that were cut."""
         self._swept_s = time.monotonic()
+        for address in list(self.faults):
+            self.faults[address] -= FAULTS_S
+            if self.faults[address] <= 0:
+                del self.faults[address]
         ended = [each for each in list(self._connections.values()) if not each.exists()]
         for connection in ended:
             del self._connections[connection.inode]
