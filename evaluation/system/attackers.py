@@ -8,10 +8,25 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 MORE, LONG, COMMAND = 1, 2, 4  # flags of a frame
+GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 BLOCK_BYTES = 64 * 1024
+TARGETS = {  # sockets of all kinds: their service, their setting, and the kind of their peers
+    "commands": ("control", "COMMANDS", "DEALER"),
+    "events": ("control", "EVENTS", "SUB"),
+    "audio": ("recognizer", "AUDIO", "DEALER"),
+    "phone_input": ("synthesizer", "PHONE_INPUT", "DEALER"),
+    "faps": ("synthesizer", "FAPS", "SUB"),
+}
+
+
+def ready(kind: str) -> bytes:
+    """Return what follows the greeting, of a socket of some kind."""
+    command = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind.encode()
+    return bytes([COMMAND, len(command)]) + command
 
 
 def connected(port: int, kind: str = "DEALER") -> socket.socket:
@@ -23,11 +38,9 @@ def connected(port: int, kind: str = "DEALER") -> socket.socket:
         If the other end refuses.
     """
     connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
-    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
-    ready = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind.encode()
-    connection.sendall(greeting + bytes([COMMAND, len(ready)]) + ready)
+    connection.sendall(GREETING + ready(kind))
     answer = b""
-    while len(answer) < len(greeting) + 2:  # and the beginning of its READY
+    while len(answer) < len(GREETING) + 2:  # and the beginning of its READY
         received = connection.recv(1024)
         if not received:
             raise ConnectionResetError("the handshake is refused")
@@ -100,3 +113,62 @@ def many_connections(port: int, num: int) -> Iterator[list[socket.socket]]:
                 connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
                 connections.append(held.enter_context(connection))
         yield connections
+
+
+Attack = Callable[[int, str, float], object]  # of a port, by a kind of peer, for some seconds
+
+
+def _together(num: int, attack: Callable[[], object]) -> None:
+    """Attack over several connections; where one is refused the others go on."""
+
+    def one(_: int) -> None:
+        with contextlib.suppress(OSError):
+            attack()
+
+    with ThreadPoolExecutor(num) as pool:
+        list(pool.map(one, range(num)))
+
+
+def _endless(part: bytes, num: int) -> Attack:
+    return lambda port, kind, seconds: _together(
+        num, lambda: endless_message(port, kind, part, seconds)
+    )
+
+
+def _flood(body: bytes, num: int) -> Attack:
+    return lambda port, kind, seconds: _together(
+        num, lambda: many_messages(port, kind, body, seconds)
+    )
+
+
+def _parts(port: int, kind: str, _seconds: float) -> None:
+    _together(1, lambda: many_parts(port, kind, 200_000))
+
+
+FLOODS: dict[str, Attack] = {
+    "an endless message of large parts": _endless(b"x" * 65_536, 1),
+    "an endless message of small parts": _endless(b"x" * 300, 1),
+    "endless messages of empty parts": _endless(b"", 4),
+    "a message of very many parts": _parts,
+    "messages of 1 MiB": _flood(b"x" * 2**20, 4),
+    "messages of the largest size": _flood(b"x" * 65_000, 4),
+    "small messages": _flood(b"x" * 10, 1),
+}
+
+
+def _subscriptions(num_bytes: int) -> Attack:
+    return lambda port, _kind, seconds: _together(
+        12, lambda: many_subscriptions(port, num_bytes, seconds)
+    )
+
+
+SUBSCRIPTIONS = {
+    "subscriptions of 1 MiB": _subscriptions(2**20),
+    "very many subscriptions": _subscriptions(120),
+}
+
+
+def hold_connections(port: int, _kind: str, seconds: float) -> None:
+    """Hold more connections than a process takes."""
+    with many_connections(port, 1500):
+        time.sleep(seconds)

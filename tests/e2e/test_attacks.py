@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import resource
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+import socket
+import time
+from collections.abc import Iterator
 from pathlib import Path
+from random import Random
 
 import numpy as np
 import pytest
@@ -24,70 +25,28 @@ pytestmark = pytest.mark.e2e
 MAX_GROWTH_MB = 64.0
 MAX_KEPT_MB = 16.0
 SECONDS = 1.0
-PORTS = {  # of a socket of each kind: its service, its key, and the kind of its peers
-    "commands": ("control", "COMMANDS", "DEALER"),
-    "events": ("control", "EVENTS", "SUB"),
-    "audio": ("recognizer", "AUDIO", "DEALER"),
-    "phone_input": ("synthesizer", "PHONE_INPUT", "DEALER"),
-    "faps": ("synthesizer", "FAPS", "SUB"),
-}
-Attack = Callable[[int, str], object]
 
 
-def together(num: int, attack: Callable[[], object]) -> None:
-    """Attack over several connections at once; that one is refused ends none of the others."""
-
-    def one(_: int) -> None:
-        with contextlib.suppress(ConnectionError):
-            attack()
-
-    with ThreadPoolExecutor(num) as pool:
-        list(pool.map(one, range(num)))
-
-
-def endless(part: bytes, num: int) -> Attack:
-    return lambda port, kind: together(
-        num, lambda: attackers.endless_message(port, kind, part, SECONDS)
-    )
-
-
-def floods(body: bytes, num: int) -> Attack:
-    return lambda port, kind: together(
-        num, lambda: attackers.many_messages(port, kind, body, SECONDS)
-    )
-
-
-ATTACKS: dict[str, Attack] = {
-    "an endless message of large parts": endless(b"x" * 65_536, 1),
-    "an endless message of small parts": endless(b"x" * 300, 1),
-    "endless messages of empty parts": endless(b"", 4),
-    "a message of very many parts": lambda port, kind: attackers.many_parts(port, kind, 200_000),
-    "messages of 1 MiB": floods(b"x" * 2**20, 4),
-    "messages of the largest size": floods(b"x" * 65_000, 4),
-    "small messages": floods(b"x" * 10, 1),
-}
-
-
-@pytest.mark.parametrize("attack", ATTACKS)
-@pytest.mark.parametrize("target", PORTS)
+@pytest.mark.parametrize("attack", attackers.FLOODS)
+@pytest.mark.parametrize("target", attackers.TARGETS)
 def test_a_flood_takes_little_memory_and_leaves_none(
     system: System, witness: Session, target: str, attack: str
 ) -> None:
-    service, key, kind = PORTS[target]
+    service, key, kind = attackers.TARGETS[target]
     port = int(system.environment[f"KOUXING_{service.upper()}_{key}"].rpartition(":")[2])
     memory = Memory(system.processes[service].pid)
-    ATTACKS[attack](port, kind)
+    attackers.FLOODS[attack](port, kind, SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
 
 
-@pytest.mark.parametrize("num_bytes", [120, 2**20])
+@pytest.mark.parametrize("attack", attackers.SUBSCRIPTIONS)
 def test_subscriptions_are_bounded_in_length_and_number(
-    system: System, witness: Session, num_bytes: int
+    system: System, witness: Session, attack: str
 ) -> None:
     port = int(system.environment["KOUXING_SYNTHESIZER_FAPS"].rpartition(":")[2])
     memory = Memory(system.processes["synthesizer"].pid)
-    together(12, partial(attackers.many_subscriptions, port, num_bytes, SECONDS))
+    attackers.SUBSCRIPTIONS[attack](port, "SUB", SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
 
@@ -114,3 +73,35 @@ def test_with_very_many_connections_sessions_still_open(few_files: System) -> No
             held.enter_context(attackers.many_connections(port, MAX_CONNECTIONS + 200))
         assert stream(few_files.control, np.zeros(3200, np.float32)).ended
     few_files.assert_all_alive()
+
+
+def raw_bytes(random: Random) -> bytes:
+    """Return what no peer says, after a beginning that some peer might say."""
+    beginnings = [
+        b"",
+        attackers.GREETING,
+        attackers.GREETING + attackers.ready("DEALER"),
+        attackers.GREETING + attackers.ready("SUB"),
+        attackers.GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32),
+        b"\xff" + bytes(8) + b"\x7f\x01\x05",
+        b"\x01\x00",
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
+        b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\nffffffff\r\n",
+        b"\x16\x03\x01",
+    ]
+    return random.choice(beginnings) + random.randbytes(random.choice([1, 10, 100, 10_000]))
+
+
+def test_raw_bytes_at_every_port_harm_nobody(system: System, witness: Session) -> None:
+    random = Random(1)  # noqa: S311 - the same bytes every time
+    for port in system.ports:
+        end_s = time.monotonic() + SECONDS
+        while time.monotonic() < end_s:
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection(("127.0.0.1", port), timeout=0.02) as connection,
+            ):
+                for _ in range(random.choice([1, 1, 20])):
+                    connection.sendall(raw_bytes(random))
+                connection.recv(1000)
+    system.assert_all_alive()

@@ -1,0 +1,242 @@
+"""Peers that say anything to a service's sockets: it goes on and answers the next one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from functools import cache
+from typing import Any
+
+import pytest
+import zmq
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from services.control.config import ControlConfig
+from services.control.service import ControlService
+from services.recognizer.config import RecognizerConfig
+from services.recognizer.service import RecognizerService
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.service import SynthesizerService
+from shared.bus import Bus, Socket
+from shared.service import Service
+from shared.wire.codec import encode
+from shared.wire.control import Heartbeat, SessionInput, StartSession, StatusReport, StatusRequest
+from shared.wire.message import MAX_AUDIO_BYTES, Message
+from shared.wire.session import Done, Error, OpenSession
+from tests.samples import SAMPLES
+from tests.system import free_port
+
+pytestmark = pytest.mark.property
+
+LOCAL = "tcp://127.0.0.1:*"
+MAX_SESSIONS = 4
+WORKER = Heartbeat(
+    service="all",
+    instance="worker",
+    role="worker",
+    state="ready",
+    sent_ns=0,
+    endpoints={name: f"tcp://127.0.0.1:{port}" for port, name in
+               enumerate(("audio", "phones", "faps", "phone_input"), start=1)},
+)  # fmt: skip
+START = StartSession(
+    session="demo",
+    epoch=1,
+    request="start-demo-1",
+    token="t",
+    encoding="s16le",
+    sample_rate_hz=16000,
+    num_channels=1,
+    record=False,
+    paced=False,
+    language="mandarin",
+    endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
+)
+
+TEXTS = st.sampled_from(
+    ["", "demo", "t", "worker", "observer", "draining", "ready", "start-demo-1", "learnt", "f32le",
+     "tcp://-:1", "tcp://*:1", "tcp://127.0.0.1:1", "ipc:///tmp/x", "../x", "x" * 2000, "\0", "人"]
+)  # fmt: skip
+NUMBERS = st.sampled_from([0, 1, 2, 7, 8, 320, 2**31, 2**40, 2**53, -1, 2**63])
+REALS = st.sampled_from([0.0, 0.5, -1.0, 1e9, 1e300, math.nan, math.inf])
+DATA = st.one_of(
+    st.binary(max_size=300),
+    st.integers(0, MAX_AUDIO_BYTES + 1).map(bytes),
+    st.sampled_from([b"\xff" * 272, b"\x00\x00\x80\x7f" * 28, b"\xff" * 9]),
+)
+MAPS = st.dictionaries(
+    st.one_of(TEXTS, st.sampled_from(["audio", "phones", "faps", "phone_input"])),
+    st.one_of(TEXTS, REALS, st.builds(SessionInput, idle_s=REALS, sequence=NUMBERS)),
+    max_size=4,
+)
+
+
+def values_like(value: object) -> st.SearchStrategy[Any]:
+    by_type: list[tuple[type, st.SearchStrategy[Any]]] = [
+        (bool, st.booleans()), (int, NUMBERS), (float, REALS), (str, TEXTS), (bytes, DATA),
+        (dict, MAPS), (list, st.lists(TEXTS, max_size=3)),
+    ]  # fmt: skip
+    return next((values for kind, values in by_type if isinstance(value, kind)), st.none())
+
+
+@st.composite
+def messages(draw: st.DrawFn) -> Message:
+    """Draw a message of any kind in which some fields hold what they should not."""
+    sample = draw(st.sampled_from(SAMPLES))
+    names = [field.name for field in dataclasses.fields(sample)]
+    changed = draw(st.lists(st.sampled_from(names), max_size=3, unique=True))
+    values = {name: draw(values_like(getattr(sample, name))) for name in changed}
+    return dataclasses.replace(sample, **values)
+
+
+class Peers(RuleBasedStateMachine):
+    """Peers of one ROUTER socket and, as subscribers, of one XPUB socket of a service."""
+
+    service: Service
+    router: Socket
+    publisher: Socket
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bus, self.context = Bus(), zmq.Context()
+        self.num_asked = 0
+
+    def begin(self) -> None:
+        self.honest = self.bus.connect_dealer(self.router.endpoint)
+        self.hostile: zmq.Socket[bytes] = self.context.socket(zmq.DEALER)
+        self.subscriber: zmq.Socket[bytes] = self.context.socket(zmq.XSUB)
+        for socket in (self.hostile, self.subscriber):
+            socket.setsockopt(zmq.LINGER, 0)
+        self.hostile.connect(self.router.endpoint)
+        self.subscriber.connect(self.publisher.endpoint)
+
+    def teardown(self) -> None:
+        self.bus.close()
+        self.context.destroy(linger=0)
+
+    @rule(message=messages())
+    def send_a_message(self, message: Message) -> None:
+        self.hostile.send_multipart(encode(message))
+
+    @rule(parts=st.lists(st.binary(max_size=300), min_size=1, max_size=6))
+    def send_parts(self, parts: list[bytes]) -> None:
+        self.hostile.send_multipart(parts)
+
+    @rule(topic=st.binary(max_size=140), begins=st.booleans())
+    def subscribe(self, topic: bytes, begins: bool) -> None:
+        self.subscriber.send(bytes([begins]) + topic)
+
+    @rule(parts=st.lists(st.binary(max_size=140), min_size=1, max_size=6))
+    def send_to_the_publisher(self, parts: list[bytes]) -> None:
+        self.subscriber.send_multipart(parts)
+
+    @rule(name=st.binary(min_size=1, max_size=4))
+    def come_by_another_name(self, name: bytes) -> None:
+        self.hostile.close(linger=100)
+        self.hostile = self.context.socket(zmq.DEALER)
+        self.hostile.setsockopt(zmq.ROUTING_ID, b"x" + name)
+        self.hostile.connect(self.router.endpoint)
+
+    def answer(self) -> Message:
+        """Ask as an honest peer; return what comes."""
+        self.num_asked += 1
+        request = f"ask-{self.num_asked}"
+        self.honest.send(StatusRequest(request=request))
+        end_s = time.monotonic() + 20
+        while time.monotonic() < end_s:
+            self.service.step(0.001)
+            for received in self.honest.receive():
+                answer = received.message
+                if isinstance(answer, Error) or getattr(answer, "request", "") == request:
+                    assert isinstance(answer, Message)
+                    return answer
+        raise AssertionError("the service does not answer")
+
+
+class PeersOfControl(Peers):
+    @initialize()
+    def start(self) -> None:
+        config = ControlConfig(
+            commands=LOCAL, events=LOCAL, insecure=True, max_sessions=MAX_SESSIONS
+        )
+        service = ControlService(config)
+        self.service, self.router, self.publisher = service, service._commands, service._events
+        self.begin()
+        self.honest.send(WORKER)
+        self.honest.send(OpenSession(session="demo", request="open"))
+
+    @rule(message=messages())
+    def send_as_the_worker(self, message: Message) -> None:
+        self.hostile.send_multipart(encode(WORKER))
+        self.hostile.send_multipart(encode(message))
+
+    @rule()
+    def start_sessions(self) -> None:
+        self.honest.send(Done(session="demo", request="start-demo-1"))
+
+    @invariant()
+    def it_tells_the_status(self) -> None:
+        report = self.answer()
+        assert isinstance(report, StatusReport)
+        assert len(report.sessions) <= MAX_SESSIONS
+
+    def teardown(self) -> None:
+        self.service.bus.close()
+        super().teardown()
+
+
+@cache
+def recognizer() -> RecognizerService:
+    control = f"tcp://127.0.0.1:{free_port()}"
+    config = RecognizerConfig(audio=LOCAL, phones=LOCAL, control=control, insecure=True)
+    return RecognizerService(config)
+
+
+@cache
+def synthesizer() -> SynthesizerService:
+    control = f"tcp://127.0.0.1:{free_port()}"
+    config = SynthesizerConfig(phone_input=LOCAL, faps=LOCAL, control=control, insecure=True)
+    return SynthesizerService(config)
+
+
+class PeersOfAWorker(Peers):
+    @rule(sequence=NUMBERS, epoch=st.sampled_from([0, 1, 2]))
+    def start_the_session_anew(self, sequence: int, epoch: int) -> None:
+        start = dataclasses.replace(START, epoch=epoch, token=f"t{sequence}"[:1])
+        self.service.start_session(start)
+
+    @invariant()
+    def it_answers(self) -> None:
+        assert isinstance(self.answer(), Error)
+
+    def teardown(self) -> None:
+        self.service.stop_session("demo")
+        super().teardown()
+
+
+class PeersOfTheRecognizer(PeersOfAWorker):
+    @initialize()
+    def start(self) -> None:
+        self.service = recognizer()
+        self.router, self.publisher = self.service._audio, self.service._phones
+        self.service.start_session(START)
+        self.begin()
+
+
+class PeersOfTheSynthesizer(PeersOfAWorker):
+    @initialize()
+    def start(self) -> None:
+        self.service = synthesizer()
+        self.router, self.publisher = self.service._input, self.service._faps
+        self.service.start_session(START)
+        self.begin()
+
+
+for machine in (PeersOfControl, PeersOfTheRecognizer, PeersOfTheSynthesizer):
+    machine.TestCase.settings = settings(max_examples=25, stateful_step_count=20)
+TestPeersOfControl = PeersOfControl.TestCase
+TestPeersOfTheRecognizer = PeersOfTheRecognizer.TestCase
+TestPeersOfTheSynthesizer = PeersOfTheSynthesizer.TestCase
