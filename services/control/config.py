@@ -17,7 +17,7 @@ class ControlConfig(ServiceConfig):
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
     """Where control publishes events."""
     max_sessions: Annotated[int, Field(ge=1, le=2000)] = 64
-    """Sessions that may be open at once."""
+    """Sessions that may be open at once; of one key, three quarters of them."""
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which a session is closed."""
     lost_after_s: Annotated[float, Field(ge=1, le=3600)] = 3.0

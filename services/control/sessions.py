@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections import Counter
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ from services.control.registry import Refusal, Registry
 from shared.keys import Peer
 from shared.wire.control import Heartbeat, SessionState, StartSession
 from shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
+
+KEY_SHARE = 0.75  # of the sessions that one key may have open
 
 
 @dataclass(slots=True)
@@ -63,7 +66,8 @@ class Sessions:
         Raises
         ------
         Refusal
-            The name is taken, there are too many sessions, or a service is missing.
+            The name is taken, there are too many sessions, of all or of the client's key, or a
+            service is missing.
         """
         name = opening.session or f"s{secrets.token_hex(4)}"
         if name in self._records:
@@ -73,6 +77,12 @@ class Sessions:
         if len(self._records) >= self._max_sessions:
             raise Refusal(
                 ErrorCode.TOO_MANY_SESSIONS, f"{self._max_sessions} sessions are open already"
+            )
+        of_key = sum(record.client.key == client.key for record in self._records.values())
+        if client.key and of_key >= math.ceil(KEY_SHARE * self._max_sessions):
+            raise Refusal(
+                ErrorCode.TOO_MANY_SESSIONS,
+                f"{of_key} sessions of your key are open already; the rest is for other keys",
             )
         workers = self._registry.place({}, self._load())
         record = SessionRecord(

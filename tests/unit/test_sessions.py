@@ -163,6 +163,17 @@ def test_there_is_a_limit() -> None:
     assert caught.value.code == "too-many-sessions"
 
 
+def test_one_key_does_not_take_all_sessions() -> None:
+    made = Made(max_sessions=4)
+    greedy, other = Peer(b"a", "greedy"), Peer(b"b", "other")
+    for _ in range(3):
+        made.sessions.open(OpenSession(request="r"), greedy, 0.0)
+    with pytest.raises(Refusal, match="of your key") as caught:
+        made.sessions.open(OpenSession(request="r"), greedy, 0.0)
+    assert caught.value.code == "too-many-sessions"
+    made.sessions.open(OpenSession(request="r"), other, 0.0)
+
+
 def test_a_session_is_only_given_for_its_token(made: Made) -> None:
     record = made.open("demo")
     assert made.sessions.owned("demo", record.token) is record
