@@ -298,6 +298,20 @@ def endpoints(
         save_figure(figure(chosen[0]), picture)
 
 
+@app.command()
+def attacks(
+    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure what hostile peers cost: memory of the services, and delay of others' faces."""
+    from evaluation.system.attacks import measure, show
+
+    check_output(json_file)
+    damages = measure(audio, CONSOLE)
+    show(damages, Console())
+    write_json(json_file, [asdict(damage) for damage in damages])
+
+
 @bench_app.command()
 def bench(
     audio: Annotated[Path, typer.Argument(help="Audio file to stream.")],

@@ -74,7 +74,7 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
             with Client(control) as client:
                 before = _cpu_s(client)
                 delays = [
-                    _stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)
+                    stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)
                     for _ in range(num_repeats)
                 ]
                 time.sleep(1.0)  # until the last heartbeats
@@ -84,8 +84,8 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
     audio_s = num_repeats * len(samples) / rate_hz
     to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
     return Latency(
-        chunk_to_frame_ms=_percentiles(to_frame_ms),
-        sound_to_frame_ms=_percentiles(from_sound_ms),
+        chunk_to_frame_ms=percentiles(to_frame_ms),
+        sound_to_frame_ms=percentiles(from_sound_ms),
         delay_ms=delay_s * 1e3,
         num_frames=len(to_frame_ms),
         cpu_s_per_audio_s={name: (after[name] - before[name]) / audio_s for name in after},
@@ -107,7 +107,7 @@ def show(latency: Latency, console: Console) -> None:
     console.print(costs)
 
 
-def _stream(
+def stream(
     client: Client, samples: NDArray[np.float32], rate_hz: int, delay_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Stream in real time; return both delays of every frame in seconds."""
@@ -155,7 +155,8 @@ def _stream(
     return np.array(to_frame), np.array(from_sound)
 
 
-def _percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:
+def percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:
+    """Return the percentiles that the tables show."""
     return {f"p{percent}": float(np.percentile(values_ms, percent)) for percent in (50, 95, 99)}
 
 
