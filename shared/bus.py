@@ -220,8 +220,12 @@ class Socket:
         return parts, "" if self._zap is None else _key(frame)
 
     def _on_subscription(self, parts: list[bytes], key: str) -> None:
-        if self._connection is not None and self._guarded is not None and len(parts) == 1:
+        if len(parts) != 1:  # nobody publishes here
+            return
+        if self._connection is not None and self._guarded is not None:
             self._guarded.subscribed(self._connection, parts[0])
+            if self._connection.is_cut:
+                return
         verb, wanted = parts[0][:1], parts[0][1:]
         may = self._zap is None or may_follow(self._zap.guests[key], wanted)
         if verb == b"\x00":

@@ -52,6 +52,7 @@ CREDIT = 5000.0  # that a connection may spend at once
 CREDIT_S = 500.0  # that it gets back in a second
 MAX_FAULTS = 100  # of an address, whose new connections are cut then
 FAULTS_S = 2  # that an address is forgiven in a second
+NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
 _BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
 _SEES_BYTES = sys.platform == "linux"
@@ -237,6 +238,7 @@ class Guard:
         self._pending: set[Connection] = set()  # something of theirs waits
         self._guarded: list[Guarded] = []
         self._swept_s = 0.0
+        self._num_trims = 0  # still to come
         self._subscribed = 0  # bytes, since they were counted; the sockets' thread's
         self._max_connections = 0
         self._is_stopping = False
@@ -356,7 +358,7 @@ class Guard:
             shares[connection.address] -= connection.is_cut
 
     def _sweep(self) -> None:
-        """Forget the connections that have ended, and return what those took that were cut."""
+        """Forget the connections that have ended; return the memory of those that were cut."""
         self._swept_s = time.monotonic()
         for address in list(self.faults):
             self.faults[address] -= FAULTS_S
@@ -367,6 +369,9 @@ class Guard:
             del self._connections[connection.inode]
             self._pending.discard(connection)
         if any(connection.is_cut for connection in ended):
+            self._num_trims = NUM_TRIMS
+        if self._num_trims:
+            self._num_trims -= 1
             with contextlib.suppress(AttributeError):  # only glibc's keeps so much
                 ctypes.CDLL(None).malloc_trim(0)
 

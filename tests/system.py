@@ -92,6 +92,8 @@ class System:
         folder: Path,
         hosts: dict[str, str] | None = None,
         settings: dict[str, str] | None = None,
+        *,
+        insecure: bool = False,
     ) -> None:
         self.folder = folder
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -104,9 +106,10 @@ class System:
             **headless(folder),
             **PATIENT,
             **addresses,
+            "KOUXING_INSECURE": str(insecure),
             **(settings or {}),
         }
-        self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=False)
+        self.control = control_endpoint(self.environment["KOUXING_CONTROL"], insecure=insecure)
 
     def __enter__(self) -> Self:
         try:

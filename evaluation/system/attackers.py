@@ -38,13 +38,17 @@ def connected(port: int, kind: str = "DEALER") -> socket.socket:
         If the other end refuses.
     """
     connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
-    connection.sendall(GREETING + ready(kind))
-    answer = b""
-    while len(answer) < len(GREETING) + 2:  # and the beginning of its READY
-        received = connection.recv(1024)
-        if not received:
-            raise ConnectionResetError("the handshake is refused")
-        answer += received
+    try:
+        connection.sendall(GREETING + ready(kind))
+        answer = b""
+        while len(answer) < len(GREETING) + 2:  # and the beginning of its READY
+            received = connection.recv(1024)
+            if not received:
+                raise ConnectionResetError("the handshake is refused")
+            answer += received
+    except BaseException:
+        connection.close()
+        raise
     return connection
 
 

@@ -27,6 +27,14 @@ MAX_KEPT_MB = 16.0
 SECONDS = 1.0
 
 
+@pytest.fixture(scope="module")
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    """A system without keys: its peers get so far as to say something."""
+    folder = tmp_path_factory.mktemp("system")
+    with System(("control", "recognizer", "synthesizer"), folder, insecure=True) as running:
+        yield running
+
+
 @pytest.mark.parametrize("attack", attackers.FLOODS)
 @pytest.mark.parametrize("target", attackers.TARGETS)
 def test_a_flood_takes_little_memory_and_leaves_none(
@@ -57,7 +65,7 @@ def few_files(tmp_path: Path) -> Iterator[System]:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
     try:
-        running = System(("control", "recognizer", "synthesizer"), tmp_path)
+        running = System(("control", "recognizer", "synthesizer"), tmp_path, insecure=True)
         running.__enter__()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
