@@ -37,6 +37,15 @@ def browser(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> Itera
     browser.close()
 
 
+@pytest.fixture
+def live(browser: Browser) -> Browser:
+    """The browser while its microphone is shown."""
+    if not browser.evaluate("window.kouxing.state.microphone"):
+        browser.click("microphone")
+    browser.wait_for(IS_LIVE)
+    return browser
+
+
 def test_the_delay_is_shown_once_it_is_measured(browser: Browser) -> None:
     assert browser.evaluate("window.kouxing.state.voiceToPictureMs") is None
     assert "ms" not in browser.evaluate(STATUS)
@@ -58,22 +67,21 @@ def test_the_delay_is_shown_once_it_is_measured(browser: Browser) -> None:
     ],
 )
 def test_a_crash_is_told_and_the_microphone_goes_on(
-    watched: Watched, browser: Browser, service: str, told: str
+    watched: Watched, live: Browser, service: str, told: str
 ) -> None:
-    browser.wait_for(IS_LIVE)
-    browser.wait_for("document.getElementById('notice').textContent === ''")
-    browser.evaluate("window.told = []")
+    live.wait_for("document.getElementById('notice').textContent === ''")
+    live.evaluate("window.told = []")
     watched.kill(service)
-    browser.wait_for(f"!{STATUS}.includes('live') || !window.kouxing.state.microphone")
-    browser.wait_for(f"window.told.some((text) => text.includes('{told}'))")
-    browser.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
+    live.wait_for(f"!{STATUS}.includes('live') || !window.kouxing.state.microphone")
+    live.wait_for(f"window.told.some((text) => text.includes('{told}'))")
+    live.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
 
 
-def test_an_abandoned_session_is_not_live(watched: Watched, browser: Browser) -> None:
-    browser.wait_for(IS_LIVE)
+def test_an_abandoned_session_is_not_live(watched: Watched, live: Browser) -> None:
     watched.kill("gateway")
-    browser.evaluate("document.getElementById('microphone').click()")  # nobody closes the session
-    browser.wait_for("window.kouxing.state.connected && window.kouxing.state.session !== null")
-    frames = browser.evaluate("window.kouxing.state.numFrames")
-    browser.wait_for(f"window.kouxing.state.numFrames > {frames + 50}")  # its face idles on
-    assert "waiting for speech" in browser.evaluate(STATUS)
+    live.evaluate("document.getElementById('microphone').click()")  # nobody closes the session
+    live.wait_for("window.kouxing.state.connected && window.kouxing.state.session !== null")
+    live.wait_for(f"{STATUS}.includes('waiting for speech')")  # once what was on its way has come
+    frames = live.evaluate("window.kouxing.state.numFrames")
+    live.wait_for(f"window.kouxing.state.numFrames > {frames + 50}")  # its face idles on
+    assert "waiting for speech" in live.evaluate(STATUS)

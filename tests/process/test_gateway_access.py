@@ -42,7 +42,7 @@ def gateway(certificate: Path) -> Iterator[Gateway]:
         allowed_origins="https://tool.example",
         frame_ancestors="https://tool.example https://other.example:8443",
     )
-    wait_until(certificate.is_file, 60)
+    wait_until(lambda: certificate.is_file() and certificate.read_bytes(), 60)
     yield gateway
     assert gateway.stop() == 0
 
