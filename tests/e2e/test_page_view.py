@@ -23,7 +23,7 @@ pytestmark = pytest.mark.e2e
 
 READY = "document.getElementById('loading')?.hidden && window.kouxing.state.connected"
 CONTROLS = [
-    *("show-phones", "microphone", "sample", "open-file", "record", "learn", "sound"),
+    *("head", "show-phones", "microphone", "sample", "open-file", "record", "learn", "sound"),
     "open-settings",
 ]
 
@@ -191,7 +191,7 @@ def test_a_screen_reader_finds_names_and_is_not_flooded(browser: Browser, gatewa
         "Array.from(document.querySelectorAll('[role=status], [role=alert], output, [aria-live]'))"
         ".filter((each) => each.getAttribute('aria-live') !== 'off').map((each) => each.id)"
     )
-    assert live == ["state", "notice", "lesson-advice", "lesson-problem"]
+    assert live == ["turned", "state", "notice", "lesson-advice", "lesson-problem"]
     browser.evaluate("document.getElementById('settings').hidePopover()")
 
 
