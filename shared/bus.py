@@ -172,10 +172,8 @@ class Socket:
         address, _, server_key = endpoint.partition(" ")
         split_endpoint(address, "endpoint")
         if bool(server_key) != (self._key is not None):
-            problem = "has a key, but here" if server_key else "has no key; not here, but there"
-            raise UserError(
-                f"{address} {problem} insecure = true is set; it must be the same everywhere"
-            )
+            where = "here, but not there" if server_key else "there, but not here"
+            raise UserError(f"{address}: insecure = true is set {where}")
         try:
             if self._key is not None:
                 self._raw.setsockopt_string(zmq.CURVE_SERVERKEY, server_key)

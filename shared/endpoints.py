@@ -8,7 +8,9 @@ import re
 from shared.errors import UserError
 
 WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - named to be recognised, not bound
-_ENDPOINT = re.compile(r"^tcp://(?P<host>\[[0-9a-fA-F:]+\]|[A-Za-z0-9_.*-]+):(?P<port>\d{1,5}|\*)$")
+_ENDPOINT = re.compile(
+    r"tcp://(?P<host>\[[0-9a-fA-F:]{2,45}\]|\*|\w[\w.-]{0,189}):(?P<port>\d{1,5}|\*)", re.ASCII
+)
 
 
 def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
@@ -19,7 +21,7 @@ def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
     UserError
         Naming the configuration key, if the endpoint is not of that form.
     """
-    match = _ENDPOINT.match(endpoint)
+    match = _ENDPOINT.fullmatch(endpoint)
     if match is None or (match["port"] != "*" and int(match["port"]) > 65535):
         raise UserError(f"{key}: {endpoint!r} is no endpoint; write tcp://HOST:PORT")
     return match["host"], match["port"]
@@ -46,6 +48,11 @@ def reachable(endpoint: str, advertise: str, key: str) -> str:
     """Return the endpoint that others connect to for one that was bound."""
     host, port = split_endpoint(endpoint, key)
     return f"tcp://{advertise or host}:{port}"
+
+
+def key_of(endpoint: str) -> str:
+    """Return the public key of whom is bound at an endpoint; empty where all is plain."""
+    return endpoint.partition(" ")[2]
 
 
 def with_key(endpoint: str, public_key: str) -> str:

@@ -1,7 +1,7 @@
 """Which services are alive, what they provide, and which of them may serve a session.
 
-Control knows no kinds of service: a worker provides endpoints and needs others, an observer takes
-part in every session.
+A worker provides endpoints and needs others, an observer takes part in every session. Control knows
+no kinds of service but those that must provide what it knows by name.
 """
 
 from __future__ import annotations
@@ -13,9 +13,16 @@ from shared.keys import Peer
 from shared.wire.control import Heartbeat
 from shared.wire.session import ErrorCode
 
-# The endpoints that a client is told, each with the command that usually starts its provider; the
-# command is only for the message when no service provides it.
-CLIENT_NEEDS = {"audio": "recognizer", "phones": "recognizer", "faps": "synthesizer"}
+CLIENT_NEEDS = ("audio", "phones", "faps")  # the endpoints that a client is told
+# Who alone may provide an endpoint, as another one's key is for another kind of service.
+PROVIDERS = {
+    "audio": "recognizer",
+    "phones": "recognizer",
+    "phone_input": "synthesizer",
+    "faps": "synthesizer",
+}
+MAX_SERVICES = 60  # a status report of the largest states is within the size of a message
+MAX_SERVICES_OF_KEY = 30
 
 
 class Refusal(Exception):
@@ -53,9 +60,29 @@ class Registry:
         """Return all services in the order of their names."""
         return sorted(self._services.items())
 
+    def check(self, heartbeat: Heartbeat, peer: Peer) -> None:
+        """Check that a heartbeat may be that of a service.
+
+        Raises
+        ------
+        Refusal
+            The instance is another key's, or there are too many services.
+        """
+        known = self._services.get(heartbeat.instance)
+        if known is None:
+            keys = [record.peer.key for record in self._services.values()]
+            if len(keys) >= MAX_SERVICES or keys.count(peer.key) >= MAX_SERVICES_OF_KEY:
+                raise Refusal(ErrorCode.TOO_MANY_SERVICES, "there are too many services")
+        elif known.peer.key != peer.key:
+            raise Refusal(ErrorCode.NOT_ALLOWED, f"{heartbeat.instance} runs with another key")
+
     def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float) -> None:
         """Add a service, or note its newest heartbeat."""
         self._services[heartbeat.instance] = ServiceRecord(peer, heartbeat, now_s)
+
+    def instance_of(self, peer: Peer) -> str:
+        """Return the service that a message comes from; empty if its sender is none."""
+        return next((name for name, each in self._services.items() if each.peer == peer), "")
 
     def remove(self, instance: str) -> None:
         """Forget a service."""
@@ -172,7 +199,7 @@ class Registry:
             and (not language or record.heartbeat.language in ("", language))
         ]
         if not providers:
-            kind = CLIENT_NEEDS.get(endpoint)
+            kind = PROVIDERS.get(endpoint)
             start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
             missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
             raise Refusal(

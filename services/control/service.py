@@ -21,7 +21,7 @@ from dataclasses import replace
 from typing import Any
 
 from services.control.config import ControlConfig
-from services.control.registry import Refusal, Registry
+from services.control.registry import PROVIDERS, Refusal, Registry
 from services.control.sessions import SessionRecord, Sessions
 from shared.bus import COMMANDS
 from shared.clock import now_ns
@@ -99,18 +99,18 @@ class ControlService(Service):
         self.register(
             self._commands,
             {
-                OpenSession: self._request_handler(self._open),
-                CloseSession: self._request_handler(self._close),
-                FlushSession: self._request_handler(self._flush),
-                ChooseLips: self._request_handler(self._choose_lips),
-                Express: self._request_handler(self._pass_on),
-                ChooseExpressiveness: self._request_handler(self._pass_on),
+                OpenSession: self._request_handler(self._open, "client"),
+                CloseSession: self._request_handler(self._close, "client"),
+                FlushSession: self._request_handler(self._flush, "client"),
+                ChooseLips: self._request_handler(self._choose_lips, "client"),
+                Express: self._request_handler(self._pass_on, "client", "operator"),
+                ChooseExpressiveness: self._request_handler(self._pass_on, "client", "operator"),
                 StatusRequest: self._request_handler(self._status),
                 Heartbeat: self._on_heartbeat,
-                Done: self._on_started,
-                Speech: self._on_speech,
-                Recorded: self._on_recorded,
-                Error: self._on_service_error,
+                Done: self._service_handler(self._on_started),
+                Speech: self._service_handler(self._on_speech),
+                Recorded: self._service_handler(self._on_recorded),
+                Error: self._service_handler(self._on_service_error),
             },
         )
         self.register(self._events, {})
@@ -158,8 +158,13 @@ class ControlService(Service):
 
     # --- requests ------------------------------------------------------------------------------
 
-    def _request_handler(self, handle: Callable[[Any, Peer], Message | None]) -> Handler:
-        """Return a handler that repeats its answer when a request is repeated."""
+    def _request_handler(
+        self, handle: Callable[[Any, Peer], Message | None], *roles: str
+    ) -> Handler:
+        """Return a handler that repeats its answer when a request is repeated.
+
+        Where roles are given, only keys with one of them may ask.
+        """
 
         def on_request(message: Request, sender: Peer) -> None:
             remembered = self._answers.get((sender, message.request))
@@ -168,6 +173,7 @@ class ControlService(Service):
                 return
             reply: Message | None
             try:
+                self._check_role(sender, *roles)
                 reply = handle(message, sender)
             except Refusal as refusal:
                 self.metrics.count(f"refused_{refusal.code}")
@@ -181,6 +187,15 @@ class ControlService(Service):
                 self._reply(sender, message.request, reply)
 
         return on_request
+
+    def _check_role(self, sender: Peer, *roles: str) -> None:
+        """Refuse a sender whose key has none of some roles; with insecure = true nobody."""
+        if self.bus.zap is None or not roles:
+            return
+        guest = self.bus.zap.guests.get(sender.key)
+        if guest is None or not set(roles) & set(guest.roles):
+            text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
+            raise Refusal(ErrorCode.NOT_ALLOWED, text)
 
     def _reply(self, sender: Peer, request: str, reply: Message) -> None:
         if not isinstance(reply, StatusReport):
@@ -239,16 +254,29 @@ class ControlService(Service):
 
     # --- from the services ---------------------------------------------------------------------
 
+    def _service_handler(self, handle: Callable[[Any, str], None]) -> Handler:
+        """Return a handler of what only registered services say; it is told which one."""
+
+        def on_message(message: Message, sender: Peer) -> None:
+            instance = self._registry.instance_of(sender)
+            if instance:
+                handle(message, instance)
+            else:
+                self.warn("no-service", f"dropped a {message.kind} message: from no service")
+
+        return on_message
+
     def _on_heartbeat(self, heartbeat: Heartbeat, sender: Peer) -> None:
         received_ns = now_ns()
-        problem = _wrong_endpoints(heartbeat)
-        if problem:
-            self.warn("endpoints", f"{heartbeat.instance}: {problem}")
-            self._commands.send(Error(code=ErrorCode.BAD_MESSAGE, text=problem), to=sender)
+        try:
+            self._check_role(sender, f"service:{heartbeat.service}")
+            self._registry.check(heartbeat, sender)
+            if heartbeat.role == "worker":
+                heartbeat = replace(heartbeat, endpoints=_keyed_endpoints(heartbeat, sender.key))
+        except Refusal as refusal:
+            self.warn(refusal.code, f"{heartbeat.instance}: {refusal.text}")
+            self._commands.send(Error(code=refusal.code, text=refusal.text), to=sender)
             return
-        if heartbeat.role == "worker":
-            keyed = {name: with_key(each, sender.key) for name, each in heartbeat.endpoints.items()}
-            heartbeat = replace(heartbeat, endpoints=keyed)
         if self._registry.differs(heartbeat):
             self._service_lost(heartbeat.instance, "it started again")
         is_new = heartbeat.instance not in self._registry
@@ -289,28 +317,24 @@ class ControlService(Service):
         elif self._sessions.take_input(record, heartbeat) > self._idle_limit_s:
             self._end(record, f"no audio for {self._idle_limit_s:g} s")
 
-    def _on_started(self, done: Done, sender: Peer) -> None:
+    def _on_started(self, done: Done, instance: str) -> None:
         record = self._sessions.get(done.session)
-        if record is None or done.request != record.start_request:
-            return
-        record.waiting_for -= {
-            instance
-            for instance in record.waiting_for
-            if instance in self._registry and self._registry[instance].peer == sender
-        }
-        self._announce_if_started(record)
+        if record is not None and done.request == record.start_request:
+            record.waiting_for.discard(instance)
+            self._announce_if_started(record)
 
-    def _on_speech(self, speech: Speech, _sender: Peer) -> None:
+    def _on_speech(self, speech: Speech, instance: str) -> None:
         record = self._sessions.get(speech.session)
-        if record is not None and record.epoch == speech.epoch:
-            record.speaking = speech.active
-            name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
-            self._publish(name, record.name, media_time=speech.media_time)
+        if record is None or (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
+            return
+        record.speaking = speech.active
+        name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
+        self._publish(name, record.name, media_time=speech.media_time)
 
-    def _on_recorded(self, recorded: Recorded, _sender: Peer) -> None:
+    def _on_recorded(self, recorded: Recorded, _instance: str) -> None:
         self._publish(EventName.RECORDED, recorded.session, detail=recorded.path)
 
-    def _on_service_error(self, error: Error, _sender: Peer) -> None:
+    def _on_service_error(self, error: Error, _instance: str) -> None:
         self._publish(EventName.ERROR, error.session, detail=f"{error.code}: {error.text}")
 
     # --- sessions ------------------------------------------------------------------------------
@@ -397,17 +421,25 @@ class ControlService(Service):
         )
 
 
-def _wrong_endpoints(heartbeat: Heartbeat) -> str:
-    """Return what is wrong with the endpoints that others are to connect to, if anything."""
-    if heartbeat.role != "worker":
-        return ""
+def _keyed_endpoints(heartbeat: Heartbeat, key: str) -> dict[str, str]:
+    """Return what a worker provides with its key, once others may connect there.
+
+    Raises
+    ------
+    Refusal
+        If an endpoint is none, or another kind of service provides it.
+    """
     if not heartbeat.endpoints:
-        return "a worker must name the endpoints that it provides"
-    for key, endpoint in heartbeat.endpoints.items():
+        raise Refusal(ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides")
+    for name, endpoint in heartbeat.endpoints.items():
+        if PROVIDERS.get(name, heartbeat.service) != heartbeat.service:
+            text = f"{name} is what a {PROVIDERS[name]} provides, not a {heartbeat.service}"
+            raise Refusal(ErrorCode.NOT_ALLOWED, text)
         try:
-            host, port = split_endpoint(endpoint, key)
+            host, port = split_endpoint(endpoint, name)
         except UserError as error:
-            return str(error)
+            raise Refusal(ErrorCode.BAD_MESSAGE, str(error)) from None
         if "*" in (host, port):
-            return f"{key}: {endpoint!r} names no host or port to connect to"
-    return ""
+            text = f"{name}: {endpoint!r} names no host or port to connect to"
+            raise Refusal(ErrorCode.BAD_MESSAGE, text)
+    return {name: with_key(each, key) for name, each in heartbeat.endpoints.items()}

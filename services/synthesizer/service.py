@@ -19,7 +19,7 @@ from services.synthesizer.face import REST_S, Face, Frame
 from services.synthesizer.lips.load import load_lip_model
 from shared.bus import PHONES
 from shared.clock import to_samples, to_seconds
-from shared.endpoints import reachable
+from shared.endpoints import key_of, reachable
 from shared.face.faps import MASK_BYTES, NUM_FAPS
 from shared.keys import Peer
 from shared.logs import LOG
@@ -161,6 +161,11 @@ class SynthesizerService(Service):
         session = self._sessions.get(message.session)
         if session is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)
+            return
+        if sender.key != key_of(session.start.endpoints["phones"]):
+            self.warn(
+                "foreign", "phones from another than the session's recognizer", message.session
+            )
             return
         if message.epoch != session.start.epoch:  # sent again until control has told both ends
             self.metrics.count("other_epoch")

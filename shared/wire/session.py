@@ -38,9 +38,11 @@ class ErrorCode(StrEnum):
     FINISHED = "finished"
     NO_SERVICE = "no-service"
     NO_VIDEO = "no-video"
+    NOT_ALLOWED = "not-allowed"
     REPLAYED = "replayed"
     SESSION_EXISTS = "session-exists"
     TIMEOUT = "timeout"
+    TOO_MANY_SERVICES = "too-many-services"
     TOO_MANY_SESSIONS = "too-many-sessions"
     UNKNOWN_SESSION = "unknown-session"
 
