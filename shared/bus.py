@@ -50,14 +50,10 @@ _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message, or why the parts were none, and its sender (ROUTER sockets only).
-
-    ``connection`` is the number of the TCP connection that it came through, 0 if that has ended.
-    """
+    """One message, or why the parts were none, and its sender (ROUTER sockets only)."""
 
     message: Message | BadMessage
     sender: Peer = NOBODY
-    connection: int = 0
 
 
 class Socket:
@@ -143,12 +139,12 @@ class Socket:
                 if self._publishes:
                     self._on_subscription(parts, key)
                     continue
-                sender = Peer(parts.pop(0), key) if self._routes else NOBODY
                 number = self._connection.inode if self._connection is not None else 0
+                sender = Peer(parts.pop(0), key, number) if self._routes else NOBODY
                 try:
-                    yield Received(decode(parts), sender, number)
+                    yield Received(decode(parts), sender)
                 except BadMessage as error:
-                    yield Received(error, sender, number)
+                    yield Received(error, sender)
         finally:
             self._connection = None
 
@@ -215,7 +211,10 @@ class Socket:
             self._refusal_cost = REFUSAL_COST + num_bytes / KIB
             if num_parts > MAX_PARTS and self._connection is not None:
                 self._connection.cut("its message has too many parts", 1 + num_parts // 10_000)
-        return parts, "" if self._zap is None else _key(frame)
+        key = "" if self._zap is None else _key(frame)
+        if self._connection is not None:
+            self._connection.key = key
+        return parts, key
 
     def _on_subscription(self, parts: list[bytes], key: str) -> None:
         if len(parts) != 1:  # nobody publishes here
@@ -283,7 +282,7 @@ class Bus:
         self._context = zmq.Context()
         self._guard = Guard()
         self._key = key
-        self.zap = None if key is None else Zap(self._context)
+        self.zap = None if key is None else Zap(self._context, self._guard.cut_keys)
         self._sockets: list[Socket] = []
 
     def __enter__(self) -> Self:

@@ -23,7 +23,7 @@ import termios
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import zmq
@@ -87,6 +87,7 @@ class Connection:
         self.inode = inode  # of the TCP socket: the descriptor's number is used again
         self.guarded: Guarded | None = None  # once the guard has seen it
         self.address = ""
+        self.key = ""  # of the peer, once something was delivered
         self.delivered = HANDSHAKE  # bytes; only the socket's thread writes it
         self.waiting = 0  # bytes that libzmq holds; the guard's, as all that follows
         self.stuck = 0  # of them, those that waited while all complete messages were delivered
@@ -275,6 +276,12 @@ class Guard:
             return None
         known = self._connections.get(inode)
         return known or self._connections.setdefault(inode, Connection(descriptor, inode))
+
+    def cut_keys(self, keys: Collection[str]) -> None:
+        """Cut the connections of some keys; those that delivered nothing get nothing, either."""
+        for connection in list(self._connections.values()):
+            if connection.key in keys:
+                connection.cut("its key is allowed no longer, or not for the same")
 
     def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
         """Keep the subscriptions of one connection, and of all, within their bounds."""

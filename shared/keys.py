@@ -18,11 +18,9 @@ import json
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
-
-import zmq
 
 from shared.endpoints import with_key
 from shared.errors import UserError
@@ -45,11 +43,13 @@ class Key:
     control: str
 
 
-class Peer(NamedTuple):
-    """Who sent something to a ROUTER socket."""
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Who sent something to a ROUTER socket; the same peer may connect again."""
 
-    address: bytes = b""  # what the peer calls itself, or a name made by the socket
+    address: bytes = b""  # what it calls itself, or a name made by the socket
     key: str = ""  # its public key, proved; empty where all is plain
+    connection: int = field(default=0, compare=False)  # its number; 0: it has ended
 
 
 NOBODY = Peer()
@@ -200,6 +200,8 @@ def may_follow(guest: Guest, topic: bytes) -> bool:
 
 
 def _new_key(control: str = "") -> str:
+    import zmq  # noqa: PLC0415 (commands that talk to nobody start without)
+
     public, secret = (part.decode() for part in zmq.curve_keypair())
     return json.dumps(asdict(Key(public, secret, control or public)), indent=1) + "\n"
 

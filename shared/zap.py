@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Collection
 
 import zmq
 from zmq.utils import z85
@@ -21,6 +22,13 @@ class Zap:
     A refusal is a temporary one (status 300): who is refused tries again, for the key may be
     allowed any moment.
 
+    Parameters
+    ----------
+    context
+        Of the sockets.
+    cut
+        Ends the connections of keys that are allowed no longer, or not for the same.
+
     Attributes
     ----------
     guests
@@ -34,9 +42,14 @@ class Zap:
         As ``read_guests``.
     """
 
-    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        cut: Callable[[Collection[str]], None],
+    ) -> None:
         self.version = guests_version()
         self.guests: Guests = read_guests()
+        self._cut = cut
         self._socket = context.socket(zmq.REP)
         self._socket.bind("inproc://zeromq.zap.01")
         threading.Thread(target=self._answer, name="zap", daemon=True).start()
@@ -47,10 +60,13 @@ class Zap:
         if version == self.version:
             return
         self.version = version
+        before = self.guests
         try:
             self.guests = read_guests()
         except UserError as error:
             LOG.error("the allowed keys stay as they were: %s", error)
+            return
+        self._cut({key for key, guest in before.items() if self.guests.get(key) != guest})
 
     def _answer(self) -> None:
         with self._socket as socket:

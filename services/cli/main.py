@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from services.cli import clients, configuration, offline, run
 from services.cli.heads import app as head_app
+from services.cli.keys import app as keys_app
 from services.cli.services import service_command
 from services.cli.terminal import CONSOLE
 from services.kinds import KINDS
@@ -80,6 +81,7 @@ for command in (
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(head_app, name="head")
+app.add_typer(keys_app, name="keys")
 for kind in KINDS.values():
     app.command(kind.name, help=kind.summary, rich_help_panel=SERVICES)(service_command(kind))
 

@@ -86,7 +86,7 @@ class ControlService(Service):
         self._registry = Registry(config.lost_after_s)
         self._sessions = Sessions(self._registry, config.max_sessions)
         self._idle_limit_s = config.idle_limit_s
-        self._answers: OrderedDict[tuple[Peer, str], Message] = OrderedDict()
+        self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
         self._num_events = 0
         self._told_version = (0, 0)  # of the allowed keys
         self._commands = self.bus.bind_router(config.commands, "control.commands", COMMANDS)
@@ -167,7 +167,7 @@ class ControlService(Service):
         """
 
         def on_request(message: Request, sender: Peer) -> None:
-            remembered = self._answers.get((sender, message.request))
+            remembered = self._answers.get(_asker(sender, message.request))
             if remembered is not None:
                 self._commands.send(remembered, to=sender)
                 return
@@ -199,13 +199,14 @@ class ControlService(Service):
 
     def _reply(self, sender: Peer, request: str, reply: Message) -> None:
         if not isinstance(reply, StatusReport):
-            self._answers[sender, request] = reply
+            self._answers[_asker(sender, request)] = reply
             if len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
         self._commands.send(reply, to=sender)
 
     def _open(self, message: OpenSession, sender: Peer) -> None:
-        if any((record.client, record.opening) == (sender, message) for record in self._sessions):
+        starting = (record for record in self._sessions if not record.announced)
+        if any((record.client, record.opening) == (sender, message) for record in starting):
             return  # the same request again while the services start
         record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
@@ -419,6 +420,11 @@ class ControlService(Service):
                 detail=detail[:2000],
             )
         )
+
+
+def _asker(sender: Peer, request: str) -> tuple[Peer, int, str]:
+    """Return who may have the answer to a request again: its sender, if that can be proved."""
+    return sender, 0 if sender.key else sender.connection, request
 
 
 def _keyed_endpoints(heartbeat: Heartbeat, key: str) -> dict[str, str]:

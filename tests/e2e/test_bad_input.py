@@ -304,7 +304,12 @@ def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) 
 
 @pytest.mark.parametrize(
     "endpoints",
-    [{}, {"audio": "x", "phones": "y"}, {"audio": "tcp://*:1", "phones": "tcp://*:2"}],
+    [
+        {},
+        {"audio": "x", "phones": "y"},
+        {"audio": "tcp://*:1", "phones": "tcp://*:2"},
+        {"audio": "tcp://-:1", "phones": "tcp://-:1"},
+    ],
 )
 def test_a_false_recognizer_is_not_given_sessions(
     system: System, client: Client, witness: Session, endpoints: dict[str, str]

@@ -200,7 +200,7 @@ def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[s
     """Start ``kouxing listen`` and return once it says what is expected first."""
     listener = subprocess.Popen(
         [sys.executable, "-m", "services", "listen", *map(str, arguments)],
-        env={**os.environ, "KOUXING_CONTROL": control},
+        env={**os.environ, "KOUXING_CONTROL": control.partition(" ")[0]},
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -7,6 +7,7 @@ import re
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +19,7 @@ import pytest
 import zmq
 
 from shared.keys import Key, key_folder, own_key, user_key
-from tests.e2e.following import samples_of_file
+from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System, connect
 
 pytestmark = pytest.mark.e2e
@@ -221,6 +222,27 @@ def test_the_examples_in_the_document_run(
     jaw = [float(line.split()[-1]) for line in result.stdout.splitlines()]
     assert len(jaw) > 100
     assert max(jaw) > 200, "/a/ opens the jaw"
+
+
+def test_the_example_in_the_readme_follows_a_face(spread: System, tmp_path: Path) -> None:
+    readme = (ROOT / "README.md").read_text("utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    faps = spread.endpoints()["faps"].partition(" ")[0]
+    for default, own in (
+        ("tcp://127.0.0.1:5571", faps),
+        (str(Path(KEY_FILE).parent), key_folder()),
+    ):
+        assert default in example
+        example = example.replace(default, str(own))
+    command = [sys.executable, "-u", "-c", example]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as program:
+        assert program.stdout is not None
+        heard = threading.Thread(target=program.stdout.readline)
+        heard.start()
+        while heard.is_alive():  # it subscribes at some time
+            stream(spread.control, samples_of_file(VOWELS_FILE)[:8000], session="demo")
+        assert program.poll() is None
+        program.terminate()
 
 
 def test_services_share_no_folder_and_say_what_they_are(spread: System, tmp_path: Path) -> None:

@@ -116,7 +116,8 @@ def lips_of(sent: Collected) -> list[Lips]:
 def recognizer_with_lips(control: str) -> Iterator[None]:
     """Run a recognizer in this process, since no shipped file holds the made-up lips."""
     local = "tcp://127.0.0.1:*"
-    config = RecognizerConfig(control=control, audio=local, phones=local)
+    address = control.partition(" ")[0]
+    config = RecognizerConfig(control=address, audio=local, phones=local)
     service = RecognizerService(config, LoudLips())
     stop = threading.Event()
 

@@ -171,7 +171,7 @@ def test_a_message_of_another_connection_has_another_number(bus: Bus) -> None:
         for sequence, connection in enumerate((first, second, first, second)):
             connection.sendall(wire_bytes(chunk(sequence, 10)))
             (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
-            numbers.append(received.connection)
+            numbers.append(received.sender.connection)
     assert numbers[:2] == numbers[2:]
     assert len({*numbers, 0}) == 3
 

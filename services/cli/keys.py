@@ -1,0 +1,66 @@
+"""The commands under ``kouxing keys``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from services.cli.terminal import print_message
+from shared.keys import CLIENT, add_guest, key_folder, read_guests, revoke_guest, user_key
+
+app = typer.Typer(no_args_is_help=True, help="Who may connect to the services.")
+
+
+@app.command()
+def init() -> None:
+    """Make the keys of a system on this machine, as whatever starts first does."""
+    user_key()
+    print_message(f"the keys are in {key_folder()}")
+
+
+@app.command()
+def add(
+    name: Annotated[str, typer.Argument(help="Whose key it is: a machine, a program, a person.")],
+    roles: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--role",
+            help="client (if none is given), operator, service:KIND, subscriber:SESSION or"
+            " 'subscriber:*'; repeatable.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write; else NAME.key.")
+    ] = None,
+) -> None:
+    """Make a key for another machine and allow it at once."""
+    roles = roles or [CLIENT]
+    path = output or Path(f"{name}.key")
+    add_guest(name, roles, path)
+    kinds = [role.removeprefix("service:") for role in roles if role.startswith("service:")]
+    print_message(
+        f"wrote {path}; move it to ~/.local/state/kouxing/{(kinds or [CLIENT])[0]}.key on the other"
+        " machine (folder: mode 700, file: mode 600)"
+    )
+
+
+@app.command("list")
+def list_keys() -> None:
+    """Show the keys that are allowed, with their roles."""
+    table = Table("name", "roles", "public key", box=box.SIMPLE)
+    for public, guest in sorted(read_guests().items(), key=lambda item: item[1].name):
+        table.add_row(guest.name, escape(", ".join(guest.roles)), escape(public))
+    Console().print(table)
+
+
+@app.command()
+def revoke(name: Annotated[str, typer.Argument(help="As 'kouxing keys list' shows it.")]) -> None:
+    """Allow a key no longer; its connections end at once."""
+    revoke_guest(name)
+    print_message(f"{name} is allowed no longer")

@@ -1,0 +1,213 @@
+"""Peers with a key that say what only others may say: it counts for nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from services.control.registry import MAX_SERVICES_OF_KEY
+from shared.bus import Bus, Socket
+from shared.client import Client, Refused, Session
+from shared.errors import UserError
+from shared.keys import add_guest, key_folder, own_key, revoke_guest, user_key
+from shared.wire.control import Event, Heartbeat, Recorded, SessionInput
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.message import Message
+from shared.wire.session import Error
+from shared.wire.speech import EndOfPhones, Phone, Progress, Speech
+from tests.e2e.following import samples_of_file
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+M = TypeVar("M", bound=Message)
+HEARTBEAT = Heartbeat(
+    service="driver", instance="a-false-one", role="observer", state="ready", sent_ns=0
+)
+ENDPOINTS = {"audio": "tcp://127.0.0.1:1", "phones": "tcp://127.0.0.1:1"}
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    services = ("control", "recognizer", "synthesizer")
+    with System(services, tmp_path_factory.mktemp("forgery")) as running:
+        yield running
+
+
+def answer(socket: Socket, kind: type[M], deadline_s: float = 20.0) -> M:
+    """Return the next message of a kind."""
+    end_s = time.monotonic() + deadline_s
+    while time.monotonic() < end_s:
+        socket.wait(0.1)
+        for received in socket.receive():
+            if isinstance(received.message, kind):
+                return received.message
+    raise AssertionError(f"no {kind.kind} came")
+
+
+@pytest.mark.parametrize("name", ["client", "driver"])
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"service": "recognizer", "role": "worker", "endpoints": ENDPOINTS},
+        {"role": "worker", "endpoints": ENDPOINTS},
+        {"instance": "the recognizer's", "role": "worker", "endpoints": ENDPOINTS},
+        {"instance": "the recognizer's", "state": "draining"},
+    ],
+)
+def test_nobody_speaks_for_a_service_of_another_key(
+    system: System, client: Client, witness: Session, name: str, forged: dict[str, object]
+) -> None:
+    own_key("driver", ("service:driver",))
+    before = {each.instance for each in client.status().services}
+    (recognizer,) = (each for each in before if each.startswith("recognizer"))
+    if "instance" in forged:
+        forged = {**forged, "instance": recognizer}
+    with Bus(own_key(name, ())) as bus:
+        stranger = bus.connect_dealer(system.control)
+        stranger.send(replace(HEARTBEAT, **forged))  # type: ignore[arg-type]
+        assert answer(stranger, Error).code == "not-allowed"
+    assert {each.instance for each in client.status().services} == before
+    session = client.open_session()
+    assert session.opened.audio == witness.opened.audio
+    session.close()
+
+
+def test_only_a_sessions_own_worker_says_that_it_is_idle(
+    system: System, client: Client, witness: Session
+) -> None:
+    with Bus(own_key("driver", ("service:driver",))) as bus:
+        stranger = bus.connect_dealer(system.control)
+        idle = {witness.name: SessionInput(idle_s=1e9)}
+        stranger.send(replace(HEARTBEAT, sessions=idle))
+        while "a-false-one" not in {each.instance for each in client.status().services}:
+            pass
+        assert witness.name in {each.session for each in client.status().sessions}
+        stranger.send(replace(HEARTBEAT, state="draining"))
+        while "a-false-one" in {each.instance for each in client.status().services}:
+            pass
+
+
+def test_only_a_services_own_messages_become_events(
+    system: System, client: Client, witness: Session
+) -> None:
+    events = client.bus.connect_subscriber(witness.opened.events)
+    events.subscribe(Event, None)
+    with Bus(user_key()) as bus:
+        stranger = bus.connect_dealer(system.control)
+        end_s = time.monotonic() + 20
+        while not events.wait(0.05):  # until the subscription is in effect
+            assert time.monotonic() < end_s
+            client.open_session().close()
+        for message in (
+            Recorded(session=witness.name, path="/etc/passwd", num_images=1, duration_s=1.0),
+            Speech(session=witness.name, epoch=1, active=True),
+            Error(session=witness.name, code="no-video", text="forged"),
+        ):
+            stranger.send(message)
+        names = set()
+        while "session-flushed" not in names:
+            witness.flush()
+            names |= {
+                received.message.name
+                for received in events.receive()
+                if isinstance(received.message, Event)
+            }
+    assert not names & {"recorded", "speech-start", "error"}
+
+
+def test_only_the_sessions_recognizer_moves_its_face(
+    system: System, client: Client, witness: Session
+) -> None:
+    output = witness.subscribe(FapFrame, EndOfFaps)
+    forged: list[Message] = [
+        Phone(index=0, symbol="a", duration=9, confidence=1.0, final=True),
+        Progress(level_db=0.0),
+        EndOfPhones(),
+    ]
+    endpoint = system.endpoints()["phone_input"]
+    with Bus(own_key("driver", ("service:driver",))) as bus:
+        stranger = bus.connect_dealer(endpoint)
+        for number, message in enumerate(forged, start=1):
+            stranger.send(
+                replace(message, session=witness.name, epoch=1, sequence=number, media_time=123_200)
+            )
+        witness.send(samples_of_file(DEMO / "hello-female.wav")[:16000])
+        frames: list[FapFrame] = []
+        end_s = time.monotonic() + 20
+        while len(frames) < 30:
+            assert time.monotonic() < end_s
+            output.wait(0.1)
+            for received in output.receive():
+                assert isinstance(received.message, FapFrame), "a false end"
+                frames.append(received.message)
+        assert max(frame.media_time for frame in frames) <= 16000
+        assert not stranger.wait(0.1), "it is told no sequence number"
+    with Bus(user_key()) as bus:
+        assert bus.is_refused(endpoint), "a client does not even get in"
+
+
+@pytest.fixture
+def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
+    """A client of another machine, whose key, ``laptop``, has the role of a subscriber."""
+    add_guest("laptop", ("subscriber:shown",), tmp_path / "laptop.key")
+    with monkeypatch.context() as there:
+        there.setenv("XDG_STATE_HOME", str(tmp_path))
+        key_folder().mkdir(mode=0o700)
+        (tmp_path / "laptop.key").rename(key_folder() / "client.key")
+        key = user_key()
+    with Client(system.control, key=key, deadline_s=5.0) as made:
+        yield made
+    with contextlib.suppress(UserError):  # revoked already
+        revoke_guest("laptop")
+
+
+def test_a_key_may_do_what_its_roles_say(keyed: Client, client: Client, witness: Session) -> None:
+    assert witness.name in {each.session for each in keyed.status().sessions}
+    with pytest.raises(Refused, match=r"not-allowed: .* no role client"):
+        keyed.open_session()
+    with pytest.raises(Refused, match=r"not-allowed: .* no role client or operator"):
+        keyed.express(witness.name, {"joy": 1.0})
+
+
+def test_a_revoked_key_is_cut_while_it_follows(
+    system: System, keyed: Client, client: Client
+) -> None:
+    shown = client.open_session(session="shown", encoding="f32le", paced=False)
+    followed = keyed.bus.connect_subscriber(shown.opened.faps)
+    followed.subscribe_session([FapFrame], "shown")
+    assert followed.wait(20.0), "joined"
+    list(followed.receive())
+    samples = samples_of_file(DEMO / "hello-female.wav")
+    shown.send(samples[:16000])
+    assert followed.wait(20.0)
+    revoke_guest("laptop")
+    own = shown.subscribe(FapFrame)
+    with contextlib.suppress(UserError):
+        while keyed.status():  # until control has seen it
+            pass
+    with pytest.raises(UserError, match="does not accept"):
+        keyed.status()
+    while followed.wait(0.5):
+        list(followed.receive())
+    shown.send(samples[16000:32000])
+    assert own.wait(20.0)
+    assert not followed.wait(0.5)
+    shown.close()
+
+
+def test_very_many_false_services_leave_the_status_readable(system: System, client: Client) -> None:
+    with Bus(own_key("lamp", ("service:lamp",))) as bus:
+        stranger = bus.connect_dealer(system.control)
+        metrics = {f"{number:0128}": 0.0 for number in range(64)}
+        for number in range(1200):
+            heartbeat = replace(HEARTBEAT, service="lamp", instance=f"{number:0128}")
+            stranger.send(replace(heartbeat, metrics=metrics))
+        assert answer(stranger, Error).code == "too-many-services"
+        lamps = [each for each in client.status().services if each.service == "lamp"]
+        assert len(lamps) == MAX_SERVICES_OF_KEY
