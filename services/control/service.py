@@ -423,8 +423,8 @@ class ControlService(Service):
 
 
 def _asker(sender: Peer, request: str) -> tuple[Peer, int, str]:
-    """Return who may have the answer to a request again: its sender, if that can be proved."""
-    return sender, 0 if sender.key else sender.connection, request
+    """Return who may have the answer to a request again: its sender, on the same connection."""
+    return sender, sender.connection, request
 
 
 def _keyed_endpoints(heartbeat: Heartbeat, key: str) -> dict[str, str]:
