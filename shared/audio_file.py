@@ -44,7 +44,7 @@ class AudioSource:
 def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
     """Open an audio file, or the sound of a video, for reading block by block.
 
-    libsndfile reads wav, flac, ogg and mp3, FFmpeg all others (m4a, mp4, webm, ...). Files above
+    libsndfile reads wav, flac and ogg, FFmpeg all others (mp3, m4a, mp4, webm, ...). Files above
     48 kHz are resampled to 48 kHz, and channels beyond the second are left out or mixed in.
 
     Raises
@@ -53,17 +53,21 @@ def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
         If the file is missing, empty, no audio, below 8 kHz, or (while reading) holds samples
         that are no numbers.
     """
+    file = None
     try:
-        file = soundfile.SoundFile(path)
-    except (soundfile.LibsndfileError, OSError) as error:
-        if not path.exists():
-            raise UserError(f"{path}: there is no such file") from None
         if path.is_dir():
-            raise UserError(f"{path}: this is a folder; give an audio file") from None
+            raise UserError(f"{path}: this is a folder; give an audio file")
         if path.stat().st_size == 0:
-            raise UserError(f"{path}: the file is empty") from None
-        if isinstance(error, OSError):
-            raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+            raise UserError(f"{path}: the file is empty")
+        if path.suffix.lower() != ".mp3":  # for which libsndfile writes to the terminal
+            file = soundfile.SoundFile(path)
+    except FileNotFoundError:
+        raise UserError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from None
+    except soundfile.LibsndfileError:
+        pass
+    if file is None:
         return _open_media(path, block_s)
     if file.frames == 0:
         raise UserError(f"{path}: the file holds no samples; was the recording cut off?")

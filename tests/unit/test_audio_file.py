@@ -11,6 +11,7 @@ import soundfile
 
 from shared.audio_file import open_audio, raw_audio, read_audio
 from shared.errors import UserError
+from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
 
@@ -92,6 +93,11 @@ def test_a_length_that_a_pipe_could_not_know_is_no_cut(tmp_path: Path) -> None:
     assert source.remarks == []
 
 
+def test_a_name_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be read: File name too long"):
+        open_audio(tmp_path / f"{'a' * 300}.wav")
+
+
 def test_a_folder_is_called_one(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="folder"):
         open_audio(tmp_path)
@@ -114,6 +120,15 @@ def _write_media(path: Path, codec: str, samples: np.ndarray, rate_hz: int) -> N
         for part in [*resampler.resample(frame), *resampler.resample(None)]:
             container.mux(stream.encode(part))
         container.mux(stream.encode(None))
+
+
+def test_reading_an_mp3_file_writes_nothing_to_the_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    speech, rate_hz = read_audio(DEMO / "hello-male.wav")
+    _write_media(tmp_path / "a.mp3", "libmp3lame", speech[:, 0], rate_hz)
+    assert len(read_audio(tmp_path / "a.mp3")[0]) >= len(speech)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize(
