@@ -465,6 +465,11 @@ def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
     )
     page.click("record")
     page.wait_for("window.kouxing.state.recording")
+    canvas = "document.getElementById('head')"
+    size = page.evaluate(f"[{canvas}.width, {canvas}.height]")
+    frames = page.evaluate("window.kouxing.state.numFrames")
+    page.wait_for(f"window.kouxing.state.numFrames > {frames + 25}")
+    page.resize(500, 400)  # the video keeps its size
 
     write_tone(tmp_path / "tone.wav")  # 2 s
     document = page.command("DOM.getDocument")["root"]["nodeId"]
@@ -482,6 +487,7 @@ def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
     page.wait_for("window.kouxing.state.session === 'seen'")
     page.click("record")
     page.wait_for("!window.kouxing.state.recording && window.saved !== null")
+    page.resize(*SIZE_PX)
     video = base64.b64decode(
         page.evaluate(
             "window.saved.arrayBuffer().then((data) =>"
@@ -489,10 +495,12 @@ def test_a_file_is_spoken_and_the_face_recorded_as_a_video(
         )
     )
     with av.open(io.BytesIO(video), "r") as container:
+        assert "mp4" in container.format.name
         assert {stream.type for stream in container.streams} == {"video", "audio"}
         frames = container.decode(video=0)
         pictures = [np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in frames]
     assert len(pictures) > 5
+    assert {picture.shape for picture in pictures} == {(size[1], size[0], 3)}
     assert colour(pictures[-1]).max() > 50  # skin
     assert pictures[-1][2, 2].min() > 200  # its own background, not black
 

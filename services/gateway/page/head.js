@@ -33,6 +33,8 @@ export class Head {
   #software; // the processor draws
   #pace;
   #isDrawing = false;
+  #isFilmed = false;
+  #size = [0, 0]; // on the page
   #numPictures = 0;
   #turn = new THREE.Quaternion();
 
@@ -92,9 +94,14 @@ export class Head {
     this.#frame(about.camera);
   }
 
-  /** Fill the background with a CSS colour; null: see through. */
-  fill(color) {
+  /**
+   * Draw for a film, before a CSS colour, with as many pixels as now to its end; null: for the page
+   * again.
+   */
+  film(color) {
+    this.#isFilmed = color !== null;
     this.#renderer.setClearColor(color ?? 0, color === null ? 0 : 1);
+    this.#resize();
     this.#stale = true;
   }
 
@@ -237,7 +244,9 @@ export class Head {
   }
 
   #resize() {
-    const { clientWidth: width, clientHeight: height } = this.#renderer.domElement;
+    const { clientWidth, clientHeight } = this.#renderer.domElement;
+    if (!this.#isFilmed) this.#size = [clientWidth, clientHeight];
+    const [width, height] = this.#size;
     if (width === 0 || height === 0) return;
     // The head is fitted into what the controls leave free, a little behind them at most.
     const hidden = this.#overlay.offsetHeight * OVERLAY_SHARE;
@@ -247,8 +256,9 @@ export class Head {
     this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
     this.#camera.aspect = width / height;
     this.#camera.setViewOffset(width, height, 0, (height - free) / 2, width, height);
+    this.#stale = true;
+    if (this.#isFilmed) return;
     this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(width, height, false);
-    this.#stale = true;
   }
 }

@@ -388,9 +388,9 @@ element("record").onclick = async () => {
   if (video.isRecording) {
     video.stop();
     sound.untap();
-    head.fill(null);
+    head.film(null);
   } else if (head !== null) {
-    head.fill(BACKGROUND);
+    head.film(BACKGROUND);
     video.start(element("head"), await sound.tap());
     if (playout.offsetMs !== null) sound.align(performance.now(), playout.offsetMs);
   }
