@@ -136,13 +136,9 @@ def read_guests() -> dict[str, Guest]:
         return _read_guests(folder)
 
 
-def guests_version() -> tuple[int, int]:
-    """Return what differs once ``read_guests`` returns something else."""
-    try:
-        about = (key_folder() / "allowed").stat()
-    except OSError:
-        return 0, 0
-    return about.st_ino, about.st_mtime_ns
+def guests_file() -> Path:
+    """Return the file that ``read_guests`` reads; a change puts another in its place."""
+    return key_folder() / "allowed"
 
 
 def add_guest(name: str, roles: Collection[str], path: Path) -> None:
@@ -180,13 +176,16 @@ def revoke_guest(name: str) -> None:
 def save_guests(guests: Guests) -> None:
     """Keep what control has told, so that a service knows its guests when it starts again.
 
+    On control's own machine the list is there, and perhaps newer.
+
     Raises
     ------
     UserError
         If it cannot be written.
     """
     with _locked_folder() as folder:
-        if _read_guests(folder) != guests:
+        is_controls = (folder / "control.key").exists()
+        if not is_controls and _read_guests(folder) != guests:
             _write(folder / "allowed", _lines(guests))
 
 

@@ -9,7 +9,7 @@ import zmq
 from zmq.utils import z85
 
 from shared.errors import UserError
-from shared.keys import Guests, guests_version, read_guests
+from shared.keys import Guests, guests_file, read_guests
 from shared.logs import LOG
 
 # Who may connect to a socket, by its setting; to the others every key that is allowed at all.
@@ -47,26 +47,35 @@ class Zap:
         context: zmq.Context[zmq.Socket[bytes]],
         cut: Callable[[Collection[str]], None],
     ) -> None:
-        self.version = guests_version()
+        self._file = guests_file()
+        self.version = self._newest_version()
         self.guests: Guests = read_guests()
         self._cut = cut
+        self._lock = threading.Lock()
         self._socket = context.socket(zmq.REP)
         self._socket.bind("inproc://zeromq.zap.01")
         threading.Thread(target=self._answer, name="zap", daemon=True).start()
 
     def refresh(self) -> None:
         """Let changes of the list take effect."""
-        version = guests_version()
-        if version == self.version:
-            return
-        self.version = version
-        before = self.guests
-        try:
-            self.guests = read_guests()
-        except UserError as error:
-            LOG.error("the allowed keys stay as they were: %s", error)
-            return
+        with self._lock:  # whoever comes second has the new list, too
+            version = self._newest_version()
+            if version == self.version:
+                return
+            before = self.guests
+            try:
+                self.guests = read_guests()
+            except UserError as error:
+                LOG.error("the allowed keys stay as they were: %s", error)
+            self.version = version
         self._cut({key for key, guest in before.items() if self.guests.get(key) != guest})
+
+    def _newest_version(self) -> tuple[int, int]:
+        try:
+            about = self._file.stat()
+        except OSError:
+            return 0, 0
+        return about.st_ino, about.st_mtime_ns
 
     def _answer(self) -> None:
         with self._socket as socket:

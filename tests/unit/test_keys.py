@@ -95,6 +95,13 @@ def test_an_added_key_works_on_another_machine(
     assert read_guests() == {public: Guest("laptop", ("client",))}
 
 
+def test_on_controls_machine_only_commands_change_the_list(tmp_path: Path) -> None:
+    add_guest("laptop", ("client",), tmp_path / "laptop.key")
+    before = read_guests()
+    save_guests({})  # told by control before it saw the new key
+    assert read_guests() == before
+
+
 def test_a_revoked_key_is_allowed_no_longer_and_its_name_is_free(tmp_path: Path) -> None:
     add_guest("laptop", ("client",), tmp_path / "1")
     with pytest.raises(UserError, match="kouxing keys revoke laptop"):
