@@ -1,0 +1,56 @@
+"""Services and a client on machines of their own, each with the key that was copied there."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.kinds import free_addresses
+from tests.e2e.following import stream
+from tests.system import System, kouxing
+
+pytestmark = pytest.mark.e2e
+KINDS = ("recognizer", "synthesizer")
+
+
+def machine(folder: Path, name: str, role: str, file: str) -> Path:
+    """Make a key by the command, and the state folder of another machine that has it alone."""
+    added = kouxing("keys", "add", name, "--role", role, "-o", folder / f"{name}.key")
+    assert added.returncode == 0, added.stderr
+    assert f"/{file}.key on the other machine" in added.stderr
+    keys = folder / name / "kouxing"
+    keys.mkdir(parents=True, mode=0o700)
+    (folder / f"{name}.key").rename(keys / f"{file}.key")
+    return folder / name
+
+
+def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
+    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1", **free_addresses(KINDS)}
+    with System(["control"], tmp_path, settings=settings) as system:
+        for kind in KINDS:
+            own = machine(tmp_path, f"{kind}-host", f"service:{kind}", kind)
+            system.start(kind, XDG_STATE_HOME=str(own))
+        system.wait_ready()
+        laptop = machine(tmp_path, "laptop", "client", "client")
+        monkeypatch.setenv("XDG_STATE_HOME", str(laptop))
+        assert stream(system.control, np.zeros(3200, np.float32)).ended
+        refused = kouxing("keys", "add", "friend")
+        assert refused.returncode == 2
+        assert "on control's machine" in refused.stderr
+
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
+        listed = kouxing("keys", "list").stdout
+        assert all(name in listed for name in ("recognizer-host", "synthesizer-host", "laptop"))
+        assert kouxing("keys", "revoke", "recognizer-host").returncode == 0
+        system.wait_until(
+            lambda report: "recognizer" not in {each.service for each in report.services}
+        )
+        while "kouxing keys add NAME --role service:recognizer" not in system.log("recognizer"):
+            system.assert_all_alive()
+            time.sleep(0.1)
