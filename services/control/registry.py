@@ -7,7 +7,7 @@ no kinds of service but those that must provide what it knows by name.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from shared.keys import Peer
 from shared.wire.control import Heartbeat
@@ -105,6 +105,11 @@ class Registry:
             and instance != heartbeat.instance
             and record.heartbeat.endpoints == heartbeat.endpoints
         ]
+
+    def excuse(self, pause_s: float) -> None:
+        """Note that control itself did not listen for some time."""
+        for instance, record in self._services.items():
+            self._services[instance] = replace(record, received_s=record.received_s + pause_s)
 
     def silent(self, now_s: float) -> list[str]:
         """Return the services whose last heartbeat is too old."""

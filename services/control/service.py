@@ -63,6 +63,7 @@ from shared.zap import Zap
 STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session
 REPLACE_LIMIT_S = 20.0  # for another worker to take the place of a lost one
+EXCUSED_S = 0.5  # without a tick: then control was busy or stopped, not the others
 MAX_ANSWERS = 1000  # kept for repeated requests
 Request = (
     OpenSession
@@ -88,6 +89,7 @@ class ControlService(Service):
         self._idle_limit_s = config.idle_limit_s
         self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
         self._num_events = 0
+        self._ticked_s = time.monotonic()
         self._told_version = (0, 0)  # of the allowed keys
         self._commands = self.bus.bind_router(config.commands, "control.commands", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
@@ -121,6 +123,9 @@ class ControlService(Service):
 
     def on_tick(self, now_s: float) -> None:
         """Look for services without heartbeat, sessions that hang, and keys that changed."""
+        pause_s, self._ticked_s = now_s - self._ticked_s, now_s
+        if pause_s > EXCUSED_S:  # their heartbeats wait to be read
+            self._registry.excuse(pause_s)
         if self.bus.zap is not None:
             self._tell_new_keys(self.bus.zap)
         for instance in self._registry.silent(now_s):

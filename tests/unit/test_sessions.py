@@ -163,6 +163,12 @@ def test_there_is_a_limit() -> None:
     assert caught.value.code == "too-many-sessions"
 
 
+def test_no_service_is_lost_because_control_did_not_listen(made: Made) -> None:
+    made.registry.excuse(10.0)
+    assert made.registry.silent(12.9) == []
+    assert len(made.registry.silent(13.1)) == 2
+
+
 def test_one_key_does_not_take_all_sessions() -> None:
     made = Made(max_sessions=4)
     greedy, other = Peer(b"a", "greedy"), Peer(b"b", "other")
