@@ -76,6 +76,7 @@ class Socket:
         self._routes = routes
         self._publishes = publishes
         self._connection: Connection | None = None  # that the last message came through
+        self._sender = NOBODY  # of it
         self._refusal_cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
@@ -92,12 +93,12 @@ class Socket:
     def send(self, message: Message, *, to: Peer = NOBODY) -> bool:
         """Send a message, on a ROUTER to one peer; return whether it could be queued.
 
-        What is sent while a message is handled is charged to that one's peer, by its size.
+        What answers the message that is being handled is charged to its sender, by its size.
         """
         parts = encode(message)
         if self._routes:
             parts.insert(0, to.address)
-        if self._connection is not None:
+        if self._connection is not None and to == self._sender:
             refusal_cost = self._refusal_cost if isinstance(message, Error) else 0.0
             self._connection.charge(len(parts[-1]) / KIB + refusal_cost)
         try:
@@ -140,11 +141,11 @@ class Socket:
                     self._on_subscription(parts, key)
                     continue
                 number = self._connection.inode if self._connection is not None else 0
-                sender = Peer(parts.pop(0), key, number) if self._routes else NOBODY
+                self._sender = Peer(parts.pop(0), key, number) if self._routes else NOBODY
                 try:
-                    yield Received(decode(parts), sender)
+                    yield Received(decode(parts), self._sender)
                 except BadMessage as error:
-                    yield Received(error, sender)
+                    yield Received(error, self._sender)
         finally:
             self._connection = None
 
@@ -210,7 +211,7 @@ class Socket:
             self._connection = self._guarded.delivered(descriptor, num_bytes)
             self._refusal_cost = REFUSAL_COST + num_bytes / KIB
             if num_parts > MAX_PARTS and self._connection is not None:
-                self._connection.cut("its message has too many parts", 1 + num_parts // 10_000)
+                self._connection.cut("its message has too many parts", 1 + num_parts // 1000)
         key = "" if self._zap is None else _key(frame)
         if self._connection is not None:
             self._connection.key = key

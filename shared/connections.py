@@ -32,7 +32,7 @@ from zmq.utils.monitor import recv_monitor_message
 from shared.logs import LOG, RateLimit
 
 KIB, MIB = 1024, 1024 * 1024
-RECEIVE_BUFFER = 64 * KIB  # of the kernel, a connection
+RECEIVE_BUFFER = 256 * KIB  # of the kernel; a few segments of loopback, or it stalls
 LOOK_S = 0.02  # between looks while bytes arrive
 NEAR_LOOK_S = 0.005  # while much waits: a flood brings some 5 MB in that time
 MUCH = 128 * KIB  # more than honest peers' messages take as a rule
