@@ -52,6 +52,7 @@ CREDIT = 5000.0  # that a connection may spend at once
 CREDIT_S = 500.0  # that it gets back in a second
 MAX_FAULTS = 100  # of an address, whose new connections are cut then
 FAULTS_S = 2  # that an address is forgiven in a second
+BAN_S = 10  # until an address with too many faults is let in again, at the longest
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
 _BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
@@ -195,7 +196,8 @@ class Guarded:
 
     def blame(self, address: str, num_faults: int) -> None:
         """Count faults against an address."""
-        self._guard.faults[address] += num_faults
+        faults = self._guard.faults
+        faults[address] = min(faults[address] + num_faults, MAX_FAULTS + FAULTS_S * BAN_S)
 
     def drained(self) -> None:
         """Note that every complete message was delivered."""

@@ -1,7 +1,7 @@
 """What hostile peers cost: memory of the services, and delay of others' faces.
 
-The services run as under ``kouxing run``, on ports of their own. For each attack a sentence is
-streamed in real time before, during and after it. The attacker is a process of its own that begins
+The services run as under ``kouxing run``, on ports of their own. For each attack a session is
+streamed in real time, before, during and after it. The attacker is a process of its own that begins
 again as soon as it was cut; the first row is a process that only spins, for the attacker needs a
 processor, too. It has no key: where all have one its handshake fails, where none has it may speak.
 """
@@ -12,9 +12,11 @@ import contextlib
 import multiprocessing
 import os
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +32,16 @@ from services.kinds import KINDS, free_addresses
 from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
+from shared.connections import BAN_S
+from shared.errors import UserError
 from shared.keys import control_endpoint
 
-STREAMED_S = 3.0
+PHASE_S = 3.0
 RETURN_S = 3.0  # for memory to come back
+ATTACKED = {  # sockets, by whether others have keys; then nobody else gets far
+    False: ("commands", "audio", "faps"),
+    True: ("audio",),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +67,12 @@ def measure(path: Path, console: Console) -> list[Damage]:
         If the file is no audio or the services cannot start.
     """
     samples, rate_hz = read_audio(path)
-    sentence = np.ascontiguousarray(samples[: round(STREAMED_S * rate_hz)])
-    return [
-        damage for keys in (False, True) for damage in _measure(sentence, rate_hz, keys, console)
-    ]
+    sound = np.resize(samples, (round(3 * PHASE_S * rate_hz), samples.shape[1]))
+    return [damage for keys in (False, True) for damage in _measure(sound, rate_hz, keys, console)]
 
 
 def _measure(
-    sentence: NDArray[np.float32], rate_hz: int, keys: bool, console: Console
+    sound: NDArray[np.float32], rate_hz: int, keys: bool, console: Console
 ) -> list[Damage]:
     environment = {
         **free_addresses(),
@@ -75,23 +81,16 @@ def _measure(
         "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
     }
     control = control_endpoint(environment["KOUXING_CONTROL"], insecure=not keys)
-    delay_s = SynthesizerConfig().delay_ms / 1e3
-
-    def p95_ms() -> float:
-        with Client(control) as client:
-            to_frame_s, _ = stream(client, sentence, rate_hz, delay_s)
-        return percentiles(to_frame_s * 1e3)["p95"]
-
     with tempfile.TemporaryDirectory() as folder:
         supervisor = Supervisor([], Path(folder), console, environment)
         try:
             supervisor.start()
             supervisor.wait_ready(control)
-            p95_ms()  # what runs for the first time is slow
+            _p95_ms(control, sound, rate_hz)  # what runs for the first time is slow
             numbers = [supervisor.process_number(service) for service in KINDS]
             return [
-                _damage(keys, attack, target, numbers, environment, p95_ms)
-                for attack, target in _attacks(list(TARGETS) if not keys else ["audio"])
+                _damage(keys, attack, target, numbers, environment, sound, rate_hz)
+                for attack, target in _attacks(ATTACKED[keys])
             ]
         finally:
             supervisor.stop()
@@ -110,14 +109,14 @@ def show(damages: list[Damage], console: Console) -> None:
     console.print(table)
 
 
-def _attacks(targets: list[str]) -> Iterator[tuple[str, str]]:
+def _attacks(targets: Iterable[str]) -> Iterator[tuple[str, str]]:
     yield "none, but a busy processor", ""
     for target in targets:
         for attack in FLOODS:
             yield attack, target
     for attack in SUBSCRIPTIONS:
         yield attack, "faps"
-    yield "very many connections", targets[0]
+    yield "very many connections", "audio"
 
 
 def _damage(
@@ -126,37 +125,66 @@ def _damage(
     target: str,
     numbers: list[int],
     environment: Mapping[str, str],
-    p95_ms: Callable[[], float],
+    sound: NDArray[np.float32],
+    rate_hz: int,
 ) -> Damage:
-    before_ms = p95_ms()
+    control = control_endpoint(environment["KOUXING_CONTROL"], insecure=not keys)
+    _wait_until_let_in(control)
     memories = [Memory(number) for number in numbers]
     with _attacker(attack, target, environment):
-        during_ms = p95_ms()
+        p95_ms = _p95_ms(control, sound, rate_hz)
     growth_mb = max(memory.growth_mb for memory in memories)
     time.sleep(RETURN_S)
     kept_mb = max(memory.kept_mb for memory in memories)
-    return Damage(keys, attack, target, growth_mb, kept_mb, before_ms, during_ms, p95_ms())
+    return Damage(keys, attack, target, growth_mb, kept_mb, *p95_ms)
+
+
+def _wait_until_let_in(control: str) -> None:
+    """Wait while faults count against this address."""
+    for _ in range(BAN_S):
+        with contextlib.suppress(UserError), Client(control) as client:
+            client.status()
+            return
+        time.sleep(1.0)
+
+
+def _p95_ms(control: str, sound: NDArray[np.float32], rate_hz: int) -> tuple[float, float, float]:
+    """Return the delay before, during and after the attack, of a session that lasts throughout."""
+    with Client(control) as client:
+        times_s, delays_s, _ = stream(client, sound, rate_hz, SynthesizerConfig().delay_ms / 1e3)
+    before, during, after = (
+        percentiles(delays_s[times_s // PHASE_S == phase] * 1e3)["p95"] for phase in range(3)
+    )
+    return before, during, after
 
 
 @contextlib.contextmanager
 def _attacker(attack: str, target: str, environment: Mapping[str, str]) -> Iterator[None]:
+    """Let a process attack in the second phase of the three."""
     port, kind = 0, ""
     if target:
         service, setting, kind = TARGETS[target]
         port = int(environment[f"KOUXING_{service.upper()}_{setting}"].rpartition(":")[2])
-    process = multiprocessing.get_context("spawn").Process(
-        target=_attack, args=(attack, port, kind), daemon=True
-    )
+    context = multiprocessing.get_context("spawn")
+    begins = context.Event()
+    process = context.Process(target=_attack, args=(attack, port, kind, begins), daemon=True)
     process.start()
+    timers = [
+        threading.Timer(PHASE_S, begins.set),
+        threading.Timer(2 * PHASE_S, process.terminate),
+    ]
+    for timer in timers:
+        timer.start()
     try:
         yield
     finally:
-        process.terminate()
+        for timer in timers:
+            timer.join()
         process.join()
 
 
-def _attack(attack: str, port: int, kind: str) -> None:
-    """Attack for ever; without a port only spin."""
+def _attack(attack: str, port: int, kind: str, begins: Event) -> None:
+    """Attack for ever, once it begins; without a port only spin."""
     attacks: dict[str, Attack] = {
         **FLOODS,
         **SUBSCRIPTIONS,

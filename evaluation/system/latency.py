@@ -74,7 +74,7 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
             with Client(control) as client:
                 before = _cpu_s(client)
                 delays = [
-                    stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)
+                    stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)[1:]
                     for _ in range(num_repeats)
                 ]
                 time.sleep(1.0)  # until the last heartbeats
@@ -109,8 +109,8 @@ def show(latency: Latency, console: Console) -> None:
 
 def stream(
     client: Client, samples: NDArray[np.float32], rate_hz: int, delay_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Stream in real time; return both delays of every frame in seconds."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Stream in real time; return media time and both delays of every frame, in seconds."""
     session = client.open_session(
         encoding="f32le", sample_rate_hz=rate_hz, num_channels=samples.shape[1]
     )
@@ -145,14 +145,15 @@ def stream(
         if time.perf_counter() > end_s:
             raise UserError("the last frame did not come; this machine is too busy to measure on")
     session.close()
-    to_frame, from_sound = [], []
+    times, to_frame, from_sound = [], [], []
     for media_s, arrival_s in arrived:
         last_needed = math.ceil((media_s + delay_s) / CHUNK_S - 1e-6) - 1
         last_shown = max(0, round(media_s / CHUNK_S) - 1)
         if arrival_s < live_until_s and last_needed < len(sent_s):
+            times.append(media_s)
             to_frame.append(arrival_s - sent_s[max(0, last_needed)])
             from_sound.append(arrival_s - sent_s[last_shown])
-    return np.array(to_frame), np.array(from_sound)
+    return np.array(times), np.array(to_frame), np.array(from_sound)
 
 
 def percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:

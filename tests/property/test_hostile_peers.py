@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import time
@@ -21,6 +22,7 @@ from services.recognizer.service import RecognizerService
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.service import SynthesizerService
 from shared.bus import Bus, Socket
+from shared.errors import UserError
 from shared.service import Service
 from shared.wire.codec import encode
 from shared.wire.control import Heartbeat, SessionInput, StartSession, StatusReport, StatusRequest
@@ -207,6 +209,12 @@ class PeersOfAWorker(Peers):
     def start_the_session_anew(self, sequence: int, epoch: int) -> None:
         start = dataclasses.replace(START, epoch=epoch, token=f"t{sequence}"[:1])
         self.service.start_session(start)
+
+    @rule(endpoint=TEXTS, epoch=st.sampled_from([1, 2]))
+    def start_with_an_endpoint_of_a_hostile_worker(self, endpoint: str, epoch: int) -> None:
+        endpoints = {"phone_input": endpoint}
+        with contextlib.suppress(UserError):  # which control is told
+            self.service.start_session(dataclasses.replace(START, epoch=epoch, endpoints=endpoints))
 
     @invariant()
     def it_answers(self) -> None:

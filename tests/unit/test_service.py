@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Iterator
 
@@ -88,3 +89,21 @@ def test_a_paused_socket_keeps_its_messages(slow: Slow) -> None:
         assert slow.num_handled == 0
         slow.pause(slow.input, paused=False)
         handle(slow, 1)
+
+
+def test_a_message_for_which_no_file_can_be_opened_is_dropped(
+    slow: Slow,
+) -> None:
+    handle_progress = slow._on_progress
+
+    def open_nothing(progress: Progress, sender: Peer) -> None:
+        handle_progress(progress, sender)
+        if slow.num_handled == 1:
+            raise OSError(errno.EMFILE, "Too many open files")
+
+    slow._handlers[slow.input][Progress] = open_nothing
+    with Bus() as bus:
+        sender = bus.connect_dealer(slow.input.endpoint)
+        for _ in range(2):
+            sender.send(Progress(session="s", level_db=0.0))
+        handle(slow, 2)
