@@ -53,9 +53,9 @@ class Damage:
     socket: str
     growth_mb: float
     kept_mb: float
-    before_p95_ms: float
-    during_p95_ms: float
-    after_p95_ms: float
+    before_p95_ms: float | None  # None: no frame came in time
+    during_p95_ms: float | None
+    after_p95_ms: float | None
 
 
 def measure(path: Path, console: Console) -> list[Damage]:
@@ -104,7 +104,10 @@ def show(damages: list[Damage], console: Console) -> None:
     for damage in damages:
         keys, attack, socket, *figures = asdict(damage).values()
         table.add_row(
-            "yes" if keys else "no", attack, socket, *(f"{figure:.1f}" for figure in figures)
+            "yes" if keys else "no",
+            attack,
+            socket,
+            *("none" if figure is None else f"{figure:.1f}" for figure in figures),
         )
     console.print(table)
 
@@ -148,14 +151,12 @@ def _wait_until_let_in(control: str) -> None:
         time.sleep(1.0)
 
 
-def _p95_ms(control: str, sound: NDArray[np.float32], rate_hz: int) -> tuple[float, float, float]:
+def _p95_ms(control: str, sound: NDArray[np.float32], rate_hz: int) -> list[float | None]:
     """Return the delay before, during and after the attack, of a session that lasts throughout."""
     with Client(control) as client:
         times_s, delays_s, _ = stream(client, sound, rate_hz, SynthesizerConfig().delay_ms / 1e3)
-    before, during, after = (
-        percentiles(delays_s[times_s // PHASE_S == phase] * 1e3)["p95"] for phase in range(3)
-    )
-    return before, during, after
+    phases = [delays_s[times_s // PHASE_S == phase] * 1e3 for phase in range(3)]
+    return [percentiles(delays_ms)["p95"] if delays_ms.size else None for delays_ms in phases]
 
 
 @contextlib.contextmanager
