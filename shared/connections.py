@@ -27,7 +27,6 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import zmq
-from zmq.utils.monitor import recv_monitor_message
 
 from shared.logs import LOG, RateLimit
 
@@ -54,6 +53,7 @@ MAX_FAULTS = 100  # of an address, whose new connections are cut then
 FAULTS_S = 2  # that an address is forgiven in a second
 BAN_S = 10  # until an address with too many faults is let in again, at the longest
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
+_EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
 _BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
 _SEES_BYTES = sys.platform == "linux"
@@ -224,7 +224,8 @@ class Guarded:
         """Yield the descriptors of new connections, each with this socket."""
         with contextlib.suppress(zmq.Again):
             while True:
-                yield recv_monitor_message(self._monitor, zmq.DONTWAIT)["value"], self
+                event, _endpoint = self._monitor.recv_multipart(zmq.DONTWAIT)
+                yield _EVENT.unpack(event)[1], self
 
     def close(self) -> None:
         """Stop watching."""
@@ -283,7 +284,7 @@ class Guard:
         """Cut the connections of some keys; those that delivered nothing get nothing, either."""
         for connection in list(self._connections.values()):
             if connection.key in keys:
-                connection.cut("its key is allowed no longer, or not for the same")
+                connection.cut("its key is allowed no longer, or not for the same", 0)
 
     def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
         """Keep the subscriptions of one connection, and of all, within their bounds."""
