@@ -7,6 +7,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
 HEADS := $(PAGE)/head.glb $(patsubst %,$(PAGE)/head-%.glb,man elder child ada leo rosa mika)
+EXPORT := services/driver/head/glb_export.py services/driver/render/shaders.py
 RIVALS := evaluation/lips/rivals
 CLIENT := proto/node
 SAMPLE := shared/demo/hello-female.wav
@@ -79,8 +80,8 @@ $(RIVALS)/node_modules/.package-lock.json $(CLIENT)/node_modules/.package-lock.j
 	$(NPM) $* ci
 	touch $@
 
-$(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py | .venv/installed
+$(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) $(EXPORT) | .venv/installed
 	$(BIN)/kouxing head export $@
 
-$(PAGE)/head-%.glb: services/driver/head/assets/%.npz services/driver/head/glb_export.py | .venv/installed
+$(PAGE)/head-%.glb: services/driver/head/assets/%.npz $(EXPORT) | .venv/installed
 	$(BIN)/kouxing head export --head $* $@

@@ -29,7 +29,8 @@ _SCALE = 2  # drawn so much larger, for smooth edges
 
 def head_names() -> list[str]:
     """Name the heads of the package, the default one first."""
-    return sorted((path.stem for path in ASSETS.glob("*.npz")), key=DEFAULT_HEAD.__ne__)
+    names = (path.stem for path in ASSETS.glob("*.npz"))
+    return sorted(names, key=lambda name: (name != DEFAULT_HEAD, name))
 
 
 def draw_choices(folder: Path) -> list[Path]:

@@ -12,10 +12,12 @@ from pathlib import Path
 
 from aiohttp import WSCloseCode, web
 
+import shared.face
 from services.gateway.access import Access
 from shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
+LIGHT = Path(shared.face.__file__).with_name("light.glsl")  # the page and the driver share it
 THREE = PAGE / "node_modules" / "three"
 FACE_MESH = PAGE / "node_modules" / "@mediapipe" / "face_mesh"
 # The files that are served: of the page, and of the module that finds a face in a picture.
@@ -149,7 +151,7 @@ def _page_file(name: str, page_asset: str, frame_ancestors: str) -> web.StreamRe
             text = f"the head is missing; make it with 'kouxing head export {path}'\n"
             raise web.HTTPNotFound(text=text)
     else:
-        path = _find(PAGE, name)
+        path = LIGHT if name == LIGHT.name else _find(PAGE, name)
     if not _has_modules():
         text = "the page's modules are missing; run 'npm ci' in services/gateway/page\n"
         raise web.HTTPServiceUnavailable(text=text)

@@ -202,7 +202,7 @@ def test_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
     [
         (
             lambda rows: rows.replace("\n8.1\t", "\n8.1 1 0 0 #"),
-            "off the mesh, in its unit: 8.1 by 0.8",
+            "off the mesh, in its unit: 8.1 by 0.79",
         ),
         (lambda rows: exchange(rows, "8.3", "8.4"), "MW is not positive"),
         (lambda rows: exchange(rows, "2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),

@@ -17,7 +17,7 @@ from training.heads import paint, paint_parts, parts
 from training.heads.asset import Piece, write
 from training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
 from training.heads.feature_points import FEATURE_POINTS
-from training.heads.hair import coarse_locks
+from training.heads.hair import Crop, coarse_locks
 from training.heads.makehuman import PIVOT, MakeHuman
 from training.heads.measures import (
     eye_sockets,
@@ -41,7 +41,7 @@ from training.heads.zones import (
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-LOWEST = 3.4  # dm, where the bust ends
+LOWEST = 3.1  # dm, where the bust ends
 # the band round the neck, as rings about the garment's edge: outwards and up, dm
 _NECKBAND = (
     (0.036, 0.000),
@@ -68,9 +68,9 @@ class Builder:
         middle = self._plain[mesh.quads].mean(axis=1)
         body = mesh.group("body")
         is_socket = np.isin(mesh.quads, eye_sockets(mesh)).all(axis=1) & (middle[:, 2] < 1.1)
-        above = middle[:, 1] - neckline_height(middle[:, 2])
-        self._face = mesh.quads[body & (above > -0.3) & (middle[:, 1] > 4.0) & ~is_socket]
-        self._torso = mesh.quads[body & (middle[:, 1] > LOWEST) & (abs(middle[:, 0]) < 2.6)]
+        neck = middle[:, 1] > np.maximum(4.2 - 0.3 * middle[:, 2], 4.0)  # well below the neckline
+        self._face = mesh.quads[body & neck & ~is_socket]
+        self._torso = mesh.quads[body & (middle[:, 1] > LOWEST) & (abs(middle[:, 0]) < 2.8)]
         self._tongue = subdivided(self._plain, mesh.quads[mesh.group("helper-tongue")])
         self._layout = subdivided(self._plain, self._face).vertices
         self._cavity = mouth_cavity(mesh, subdivided(self._plain, self._face))
@@ -185,12 +185,12 @@ class Builder:
 
     def _garment(self, vertices: Float) -> Piece:
         """Make a round-necked top: the torso, a little larger, cut off round the neck."""
-        torso = subdivided(vertices, self._torso)
-        layout = subdivided(self._plain, self._torso).vertices
-        triangles = surface.triangles_of(torso.quads)
-        normals = surface.vertex_normals(torso.vertices, triangles)
+        torso, plain = (subdivided(shape, self._torso) for shape in (vertices, self._plain))
+        smooth, layout = (skin.vertices[: len(skin.base)] for skin in (torso, plain))
+        triangles = surface.triangles_of(torso.coarse_quads)
+        normals = surface.vertex_normals(smooth, triangles)
         height = layout[:, 1] - neckline_height(layout[:, 2])
-        cut, triangles, rim = surface.clip(height, triangles, np.hstack([torso.vertices, normals]))
+        cut, triangles, rim = surface.clip(height, triangles, np.hstack([smooth, normals]))
         points, normals = cut[:, :3], cut[:, 3:]
         # the edge is folded in towards the neck
         ring, local = np.unique(rim, return_inverse=True)
@@ -243,7 +243,9 @@ class Builder:
         for name, part in person.hair.parts(layout).items():
             part.vertices = part.vertices + warp(part.vertices)
             count = len(part.vertices)
-            coarse = coarse_locks(count) if name == "hair_tips" else None
+            # long locks need all their bends
+            fewer = name == "hair_tips" and isinstance(person.hair, Crop)
+            coarse = coarse_locks(count) if fewer else None
             pieces.append(Piece(name, part, "hair", 0.7, np.ones(count), coarse_triangles=coarse))
         return pieces
 

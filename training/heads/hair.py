@@ -22,6 +22,7 @@ _SKULL = np.array([0.0, 5.93, 0.42])
 _CROWN = np.array([0.0, 0.97, -0.24])  # direction from the skull's middle in which hair whorls
 NUM_BANDS = 5  # of the texture, side by side: the body's, then those that locks choose from
 _MARGIN = 0.04  # of a band, which no lock shows
+_BODY_TONE = 0.75  # of the opaque body, a factor on the texture
 _LOCK_ROWS = 9  # odd: coarse locks use every second one
 
 
@@ -96,7 +97,7 @@ class _Sheet:
             triangles = triangles[:, ::-1]
         used, compact = np.unique(triangles, return_inverse=True)
         vertices = self.points.reshape(-1, 3)[used]
-        return Part(vertices, compact.reshape(-1, 3), uv[used], np.full((len(used), 3), 0.75))
+        return Part(vertices, compact.reshape(-1, 3), uv[used], np.full((len(used), 3), _BODY_TONE))
 
 
 @dataclass(slots=True)
@@ -130,7 +131,8 @@ class _Locks:
         middle = middle + rise[..., None] * out + wave[..., None] * side
         half = half_width[..., None] * side
         ridge = 0.22 * half_width[..., None] * out
-        points = np.stack([middle - half, middle + ridge, middle + half], axis=2)
+        fall = 0.8 * rise[..., None] * out  # edges lie on the sheet, or light shines through below
+        points = np.stack([middle - half - fall, middle + ridge, middle + half - fall], axis=2)
         band = rng.integers(1, NUM_BANDS, len(order))[:, None, None]
         share = _MARGIN + (1 - 2 * _MARGIN) * np.array([0, 0.5, 1.0])
         mirrored = np.where(rng.random(len(order)) < 0.5, 1, -1)[:, None, None]
@@ -138,12 +140,11 @@ class _Locks:
         u, v = np.broadcast_arrays(u, np.broadcast_to(t[:, :, None], (1, _LOCK_ROWS, 3)))
         one = grid_triangles(_LOCK_ROWS, 3)[:, ::-1]
         first = _LOCK_ROWS * 3 * np.arange(len(order))[:, None, None]
-        tone = rng.uniform(0.72, 1.0, (len(order), 1))
-        # what lies deeper is darker
-        tone = (
-            tone * np.interp(self.lift[order], [0, max(self.lift.max(), 1e-9)], [0.8, 1])[:, None]
-        )
-        colors = np.repeat(tone, _LOCK_ROWS * 3, axis=0) * np.ones(3)
+        tone = rng.uniform(0.76, 1.0, (len(order), 1))
+        # what lies deeper is darker; roots have the body's tone
+        tone *= np.interp(self.lift[order], [0, max(self.lift.max(), 1e-9)], [0.85, 1])[:, None]
+        tone = _BODY_TONE + (tone - _BODY_TONE) * np.clip(t / 0.3, 0, 1)
+        colors = np.repeat(tone.ravel(), 3)[:, None] * np.ones(3)
         return Part(
             points.reshape(-1, 3),
             (one[None] + first).reshape(-1, 3),
@@ -199,22 +200,22 @@ class Bob:
         for side in (1.0, -1.0):
             sheet = _Sheet(self._side(side, 26, 26))
             across, along = np.meshgrid(np.arange(25) / 25, np.arange(25) / 25, indexing="ij")
-            bodies.append(sheet.body((across >= 0.03) & (along < 0.94)))
-            count = 75
-            roots = np.concatenate([rng.uniform(0.02, 1, count), rng.uniform(0, 0.07, 18)])
+            bodies.append(sheet.body((across >= 0.03) & (along < 0.97)))
+            count = 36
+            roots = np.concatenate([rng.uniform(0.02, 1, count), rng.uniform(0, 0.07, 12)])
             front = roots < 0.10
             count = len(roots)
             locks.append(
                 _Locks(
                     across=roots,
-                    start=np.where(front, 0.0, rng.uniform(0.0, 0.10, count)),
-                    end=rng.uniform(0.93, 1.0, count),
-                    width=rng.uniform(0.07, 0.17, count) * np.where(front, 0.7, 1),
+                    start=np.where(front, 0.0, rng.uniform(0.0, 0.06, count)),
+                    end=rng.uniform(0.975, 1.01, count),
+                    width=rng.uniform(0.08, 0.18, count) * np.where(front, 0.7, 1),
                     lift=rng.uniform(0.006, 0.034, count),
                     drift=rng.normal(0, 0.02, count),
                     tip_width=0.75,
-                    root_lift=0.1,
-                    tip_lift=1.0,
+                    root_lift=0.0,
+                    tip_lift=0.6,
                 ).part(sheet, rng)
             )
         return {"hair": _joined(bodies), "hair_tips": _joined(locks)}
@@ -224,7 +225,7 @@ class Bob:
         height = np.interp(
             x,
             [0.0, 0.15, 0.30, 0.42, 0.52, 0.60, 0.66, 0.72],
-            [6.45, 6.45, 6.42, 6.36, 6.24, 6.05, 5.80, 5.55],
+            [6.40, 6.40, 6.37, 6.32, 6.21, 6.04, 5.80, 5.55],
         )
         behind = (np.arctan2(x, z - 0.35) > 1.75) & (y > 5.1)
         return np.where(behind, 2.0, (y - height) / 0.13)
@@ -245,40 +246,32 @@ class Bob:
         """
         across = np.linspace(0.0, 1.0, strands)
         parting = side * self.parting * np.interp(across, [0, 0.6, 1], [1.0, 0.6, 0.0])
-        # in degrees about the skull's centre: azimuth from the front, elevation
-        azimuth_end = np.interp(across, [0.0, 0.25, 1.0], [60.0, 84.0, 180.0])
-        start = np.stack([parting, np.interp(across, [0, 0.35, 1], [38.0, 66.0, 112.0])], axis=1)
-        middle = np.stack(
-            [
-                np.interp(across, [0.0, 0.3, 1.0], [44.0, 80.0, 175.0]) + 0.4 * parting,
-                np.interp(across, [0.0, 0.3, 1.0], [34.0, 62.0, 75.0]),
-            ],
-            axis=1,
-        )
-        end = np.stack([azimuth_end, np.full(strands, -6.0)], axis=1)
-        on_skull = np.linspace(0.0, 1.0, steps // 2 + 1)
-        angles = np.radians(_bezier(np.stack([start, middle, end]), on_skull))
-        azimuth, elevation = angles[..., 0], angles[..., 1]
-        radii = np.array([0.745, 0.925, 0.90])
+        # directions from the skull's centre, by azimuth from the front and elevation, degrees:
+        # along the parting over the crown, half-way down, and above the ears; behind, the two
+        # sides overlap
+        azimuth = np.interp(across, [0.0, 0.25, 1.0], [60.0, 84.0, 183.0])
+        halfway = np.interp(across, [0.0, 0.3, 1.0], [44.0, 80.0, 183.0]) + 0.4 * parting
+        ways = [
+            _way(parting, np.interp(across, [0, 0.35, 1], [34.0, 65.0, 112.0])),
+            _way(halfway, np.interp(across, [0.0, 0.3, 1.0], [31.0, 62.0, 40.0])),
+            _way(azimuth, np.full(strands, -6.0)),
+        ]
+        on_skull = np.linspace(0.0, 1.0, 2 * steps // 3 + 1)
+        skull = _bezier(np.stack(ways), on_skull)
+        skull /= np.linalg.norm(skull, axis=2, keepdims=True)
         # hair stands up beside the parting
-        swell = 1.0 + 0.05 * np.sin(np.pi * on_skull**0.7)[None, :]
-        skull = np.stack(
-            [
-                side * np.cos(elevation) * np.sin(azimuth),
-                np.sin(elevation),
-                np.cos(elevation) * np.cos(azimuth),
-            ],
-            axis=2,
-        ) * (radii * swell[..., None])
+        swell = 1.0 + 0.035 * np.sin(np.pi * (0.15 + 0.85 * on_skull**0.7))[None, :, None]
+        skull *= np.array([side * 0.745, 0.925, 0.90]) * swell
+        skull[..., 2] *= np.where(skull[..., 2] > 0, 1.035, 1.0)  # over the forehead
         skull += _SKULL
 
         # below the ears the hair hangs and turns inwards at the tips
-        drop = np.linspace(0.0, 1.0, steps - steps // 2)[1:]
+        drop = np.linspace(0.0, 1.0, steps - 2 * steps // 3)[1:]
         length = self.length * np.interp(across, [0.0, 0.15, 0.5, 1.0], [0.96, 1.02, 1.04, 1.0])
         last, before = skull[:, -1], skull[:, -2]
         lean = last - before
         lean /= np.maximum(np.linalg.norm(lean, axis=1, keepdims=True), 1e-9)
-        facing = azimuth[:, -1]
+        facing = np.radians(azimuth)
         out = np.stack([side * np.sin(facing), np.zeros(strands), np.cos(facing)], axis=1)
         sway = 0.05 * np.sin(np.pi * np.minimum(drop * 0.9, 1)) - self.turn_in * drop**3
         hang = (
@@ -291,7 +284,7 @@ class Bob:
         # lie over the ear
         low = np.clip((6.35 - points[..., 1]) / 0.70, 0, 1)
         low = low * low * (3 - 2 * low)
-        aside = np.exp(-(((azimuth[:, -1:] - np.radians(97)) / np.radians(30)) ** 2))
+        aside = np.exp(-(((azimuth[:, None] - 97) / 30) ** 2))
         points += (0.10 * low * aside)[..., None] * out[:, None]
         # below the cheekbone the front edge keeps to the face
         hug = np.exp(-((across / 0.10) ** 2))[:, None]
@@ -300,8 +293,14 @@ class Bob:
         return points
 
 
+def _way(azimuth: Float, elevation: Float) -> Float:
+    """Directions (A, 3) by azimuth from the front towards x, and elevation, degrees."""
+    turn, up = np.radians(azimuth), np.radians(elevation)
+    return np.stack([np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)], axis=1)
+
+
 def _bezier(points: Float, t: Float) -> Float:
-    """Evaluate quadratic curves with control points (3, A, 2) at (T,) as (A, T, 2)."""
+    """Evaluate quadratic curves with control points (3, A, 3) at (T,) as (A, T, 3)."""
     first, middle, last = points[:, :, None, :]
     s = t[None, :, None]
     curve: Float = (1 - s) ** 2 * first + 2 * s * (1 - s) * middle + s**2 * last
@@ -378,7 +377,7 @@ class Crop:
         rng = np.random.default_rng(3)
         sheet, reach = self._sheet(scalp)
         along = np.tile(np.arange(21) / 21, (60, 1))
-        body = sheet.body(along < 0.88)
+        body = sheet.body(along < 0.93)
         count = self.locks
         turn = rng.uniform(-np.pi, np.pi, count)
         line = np.interp(turn, np.linspace(-np.pi, np.pi, len(reach)), reach)
@@ -400,7 +399,9 @@ class Crop:
             across=turn / (2 * np.pi) + 0.5,
             start=start,
             end=end,
-            width=self.width * rng.uniform(0.7, 1.4, count) * np.where(front, 0.8, 1),
+            width=self.width
+            * rng.uniform(0.7, 1.4, count)
+            * np.where(front, 0.8, np.interp(end, [0.8, 1], [1.1, 0.75])),
             lift=self.lift * rng.uniform(0.25, 1.0, count) * np.where(back, 1.0, low),
             drift=combed / (2 * np.pi) + rng.normal(0, 0.012, count),
             tip_width=0.3,

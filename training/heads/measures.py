@@ -71,7 +71,7 @@ def eye_sockets(mesh: BaseMesh) -> Index:
 
 def neckline_height(z: Float) -> Float:
     """Height of the garment's edge round the neck."""
-    return 4.50 - 0.30 * z
+    return 4.66 - 0.47 * z
 
 
 def head_weight(source: MakeHuman) -> Float:

@@ -64,10 +64,13 @@ def face_map(vertices: Float, uv: Float) -> FaceMap:
     )
 
 
-def _spot(face: FaceMap, x: float, y: float, width: float, height: float) -> Float:
-    """Soft spot (H, W) of height 1 at a place of the face."""
-    spot: Float = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
-    return spot
+def _spot(
+    face: FaceMap, x: float, y: float, width: float, height: float, until: float = 1.5
+) -> Float:
+    """Soft spot (H, W) of height 1 at a place of the face; none beyond the angle ``until``."""
+    spot = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
+    front: Float = spot * np.clip((until - face.angle) / 0.25, 0, 1)
+    return front
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +89,7 @@ class Look:
     age: float = 0.0  # wrinkles and spots
     iris: Color = (0.36, 0.22, 0.13)
     iris_size: float = 1.0
+    lash_line: float = 1.0  # width of the dark edge of the upper lid
     cloth: Color = (0.20, 0.29, 0.38)
     cel: bool = False  # plain colours, light and shade
 
@@ -128,7 +132,8 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: 
     image = mix(image, rosy, 0.30 * look.blush * _spot(face, 0.42, 5.42, 0.20, 0.17))
     image = mix(image, rosy, 0.16 * _spot(face, 0.0, 5.46, 0.10, 0.10))
     image = mix(image, rosy, 0.10 * _spot(face, 0.0, 4.92, 0.16, 0.10))
-    image = mix(image, rosy, 0.20 * _spot(face, 0.76, 5.60, 0.06, 0.25) * (face.angle > 1.3))
+    ear = _spot(face, 0.76, 5.60, 0.06, 0.25, until=2.0) * (face.angle > 1.3)
+    image = mix(image, rosy, 0.20 * ear)
     image = mix(image, tone(0.90, 0.83, 0.85), 0.22 * _spot(face, 0.28, 5.70, 0.13, 0.035))
     image = mix(image, tone(0.88, 0.79, 0.82), 0.18 * _spot(face, 0.27, 5.885, 0.14, 0.05))
     image = mix(image, tone(1.07, 1.10, 1.12), 0.25 * _spot(face, 0.0, 6.15, 0.35, 0.20))
@@ -137,7 +142,7 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: 
     if look.age:
         image = _paint_age(image, face, look.age)
     image = _paint_lips(image, face, lips, look)
-    image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2])
+    image = _paint_eye_lines(image, face, lid[:, :2], lid[:, 2], look.lash_line)
     image = _paint_brow(image, face, brow, look)
     return np.clip(_paint_roots(image, face, look, hair), 0, 1)
 
@@ -211,6 +216,7 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     inside = 1 / (1 + np.exp((face.y - upper + 0.004 * inset) / edge))
     inside *= 1 / (1 + np.exp((lower + 0.012 * inset - face.y) / edge))
     inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.004) / 0.006))
+    inside *= face.angle < 1.5
     lines = noise(face.x.shape, (14, 1.8), 4)
     color = np.array(look.lip) * (1 + 0.022 * lines[..., None])
     image = image + (color - image) * (look.lip_strength * inside)[..., None]
@@ -219,13 +225,13 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
     return shaded
 
 
-def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> Float:
+def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, width: float) -> Float:
     """Darken the edges of the lids, where the lashes grow, and the upper lid's fold."""
     edge = np.interp(face.x, lid[:, 0], lid[:, 1])
     inside = 1 / (1 + np.exp(-(face.x - lid[0, 0] - 0.01) / 0.008))
     inside *= 1 / (1 + np.exp((face.x - lid[-1, 0] - 0.02) / 0.012))
     height = face.y - edge
-    line = np.exp(-((height / 0.011) ** 2)) * inside
+    line = np.exp(-((height / (0.011 * width)) ** 2)) * inside
     fold = np.exp(-(((height - 0.052) / 0.010) ** 2)) * inside
     below = np.interp(face.x, lid[:, 0], lower)
     rim = np.exp(-(((face.y - below) / 0.010) ** 2)) * inside
@@ -239,12 +245,12 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float) -> F
 # direction of its hairs against its line, rad
 _BROW = np.array(
     [
-        [0.00, -0.026, 0.014, 1.20],
-        [0.12, -0.022, 0.025, 1.00],
-        [0.38, -0.008, 0.026, 0.55],
-        [0.68, 0.004, 0.021, 0.25],
-        [0.88, -0.004, 0.012, 0.05],
-        [1.00, -0.016, 0.004, 0.00],
+        [0.00, -0.031, 0.014, 1.20],
+        [0.12, -0.026, 0.025, 1.00],
+        [0.38, -0.009, 0.026, 0.55],
+        [0.68, 0.007, 0.021, 0.25],
+        [0.88, 0.001, 0.012, 0.05],
+        [1.00, -0.011, 0.004, 0.00],
     ]
 )
 

@@ -59,25 +59,25 @@ REFERENCE: tuple[Shape, Shape] = (
 # the corners of the mouth and the cheeks a little up
 _FRIENDLY: Shape = (
     *_REST,
-    ("mouthSmileLeft", 0.22),
-    ("mouthSmileRight", 0.22),
+    ("mouthSmileLeft", 0.30),
+    ("mouthSmileRight", 0.30),
     ("cheekSquintLeft", 0.15),
     ("cheekSquintRight", 0.15),
 )
 
 _NAPE = (
-    (0.70, 5.99, 0.38), (0.69, 5.84, 0.27), (0.68, 5.60, 0.22), (0.61, 5.38, 0.16),
+    (0.70, 5.92, 0.38), (0.69, 5.82, 0.29), (0.68, 5.60, 0.22), (0.61, 5.38, 0.16),
     (0.47, 5.22, 0.06), (0.28, 5.12, -0.02), (0.0, 5.09, -0.06),
 )  # fmt: skip
 _SHORT = (
-    (0.0, 6.42, 1.20), (0.22, 6.44, 1.14), (0.40, 6.39, 1.02), (0.50, 6.27, 0.95),
-    (0.585, 6.12, 0.87), (0.64, 5.96, 0.79), (0.672, 5.78, 0.745), (0.68, 5.64, 0.70),
-    (0.69, 5.64, 0.63), (0.70, 5.84, 0.57), (0.70, 5.97, 0.48), *_NAPE,
+    (0.0, 6.41, 1.20), (0.12, 6.42, 1.18), (0.26, 6.45, 1.12), (0.40, 6.42, 1.02),
+    (0.50, 6.29, 0.95), (0.585, 6.12, 0.87), (0.64, 5.96, 0.79), (0.672, 5.80, 0.755),
+    (0.68, 5.70, 0.72), (0.69, 5.70, 0.63), (0.70, 5.84, 0.57), (0.70, 5.91, 0.48), *_NAPE,
 )  # fmt: skip
 _RECEDING = (
     (0.0, 6.50, 1.14), (0.16, 6.52, 1.10), (0.32, 6.53, 0.96), (0.47, 6.38, 0.84),
-    (0.585, 6.12, 0.84), (0.64, 5.96, 0.78), (0.672, 5.78, 0.735), (0.68, 5.66, 0.70),
-    *_SHORT[8:],
+    (0.585, 6.12, 0.84), (0.64, 5.96, 0.78), (0.672, 5.80, 0.745), (0.68, 5.70, 0.71),
+    *_SHORT[9:],
 )  # fmt: skip
 _BOWL = (
     (0.0, 6.18, 1.28), (0.20, 6.18, 1.25), (0.38, 6.16, 1.14), (0.52, 6.10, 1.01),
@@ -230,10 +230,15 @@ PEOPLE = {
             lift=0.015,
             bun=0.36,
         ),
+        raised=0.003,
     ),
     "leo": Person(
         targets=(
             ("macrodetails/caucasian-male-young", 1.0),
+            ("eyebrows/eyebrows-trans-up", 0.5),
+            ("mouth/mouth-angles-up", 0.35),
+            *_both("eyes/eye-height1-incr", 0.2),
+            *_both("eyes/eye-height2-incr", 0.6),
             ("mouth/mouth-trans-down", 0.3),
             ("mouth/mouth-upperlip-height-decr", 0.25),
             ("mouth/mouth-lowerlip-height-decr", 0.25),
@@ -265,11 +270,12 @@ PEOPLE = {
             lift=0.06,
         ),
         lashes=0.55,
-        raised=0.007,
+        raised=0.012,
     ),
     "rosa": Person(
         targets=(
             ("macrodetails/caucasian-female-old", 1.0),
+            ("eyebrows/eyebrows-angle-up", 0.6),
             ("mouth/mouth-trans-down", 0.40),
             ("mouth/mouth-angles-up", 0.35),
             *_both("eyes/eye-scale-incr", 0.40),
@@ -290,7 +296,7 @@ PEOPLE = {
         ),
         hair=Bob(parting=-20.0, length=0.72, turn_in=0.24),
         lashes=0.70,
-        raised=0.010,
+        raised=0.015,
     ),
     "mika": Person(
         targets=(
@@ -302,13 +308,14 @@ PEOPLE = {
             ("nose/nose-scale-horiz-decr", 1.0),
             ("nose/nose-scale-depth-decr", 0.60),
             ("nose/nose-volume-decr", 0.60),
+            ("mouth/mouth-trans-down", 0.25),
             ("mouth/mouth-scale-horiz-decr", 0.30),
             ("mouth/mouth-upperlip-height-decr", 0.60),
-            ("mouth/mouth-lowerlip-height-decr", 0.50),
+            ("mouth/mouth-lowerlip-height-decr", 0.40),
             ("neck/neck-scale-horiz-decr", 0.70),
             ("neck/neck-scale-depth-decr", 0.50),
-            *_both("eyes/eye-scale-incr", 1.8),
-            *_both("eyes/eye-height2-incr", 1.0),
+            *_both("eyes/eye-scale-incr", 2.3),
+            *_both("eyes/eye-height2-incr", 1.2),
             *_both("ears/ear-wing-decr", 0.60),
             *_both("ears/ear-scale-decr", 0.50),
         ),
@@ -316,11 +323,12 @@ PEOPLE = {
         look=Look(
             skin=(0.965, 0.835, 0.770),
             lip=(0.850, 0.520, 0.500),
-            lip_strength=0.70,
+            lip_strength=0.75,
             hair=(0.36, 0.42, 0.66),
             brow=(0.26, 0.29, 0.48),
             iris=(0.30, 0.62, 0.80),
-            iris_size=1.45,
+            iris_size=1.6,
+            lash_line=1.9,
             brow_width=0.60,
             blush=1.1,
             cloth=(0.66, 0.76, 0.86),

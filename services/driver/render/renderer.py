@@ -241,14 +241,10 @@ class Renderer:
     def _paint(self, target: Any) -> None:
         context = self._context
         target.use()
-        eye = np.array(self._camera.position)
         matrix = tuple(self._camera.view_projection(*self.size).T.ravel())
         for program in (self._program, self._eye_program):
             program["view_projection"] = matrix
             program["eye"] = self._camera.position
-        for name, source in (("half_way", shaders.WINDOW), ("half_way_low", shaders.FLOOR)):
-            half_way = source + eye / np.linalg.norm(eye)
-            self._eye_program[name] = tuple(half_way / np.linalg.norm(half_way))
         for part in self.head.parts:
             if not part.transparent:
                 culled = 0 if part.double_sided else moderngl.CULL_FACE
@@ -272,8 +268,9 @@ class Renderer:
         wrap, gloss, shine = shaders.MATERIALS.get(part.name, shaders.PLAIN)
         for name, value in (
             ("wrap", wrap), ("gloss", gloss), ("shine", shine),
-            ("two_sided", float(part.double_sided)),
-            ("cel", float(self.head.cel)),
+            ("two_sided", part.double_sided),
+            ("strands", part.name in shaders.HAIR),
+            ("cel", self.head.cel and part.name not in shaders.EYES),
             ("share", self._mouth_light if part.name in shaders.IN_MOUTH else 1.0),
         ):  # fmt: skip
             if name in program:

@@ -232,8 +232,9 @@ export class Head {
   /** A key from the front upper left, a rim, and the light of a studio. */
   #light() {
     this.#scene.environment = studio(this.#renderer);
+    this.#scene.environmentIntensity = 0.8;
     for (const [color, intensity, x, y, z] of [
-      [0xfff2e4, 2.4, -0.42, 0.5, 0.8],
+      [0xfff2e4, 2.7, -0.42, 0.5, 0.8],
       [0xe6eeff, 0.6, 0.75, 0.1, 0.6],
       [0xffffff, 0.9, 0.55, 0.45, -0.7],
     ]) {

@@ -1,6 +1,6 @@
 // What the head is drawn with: physical materials where a graphics card is there; the driver's own
-// shading (services/driver/render/shaders.py), worked out at the vertices, where the processor
-// draws, and for heads drawn as cartoons.
+// shading (shared/face/light.glsl), worked out at the vertices, where the processor draws, and for
+// heads drawn as cartoons.
 
 import * as THREE from "three";
 
@@ -8,9 +8,7 @@ const EYES = ["eye_left", "eye_right"];
 const HAIR = ["hair", "hair_tips"];
 const UNKNOWN = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // of files that do not say
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
-// half-way to a bright window, in the camera's axes: what eyes mirror
-const CATCH_LIGHT = "vec3(-0.187, 0.176, 0.966)";
-const MIRROR = `smoothstep(0.988, 0.9935, dot(normal, ${CATCH_LIGHT}))`;
+const LIGHT = await (await fetch("light.glsl")).text(); // GLSL, the driver's, too
 
 /** Say whether the processor draws, and not a graphics card. */
 export function drawsInSoftware(gl) {
@@ -19,21 +17,14 @@ export function drawsInSoftware(gl) {
 }
 
 const PLAIN_VERTEX = `
-uniform vec3 wrap;
-uniform float gloss;
-uniform float shine;
-uniform float share;
+${LIGHT}
 varying vec2 vUv;
 varying vec3 vLight;
 varying float vHigh;
-varying vec3 vNormal;
+varying vec3 vFacing;
 #ifdef USE_SKINNING
   uniform mat4 turn;
 #endif
-
-const vec3 KEY = vec3(-0.4067, 0.4842, 0.7747);
-const vec3 FILL = vec3(0.7767, 0.1036, 0.6213);
-const vec3 RIM = vec3(0.5518, 0.4515, -0.7023);
 
 void main() {
   vec3 turned = position;
@@ -43,50 +34,43 @@ void main() {
     n = mix(normal, mat3(turn) * normal, skinWeight.y);
   #endif
   vec4 place = modelMatrix * vec4(turned, 1.0);
-  n = normalize(mat3(modelMatrix) * n);
-  vec3 v = normalize(cameraPosition - place.xyz);
-  float facing = dot(n, v);
-  #ifdef TWO_SIDED
-    if (facing < 0.0) { n = -n; facing = -facing; }
-  #endif
-  float key = dot(n, KEY);
-  vLight = mix(vec3(0.25, 0.21, 0.19), vec3(0.42, 0.44, 0.48), 0.5 + 0.5 * n.y)
-    + vec3(1.16, 1.06, 0.96) * max((key + wrap) / (1.0 + wrap), 0.0) / (1.0 + wrap)
-    + vec3(0.34, 0.38, 0.44) * max(dot(n, FILL) * 0.7 + 0.3, 0.0)
-    + vec3(0.45, 0.47, 0.50) * max(dot(n, RIM), 0.0);
-  vLight *= share * color.rgb;
-  float grazing = 1.0 - max(facing, 0.0);
-  float fresnel = 0.04 + 0.5 * grazing * grazing * grazing * grazing;
-  vHigh = pow(max(dot(n, normalize(KEY + v)), 0.0), gloss) * max(key, 0.0) * (0.6 + fresnel);
-  vHigh = (vHigh + fresnel * 0.10) * shine * share * min(1.0, color.g * 1.6);
-  vNormal = mat3(viewMatrix) * n;
+  vFacing = normalize(mat3(modelMatrix) * n);
+  light_vertex(vFacing, normalize(cameraPosition - place.xyz), color.rgb, vLight, vHigh);
   vUv = uv;
   gl_Position = projectionMatrix * viewMatrix * place;
 }`;
 
 const PLAIN_FRAGMENT = `
+${LIGHT}
 uniform sampler2D map;
 varying vec2 vUv;
 varying vec3 vLight;
 varying float vHigh;
-varying vec3 vNormal;
+varying vec3 vFacing;
 
 void main() {
   vec4 texel = texture2D(map, vUv);
-  texel.rgb *= texel.rgb; // close to sRGB, as the root below
-  vec3 lit = vLight;
-  float high = vHigh;
-  #ifdef CEL
-    float strength = dot(lit, vec3(0.333));
-    lit *= mix(0.70, 0.96, smoothstep(0.60, 0.66, strength)) / max(strength, 0.25);
-    high = 0.0;
-  #endif
   #ifdef EYE
-    vec3 normal = normalize(vNormal);
-    high += ${MIRROR};
+    float high = mirrored(normalize(vFacing), normalize(cameraPosition));
+  #else
+    float high = vHigh;
   #endif
-  gl_FragColor = vec4(sqrt(min(texel.rgb * lit + high, 1.0)), texel.a);
+  gl_FragColor = vec4(shaded(texel.rgb, vLight, high), texel.a);
 }`;
+
+/** The uniforms of light.glsl. */
+function lightUniforms(name, gltf, cel) {
+  const { wrap, gloss, shine } = gltf.userData.kouxing ?? UNKNOWN;
+  return {
+    wrap: { value: new THREE.Vector3(...wrap) },
+    gloss: { value: gloss },
+    shine: { value: shine },
+    share: { value: 1 },
+    two_sided: { value: gltf.side === THREE.DoubleSide },
+    strands: { value: HAIR.includes(name) },
+    cel: { value: cel },
+  };
+}
 
 /**
  * The driver's shading for a part; `gltf` is its material in the file, `head` the node that the skin
@@ -95,20 +79,13 @@ void main() {
 export function plainMaterial(name, gltf, head, cel) {
   gltf.map.colorSpace = THREE.NoColorSpace;
   gltf.map.minFilter = THREE.LinearMipmapNearestFilter;
-  const { wrap, gloss, shine } = gltf.userData.kouxing ?? UNKNOWN;
-  const defines = {};
-  if (cel && !EYES.includes(name)) defines.CEL = 1;
-  if (EYES.includes(name)) defines.EYE = 1;
-  if (gltf.side === THREE.DoubleSide) defines.TWO_SIDED = 1;
+  const isEye = EYES.includes(name);
   return new THREE.ShaderMaterial({
-    defines,
+    defines: isEye ? { EYE: 1 } : {},
     uniforms: {
       map: { value: gltf.map },
-      wrap: { value: new THREE.Vector3(...wrap) },
-      gloss: { value: gloss },
-      shine: { value: shine },
-      share: { value: 1 },
       turn: { value: head.matrixWorld },
+      ...lightUniforms(name, gltf, cel && !isEye),
     },
     vertexShader: PLAIN_VERTEX,
     fragmentShader: PLAIN_FRAGMENT,
@@ -117,9 +94,18 @@ export function plainMaterial(name, gltf, head, cel) {
   });
 }
 
+// what physical parts mirror as the plain ones do
+const WINDOW = `totalEmissiveRadiance += mirrored(
+  inverseTransformDirection(normal, viewMatrix), normalize(cameraPosition));`;
+const SHEEN = `vec3 light;
+  float high;
+  light_vertex(inverseTransformDirection(normal, viewMatrix),
+    inverseTransformDirection(normalize(vViewPosition), viewMatrix), vColor.rgb, light, high);
+  totalEmissiveRadiance += high;`;
+const ADDED = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN, hair_tips: SHEEN };
+
 /** A physical material for a part: light that scatters under the skin, wet eyes, silky hair. */
 export function physicalMaterial(name, gltf) {
-  const { wrap } = gltf.userData.kouxing ?? UNKNOWN;
   const material = new THREE.MeshPhysicalMaterial({
     map: gltf.map,
     vertexColors: true,
@@ -131,14 +117,14 @@ export function physicalMaterial(name, gltf) {
     Object.assign(material, { sheen: 0.25, sheenRoughness: 0.5, specularIntensity: 0.6 });
     material.sheenColor.set(0xffc8b0);
   } else if (HAIR.includes(name)) {
-    Object.assign(material, { specularIntensity: 0.35, roughness: 0.5 });
+    Object.assign(material, { specularIntensity: 0.2, roughness: 0.6 });
   } else if (EYES.includes(name)) {
-    Object.assign(material, { clearcoat: 1, clearcoatRoughness: 0.03 });
+    Object.assign(material, { clearcoat: 0.3, clearcoatRoughness: 0.03, specularIntensity: 0.3 });
   }
   material.onBeforeCompile = (shader) => {
-    shader.uniforms.wrap = { value: new THREE.Vector3(...wrap) };
+    Object.assign(shader.uniforms, lightUniforms(name, gltf, false));
     shader.fragmentShader =
-      "uniform vec3 wrap;\n" +
+      LIGHT +
       shader.fragmentShader
         .replace(
           "#include <lights_physical_pars_fragment>",
@@ -153,11 +139,10 @@ export function physicalMaterial(name, gltf) {
         .replace(
           "#include <aomap_fragment>",
           // what lies in shadow, by its baked vertex colours, shines less, too
-          EYES.includes(name)
-            ? `totalEmissiveRadiance += ${MIRROR};`
-            : `float open = min(1.0, 1.6 * vColor.g * diffuse.g);
-               reflectedLight.directSpecular *= open;
-               reflectedLight.indirectSpecular *= open;`,
+          `float open = min(1.0, 1.6 * vColor.g * diffuse.g);
+          reflectedLight.directSpecular *= open;
+          reflectedLight.indirectSpecular *= open;
+          ${ADDED[name] ?? ""}`,
         );
   };
   return material;

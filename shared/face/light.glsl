@@ -1,0 +1,72 @@
+// How a head is lit: the driver's shaders are made of this (services/driver/render/shaders.py), and
+// so are the page's where it draws plainly (services/gateway/page/materials.js).
+//
+// Colours are linear. A sky and a ground, a warm key light from the front upper left, a cool fill
+// light and a rim light; skin wraps the key light round the terminator, red farthest, as light
+// scattered under it does. Highlights follow Blinn and Phong, those of hair Kajiya and Kay, with
+// Schlick's Fresnel factor.
+
+uniform vec3 wrap; // of the key light, by channel
+uniform float gloss; // exponent of the highlight
+uniform float shine; // its strength
+uniform float share; // of the light that falls into the mouth
+uniform bool two_sided;
+uniform bool strands; // hair, which runs down from the crown
+uniform bool cel; // one tone of light and one of shade, no highlights
+
+const vec3 KEY = vec3(-0.4067, 0.4842, 0.7747);
+const vec3 FILL = vec3(0.7767, 0.1036, 0.6213);
+const vec3 RIM = vec3(0.5518, 0.4515, -0.7023);
+const vec3 KEY_COLOR = vec3(1.16, 1.06, 0.96);
+const vec3 FILL_COLOR = vec3(0.34, 0.38, 0.44);
+const vec3 RIM_COLOR = vec3(0.45, 0.47, 0.50);
+const vec3 SKY = vec3(0.42, 0.44, 0.48);
+const vec3 GROUND = vec3(0.25, 0.21, 0.19);
+const vec3 CROWN = vec3(0.0, 0.97, -0.24);
+// what eyes mirror: lower than the key light, or the lid would hide it
+const vec3 WINDOW = vec3(-0.36, 0.34, 0.87);
+const vec3 FLOOR = vec3(0.50, -0.46, 0.82);
+
+// Light on a vertex with the normal n, seen from the direction v: that which its texture scatters
+// (tint: its own colour, with the baked occlusion) and that which it mirrors.
+void light_vertex(vec3 n, vec3 v, vec3 tint, out vec3 light, out float high) {
+  float facing = dot(n, v);
+  if (two_sided && facing < 0.0) {
+    n = -n;
+    facing = -facing;
+  }
+  float key = dot(n, KEY);
+  light = mix(GROUND, SKY, 0.5 + 0.5 * n.y)
+    + KEY_COLOR * max((key + wrap) / (1.0 + wrap), 0.0) / (1.0 + wrap)
+    + FILL_COLOR * max(dot(n, FILL) * 0.7 + 0.3, 0.0)
+    + RIM_COLOR * max(dot(n, RIM), 0.0);
+  light *= share * tint;
+  vec3 half_way = normalize(KEY + v);
+  float mirrored = max(dot(n, half_way), 0.0);
+  if (strands) { // darker locks shine higher up
+    vec3 strand = normalize(n * (dot(n, CROWN) - 0.6 + 0.3 * tint.g) - CROWN);
+    float along = dot(strand, half_way);
+    mirrored = sqrt(max(1.0 - along * along, 0.0));
+  }
+  float grazing = 1.0 - max(facing, 0.0);
+  float fresnel = 0.04 + 0.5 * grazing * grazing * grazing * grazing;
+  high = pow(mirrored, gloss) * max(key, 0.0) * (0.6 + fresnel);
+  high = (high + fresnel * 0.10) * shine * share * min(1.0, tint.g * 1.6);
+}
+
+// Colour of a texel. Both are sRGB, and are taken as squared for linear light: close to it, and cheap.
+vec3 shaded(vec3 texel, vec3 light, float high) {
+  if (cel) {
+    float strength = dot(light, vec3(0.333));
+    light *= mix(0.70, 0.96, smoothstep(0.60, 0.66, strength)) / max(strength, 0.25);
+    high = 0.0;
+  }
+  return sqrt(min(texel * texel * light + high, 1.0));
+}
+
+// What an eye with the normal n mirrors: a bright window, sharply, and the ground, softly; `ahead`
+// leads from the head to the camera.
+float mirrored(vec3 n, vec3 ahead) {
+  float window = smoothstep(0.988, 0.9935, dot(n, normalize(WINDOW + ahead)));
+  return window + 0.05 * smoothstep(0.980, 0.992, dot(n, normalize(FLOOR + ahead)));
+}
