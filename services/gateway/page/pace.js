@@ -6,11 +6,10 @@ const MIN_RATIO = 0.35;
 const ENOUGH = 10; // pictures, before their time is believed
 const SMOOTHING = 0.2;
 const TOLERANCE_MS = 4; // of the display's ticks
-const MAX_REST_MS = 20;
-// Pictures that take longer get fewer pixels, and those that take less get more: with the rest, the
-// longest are 20 a second.
-const SLOW_MS = 28;
-const QUICK_MS = 15;
+const PERIOD_MS = 50; // 20 pictures a second
+const LEAST_REST_MS = 10;
+const SLOW_MS = 36; // pictures that take longer get fewer pixels,
+const QUICK_MS = 16; // and those that take less get more
 
 export class Pace {
   pictureMs = 0; // that a picture takes, the mean since the ratio changed
@@ -22,8 +21,8 @@ export class Pace {
 
   /**
    * @param ratio the pixels that are drawn for one of the page, to begin with; @param maxRatio at
-   *   most; @param rests whether to rest as long as a picture took: where the processor draws, sound
-   *   and messages are its work, too
+   *   most; @param rests whether to rest after a picture as long as it took, or until 20 a second are
+   *   held: where the processor draws, sound and messages are its work, too
    */
   constructor(ratio, maxRatio, rests) {
     this.#rests = rests;
@@ -34,7 +33,7 @@ export class Pace {
   /** Whether it is time for a picture, once the one before is done. */
   isDue(nowMs) {
     if (!this.#rests) return true;
-    const restMs = Math.min(this.#tookMs, MAX_REST_MS);
+    const restMs = Math.min(this.#tookMs, Math.max(PERIOD_MS - this.#tookMs, LEAST_REST_MS));
     return nowMs - this.#begunMs >= this.#tookMs + restMs - TOLERANCE_MS;
   }
 
