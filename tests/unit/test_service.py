@@ -107,3 +107,12 @@ def test_a_message_for_which_no_file_can_be_opened_is_dropped(
         for _ in range(2):
             sender.send(Progress(session="s", level_db=0.0))
         handle(slow, 2)
+
+
+@pytest.mark.parametrize(("address", "warns"), [("10.0.0.1", True), ("127.0.0.1", False)])
+def test_an_open_service_that_others_reach_says_so(
+    slow: Slow, caplog: pytest.LogCaptureFixture, address: str, warns: bool
+) -> None:
+    slow.endpoints = {"input": f"tcp://{address}:5570"}
+    slow.announce_ready()
+    assert ("insecure = true" in caplog.text) == warns
