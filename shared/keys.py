@@ -90,7 +90,7 @@ def own_key(name: str, roles: Collection[str]) -> Key:
                     )
                 _write(folder / "control.key", _new_key())
             if name != CONTROL:
-                _write(path, _allow(folder, name, roles))
+                _add_key(folder, path, name, roles)
         return _read_key(path)
 
 
@@ -151,10 +151,7 @@ def add_guest(name: str, roles: Collection[str], path: Path) -> None:
     """
     own_key(CONTROL, ())
     with _locked_folder() as folder:
-        try:
-            _write(path, _allow(folder, name, roles))
-        except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+        _add_key(folder, path, name, roles)
 
 
 def revoke_guest(name: str) -> None:
@@ -205,8 +202,8 @@ def _new_key(control: str = "") -> str:
     return json.dumps(asdict(Key(public, secret, control or public)), indent=1) + "\n"
 
 
-def _allow(folder: Path, name: str, roles: Collection[str]) -> str:
-    """Add a new key to the list; return its file's text."""
+def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> None:
+    """Write a new key to a file, then allow it."""
     if not _NAME.fullmatch(name):
         raise UserError(f"no key can be called {name!r}; use letters, digits, '-' and '_'")
     for role in roles:
@@ -218,9 +215,9 @@ def _allow(folder: Path, name: str, roles: Collection[str]) -> str:
     if any(guest.name == name for guest in guests.values()):
         raise UserError(f"a key is called {name!r}; first 'kouxing keys revoke {name}'")
     text = _new_key(_read_key(folder / "control.key").public)
+    _write(path, text)
     guests[json.loads(text)["public"]] = Guest(name, tuple(roles))
     _write(folder / "allowed", _lines(guests))
-    return text
 
 
 def _read_key(path: Path) -> Key:
@@ -254,15 +251,12 @@ def _lines(guests: Guests) -> str:
 
 @contextlib.contextmanager
 def _locked_folder() -> Iterator[Path]:
-    folder = key_folder()
     try:
+        folder = key_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        raise UserError(
-            f"{folder}: cannot keep keys here: {error.strerror}; name another folder by"
-            " XDG_STATE_HOME"
-        ) from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
+        raise UserError(f"no place for keys: {error}; name a folder by XDG_STATE_HOME") from None
     try:
         _check_private(folder, 0o700)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -290,8 +284,11 @@ def _read(path: Path) -> str:
 def _write(path: Path, text: str) -> None:
     """Write a file that nobody else can read, whole or not at all."""
     new = path.with_name(f"{path.name}.new")
-    new.unlink(missing_ok=True)
-    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="ascii") as file:
-        file.write(text)
-    new.replace(path)
+    try:
+        new.unlink(missing_ok=True)
+        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            file.write(text)
+        new.replace(path)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None

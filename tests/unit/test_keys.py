@@ -78,6 +78,23 @@ def test_a_folder_without_a_home_is_named(tmp_path: Path, monkeypatch: pytest.Mo
         user_key()
 
 
+def test_without_a_home_a_folder_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_STATE_HOME")
+    monkeypatch.setattr(Path, "home", no_home)
+    with pytest.raises(UserError, match="XDG_STATE_HOME"):
+        user_key()
+
+
+def test_a_key_that_cannot_be_written_is_not_allowed(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "laptop.key"
+    with pytest.raises(UserError, match=f"{path}: cannot be written"):
+        add_guest("laptop", ("client",), path)
+    assert read_guests() == {}
+
+
 def test_an_added_key_works_on_another_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
