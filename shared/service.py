@@ -7,12 +7,14 @@ Heartbeats are sent from this loop, so control sees a hung loop as a lost servic
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import gc
 import os
 import secrets
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -43,7 +45,7 @@ from shared.wire.session import ChooseExpressiveness, Done, Error, ErrorCode, Ex
 HEARTBEAT_S = 0.5
 TICK_S = 0.01
 TURN_S = 0.05  # for one socket's messages, before other sockets, ticks and heartbeats
-UNANSWERED_S = 5.0  # without an answer to heartbeats it is worth asking why
+UNANSWERED_S = 10.0  # without an answer to heartbeats it is worth asking why
 DRAIN_LIMIT_S = 5.0
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # its process number; the underscore: no setting
 
@@ -314,8 +316,13 @@ class Service:
     def _ask_why_unanswered(self, now_s: float) -> None:
         if self.control is not None and now_s - self._answered_s > UNANSWERED_S:
             self._answered_s = now_s
-            if self.bus.is_refused(self.control_endpoint):
-                self.warn("refused", refusal(self.control_endpoint, self.name, self.roles))
+            threading.Thread(target=self._warn_if_refused, daemon=True).start()
+
+    def _warn_if_refused(self) -> None:
+        """Say what to do if control does not accept the key; it waits, on sockets of its own."""
+        with contextlib.suppress(UserError), Bus(self.key) as bus:
+            if bus.is_refused(self.control_endpoint):
+                LOG.warning(refusal(self.control_endpoint, self.name, self.roles))
 
     def _on_heartbeat_seen(self, seen: HeartbeatSeen, _sender: Peer) -> None:
         self._answered_s = time.monotonic()
