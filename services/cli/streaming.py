@@ -25,6 +25,7 @@ from shared.wire.speech import Phone
 QUEUE_WAIT_S = 0.005
 END_LIMIT_S = 30.0  # for the last frames after the last sample
 STATUS_S = 1.0  # between questions to control
+DRIVER_LIMIT_S = 20.0  # for a driver to be back that was lost, as on a busy machine
 QUIET_PEAK = 1e-3  # below this (-60 dBFS) a file is called silent
 
 
@@ -58,6 +59,7 @@ def stream(
         If the system does not answer, refuses the session or stops answering.
     """
     with Client(control) as client:
+        drawn_before_s = _drawn_s(client) if record else 0.0
         opened = client.open_session(
             session=session,
             encoding="f32le",
@@ -71,7 +73,6 @@ def stream(
         phones = opened.subscribe(Phone)
         events = client.bus.connect_subscriber(opened.opened.events)
         events.subscribe(Event, opened.name)
-        drawn_before_s = _drawn_s(client) if record else 0.0
         try:
             with _progress(console) as progress:
                 face = _Face(output, progress, f"speaking {source.name}", source.duration_s)
@@ -234,7 +235,7 @@ def _wait_for_video(
         task = progress.add_task("writing the video", total=duration_s)
         newest_s = drawn_before_s
         while True:
-            drawn_s = _drawn_s(client)
+            drawn_s = _drawn_s(client, DRIVER_LIMIT_S)
             if drawn_s < newest_s:
                 raise UserError("the driver was started again, so there is no video; speak again")
             newest_s = drawn_s
@@ -250,18 +251,22 @@ def _wait_for_video(
                     return ""
 
 
-def _drawn_s(client: Client) -> float:
+def _drawn_s(client: Client, wait_s: float = 0.0) -> float:
     """Return how many seconds of video the driver has drawn since it started.
 
     Raises
     ------
     UserError
-        If no driver runs.
+        If no driver runs, nor is back within the wait.
     """
-    drivers = [each for each in client.status().services if each.service == "driver"]
-    if not drivers:
-        raise UserError("no driver runs, so there is no video; start one: kouxing driver")
-    return max(each.metrics.get("video_ms", 0.0) for each in drivers) / 1000
+    end_s = time.monotonic() + wait_s
+    while True:
+        drivers = [each for each in client.status().services if each.service == "driver"]
+        if drivers:
+            return max(each.metrics.get("video_ms", 0.0) for each in drivers) / 1000
+        if time.monotonic() >= end_s:
+            raise UserError("no driver runs, so there is no video; start one: kouxing driver")
+        time.sleep(STATUS_S)
 
 
 def _warn(console: Console, text: str) -> None:

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -129,6 +130,23 @@ def test_silence_and_clipping_are_spoken_with_a_remark(
     result = kouxing("speak", path, "--fast", control=system.control)
     assert result.returncode == 0, result.stderr
     assert word in result.stderr
+
+
+def test_a_driver_that_was_silent_for_a_while_still_writes_its_video(tmp_path: Path) -> None:
+    services = ("control", "recognizer", "synthesizer", "driver")
+    with System(services, tmp_path, settings={"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as own:
+        driver = own.processes["driver"]
+        command = [sys.executable, "-m", "services", "speak", str(SENTENCE), "--record", "--fast"]
+        speaker = subprocess.Popen(
+            command, env=own.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True
+        )
+        own.wait_until(lambda report: len(report.sessions) > 0)
+        driver.send_signal(signal.SIGSTOP)
+        own.wait_until(lambda report: "driver" not in {each.service for each in report.services})
+        driver.send_signal(signal.SIGCONT)
+        _, log = speaker.communicate(timeout=100)
+    assert speaker.returncode == 0, log
+    assert "wrote" in log
 
 
 def test_raw_sound_from_standard_input(system: System) -> None:
