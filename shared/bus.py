@@ -35,11 +35,11 @@ from shared.zap import Zap
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
 AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
 # What a bound socket takes in: the largest message, and how many of a connection wait.
-AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4)
-COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
-PHONES = Bounds(message_bytes=4 * KIB, queue_length=64)
+AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_slow=16)
+COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, num_slow=1, cost=1.0)
+PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
 # ZeroMQ stores a subscription before it is received; a handshake takes most of the size.
-SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, cost=1.0)
+SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, num_slow=128, cost=1.0)
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn

@@ -33,11 +33,11 @@ from shared.logs import LOG, RateLimit
 KIB, MIB = 1024, 1024 * 1024
 RECEIVE_BUFFER = 256 * KIB  # of the kernel; a few segments of loopback, or it stalls
 LOOK_S = 0.02  # between looks while bytes arrive
-NEAR_LOOK_S = 0.005  # while much waits: a flood brings some 5 MB in that time
+NEAR_LOOK_S = 0.005  # while much waits, and at first: a flood takes some 5 MB in that time
+NEAR_S = 0.2  # after a connection has come
 MUCH = 128 * KIB  # more than honest peers' messages take as a rule
 SWEEP_S = 1.0  # between looks for connections that have ended
 STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
-MAX_STUCK = 1 * MIB  # of all connections: an empty part takes 2 bytes on the wire, 64 in memory
 MAX_WAITING = 24 * MIB  # of all connections
 MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
 MAX_SHARE = 0.75  # of them that may come from one address
@@ -67,6 +67,7 @@ class Bounds:
 
     message_bytes: int  # the largest part
     queue_length: int  # messages of a connection that wait for delivery
+    num_slow: int  # connections that may be in the midst of the largest message
     cost: float = 0.0
 
     @property
@@ -127,7 +128,7 @@ class Connection:
     def look(self, now_s: float) -> None:
         """Find what waits, and what of that is stuck; cut the connection if it is too much.
 
-        Two turns and a while after bytes came, their message was delivered if it is complete.
+        A turn and a while after bytes came, their message was delivered if it is complete.
         """
         if self.guarded is None:
             return
@@ -139,7 +140,7 @@ class Connection:
         if delivered != before:
             self.stuck = 0
             self._mark = (delivered, self.waiting, turns, now_s)
-        elif turns >= turn + 2 and now_s >= time_s + STUCK_S:
+        elif turns > turn and now_s >= time_s + STUCK_S:
             self.stuck = waiting
             self._mark = (delivered, self.waiting, turns, now_s)
         if self.waiting > bounds.full_queue:
@@ -241,7 +242,7 @@ class Guard:
         self._descriptors: dict[int, Connection] = {}  # the thread's, as all that follows
         self._pending: set[Connection] = set()  # something of theirs waits
         self._guarded: list[Guarded] = []
-        self._swept_s = 0.0
+        self._admitted_s = self._swept_s = 0.0
         self._num_trims = 0  # still to come
         self._subscribed = 0  # bytes, since they were counted; the sockets' thread's
         self._max_connections = 0
@@ -318,7 +319,8 @@ class Guard:
                 self._sweep()
             self._look(ready, now_s)
             much = any(connection.waiting > MUCH for connection in self._pending)
-            time.sleep(NEAR_LOOK_S if much or self.faults else LOOK_S)
+            is_near = much or self.faults or now_s < self._admitted_s + NEAR_S
+            time.sleep(NEAR_LOOK_S if is_near else LOOK_S)
 
     def _wait(self) -> list[Connection]:
         """Wait until bytes arrive or something is due; return the connections that have some."""
@@ -339,10 +341,12 @@ class Guard:
             connection.address = _address(descriptor)
             connection.guarded = guarded
             self._descriptors[descriptor] = connection
-            if self.faults[connection.address] > MAX_FAULTS:
+            is_silent = connection.delivered == HANDSHAKE  # else it was quicker, and is heard
+            if is_silent and self.faults[connection.address] > MAX_FAULTS:
                 connection.cut("its address sent too much that is of no use", 0)
             self._pending.add(connection)  # bytes may have come before
             admitted.append(connection)
+            self._admitted_s = time.monotonic()
             if self._events is not None:
                 with contextlib.suppress(OSError):  # it has just ended
                     self._events.register(descriptor, _ONCE)
@@ -398,18 +402,22 @@ class Guard:
         for connection in ready:
             with contextlib.suppress(OSError):  # it has just ended
                 self._events.modify(connection.descriptor, _ONCE)
-        self._shed("stuck", MAX_STUCK, "the messages of all connections do not end")
+        for guarded in self._guarded:
+            max_stuck = guarded.bounds.num_slow * guarded.bounds.message_bytes
+            self._shed("stuck", max_stuck, "too many messages do not end", guarded)
         self._shed("waiting", MAX_WAITING, "too much waits")
 
-    def _shed(self, measure: str, limit: int, reason: str) -> int:
-        """Cut the connections with the most of something until all together keep the limit.
+    def _shed(self, measure: str, limit: int, reason: str, guarded: Guarded | None = None) -> int:
+        """Cut those with the most of something until all connections together keep the limit.
 
-        Returns what is left.
+        All are those of one socket, if it is given. Returns what is left.
         """
         shares: dict[Connection, int] = {
             connection: share
             for connection in list(self._connections.values())
-            if not connection.is_cut and (share := getattr(connection, measure)) > 0
+            if not connection.is_cut
+            and guarded in (None, connection.guarded)
+            and (share := getattr(connection, measure)) > 0
         }
         total = sum(shares.values())
         while total > limit:

@@ -17,7 +17,7 @@ from tests.system import System, connect
 pytestmark = pytest.mark.e2e
 
 MAX_GROWTH_MB = 64.0
-MAX_KEPT_MB = 16.0
+MAX_KEPT_MB = 32.0
 SECONDS = 1.0
 
 
