@@ -26,8 +26,8 @@ from shared.audio_file import read_audio
 from shared.errors import UserError
 
 SIZE_PX = (1100, 800)
-_SETTLE_S = 12.0  # until the page has found how finely it can draw, and for how long to wait
-_MEASURE_S = 15.0
+SETTLE_S = 12.0  # until the page has found how finely it can draw, and for how long to wait
+MEASURE_S = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +105,10 @@ def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:
 
 
 def _drawing(browser: Chromium) -> Drawing:
-    time.sleep(_SETTLE_S)
+    time.sleep(SETTLE_S)
     begin_s, begin_cpu_s = time.monotonic(), browser.cpu_s()
     states = [browser.evaluate("window.kouxing.state")]
-    while time.monotonic() < begin_s + _MEASURE_S:
+    while time.monotonic() < begin_s + MEASURE_S:
         time.sleep(1.0)
         states.append(browser.evaluate("window.kouxing.state"))
     took_s, cpu_s = time.monotonic() - begin_s, browser.cpu_s() - begin_cpu_s

@@ -162,7 +162,7 @@ class SynthesizerService(Service):
         if session is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)
             return
-        if sender.key != key_of(session.start.endpoints["phones"]):
+        if sender.key != key_of(session.start.endpoints.get("phones", "")):
             self.warn(
                 "foreign", "phones from another than the session's recognizer", message.session
             )

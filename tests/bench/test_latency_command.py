@@ -18,6 +18,8 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("evaluation.system.rendering.NUM_IMAGES", 10)
+    monkeypatch.setattr("evaluation.system.page.SETTLE_S", 0.5)
+    monkeypatch.setattr("evaluation.system.page.MEASURE_S", 2.0)
     figures = tmp_path / "latency.json"
     arguments = [str(VOWELS_FILE), "--repeats", "1", "--json", str(figures)]
     result = CliRunner().invoke(bench_app, arguments)
@@ -38,4 +40,6 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     assert list(live) == ["deform", "upload", "draw", "read back"]
     assert list(video) == [*live, "encode"]
     assert rendering["asset_bytes"] > 500_000
+    assert list(latency["page"]) == ["idle", "microphone"]
+    assert all(drawing["pictures_per_s"] > 0 for drawing in latency["page"].values())
     assert f"{latency['chunk_to_frame_ms']['p50']:.1f}" in result.stdout

@@ -184,4 +184,4 @@ def test_where_no_camera_may_be_used_it_says_what_is_needed(browser: Browser) ->
     browser.evaluate("Object.defineProperty(navigator, 'mediaDevices', { value: undefined })")
     browser.click("learn")
     assert "https" in text_of(browser, "lesson-insecure")
-    assert browser.evaluate("document.getElementById('lesson-start').disabled")
+    browser.wait_for("document.getElementById('lesson-start').disabled")
