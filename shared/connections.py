@@ -56,6 +56,8 @@ NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a lit
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
 _BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
+_SINK = bytearray(MIB)
+_DISCARD = socket.MSG_DONTWAIT | socket.MSG_TRUNC
 _SEES_BYTES = sys.platform == "linux"
 _ONCE = select.EPOLLIN | select.EPOLLONESHOT if _SEES_BYTES else 0
 _WARNINGS = RateLimit()
@@ -165,6 +167,8 @@ class Connection:
                     with _borrowed(own) as connection:  # reset when libzmq closes it
                         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
                         connection.shutdown(socket.SHUT_RDWR)
+                        while connection.recv_into(_SINK, 0, _DISCARD):  # else libzmq reads it
+                            pass
             finally:
                 os.close(own)
         if _WARNINGS.allows(reason):
@@ -316,7 +320,9 @@ class Guard:
             now_s = time.monotonic()
             self._admit([pair for guarded in self._guarded for pair in guarded.accepted()])
             if now_s > self._swept_s + SWEEP_S:
+                self._swept_s = now_s
                 self._sweep()
+                self._forgive()
             self._look(ready, now_s)
             much = any(connection.waiting > MUCH for connection in self._pending)
             is_near = much or self.faults or now_s < self._admitted_s + NEAR_S
@@ -373,11 +379,6 @@ class Guard:
 
     def _sweep(self) -> None:
         """Forget the connections that have ended; return the memory of those that were cut."""
-        self._swept_s = time.monotonic()
-        for address in list(self.faults):
-            self.faults[address] -= FAULTS_S
-            if self.faults[address] <= 0:
-                del self.faults[address]
         ended = [each for each in list(self._connections.values()) if not each.exists()]
         for connection in ended:
             del self._connections[connection.inode]
@@ -388,6 +389,13 @@ class Guard:
             self._num_trims -= 1
             with contextlib.suppress(AttributeError):  # only glibc's keeps so much
                 ctypes.CDLL(None).malloc_trim(0)
+
+    def _forgive(self) -> None:
+        """Take a second's faults off every address."""
+        for address in list(self.faults):
+            self.faults[address] -= FAULTS_S
+            if self.faults[address] <= 0:
+                del self.faults[address]
 
     def _look(self, ready: Iterable[Connection], now_s: float) -> None:
         """Keep the bounds of what waits, of each connection and of all."""
