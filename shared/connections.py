@@ -51,7 +51,8 @@ CREDIT = 5000.0  # that a connection may spend at once
 CREDIT_S = 500.0  # that it gets back in a second
 MAX_FAULTS = 100  # of an address, whose new connections are cut then
 FAULTS_S = 2  # that an address is forgiven in a second
-BAN_S = 10  # until an address with too many faults is let in again, at the longest
+FLOOD_FAULTS = 50  # of a connection that has sent what no honest one can
+BAN_S = 3  # until an address with too many faults is let in again, at the longest
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
@@ -146,9 +147,9 @@ class Connection:
             self.stuck = waiting
             self._mark = (delivered, self.waiting, turns, now_s)
         if self.waiting > bounds.full_queue:
-            self.cut("more waits than a queue holds")
+            self.cut("more waits than a queue holds", FLOOD_FAULTS)
         elif self.stuck > bounds.one_message:
-            self.cut("its message does not end")
+            self.cut("its message does not end", FLOOD_FAULTS)
 
     def cut(self, reason: str, num_faults: int = 1) -> None:
         """End the connection; libzmq then frees what it holds. Any thread may call this.

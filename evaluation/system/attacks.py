@@ -144,7 +144,7 @@ def _damage(
 
 def _wait_until_let_in(control: str) -> None:
     """Wait while faults count against this address."""
-    for _ in range(BAN_S):
+    for _ in range(2 * BAN_S):
         with contextlib.suppress(UserError), Client(control) as client:
             client.status()
             return

@@ -17,7 +17,6 @@ from evaluation.system import attackers
 from evaluation.system.memory import Memory
 from shared.client import Client, Session
 from shared.connections import MAX_CONNECTIONS
-from shared.errors import UserError
 from tests.e2e.following import stream
 from tests.system import System
 
@@ -36,28 +35,44 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
         yield running
 
 
+def port_of(system: System, target: str) -> int:
+    service, setting, _ = attackers.TARGETS[target]
+    return int(system.environment[f"KOUXING_{service.upper()}_{setting}"].rpartition(":")[2])
+
+
+def is_let_in(port: int, kind: str) -> bool:
+    """Whether a new connection of this address stays."""
+    try:
+        with attackers.connected(port, kind) as connection:
+            connection.settimeout(0.1)
+            while connection.recv(1000):
+                pass
+    except TimeoutError:
+        return True
+    except OSError:
+        pass
+    return False
+
+
 @pytest.fixture
 def client(system: System) -> Iterator[Client]:
-    """A client of the same address; it is let in a while after the attack before."""
+    """A client of the same address, once that is let in again after the attack before."""
     end_s = time.monotonic() + 60
+    for target, (_, _, kind) in attackers.TARGETS.items():
+        while not is_let_in(port_of(system, target), kind):
+            assert time.monotonic() < end_s, "it is not let in again"
+            time.sleep(0.2)
     with Client(system.control) as made:
-        while True:
-            try:
-                made.status()
-                break
-            except UserError:
-                assert time.monotonic() < end_s, "it is not let in again"
-                time.sleep(0.5)
         yield made
 
 
 @pytest.mark.parametrize("attack", attackers.FLOODS)
-@pytest.mark.parametrize("target", attackers.TARGETS)
+@pytest.mark.parametrize("target", ["commands", "audio", "faps"])
 def test_a_flood_takes_little_memory_and_leaves_none(
     system: System, witness: Session, target: str, attack: str
 ) -> None:
-    service, key, kind = attackers.TARGETS[target]
-    port = int(system.environment[f"KOUXING_{service.upper()}_{key}"].rpartition(":")[2])
+    service, _, kind = attackers.TARGETS[target]
+    port = port_of(system, target)
     memory = Memory(system.processes[service].pid)
     attackers.FLOODS[attack](port, kind, SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
