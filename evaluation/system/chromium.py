@@ -149,9 +149,12 @@ class Chromium:
         return result["result"].get("value")
 
     def click(self, name: str) -> None:
-        """Click on an element as a person does, which lets the page play sound."""
+        """Click on an element as a person does, where it is drawn; so the page may play sound."""
         x, y = self.evaluate(
-            f"(() => {{ const box = document.getElementById('{name}').getBoundingClientRect();"
+            "(async () => {"
+            "const drawn = () => new Promise((done) => requestAnimationFrame(done));"
+            "await drawn(); await drawn();"
+            f"const box = document.getElementById('{name}').getBoundingClientRect();"
             "return [box.x + box.width / 2, box.y + box.height / 2]; })()"
         )
         for event in ("mousePressed", "mouseReleased"):

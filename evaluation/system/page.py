@@ -24,6 +24,7 @@ from services.cli.supervisor import Supervisor
 from services.kinds import free_addresses
 from shared.audio_file import read_audio
 from shared.errors import UserError
+from shared.keys import control_endpoint
 
 SIZE_PX = (1100, 800)
 SETTLE_S = 12.0  # until the page has found how finely it can draw, and for how long to wait
@@ -65,7 +66,7 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
         supervisor = Supervisor([], folder, console, environment)
         try:
             supervisor.start()
-            supervisor.wait_ready(environment["KOUXING_CONTROL"])
+            supervisor.wait_ready(control_endpoint(environment["KOUXING_CONTROL"], insecure=False))
             browser = Chromium(folder / "profile", SIZE_PX, folder / "voice.wav")
             try:
                 return _measure(browser, f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/")
