@@ -49,17 +49,9 @@ WORKERS = [
     for service, names in
     (("recognizer", ("audio", "phones")), ("synthesizer", ("faps", "phone_input")))
 ]  # fmt: skip
-START = StartSession(
-    session="demo",
-    epoch=1,
-    request="start-demo-1",
-    token="t",
-    encoding="s16le",
-    sample_rate_hz=16000,
-    num_channels=1,
-    record=False,
+START = dataclasses.replace(
+    next(sample for sample in SAMPLES if isinstance(sample, StartSession)),
     paced=False,
-    language="mandarin",
     endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
 )
 
