@@ -213,8 +213,8 @@ class Socket:
             if num_parts > MAX_PARTS and self._connection is not None:
                 self._connection.cut("its message has too many parts", 1 + num_parts // 1000)
         key = "" if self._zap is None else _key(frame)
-        if self._connection is not None:
-            self._connection.key = key
+        if self._connection is not None and self._guarded is not None:
+            self._guarded.identify(self._connection, key)
         return parts, key
 
     def _on_subscription(self, parts: list[bytes], key: str) -> None:

@@ -40,7 +40,7 @@ SWEEP_S = 1.0  # between looks for connections that have ended
 STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
 MAX_WAITING = 24 * MIB  # of all connections
 MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
-MAX_SHARE = 0.75  # of them that may come from one address
+MAX_SHARE = 0.75  # of them that may come from one address, or have one key
 RESERVED_FILES = 256  # for the process itself: models, pages, its own connections
 MAX_SUBSCRIPTION = 128  # bytes of a topic's beginning
 MAX_SUBSCRIBED = 128 * KIB  # of a connection; in memory up to 60 times that, or twice as much
@@ -200,6 +200,12 @@ class Guarded:
         connection.charge(self.bounds.cost)
         return connection
 
+    def identify(self, connection: Connection, key: str) -> None:
+        """Note whose connection it is."""
+        if connection.key != key:
+            connection.key = key
+            self._guard.bound_key(connection)
+
     def blame(self, address: str, num_faults: int) -> None:
         """Count faults against an address."""
         faults = self._guard.faults
@@ -291,6 +297,12 @@ class Guard:
         for connection in list(self._connections.values()):
             if connection.key in keys:
                 connection.cut("its key is allowed no longer, or not for the same", 0)
+
+    def bound_key(self, connection: Connection) -> None:
+        """Cut a connection whose key has too many."""
+        shared = [each for each in list(self._connections.values()) if each.key == connection.key]
+        if sum(not each.is_cut for each in shared) > MAX_SHARE * self._max_connections:
+            connection.cut("its key has too many connections", 0)
 
     def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
         """Keep the subscriptions of one connection, and of all, within their bounds."""

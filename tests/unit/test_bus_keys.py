@@ -7,15 +7,19 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import zmq
 
+from shared import connections
 from shared.bus import Bus, Socket
 from shared.endpoints import split_endpoint, with_key
 from shared.errors import UserError
 from shared.keys import Key, add_guest, key_folder, own_key, revoke_guest
+from shared.wire.codec import encode
 from shared.wire.control import StatusRequest
 from shared.wire.face import FapFrame
 from shared.wire.message import Message
 from shared.wire.session import Joined
+from tests.system import connect
 
 pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"
@@ -106,6 +110,28 @@ def test_a_key_of_another_system_does_not_get_in(
         assert not router.wait(0.5)
         assert bus.is_refused(endpoint)
         assert bus.is_refused(with_key(router.endpoint, control.public))
+
+
+def test_one_key_has_not_all_connections_wherever_they_come_from(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
+    router, endpoint = server.router("recognizer.audio")
+    key = key_of("guest", "client")
+    with zmq.Context() as context:
+        guests = [context.socket(zmq.DEALER) for _ in range(7)]
+        ends = [guest.get_monitor_socket(zmq.EVENT_DISCONNECTED) for guest in guests]
+        for number, guest in enumerate(guests, start=2):
+            connect(guest, endpoint.replace("tcp://", f"tcp://127.0.0.{number}:0;"), key)
+            guest.send_multipart(encode(StatusRequest(request="1")))
+            assert router.wait(5.0)
+            list(router.receive())
+        assert ends[-1].poll(20_000)
+        assert not any(end.poll(0) for end in ends[:-1])
+        for guest, end in zip(guests, ends, strict=True):
+            guest.disable_monitor()
+            end.close()
+            guest.close(linger=0)
 
 
 def test_nobody_is_refused_where_nobody_listens(server: Server) -> None:
