@@ -188,11 +188,10 @@ def save_guests(guests: Guests) -> None:
 
 def may_follow(guest: Guest, topic: bytes) -> bool:
     """Return whether somebody may subscribe to the messages whose topic begins so."""
-    sessions = {role.removeprefix(_SUBSCRIBER) for role in guest.roles if _SUBSCRIBER in role}
-    if "*" in sessions or len(sessions) < len(guest.roles):
+    if any(role == f"{_SUBSCRIBER}*" or not role.startswith(_SUBSCRIBER) for role in guest.roles):
         return True
     _kind, *rest = topic.decode("ascii", "replace").split("/")
-    return len(rest) == 2 and rest[0] in sessions
+    return len(rest) == 2 and f"{_SUBSCRIBER}{rest[0]}" in guest.roles
 
 
 def _new_key(control: str = "") -> str:

@@ -143,6 +143,7 @@ def test_a_wrong_name_or_role_is_refused(tmp_path: Path, name: str, role: str) -
         (("service:lamp",), b"fap-frame/", True),
         (("subscriber:*",), b"fap-frame/", True),
         (("subscriber:a",), b"fap-frame/a/", True),
+        (("subscriber:a", "subscriber:a"), b"fap-frame/b/", False),
         (("subscriber:a", "subscriber:b"), b"sound/b/", True),
         (("subscriber:a",), b"fap-frame/ab/", False),
         (("subscriber:a",), b"fap-frame/a", False),
