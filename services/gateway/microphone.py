@@ -18,7 +18,7 @@ from aiohttp import WSMsgType, web
 
 from services.gateway import wire
 from services.gateway.http import WebSockets
-from services.gateway.pace import Pace
+from services.gateway.pace import COMMAND_S, Pace
 from shared.audio_file import open_audio
 from shared.client import Client, Refused, Session
 from shared.errors import UserError
@@ -31,8 +31,6 @@ MAX_MICROPHONES = 16
 HELLO_LIMIT_S = 10.0
 LAST_FRAME_LIMIT_S = 1.5  # for the last frames, when a microphone ends
 CONTROL_LIMIT_S = 3.0  # for control's answers
-AUDIO_BURST_S = 5.0  # of audio that may come faster than in real time
-COMMAND_S = 0.05  # a command counts as much as so much audio
 
 Warn = Callable[[str, str, str], None]  # reason, text, session
 
@@ -172,7 +170,7 @@ class Microphones:
     async def _forward_audio(
         self, browser: web.WebSocketResponse, session: Session, hello: wire.Hello
     ) -> None:
-        pace = Pace(AUDIO_BURST_S)
+        pace = Pace()
         async for message in browser:
             if message.type is WSMsgType.BINARY:
                 num_frames, rest = divmod(len(message.data), hello.frame_bytes)

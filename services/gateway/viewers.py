@@ -14,13 +14,11 @@ from aiohttp import WSMsgType, web
 from services.gateway import wire
 from services.gateway.http import WebSockets
 from services.gateway.outbox import Kind, Outbox
-from services.gateway.pace import Pace
+from services.gateway.pace import COMMAND_S, Pace
 from shared.errors import UserError
 from shared.metrics import Metrics
 
 MAX_VIEWERS = 64
-COMMAND_S = 0.05  # between commands,
-COMMAND_BURST_S = 5.0  # after the first hundred
 SEND_BUFFER_BYTES = 64 * 1024  # what the kernel may hold for a slow viewer, about a second
 _SESSION = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -157,7 +155,7 @@ class Viewers:
 
     async def _converse(self, viewer: Viewer, browser: web.WebSocketResponse) -> None:
         writer = asyncio.create_task(_write(browser, viewer.outbox))
-        pace = Pace(COMMAND_BURST_S)
+        pace = Pace()
         try:
             async for message in browser:
                 if message.type is WSMsgType.TEXT:

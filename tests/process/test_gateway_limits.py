@@ -158,7 +158,7 @@ def test_no_descriptor_left_is_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_flood_is_slowed_down_to_real_time() -> None:
     async def flood() -> None:
         loop = asyncio.get_running_loop()
-        pace = Pace(burst_s=5.0)
+        pace = Pace()
         begin_s = loop.time()
         for _ in range(106):
             await pace.keep(0.05)
