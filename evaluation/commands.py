@@ -6,19 +6,32 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from typer.core import TyperGroup
 
 from services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from shared.face.lip_models import LipModelName
 
 if TYPE_CHECKING:
     from services.recognizer.acoustic.acoustic_model import AcousticModel
 
+
+class BenchGroup(TyperGroup):
+    """Takes ``kouxing bench my.wav`` for ``kouxing bench chain my.wav``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the command in front where there is none."""
+        if args and args[0] not in {*self.commands, *self.get_help_option_names(ctx)}:
+            args = ["chain", *args]
+        return super().parse_args(ctx, args)
+
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure the models.")
 plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
-bench_app = typer.Typer(add_completion=False)
+bench_app = typer.Typer(cls=BenchGroup, add_completion=False, help="Measure the running system.")
 
 Manifest = Annotated[Path, typer.Option(help="Manifest or corpus folder.")]
 Audio = Annotated[
@@ -148,6 +161,61 @@ def lips(
     scores = main(clips, parameters, source or ())
     print_scores(scores, Console())
     write_json(json_file, [asdict(score) for score in scores])
+
+
+@app.command()
+def schemes(
+    manifest: Annotated[
+        Path | None, typer.Option(help="Manifest or corpus folder: 20 sentences of it.")
+    ] = None,
+    audio: Audio = None,
+    split: Split = "test",
+    clips: Annotated[
+        Path | None, typer.Option(help="Folder of tracked lips with sound: these sentences.")
+    ] = None,
+    acoustic: Acoustic = None,
+    lips: Annotated[
+        list[LipModelName] | None, typer.Option(help="Lip model; repeatable; else all.")
+    ] = None,
+    paper_rule: Annotated[
+        bool, typer.Option("--paper-rule", help="Phones as in the paper: N = 3, never corrected.")
+    ] = False,
+    videos: Annotated[
+        Path | None, typer.Option(help="Write CONDITION/SENTENCE.mp4 there, unless they exist.")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare the four schemes of Li et al. 2011: aligned, recognised, live, next phone.
+
+    Without a corpus or clips the sentences are the samples that come with kouxing, without
+    --acoustic the recognizers blocks and gmm.
+    """
+    from evaluation.lips import sentences
+    from evaluation.lips.four_schemes import film_all, hear_all, listeners_of
+    from evaluation.lips.scheme_report import print_outcome
+    from evaluation.lips.scheme_scores import evaluate
+    from services.recognizer.acoustic.load import load_live_model
+    from shared.errors import UserError
+
+    check_output(json_file)
+    if manifest and clips:
+        raise UserError("--manifest and --clips both name sentences; give one of them")
+    model = load_live_model()
+    if manifest:
+        chosen = sentences.of_corpus(model, manifest, split, audio)
+    elif clips:
+        chosen = sentences.of_clips(model, clips)
+    else:
+        chosen = sentences.of_samples(model, SENTENCE.parent)
+    listeners = listeners_of(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
+    lip_models = lips or list(LipModelName)
+    heard = hear_all(model, listeners, chosen)
+    outcome = evaluate(heard, listeners, lip_models)
+    print_outcome(outcome, Console())
+    write_json(json_file, asdict(outcome))
+    if videos:
+        written = film_all(heard, listeners, lip_models, videos)
+        print_message(f"wrote {len(written)} videos to {videos}")
 
 
 @app.command()
@@ -312,33 +380,147 @@ def attacks(
     write_json(json_file, [asdict(damage) for damage in damages])
 
 
+@app.command()
+def faults(
+    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Only this one, as the table names it; repeatable.")
+    ] = None,
+    logs: Annotated[Path | None, typer.Option(help="Keep the services' logs there.")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure what faults do to a live face: how long it stands, what is lost, how it jumps."""
+    from evaluation.system.faults import TIMING, measure, show
+
+    check_output(json_file)
+    outcomes = list(measure(audio, fault or (), logs, CONSOLE, TIMING))
+    show(outcomes, Console())
+    write_json(json_file, [asdict(outcome) for outcome in outcomes])
+
+
+@app.command()
+def senders(
+    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
+    seconds: Annotated[float, typer.Option(min=10.0, help="How long to speak at least.")] = 60.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure how many frames arrive at other programs that show the face, and how evenly."""
+    from evaluation.system.sending import measure, show
+
+    check_output(json_file)
+    arrivals = measure(audio, seconds, CONSOLE)
+    show(arrivals, Console())
+    write_json(json_file, [asdict(arrival) for arrival in arrivals])
+
+
+@app.command()
+def control(
+    workers: Annotated[
+        int, typer.Option(min=2, max=1500, help="Recognizers and synthesizers together.")
+    ] = 1000,
+    sessions: Annotated[int, typer.Option(min=1, help="Sessions that they serve.")] = 100_000,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure what many workers and sessions cost one control: CPU, memory, delay of an open.
+
+    The workers are played: each sends its heartbeats and starts what it is told. A tenth and a
+    hundredth of them are measured, too.
+    """
+    from evaluation.system.control_scale import measure, show
+
+    check_output(json_file)
+    costs = [
+        measure(max(2, workers // part), max(1, sessions // part), CONSOLE) for part in (100, 10, 1)
+    ]
+    show(costs, Console())
+    write_json(json_file, [asdict(cost) for cost in costs])
+
+
+@app.command()
+def soak(
+    audio: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings to speak; else the samples.")
+    ] = None,
+    hours: Annotated[float, typer.Option(min=0.0, help="Of sound; one round at least.")] = 24.0,
+    picture: Annotated[Path | None, typer.Option(help="Picture of the curves (.png).")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Speak without end, as fast as the services work: drift, memory, lost phones.
+
+    The file is written after each round, so an interrupted run keeps its figures.
+    """
+    from corpora.figures import save_figure
+    from evaluation.system.soak import Round, draw, measure, show, summary
+
+    def keep(rounds: list[Round]) -> None:
+        figures = [asdict(each) for each in rounds]
+        write_json(json_file, {"rounds": figures, "summary": summary(rounds)})
+
+    check_output(picture, json_file)
+    recordings = audio or sorted(SENTENCE.parent.glob("*.wav"))
+    rounds = measure(recordings, hours, CONSOLE, keep)
+    show(rounds, Console())
+    if picture is not None:
+        save_figure(draw(rounds), picture)
+
+
 @bench_app.command()
-def bench(
+def chain(
     audio: Annotated[Path, typer.Argument(help="Audio file to stream.")],
     repeats: Annotated[int, typer.Option(min=1, help="How often to stream it.")] = 3,
     json_file: JsonFile = None,
 ) -> None:
     """Measure latency, CPU and images per second of the whole chain on this machine.
 
-    The page is measured where Chromium is installed.
+    The page is measured where Chromium is installed, and how far its sound is from its picture.
     """
     from evaluation.system import chromium, latency, page, rendering, sessions
 
     delays = latency.measure(audio, repeats, CONSOLE)
     costs = sessions.measure(audio)
     pictures = rendering.measure()
-    drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
+    figures = page.measure(audio, CONSOLE) if chromium.is_installed() else None
     out = Console()
     latency.show(delays, out)
     sessions.show(costs, out)
     rendering.show(pictures, out)
-    page.show(drawings, out)
+    if figures is not None:
+        page.show(figures, out)
     write_json(
         json_file,
         asdict(delays)
         | {"sessions": costs, "rendering": asdict(pictures)}
-        | {"page": {name: asdict(drawing) for name, drawing in drawings.items()}},
+        | {"page": asdict(figures) if figures is not None else {}},
     )
+
+
+@bench_app.command()
+def load(
+    audio: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings to speak; else the samples.")
+    ] = None,
+    sessions: Annotated[
+        int, typer.Option(min=1, max=1000, help="As many live sessions at the end.")
+    ] = 24,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="How long each of up to 9 numbers is measured.")
+    ] = 12.0,
+    picture: Annotated[Path | None, typer.Option(help="Picture of the curves (.png).")] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Measure how many live sessions control, a recognizer and a synthesizer carry here.
+
+    One process speaks into all of them, each with a voice of its own.
+    """
+    from corpora.figures import save_figure
+    from evaluation.system.load import draw, measure, show
+
+    check_output(picture, json_file)
+    figures = measure(audio or sorted(SENTENCE.parent.glob("*.wav")), sessions, seconds, CONSOLE)
+    show(figures, Console())
+    if picture is not None:
+        save_figure(draw(figures), picture)
+    write_json(json_file, asdict(figures) | {"summary": figures.summary})
 
 
 @plot_app.callback()

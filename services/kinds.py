@@ -67,6 +67,8 @@ KINDS = {
     )
 }
 
+WORKERS = ("recognizer", "synthesizer")  # of which there may be several
+
 
 def read_settings(
     file: Path | None = None, assignments: Mapping[str, str] | None = None
@@ -138,6 +140,30 @@ def available_addresses(settings: Settings) -> dict[str, str]:
                     )
             environment[variable(kind.name, key)] = free[variable(kind.name, key)]
     return environment
+
+
+def more_workers(settings: Settings, number: int) -> dict[str, dict[str, str]]:
+    """Return environments of that many workers of a kind in all, but for the first of each.
+
+    Their names are ``recognizer-2`` and so on. They bind free ports, on the addresses of the first.
+    """
+    environments: dict[str, dict[str, str]] = {}
+    for name in WORKERS:
+        config = settings.load(KINDS[name].config_type)
+        own = {variable(name, "instance"): ""}
+        for key, bound in bound_keys(type(config)).items():
+            if bound is Bound.ENDPOINT:
+                host = str(getattr(config, key)).rpartition(":")[0]
+                own[variable(name, key)] = f"{host}:*"
+            elif bound is Bound.PORT:
+                own[variable(name, key)] = "0"
+        environments |= {f"{name}-{count}": own for count in range(2, number + 1)}
+    return environments
+
+
+def kind_of(name: str) -> str:
+    """Return the kind of service that has some name, such as ``recognizer-2``."""
+    return name.partition("-")[0]
 
 
 def _is_taken(host: str, port: int) -> bool:

@@ -26,12 +26,14 @@ def sound_events(
     samples: NDArray[np.float32],
     lips_from_sound: LipsFromSound | None = None,
     face_delay_s: float = 0.0,
+    config: RecognizerConfig | None = None,
 ) -> list[SoundEvent]:
-    """Return the events of a whole sound, 16 kHz mono, shape (n,), by the default settings.
+    """Return the events of a whole sound, 16 kHz mono, shape (n,); None: by default settings.
 
     With a model of lips there are lip frames among them, in time for a face of this delay.
     """
-    stream = _new_stream(model, RecognizerConfig(), MEDIA_RATE_HZ, 1, lips_from_sound, face_delay_s)
+    config = config or RecognizerConfig()
+    stream = _new_stream(model, config, MEDIA_RATE_HZ, 1, lips_from_sound, face_delay_s)
     return _events_of(stream.accept_waveform(samples) + stream.input_finished())
 
 

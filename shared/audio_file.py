@@ -1,8 +1,7 @@
-"""Audio files and microphones as blocks of samples."""
+"""Audio files and pipes as blocks of samples."""
 
 from __future__ import annotations
 
-import queue
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ import soxr
 from numpy.typing import NDArray
 
 from shared.errors import UserError
+from shared.wav_header import read_wav_header
 
 if TYPE_CHECKING:
     from shared.media_file import MediaSound
@@ -39,6 +39,7 @@ class AudioSource:
     duration_s: float | None  # None where the end is not known
     blocks: Iterator[Samples]
     remarks: list[str] = field(default_factory=list)  # what is wrong; complete after the last block
+    is_live: bool = False  # it comes in real time by itself
 
 
 def open_audio(path: Path, block_s: float = 0.02) -> AudioSource:
@@ -158,53 +159,40 @@ def clipping_remarks(name: str, share: float) -> list[str]:
 
 
 def raw_audio(stream: IO[bytes], sample_rate_hz: int, num_channels: int) -> AudioSource:
-    """Read raw little-endian int16 samples from a pipe."""
-
-    def blocks() -> Iterator[Samples]:
-        frame_bytes = 2 * num_channels
-        rest = b""
-        while data := stream.read(frame_bytes * sample_rate_hz // 50):
-            data = rest + data
-            whole = len(data) - len(data) % frame_bytes
-            rest = data[whole:]
-            pcm = np.frombuffer(data[:whole], "<i2").reshape(-1, num_channels)
-            yield pcm.astype(np.float32) / np.float32(32768)
-
-    return AudioSource("standard input", sample_rate_hz, num_channels, None, blocks())
-
-
-def microphone(sample_rate_hz: int = 16_000) -> AudioSource:
-    """Read the default microphone until interrupted.
+    """Read little-endian int16 samples from a pipe; a WAV header says how they are instead.
 
     Raises
     ------
     UserError
-        If the system has no sound library or no microphone.
+        If the header states another encoding than 16-bit integers or 32-bit floats, a rate below
+        8 kHz or above 48 kHz, or more than two channels.
     """
-    try:
-        import sounddevice  # noqa: PLC0415 - fails to import where PortAudio is missing
-    except OSError:
-        raise UserError(
-            "the microphone needs the PortAudio library; type: sudo apt install libportaudio2"
-        ) from None
-    recorded: queue.SimpleQueue[Samples] = queue.SimpleQueue()
-    try:
-        stream = sounddevice.InputStream(
-            samplerate=sample_rate_hz,
-            channels=1,
-            dtype="float32",
-            blocksize=sample_rate_hz // 50,
-            callback=lambda data, *_: recorded.put(data.copy()),
-        )
-    except (sounddevice.PortAudioError, ValueError) as error:
-        raise UserError(f"no microphone can be opened: {error}") from None
+    rest = stream.read(2 * num_channels * sample_rate_hz // 50)
+    header = read_wav_header(rest)
+    kind, scale = "<i2", 1 / 32768
+    if header is not None:
+        sample_rate_hz, num_channels = header.sample_rate_hz, header.num_channels
+        if not LOWEST_RATE_HZ <= sample_rate_hz <= HIGHEST_RATE_HZ or num_channels not in (1, 2):
+            raise UserError(
+                f"the WAV header says {sample_rate_hz} Hz and {num_channels} channels; expected "
+                f"{LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ} Hz and 1 or 2"
+            )
+        if header.encoding == "f32le":
+            kind, scale = "<f4", 1.0
+        rest = rest[header.num_bytes :]
 
     def blocks() -> Iterator[Samples]:
-        with stream:
-            while True:
-                yield recorded.get()
+        frame_bytes = np.dtype(kind).itemsize * num_channels
+        data = rest
+        while data:
+            whole = len(data) - len(data) % frame_bytes
+            pcm = np.frombuffer(data[:whole], kind).reshape(-1, num_channels)
+            if whole:
+                yield np.clip(pcm * np.float32(scale), -1.0, 1.0)
+            more = stream.read(frame_bytes * sample_rate_hz // 50)
+            data = data[whole:] + more if more else b""
 
-    return AudioSource("microphone", sample_rate_hz, 1, None, blocks())
+    return AudioSource("standard input", sample_rate_hz, num_channels, None, blocks())
 
 
 def _file_blocks(

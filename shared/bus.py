@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self
 
@@ -32,10 +33,12 @@ from shared.wire.message import (
 from shared.wire.session import Error, Joined
 from shared.zap import Zap
 
-QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames for a subscriber that pauses
+QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames of a recording for a subscriber that pauses
+LIVE_BUFFER = 65_536  # bytes of the kernel: some seconds of FAP frames, over any distance
 AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
 # What a bound socket takes in: the largest message, and how many of a connection wait.
-AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_slow=16)
+# Of answers to audio few wait: not every client reads them.
+AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_slow=16, num_answers=100)
 COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, num_slow=1, cost=1.0)
 PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
 # ZeroMQ stores a subscription before it is received; a handshake takes most of the size.
@@ -43,7 +46,8 @@ SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, num_slow=128, cost=1.
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
-RECONNECT_MS = (50, 1000)
+RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
+CONNECT_MS = 300  # for one; whoever is further away cannot be reached
 HANDSHAKE_MS = 2000
 _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
 
@@ -68,6 +72,7 @@ class Socket:
         *,
         routes: bool = False,
         publishes: bool = False,
+        on_joined: Callable[[str], None] = lambda session: None,
     ) -> None:
         self._raw = raw
         self._key = key
@@ -75,6 +80,7 @@ class Socket:
         self._guarded = guarded  # where it is bound
         self._routes = routes
         self._publishes = publishes
+        self._on_joined = on_joined
         self._connection: Connection | None = None  # that the last message came through
         self._sender = NOBODY  # of it
         self._refusal_cost = 0.0  # that refusing it takes
@@ -149,10 +155,25 @@ class Socket:
         finally:
             self._connection = None
 
+    def drop_stopped(self, kinds: Collection[type[Message]], sessions: Iterable[str]) -> None:
+        """End the connections of subscribers that stand still, to be called about once a second.
+
+        Only of those that follow some kinds of message of one of some sessions: what is live is
+        worth nothing when it is late. A subscriber connects again by itself when it goes on.
+        """
+        if self._guarded is not None:
+            topics = [topic(kind, session) for session in sessions for kind in kinds]
+            self._guarded.cut_stopped(topics, time.monotonic())
+
     def drained(self) -> None:
         """Note that nothing more has arrived."""
         if self._guarded is not None:
             self._guarded.drained()
+
+    def ended(self) -> Iterator[int]:
+        """Yield the numbers of connections to this bound socket that have ended since."""
+        if self._guarded is not None:
+            yield from self._guarded.ended()
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether something arrived within the time."""
@@ -237,6 +258,7 @@ class Socket:
         session = wanted.removeprefix(prefix).decode("ascii", "replace").removesuffix("/")
         if wanted.startswith(prefix) and _SESSION.match(session):
             self.send(Joined(session=session, publisher=self._name))
+            self._on_joined(session)
 
 
 def _descriptor(frame: zmq.Frame) -> int:
@@ -267,6 +289,8 @@ class Bus:
     key
         Proves who this process is; its sockets accept only keys that are allowed. None: all is
         plain, to anybody.
+    extra_connections
+        How many more others may have here than is usual.
 
     Attributes
     ----------
@@ -279,9 +303,9 @@ class Bus:
         If the allowed keys cannot be read.
     """
 
-    def __init__(self, key: Key | None = None) -> None:
+    def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
         self._context = zmq.Context()
-        self._guard = Guard()
+        self._guard = Guard(extra_connections)
         self._key = key
         self.zap = None if key is None else Zap(self._context, self._guard.cut_keys)
         self._sockets: list[Socket] = []
@@ -296,17 +320,30 @@ class Bus:
         """Bind a socket that many peers send commands or data to."""
         return self._bind(zmq.ROUTER, endpoint, key, bounds)
 
-    def bind_publisher(self, endpoint: str, key: str) -> Socket:
-        """Bind a socket that many peers subscribe to."""
-        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS)
+    def bind_publisher(
+        self, endpoint: str, key: str, on_joined: Callable[[str], None] = lambda session: None
+    ) -> Socket:
+        """Bind a socket that many peers subscribe to.
+
+        ``on_joined`` is called with the session when somebody's subscriptions are in effect.
+        """
+        return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_joined)
 
     def connect_dealer(self, endpoint: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
         """Connect to a router; messages queue until it is there."""
         return self._connect(zmq.DEALER, endpoint, queue_length=queue_length)
 
-    def connect_subscriber(self, *endpoints: str) -> Socket:
-        """Connect to publishers; nothing arrives before ``subscribe``."""
-        return self._connect(zmq.SUB, *endpoints, queue_length=QUEUE_LENGTH)
+    def connect_subscriber(self, *endpoints: str, live: Iterable[str] = ()) -> Socket:
+        """Connect to publishers; nothing arrives before ``subscribe``.
+
+        From those in ``live`` the kernel takes few messages ahead, so that there is not much to
+        skip after this process was stopped.
+        """
+        socket = self._connect(zmq.SUB, *endpoints, queue_length=QUEUE_LENGTH)
+        socket.raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
+        for endpoint in live:
+            socket.connect(endpoint)
+        return socket
 
     def is_refused(self, endpoint: str) -> bool:
         """Return whether somebody listens there who does not accept this key, or has another."""
@@ -349,13 +386,21 @@ class Bus:
         raw.setsockopt(zmq.RCVHWM, queue_length)
         raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
         raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
+        raw.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_MS)
         raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         raw.setsockopt(zmq.LINGER, 0)
         return raw
 
-    def _bind(self, kind: int, endpoint: str, key: str, bounds: Bounds) -> Socket:
+    def _bind(
+        self,
+        kind: int,
+        endpoint: str,
+        key: str,
+        bounds: Bounds,
+        on_joined: Callable[[str], None] = lambda session: None,
+    ) -> Socket:
         split_endpoint(endpoint, key)
-        raw = self._open(kind, QUEUE_LENGTH)
+        raw = self._open(kind, bounds.num_answers)
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
         raw.setsockopt_string(zmq.ZAP_DOMAIN, key)  # with one, libzmq refuses ZMTP 1 and 2
         if self._key is not None:
@@ -376,7 +421,13 @@ class Bus:
                 "is another system running, or the address not this host's?"
             ) from None
         socket = Socket(
-            raw, self._key, self.zap, guarded, routes=kind == zmq.ROUTER, publishes=kind == zmq.XPUB
+            raw,
+            self._key,
+            self.zap,
+            guarded,
+            routes=kind == zmq.ROUTER,
+            publishes=kind == zmq.XPUB,
+            on_joined=on_joined,
         )
         self._sockets.append(socket)
         return socket

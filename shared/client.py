@@ -23,6 +23,7 @@ from shared.wire.codec import BadMessage
 from shared.wire.control import StatusReport, StatusRequest
 from shared.wire.message import MAX_AUDIO_BYTES, Message
 from shared.wire.session import (
+    AddShapes,
     ChooseExpressiveness,
     ChooseLips,
     CloseSession,
@@ -34,20 +35,28 @@ from shared.wire.session import (
     SessionMoved,
     SessionOpened,
 )
+from shared.wire.speech import Acknowledge
 
 RETRY_S = 1.0
 RESEND_S = 10.0  # audio kept for a recognizer that takes the place of a lost one
-MAX_RESEND = 5000  # messages of that
+MAX_KEPT = 5000  # messages of that
+MAX_UNSENT = 500  # messages; then whoever sends must wait
+ANSWER_S = (0.6, 10.0)  # without an acknowledgement, at first and at most, to connect again
+HURRIED_ANSWER_S = 5.0  # at first, where audio comes as fast as it is taken and may wait for long
+LAST_ANSWER_S = 2.0  # for the end of the audio to be acknowledged before a session is closed
+ANSWER_WAIT_S = 0.02  # between looks for it
+REJOIN_S = 1.0  # for subscriptions to be in effect again before audio is sent again
 MOVE_LIMIT_S = 5.0  # for a session that its recognizer does not know to move
 
 
 class Refused(UserError):
     """A service refused a request."""
 
-    def __init__(self, code: str, text: str) -> None:
+    def __init__(self, code: str, text: str, retry_after_s: float = 0.0) -> None:
         super().__init__(f"{code}: {text}")
         self.code = code
         self.text = text
+        self.retry_after_s = retry_after_s  # when it is worth trying again; 0: not stated
 
 
 class Client:
@@ -155,12 +164,36 @@ class Client:
             )
         )
 
-    def status(self) -> StatusReport:
-        """Return the state of all services and sessions."""
-        report = self._ask(StatusRequest(request=_request_id()))
-        if not isinstance(report, StatusReport):
-            raise UserError(f"control answered {report.kind} to status")
-        return report
+    def add_shapes(self, session: str, shapes: Iterable[str]) -> None:
+        """Let a session, anybody's, publish sets of shapes beside its FAP frames.
+
+        Raises
+        ------
+        Refused
+            If there is no such session or set.
+        """
+        self._ask(AddShapes(session=session, request=_request_id(), shapes=list(shapes)))
+
+    def status(self, session: str = "") -> StatusReport:
+        """Return the state of all services and sessions, or of one session and its services.
+
+        Raises
+        ------
+        Refused
+            If there is no such session.
+        """
+        pages: list[StatusReport] = []
+        while not pages or pages[-1].next:
+            after = pages[-1].next if pages else 0
+            page = self._ask(StatusRequest(session=session, request=_request_id(), after=after))
+            if not isinstance(page, StatusReport):
+                raise UserError(f"control answered {page.kind} to status")
+            pages.append(page)
+        return dataclasses.replace(
+            pages[-1],
+            services=[state for page in pages for state in page.services],
+            sessions=[state for page in pages for state in page.sessions],
+        )
 
     def take_notices(self) -> None:
         """Handle what control sends unasked: sessions that moved."""
@@ -179,6 +212,7 @@ class Client:
         | ChooseLips
         | Express
         | ChooseExpressiveness
+        | AddShapes
         | StatusRequest,
     ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
@@ -198,7 +232,7 @@ class Client:
                     if getattr(answer, "request", None) != message.request:
                         continue
                     if isinstance(answer, Error):
-                        raise Refused(answer.code, answer.text)
+                        raise Refused(answer.code, answer.text, answer.retry_after_s)
                     if isinstance(answer, Message):
                         return answer
             if self.bus.is_refused(self._control):
@@ -213,7 +247,9 @@ class Session:
     """One open session: sends audio and subscribes to what comes out.
 
     When control moves the session to another recognizer, the session sends the audio again that the
-    lost one did not get, and its subscriptions follow. Whoever uses the session need not notice.
+    lost one did not get, and its subscriptions follow. When nothing is acknowledged any more, it
+    connects again, and sends what was not. Whoever uses the session need not notice: calls of
+    ``send``, ``finish`` and ``errors`` do that.
     """
 
     def __init__(self, client: Client, opening: OpenSession, opened: SessionOpened) -> None:
@@ -225,8 +261,15 @@ class Session:
         self._subscriptions: list[Subscription] = []
         self._sequence = 0
         self._num_frames_sent = 0
-        self._sent: deque[AudioChunk | EndOfAudio] = deque(maxlen=MAX_RESEND)
-        self._to_resend: deque[AudioChunk | EndOfAudio] = deque()
+        self._has_finished = False
+        self._kept: deque[AudioChunk | EndOfAudio] = deque(maxlen=MAX_KEPT)
+        self._next = 1  # number of the next message for the socket
+        self._acknowledged = 0  # number of the newest message that the recognizer has
+        self._progress_s = 0.0  # when something was acknowledged, or the first message waited
+        self._least_answer_s = ANSWER_S[0] if opening.paced else HURRIED_ANSWER_S
+        self._answer_s = self._least_answer_s  # how long to wait for more
+        self._rejoin_end_s = 0.0  # until then audio waits for subscriptions
+        self._errors: deque[Error] = deque()
         self._unknown: tuple[float, Error] | None = (
             None  # when the recognizer did not know the session
         )
@@ -256,19 +299,19 @@ class Session:
         """
         if len(pcm) > MAX_AUDIO_BYTES:
             raise UserError(f"a chunk of {len(pcm)} bytes is too large; send {MAX_AUDIO_BYTES}")
-        sent = self._resend() and self._send_new(
-            AudioChunk(
-                session=self.name,
-                epoch=self.opened.epoch,
-                token=self.opened.token,
-                sequence=self._sequence + 1,
-                media_time=self.media_time,
-                pcm=pcm,
-            )
+        chunk = AudioChunk(
+            session=self.name,
+            epoch=self.opened.epoch,
+            token=self.opened.token,
+            sequence=self._sequence + 1,
+            media_time=self.media_time,
+            pcm=pcm,
+            acknowledge=True,
         )
-        if sent:
-            self._num_frames_sent += num_frames
-        return sent
+        if not self._send(chunk):
+            return False
+        self._num_frames_sent += num_frames
+        return True
 
     def skip(self, num_frames: int) -> None:
         """Leave audio out that could not be sent: media time goes on without it."""
@@ -276,15 +319,19 @@ class Session:
 
     def finish(self) -> bool:
         """Say that no more audio comes; False if the queue is full, as in ``send``."""
-        return self._resend() and self._send_new(
-            EndOfAudio(
-                session=self.name,
-                epoch=self.opened.epoch,
-                token=self.opened.token,
-                sequence=self._sequence + 1,
-                media_time=self.media_time,
+        if not self._has_finished:
+            self._has_finished = self._send(
+                EndOfAudio(
+                    session=self.name,
+                    epoch=self.opened.epoch,
+                    token=self.opened.token,
+                    sequence=self._sequence + 1,
+                    media_time=self.media_time,
+                    acknowledge=True,
+                )
             )
-        )
+        self._send_waiting()
+        return self._next > self._sequence
 
     def errors(self) -> Iterator[Error]:
         """Yield the recognizer's errors since the last call.
@@ -292,12 +339,10 @@ class Session:
         An unknown session is reported only after a while: a recognizer that has just started again
         does not know it before control has moved the session.
         """
-        self._resend()
+        self._send_waiting()
         now_s = time.monotonic()
-        for received in self._audio.receive():
-            error = received.message
-            if not isinstance(error, Error):
-                continue
+        while self._errors:
+            error = self._errors.popleft()
             if error.code == ErrorCode.UNKNOWN_SESSION:
                 self._unknown = self._unknown or (now_s, error)
             else:
@@ -314,36 +359,33 @@ class Session:
         UserError
             If a publisher does not confirm the subscription in time.
         """
-        subscription = Subscription(self._client.bus, self.name, kinds)
+        subscription = Subscription(self._client.bus, self.name, kinds, live=self._opening.paced)
         subscription.start(self.opened)
         subscription.wait_until_complete(deadline_s)
         self._subscriptions.append(subscription)
         return subscription
 
     def move(self, moved: SessionMoved) -> None:
-        """Go on where control has placed the session."""
+        """Go on where control has placed the session; it may say so more than once."""
         before = self.opened
+        if moved.epoch <= before.epoch:
+            return
         self.opened = dataclasses.replace(
             before, epoch=moved.epoch, audio=moved.audio, phones=moved.phones, faps=moved.faps
         )
         if (before.phones, before.faps) != (moved.phones, moved.faps):
-            for subscription in self._subscriptions:
-                subscription.start(self.opened)
+            self._subscribe_again()
         if moved.next_sequence:
-            self._client.bus.drop(self._audio, linger_s=0.0)
-            self._audio = self._client.bus.connect_dealer(
-                moved.audio, queue_length=AUDIO_QUEUE_LENGTH
-            )
-            self._to_resend = deque(
-                dataclasses.replace(message, epoch=moved.epoch)
-                for message in self._sent
-                if message.sequence >= moved.next_sequence
-            )
+            self._acknowledged = moved.next_sequence - 1
             self._unknown = None
+            self._connect_audio()
 
     def flush(self) -> None:
-        """Interrupt: drop audio not yet shown."""
+        """Interrupt: drop audio not yet shown; none of it is sent again."""
         self._client.flush_session(self.name, self.opened.token)
+        self._kept = deque(
+            (each for each in self._kept if isinstance(each, EndOfAudio)), maxlen=MAX_KEPT
+        )
 
     def choose_lips(self, lips: str) -> None:
         """Let another lip model move the mouth: "dynamic-visemes" or "learnt"."""
@@ -354,36 +396,109 @@ class Session:
         self._client.express(self.name, expressions, hold_s)
 
     def close(self) -> None:
-        """Close the session."""
+        """Close the session; after ``finish`` once the recognizer has told all its results."""
+        end_s = time.monotonic() + LAST_ANSWER_S
+        while self._has_finished and self._acknowledged < self._sequence:
+            self._audio.wait(ANSWER_WAIT_S)
+            self._send_waiting()
+            if time.monotonic() > end_s:
+                break
         self._client.close_session(self.name, self.opened.token)
 
-    def _resend(self) -> bool:
-        """Send again what a new recognizer needs; return whether all of it is sent."""
-        self._client.take_notices()
-        while self._to_resend:
-            if not self._audio.send(self._to_resend[0]):
+    def _send(self, message: AudioChunk | EndOfAudio) -> bool:
+        """Send a new message; return False if the queue is full.
+
+        While subscriptions are renewed, it may wait behind others.
+        """
+        self._send_waiting()
+        if self._is_rejoining():
+            if self._sequence + 1 - self._next >= MAX_UNSENT:
                 return False
-            self._to_resend.popleft()
+        elif self._next <= self._sequence or not self._give(message):
+            return False
+        else:
+            self._next += 1
+        if self._acknowledged == self._sequence:
+            self._progress_s = time.monotonic()
+        self._sequence = message.sequence
+        self._kept.append(message)
+        oldest_needed = message.media_time - RESEND_S * MEDIA_RATE_HZ
+        while self._kept[0].sequence <= self._acknowledged:
+            if self._kept[0].media_time >= oldest_needed:
+                break
+            self._kept.popleft()
         return True
 
-    def _send_new(self, message: AudioChunk | EndOfAudio) -> bool:
-        if not self._audio.send(message):
-            return False
-        self._sequence = message.sequence
-        self._sent.append(message)
-        oldest_needed = message.media_time - RESEND_S * MEDIA_RATE_HZ
-        while self._sent[0].media_time < oldest_needed:
-            self._sent.popleft()
-        return True
+    def _send_waiting(self) -> None:
+        """Take what has come, and give the socket as many messages as it takes."""
+        self._client.take_notices()
+        self._take_answers()
+        is_late = 0 < self._acknowledged < self._sequence  # an older recognizer says nothing
+        if is_late and time.monotonic() - self._progress_s > self._answer_s:
+            self._reconnect()
+        if self._is_rejoining():
+            return
+        oldest = self._kept[0].sequence if self._kept else self._sequence + 1
+        self._next = max(self._next, oldest)
+        while self._next <= self._sequence:
+            message = self._kept[self._next - oldest]
+            if not self._give(message):
+                return
+            self._next += 1
+
+    def _give(self, message: AudioChunk | EndOfAudio) -> bool:
+        """Give the socket a message; return whether it took it."""
+        return self._audio.send(dataclasses.replace(message, epoch=self.opened.epoch))
+
+    def _is_rejoining(self) -> bool:
+        """Return whether audio waits for subscriptions, so that no frame of it is missed."""
+        return time.monotonic() < self._rejoin_end_s and not all(
+            each.has_joined() for each in self._subscriptions
+        )
+
+    def _take_answers(self) -> None:
+        """Take the recognizer's acknowledgements and errors."""
+        for received in self._audio.receive():
+            message = received.message
+            if isinstance(message, Error):
+                self._errors.append(message)
+            elif isinstance(message, Acknowledge) and message.sequence > self._acknowledged:
+                self._acknowledged = min(message.sequence, self._sequence)
+                self._progress_s = time.monotonic()
+                self._answer_s = max(self._least_answer_s, self._answer_s / 2)
+
+    def _reconnect(self) -> None:
+        """Give up the sockets: nothing comes through, but TCP may not say so for long."""
+        self._answer_s = min(2 * self._answer_s, ANSWER_S[1])
+        self._subscribe_again()
+        self._connect_audio()
+
+    def _subscribe_again(self) -> None:
+        self._rejoin_end_s = time.monotonic() + REJOIN_S
+        for subscription in self._subscriptions:
+            subscription.start(self.opened)
+
+    def _connect_audio(self) -> None:
+        """Connect to the recognizer again; what it does not have goes first."""
+        self._client.bus.drop(self._audio, linger_s=0.0)
+        self._audio = self._client.bus.connect_dealer(
+            self.opened.audio, queue_length=AUDIO_QUEUE_LENGTH
+        )
+        self._next = self._acknowledged + 1
+        self._progress_s = time.monotonic()
 
 
 class Subscription:
     """Messages of one session in the order in which they arrive."""
 
-    def __init__(self, bus: Bus, session: str, kinds: Iterable[type[Message]]) -> None:
+    def __init__(
+        self, bus: Bus, session: str, kinds: Iterable[type[Message]], *, live: bool
+    ) -> None:
         self._loop = PollingLoop(bus)
         self._received: deque[Received] = deque()
-        self._follower = SessionFollower(self._loop, session, dict.fromkeys(kinds, self._take))
+        self._follower = SessionFollower(
+            self._loop, session, dict.fromkeys(kinds, self._take), live=live
+        )
 
     def start(self, opened: SessionOpened) -> None:
         """Subscribe at the session's publishers; again when they are others."""
@@ -403,6 +518,11 @@ class Subscription:
             if left_s <= 0:
                 raise UserError("a publisher did not confirm the subscription")
             self._loop.step(left_s)
+
+    def has_joined(self) -> bool:
+        """Take what has arrived; return whether the subscription is in effect."""
+        self._loop.step(0.0)
+        return self._follower.is_complete
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether something arrived within the time."""

@@ -10,6 +10,7 @@ import time
 from collections import deque
 
 MEDIA_RATE_HZ = 16_000  # media time counts samples at this rate
+STOPPED_S = 0.5  # longer than a busy machine keeps a process waiting
 
 
 def to_samples(time_s: float) -> int:
@@ -52,3 +53,16 @@ class ClockOffset:
 def now_ns() -> int:
     """Return this host's wall clock."""
     return time.time_ns()
+
+
+def was_stopped(begin_s: float, timeout_s: float) -> bool:
+    """Return whether a wait, which ends now, took so long that the process was stopped meanwhile.
+
+    Parameters
+    ----------
+    begin_s
+        When it began, by ``time.monotonic``.
+    timeout_s
+        How long it was to take at most.
+    """
+    return time.monotonic() > begin_s + timeout_s + STOPPED_S

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import difflib
 import os
-import socket
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
@@ -26,7 +25,7 @@ from annotated_types import Ge, Le, MultipleOf
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from shared.endpoints import WILDCARDS, is_loopback, split_endpoint
+from shared.endpoints import WILDCARDS, is_loopback, own_address, split_endpoint, with_host
 from shared.errors import UserError
 
 PREFIX = "KOUXING_"
@@ -47,6 +46,7 @@ class Form:
     """Says in words what a value looks like, where its type does not tell."""
 
     text: str
+    is_list: bool = False  # texts separated by spaces, or in a file a list of them
 
 
 def _check_endpoint(value: str) -> str:
@@ -54,6 +54,12 @@ def _check_endpoint(value: str) -> str:
         split_endpoint(value, "")
     except UserError as error:
         raise ValueError(str(error)) from None
+    return value
+
+
+def _check_host(value: str) -> str:
+    if value:
+        _check_endpoint(with_host("tcp://*:*", value))
     return value
 
 
@@ -70,6 +76,7 @@ def _lower(value: object) -> object:
 Switch = Annotated[bool, BeforeValidator(_check_boolean)]
 Endpoint = Annotated[str, AfterValidator(_check_endpoint), Form("an endpoint, tcp://HOST:PORT")]
 BoundEndpoint = Annotated[Endpoint, Bound.ENDPOINT]
+Host = Annotated[str, AfterValidator(_check_host), Form("a host name or address")]
 BoundHost = Annotated[str, Bound.HOST, Form("a host name or address")]
 BoundPort = Annotated[int, Field(ge=0, le=65535), Bound.PORT]
 LogLevel = Annotated[Literal["debug", "info", "warning", "error"], BeforeValidator(_lower)]
@@ -85,8 +92,9 @@ class ServiceConfig(BaseModel):
 
     control: Endpoint = "tcp://127.0.0.1:5550"
     """Where control takes commands."""
-    advertise: str = ""
-    """Host name or address by which other machines reach this service."""
+    advertise: Host = ""
+    """Host name or address by which others reach this service, as behind NAT; when empty the one
+    that is bound, for every address (0.0.0.0) this host's own on the way to control."""
     insecure: Switch = False
     """Let services and clients talk unencrypted, to anybody; docs/security.md says what that gives
     away."""
@@ -94,8 +102,25 @@ class ServiceConfig(BaseModel):
     """Least level of the log lines that are written."""
     instance: str = ""
     """Name of this process; chosen when empty."""
+    metrics_port: Annotated[int, Field(ge=0, le=65535)] = 0
+    """Port of figures for Prometheus (/metrics) and of a health check (/healthz), over plain HTTP;
+    0: none. Each service on a machine needs its own."""
+    metrics_host: Annotated[str, Form("a host name or address")] = "127.0.0.1"
+    """Address to bind for them; 0.0.0.0 lets other machines read them."""
     idle_motion_seed: Annotated[int, Field(ge=0, le=2**32 - 1)] = 3
     """Seed of blinks, gaze, brows and head motion, of what makes or shows a face; 0: none."""
+
+    @property
+    def own_host(self) -> str:
+        """Host by which others reach what is bound to every address of this one."""
+        host, _ = split_endpoint(self.control, "control")
+        return own_address() if is_loopback(host) else own_address(host)
+
+    def reachable(self, endpoint: str) -> str:
+        """Return the endpoint that others connect to for one that was bound."""
+        host, _ = split_endpoint(endpoint, "endpoint")
+        own = self.own_host if host in WILDCARDS and not self.advertise else host
+        return with_host(endpoint, self.advertise or own)
 
     @property
     def is_encrypted(self) -> bool:
@@ -292,11 +317,18 @@ def _read_file(file: Path, tables: Mapping[str, type[ServiceConfig]]) -> Layer:
                 ]
                 name = f"{table}.{key}"
                 raise UserError(f"{file}: unknown key {name}; {_nearest(name, candidates)}")
+            if _is_list(tables[table], key) and isinstance(value, list):
+                value = " ".join(map(str, value))  # noqa: PLW2901 - as it is written elsewhere
             text = str(value).lower() if isinstance(value, bool) else str(value)
             layer[table][key] = Given(text, str(file))
             if not isinstance(value, str | int | float):
                 raise _refusal(table, key, layer[table][key], tables[table])
     return layer
+
+
+def _is_list(config_type: type[ServiceConfig], key: str) -> bool:
+    marks = config_type.model_fields[key].metadata
+    return any(isinstance(mark, Form) and mark.is_list for mark in marks)
 
 
 def _read_environment(
@@ -344,21 +376,14 @@ def _nearest(name: str, known: Iterable[str]) -> str:
 
 
 def _check_addresses(table: str, config: ServiceConfig) -> None:
-    """Refuse addresses that others cannot use, or can use though nothing is encrypted."""
+    """Refuse hosts that others can reach though nothing is encrypted, as endpoints are."""
     for key, kind in bound_keys(type(config)).items():
-        if kind is Bound.PORT:
-            continue
-        name = f"{table}.{key}"
         host = getattr(config, key)
-        if kind is Bound.ENDPOINT:  # encrypted, or not by choice
-            host, _ = split_endpoint(host, name)
-            if host in WILDCARDS and not config.advertise:
-                raise UserError(
-                    f"{table}.advertise: name the host by which others reach {name} "
-                    f"({host} is every address of this host), for example {socket.gethostname()}"
-                )
-        elif not is_loopback(host) and not config.insecure and not config.is_encrypted:
+        if kind is not Bound.HOST or is_loopback(host):
+            continue
+        if not config.insecure and not config.is_encrypted:
             raise UserError(
-                f"{name}: {host} can be reached from other machines and nothing is encrypted; "
-                f"{config.safer}, or accept the risk on a trusted network with insecure = true"
+                f"{table}.{key}: {host} can be reached from other machines and nothing is "
+                f"encrypted; {config.safer}, or accept the risk on a trusted network with "
+                "insecure = true"
             )

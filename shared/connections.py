@@ -10,7 +10,6 @@ held. An honest peer is never cut: its queue fills, ZeroMQ stops reading, and it
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import fcntl
 import os
 import resource
@@ -22,13 +21,14 @@ import sys
 import termios
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import zmq
 
 from shared.logs import LOG, RateLimit
+from shared.metrics import give_back_memory
 
 KIB, MIB = 1024, 1024 * 1024
 RECEIVE_BUFFER = 256 * KIB  # of the kernel; a few segments of loopback, or it stalls
@@ -37,6 +37,8 @@ NEAR_LOOK_S = 0.005  # while much waits, and at first: a flood takes some 5 MB i
 NEAR_S = 0.2  # after a connection has come
 MUCH = 128 * KIB  # more than honest peers' messages take as a rule
 SWEEP_S = 1.0  # between looks for connections that have ended
+STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscriber stands still
+STUCK_SMALL = 4 * KIB  # of each connection, that a busy ZeroMQ may not have passed on yet
 STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
 MAX_WAITING = 24 * MIB  # of all connections
 MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
@@ -56,7 +58,8 @@ BAN_S = 3  # until an address with too many faults is let in again, at the longe
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
-_BYTES_RECEIVED = 128  # where struct tcp_info has tcpi_bytes_received
+# where struct tcp_info has tcpi_bytes_acked and tcpi_bytes_received
+_BYTES_ACKED, _BYTES_RECEIVED = 120, 128
 _SINK = bytearray(MIB)
 _DISCARD = socket.MSG_DONTWAIT | socket.MSG_TRUNC
 _SEES_BYTES = sys.platform == "linux"
@@ -71,6 +74,7 @@ class Bounds:
     message_bytes: int  # the largest part
     queue_length: int  # messages of a connection that wait for delivery
     num_slow: int  # connections that may be in the midst of the largest message
+    num_answers: int = 20_000  # that wait for one peer; more are lost
     cost: float = 0.0
 
     @property
@@ -103,6 +107,7 @@ class Connection:
         self._credit = CREDIT
         self._credit_s = time.monotonic()
         self._mark = (0, 0, 0, 0.0)  # delivered, waiting, turns and time at an earlier look
+        self._taken = (-1, 0.0)  # bytes that the peer has acknowledged, and since when no more
 
     def charge(self, cost: float) -> None:
         """Take credit for what the connection makes this process do; without any it is cut."""
@@ -124,6 +129,20 @@ class Connection:
             self._subscriptions.remove(topic)
             self.subscribed_bytes -= len(topic)
 
+    def wants(self, topics: Iterable[bytes]) -> bool:
+        """Return whether it has subscribed to one of some topics."""
+        begins = tuple(self._subscriptions)
+        return any(topic.startswith(begins) for topic in topics)
+
+    def is_stopped(self, now_s: float) -> bool:
+        """Return whether the peer has taken nothing for a while, though something waits for it."""
+        before, since_s = self._taken
+        taken, waiting = _bytes_taken(self.descriptor) if _SEES_BYTES else (0, 0)
+        if taken == before and waiting:
+            return now_s - since_s > STOPPED_S
+        self._taken = (taken, now_s)
+        return False
+
     def exists(self) -> bool:
         """Return whether it is not closed yet."""
         return _inode(self.descriptor) == self.inode
@@ -131,19 +150,19 @@ class Connection:
     def look(self, now_s: float) -> None:
         """Find what waits, and what of that is stuck; cut the connection if it is too much.
 
-        A turn and a while after bytes came, their message was delivered if it is complete.
+        A whole turn and a while after bytes came, their message was delivered if it is complete.
         """
         if self.guarded is None:
             return
         delivered, turns, bounds = self.delivered, self.guarded.turns, self.guarded.bounds
         received = _bytes_read(self.descriptor)
-        self._surplus = max(self._surplus, delivered - received)
-        self.waiting = received - delivered + self._surplus
+        self._surplus = max(self._surplus, delivered - max(received, HANDSHAKE))
+        self.waiting = max(0, received - delivered + self._surplus)
         before, waiting, turn, time_s = self._mark
         if delivered != before:
             self.stuck = 0
             self._mark = (delivered, self.waiting, turns, now_s)
-        elif turns > turn and now_s >= time_s + STUCK_S:
+        elif turns > turn + 1 and now_s >= time_s + STUCK_S:
             self.stuck = waiting
             self._mark = (delivered, self.waiting, turns, now_s)
         if self.waiting > bounds.full_queue:
@@ -185,6 +204,7 @@ class Guarded:
         self._guard = guard
         self._monitor = monitor
         self._num_delivered = 0  # in this turn
+        self._ended: deque[int] = deque(maxlen=MAX_CONNECTIONS)  # numbers; the thread adds
 
     def delivered(self, descriptor: int, num_bytes: int) -> Connection | None:
         """Note a message that came through a descriptor; return its connection if it lasts."""
@@ -227,17 +247,32 @@ class Guarded:
         else:
             connection.unsubscribe(topic)
 
+    def note_end(self, connection: Connection) -> None:
+        """Note that a connection has ended."""
+        self._ended.append(connection.inode)
+
+    def ended(self) -> Iterator[int]:
+        """Yield the numbers of the connections that have ended since the last call."""
+        while self._ended:
+            yield self._ended.popleft()
+
+    def cut_stopped(self, topics: Collection[bytes], now_s: float) -> None:
+        """Cut subscribers to some topics that stand still; what waits for them is dropped."""
+        for connection in self._guard.connections_to(self):
+            if connection.wants(topics) and connection.is_stopped(now_s):
+                connection.cut("it takes nothing, and what waits for it grows old", 0)
+
     @property
     def descriptor(self) -> int:
-        """Readable when connections may have come (edge-triggered)."""
+        """Readable when connections may have come or ended (edge-triggered)."""
         return int(self._monitor.getsockopt(zmq.FD))
 
-    def accepted(self) -> Iterator[tuple[int, Guarded]]:
-        """Yield the descriptors of new connections, each with this socket."""
+    def events(self) -> Iterator[tuple[int, int]]:
+        """Yield what happened, ``zmq.EVENT_ACCEPTED`` or another end of a connection, and where."""
         with contextlib.suppress(zmq.Again):
             while True:
                 event, _endpoint = self._monitor.recv_multipart(zmq.DONTWAIT)
-                yield _EVENT.unpack(event)[1], self
+                yield _EVENT.unpack(event)
 
     def close(self) -> None:
         """Stop watching."""
@@ -245,13 +280,21 @@ class Guarded:
 
 
 class Guard:
-    """Watches the connections of all bound sockets of a process."""
+    """Watches the connections of all bound sockets of a process.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    extra_connections
+        How many more it may have than others.
+    """
+
+    def __init__(self, extra_connections: int = 0) -> None:
+        self._extra_connections = extra_connections
         self.faults: Counter[str] = Counter()  # by address; both threads add
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
         self._descriptors: dict[int, Connection] = {}  # the thread's, as all that follows
         self._pending: set[Connection] = set()  # something of theirs waits
+        self._ending: set[Connection] = set()  # ZeroMQ is about to close them
         self._guarded: list[Guarded] = []
         self._admitted_s = self._swept_s = 0.0
         self._num_trims = 0  # still to come
@@ -272,7 +315,8 @@ class Guard:
         raw.setsockopt(zmq.MAXMSGSIZE, bounds.message_bytes)
         raw.setsockopt(zmq.RCVHWM, bounds.queue_length)
         raw.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER)
-        guarded = Guarded(self, bounds, raw.get_monitor_socket(zmq.EVENT_ACCEPTED))
+        monitor = raw.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        guarded = Guarded(self, bounds, monitor)
         self._guarded.append(guarded)
         if self._events is not None:
             self._events.register(guarded.descriptor, select.EPOLLIN | select.EPOLLET)
@@ -280,7 +324,8 @@ class Guard:
             if self._events is not None:
                 self._events.register(self._stop, select.EPOLLIN)
             max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-            self._max_connections = max(1, min(MAX_CONNECTIONS, max_files - RESERVED_FILES))
+            wanted = MAX_CONNECTIONS + self._extra_connections
+            self._max_connections = max(1, min(wanted, max_files - RESERVED_FILES))
             self._thread.start()
         return guarded
 
@@ -291,6 +336,11 @@ class Guard:
             return None
         known = self._connections.get(inode)
         return known or self._connections.setdefault(inode, Connection(descriptor, inode))
+
+    def connections_to(self, guarded: Guarded) -> list[Connection]:
+        """Return the connections to a socket."""
+        connections = list(self._connections.values())
+        return [each for each in connections if each.guarded is guarded and not each.is_cut]
 
     def cut_keys(self, keys: Collection[str]) -> None:
         """Cut the connections of some keys; those that delivered nothing get nothing, either."""
@@ -310,8 +360,11 @@ class Guard:
             connection.cut("it has too many subscriptions")
         self._subscribed += num_bytes
         if self._subscribed > MAX_ALL_SUBSCRIBED:
-            self._subscribed = self._shed(
-                "subscribed_bytes", MAX_ALL_SUBSCRIBED, "there are too many subscriptions"
+            self._subscribed = _shed(
+                list(self._connections.values()),
+                "subscribed_bytes",
+                MAX_ALL_SUBSCRIBED,
+                "there are too many subscriptions",
             )
 
     def close(self) -> None:
@@ -331,7 +384,7 @@ class Guard:
         while not self._is_stopping:
             ready = self._wait()
             now_s = time.monotonic()
-            self._admit([pair for guarded in self._guarded for pair in guarded.accepted()])
+            self._take_events()
             if now_s > self._swept_s + SWEEP_S:
                 self._swept_s = now_s
                 self._sweep()
@@ -343,12 +396,24 @@ class Guard:
 
     def _wait(self) -> list[Connection]:
         """Wait until bytes arrive or something is due; return the connections that have some."""
-        timeout_s = STUCK_S if self._pending else SWEEP_S
+        timeout_s = STUCK_S if self._pending or self._ending else SWEEP_S
         if self._events is None:
             time.sleep(STUCK_S)
             return []
         descriptors = [descriptor for descriptor, _ in self._events.poll(timeout_s)]
         return [self._descriptors[each] for each in descriptors if each in self._descriptors]
+
+    def _take_events(self) -> None:
+        """Begin to watch new connections, and say of others that they have ended."""
+        accepted: list[tuple[int, Guarded]] = []
+        for guarded in self._guarded:
+            for event, descriptor in guarded.events():
+                if event == zmq.EVENT_ACCEPTED:
+                    accepted.append((descriptor, guarded))
+                elif descriptor in self._descriptors:  # if it is used again, it is not closed
+                    self._ending.add(self._descriptors[descriptor])
+        self._admit(accepted)
+        self._forget_ended(self._ending)
 
     def _admit(self, accepted: Iterable[tuple[int, Guarded]]) -> None:
         """Begin to watch connections; cut the newest where there are too many."""
@@ -392,16 +457,20 @@ class Guard:
 
     def _sweep(self) -> None:
         """Forget the connections that have ended; return the memory of those that were cut."""
-        ended = [each for each in list(self._connections.values()) if not each.exists()]
-        for connection in ended:
-            del self._connections[connection.inode]
-            self._pending.discard(connection)
-        if any(connection.is_cut for connection in ended):
-            self._num_trims = NUM_TRIMS
+        self._forget_ended(list(self._connections.values()))
         if self._num_trims:
             self._num_trims -= 1
-            with contextlib.suppress(AttributeError):  # only glibc's keeps so much
-                ctypes.CDLL(None).malloc_trim(0)
+            give_back_memory()
+
+    def _forget_ended(self, connections: Iterable[Connection]) -> None:
+        """Forget those of some connections that have ended, and say so."""
+        for connection in [each for each in connections if not each.exists()]:
+            if connection.is_cut:
+                self._num_trims = NUM_TRIMS
+            self._ending.discard(connection)
+            self._pending.discard(connection)
+            if self._connections.pop(connection.inode, None) and connection.guarded is not None:
+                connection.guarded.note_end(connection)
 
     def _forgive(self) -> None:
         """Take a second's faults off every address."""
@@ -425,27 +494,28 @@ class Guard:
                 self._events.modify(connection.descriptor, _ONCE)
         for guarded in self._guarded:
             max_stuck = guarded.bounds.num_slow * guarded.bounds.message_bytes
-            self._shed("stuck", max_stuck, "too many messages do not end", guarded)
-        self._shed("waiting", MAX_WAITING, "too much waits")
+            max_stuck += STUCK_SMALL * self.num_connections
+            own = [each for each in self._pending if each.guarded is guarded]
+            _shed(own, "stuck", max_stuck, "too many messages do not end")
+        _shed(self._pending, "waiting", MAX_WAITING, "too much waits")
 
-    def _shed(self, measure: str, limit: int, reason: str, guarded: Guarded | None = None) -> int:
-        """Cut those with the most of something until all connections together keep the limit.
 
-        All are those of one socket, if it is given. Returns what is left.
-        """
-        shares: dict[Connection, int] = {
-            connection: share
-            for connection in list(self._connections.values())
-            if not connection.is_cut
-            and guarded in (None, connection.guarded)
-            and (share := getattr(connection, measure)) > 0
-        }
-        total = sum(shares.values())
-        while total > limit:
-            largest = max(shares, key=lambda connection: shares[connection])
-            largest.cut(reason)
-            total -= shares.pop(largest)
-        return total
+def _shed(connections: Iterable[Connection], measure: str, limit: int, reason: str) -> int:
+    """Cut those with the most of something until all together keep the limit.
+
+    Returns what is left.
+    """
+    shares: dict[Connection, int] = {
+        connection: share
+        for connection in connections
+        if not connection.is_cut and (share := getattr(connection, measure)) > 0
+    }
+    total = sum(shares.values())
+    while total > limit:
+        largest = max(shares, key=lambda connection: shares[connection])
+        largest.cut(reason)
+        total -= shares.pop(largest)
+    return total
 
 
 def raise_file_limit() -> None:
@@ -473,12 +543,29 @@ def _address(descriptor: int) -> str:
 
 def _bytes_read(descriptor: int) -> int:
     """Return how many bytes libzmq has read from a connection; the kernel has others still."""
-    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
-        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _BYTES_RECEIVED + 8)
-        (unread,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))
-        (received,) = struct.unpack_from("Q", info, _BYTES_RECEIVED)
-        return int(received - unread)
+    with contextlib.suppress(OSError):
+        received = _tcp_figure(descriptor, _BYTES_RECEIVED)
+        return received - _kernel_figure(descriptor, termios.FIONREAD)
     return 0
+
+
+def _bytes_taken(descriptor: int) -> tuple[int, int]:
+    """Return how many bytes the peer has acknowledged, and how many it has still to."""
+    with contextlib.suppress(OSError):
+        waiting = _kernel_figure(descriptor, termios.TIOCOUTQ)
+        return _tcp_figure(descriptor, _BYTES_ACKED), waiting
+    return 0, 0
+
+
+def _tcp_figure(descriptor: int, offset: int) -> int:
+    """Return a 64-bit figure of struct tcp_info."""
+    with _borrowed(descriptor) as connection:
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, offset + 8)
+    return int(struct.unpack_from("Q", info, offset)[0])
+
+
+def _kernel_figure(descriptor: int, request: int) -> int:
+    return int(struct.unpack("i", fcntl.ioctl(descriptor, request, bytes(4)))[0])
 
 
 @contextlib.contextmanager

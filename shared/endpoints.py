@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import re
+import socket
 
 from shared.errors import UserError
 
@@ -44,10 +46,30 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def reachable(endpoint: str, advertise: str, key: str) -> str:
-    """Return the endpoint that others connect to for one that was bound."""
-    host, port = split_endpoint(endpoint, key)
-    return f"tcp://{advertise or host}:{port}"
+def with_host(endpoint: str, host: str) -> str:
+    """Return an endpoint at another host, given by name or address."""
+    _, port = split_endpoint(endpoint, "endpoint")
+    if ":" in host and not host.startswith("["):
+        host = f"[{host}]"
+    return f"tcp://{host}:{port}"
+
+
+def own_address(towards: str = "192.0.2.1") -> str:
+    """Return the address of this host from which it would connect to another; nothing is sent.
+
+    Parameters
+    ----------
+    towards
+        Name or address of the other host; by default one of no network of its own (RFC 5737).
+        Where no way leads there, the way to that one counts, then 127.0.0.1.
+    """
+    for host in dict.fromkeys((towards, "192.0.2.1")):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.connect((host.strip("[]"), 9))
+            address: str = probe.getsockname()[0]
+            return address
+    return "127.0.0.1"
 
 
 def key_of(endpoint: str) -> str:

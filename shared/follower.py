@@ -6,18 +6,26 @@ another program's protocol) is a follower and a converter.
 
 from __future__ import annotations
 
+import math
+import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from shared.bus import Bus, Socket
+from shared.clock import was_stopped
 from shared.errors import UserError
 from shared.keys import Peer
 from shared.metrics import Metrics
 from shared.wire.codec import BadMessage
-from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.kinds import PUBLISHER_OF
 from shared.wire.message import Message
 from shared.wire.session import Joined
+
+KEPT_S = 3.0  # a connection that may be dead, for what TCP still brings
+CATCH_UP_S = 0.1  # after the process was stopped, within which all comes that waited
+MAX_OLD = 8  # live frames of these that are taken
 
 SocketHandlers = dict[type[Message], Callable[[Any, Peer], None]]
 
@@ -27,6 +35,7 @@ class MessageLoop(Protocol):
 
     bus: Bus
     metrics: Metrics
+    went_on_s: float  # when it went on after the process had been stopped, if ever
 
     def register(self, socket: Socket, handlers: SocketHandlers) -> None:
         """Handle messages that arrive on a socket, by their type."""
@@ -36,7 +45,11 @@ class MessageLoop(Protocol):
 
 
 class SessionFollower:
-    """Receives chosen kinds of messages of one session, through its restarts, to its end.
+    """Receives chosen kinds of messages of one session, through its moves, to its end.
+
+    After a move it stays subscribed where it was until the new subscriptions are in effect, and
+    where the session stays ``KEPT_S`` longer. It takes once what comes both ways, and a frame that
+    is made again in a new epoch.
 
     Parameters
     ----------
@@ -46,6 +59,9 @@ class SessionFollower:
         Name of the session.
     handlers
         What to call with a message, by its class; these classes are subscribed to.
+    live
+        Whether frames are worth nothing when they are late: after this process was stopped for a
+        while only the newest ``MAX_OLD`` of those that waited come.
     on_complete
         Called when every publisher has confirmed the subscriptions: no later message is missed.
         Called again after each ``start``.
@@ -55,8 +71,8 @@ class SessionFollower:
     Attributes
     ----------
     epoch
-        The session's restarts as far as known here; 0 before the first message or start tells.
-        Messages of an earlier epoch are dropped.
+        The greatest of a message or of the first start; 0 if neither has told it. Once a publisher
+        has told of one, its messages of earlier ones are dropped; another's may still be unread.
     is_complete
         Whether every publisher has confirmed.
     has_ended
@@ -71,6 +87,7 @@ class SessionFollower:
         session: str,
         handlers: Mapping[type[Message], Callable[[Any], None]],
         *,
+        live: bool = True,
         on_complete: Callable[[], None] = lambda: None,
         on_restart: Callable[[], None] = lambda: None,
     ) -> None:
@@ -81,12 +98,24 @@ class SessionFollower:
         self.num_missed = 0
         self._loop = loop
         self._handlers = handlers
+        self._live = live
         self._on_complete = on_complete
         self._on_restart = on_restart
         self._socket: Socket | None = None
-        self._num_publishers = 0
+        self._socket_before: Socket | None = None  # until the new one is complete, or longer
+        self._leave_s = math.inf  # when it is left
+        self._addresses: set[str] = set()
+        self._stays = False  # it subscribed again at the same addresses
         self._confirmed: set[str] = set()
+        self._first_epoch = 0  # that of the first start
+        self._epochs: dict[str, int] = {}  # of the newest message, by publisher
+        # epoch and sequence of it, by publisher; of shapes by their set, as frames share theirs
+        self._newest: dict[str, tuple[int, int]] = {}
+        self._newest_before: dict[str, tuple[int, int]] = {}  # when it subscribed again
+        self._taken: set[tuple[str, tuple[int, int]]] = set()  # since then
+        self._last_frames: dict[str, tuple[int, int]] = {}  # media time and sequence
         self._last_sequence: int | None = None
+        self._waiting: deque[FapFrame | Shapes] = deque(maxlen=MAX_OLD)
 
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
         """Subscribe; when called again, subscribe where the session is published now.
@@ -94,7 +123,7 @@ class SessionFollower:
         Parameters
         ----------
         epoch
-            As in the start message; 0 if unknown.
+            As in the first start message; 0 if unknown. Messages tell the later ones.
         endpoints
             Addresses of the session's publishers, by name (``phones``, ``faps``).
 
@@ -107,47 +136,109 @@ class SessionFollower:
         missing = sorted(names - endpoints.keys())
         if missing:
             raise UserError(f"session {self.session}: no endpoint is named for {missing[0]!r}")
-        self.close()
-        addresses = sorted({endpoints[name] for name in names})
-        self._num_publishers = len(addresses)
-        self._last_sequence = None
-        self._enter_epoch(epoch)
-        self._socket = self._loop.bus.connect_subscriber(*addresses)
+        addresses = {endpoints[name] for name in names}
+        frames = {endpoints["faps"]} & addresses if self._live and "faps" in names else set()
+        socket = self._loop.bus.connect_subscriber(*sorted(addresses - frames), live=frames)
+        self._leave_socket_before()
+        self._socket_before, self._socket = self._socket, socket
+        self._newest_before, self._taken = dict(self._newest), set()
+        self._leave_s = math.inf
+        self._stays = addresses == self._addresses
+        self._addresses = addresses
+        self._confirmed.clear()
+        self.is_complete = False
+        self._first_epoch = self._first_epoch or epoch
+        self.epoch = self.epoch or epoch
         self._loop.register(
-            self._socket,
+            socket,
             {
-                Joined: lambda message, _: self._on_joined(message),
+                Joined: lambda message, _: self._on_joined(message, socket),
                 **dict.fromkeys(self._handlers, lambda message, _: self._on_message(message)),
             },
         )
-        self._socket.subscribe_session(self._handlers, self.session)
+        socket.subscribe_session(self._handlers, self.session)
 
     def close(self) -> None:
         """Unsubscribe; nothing is called any more."""
-        if self._socket is not None:
-            self._loop.unregister(self._socket)
-        self._socket = None
+        for socket in (self._socket, self._socket_before):
+            if socket is not None:
+                self._loop.unregister(socket)
+        self._socket = self._socket_before = None
         self._confirmed.clear()
         self.is_complete = False
 
-    def _on_joined(self, joined: Joined) -> None:
+    def _leave_if_due(self) -> None:
+        if time.monotonic() >= self._leave_s:
+            self._leave_s = math.inf
+            self._leave_socket_before()
+
+    def _leave_socket_before(self) -> None:
+        """Take what came through the socket before, and close it."""
+        socket = self._socket_before
+        if socket is None:
+            return
+        while received := list(socket.receive()):
+            for each in received:
+                if type(each.message) in self._handlers:
+                    self._on_message(each.message)
+        if self._socket_before is socket:  # no handler has closed it
+            self._loop.unregister(socket)
+            self._socket_before = None
+
+    def _on_joined(self, joined: Joined, socket: Socket) -> None:
+        if socket is not self._socket:
+            return
         self._confirmed.add(joined.publisher)
         # A publisher that came back confirms once more, under a new name.
-        if not self.is_complete and len(self._confirmed) >= self._num_publishers:
+        if not self.is_complete and len(self._confirmed) >= len(self._addresses):
+            self._leave_s = time.monotonic() + (KEPT_S if self._stays else 0.0)
+            self._leave_if_due()
             self.is_complete = True
             self._on_complete()
 
-    def _on_message(self, message: Message) -> None:
-        if message.epoch < self.epoch:
+    def _on_message(self, message: Any) -> None:
+        is_catching_up = time.monotonic() < self._loop.went_on_s + CATCH_UP_S
+        if self._live and is_catching_up and isinstance(message, FapFrame | Shapes):
+            self._waiting.append(message)
+            return
+        while self._waiting:
+            self._take(self._waiting.popleft())
+        self._take(message)
+
+    def _take(self, message: Any) -> None:
+        known_epoch = self._epochs.get(PUBLISHER_OF[type(message)], self._first_epoch)
+        has_passed = message.epoch < self.epoch and isinstance(message, EndOfFaps)
+        if message.epoch < known_epoch or has_passed:
             self._loop.metrics.count("dropped_old_epoch")
             return
-        if message.epoch > self.epoch:  # the publisher restarted; control may tell later
+        if message.epoch > self.epoch:
             self._enter_epoch(message.epoch)
+        if self._is_repeated(message):
+            return
         if isinstance(message, FapFrame):
             self._count_missed(message.sequence)
         elif isinstance(message, EndOfFaps):
             self.has_ended = True
         self._handlers[type(message)](message)
+        self._leave_if_due()
+
+    def _is_repeated(self, message: Message) -> bool:
+        """Return whether the message came before, through the other socket or in another epoch."""
+        publisher, number = PUBLISHER_OF[type(message)], (message.epoch, message.sequence)
+        stream = message.set if isinstance(message, Shapes) else publisher
+        is_older = number <= self._newest_before.get(stream, (-1, -1))
+        if is_older or (stream, number) in self._taken:
+            return True
+        if self._socket_before is not None:
+            self._taken.add((stream, number))
+        self._epochs[publisher] = message.epoch
+        self._newest[stream] = max(number, self._newest.get(stream, number))
+        if isinstance(message, FapFrame | Shapes):
+            place = (message.media_time, message.sequence)
+            if place <= self._last_frames.get(stream, (-1, -1)):
+                return True
+            self._last_frames[stream] = place
+        return False
 
     def _enter_epoch(self, epoch: int) -> None:
         is_restart = 0 < self.epoch != epoch
@@ -171,6 +262,7 @@ class PollingLoop:
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
         self.metrics = Metrics()
+        self.went_on_s = -math.inf
         self._poller = bus.poller()
         self._handlers: dict[Socket, SocketHandlers] = {}
 
@@ -187,7 +279,10 @@ class PollingLoop:
 
     def step(self, timeout_s: float) -> bool:
         """Handle what has arrived, waiting up to the timeout; return whether anything had."""
+        begin_s = time.monotonic()
         sockets = self._poller.wait(timeout_s)
+        if was_stopped(begin_s, timeout_s):
+            self.went_on_s = time.monotonic()
         for socket in sockets:
             for received in socket.receive():
                 message = received.message

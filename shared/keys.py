@@ -6,6 +6,9 @@ system. Whatever starts first makes it. It has
 - ``NAME.key``: a key pair of one service or client, with control's public key;
 - ``allowed``: who may connect, a line ``PUBLIC-KEY NAME ROLE...`` each.
 
+A file of the same name in ``$CREDENTIALS_DIRECTORY``, such as a container's secret or what systemd
+gives a unit, counts instead, and is only read.
+
 Roles are ``client`` (opens sessions), ``operator`` (changes the faces of others' sessions),
 ``service:KIND`` and ``subscriber:SESSION`` (or ``subscriber:*``); each may ask for the status.
 """
@@ -28,6 +31,7 @@ from shared.errors import UserError
 CONTROL = "control"
 CLIENT = "client"
 CLIENT_ROLES = ("client", "operator")  # of whoever uses control's machine
+_ALLOWED = "allowed"
 _SUBSCRIBER = "subscriber:"
 _PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -79,6 +83,8 @@ def own_key(name: str, roles: Collection[str]) -> Key:
     UserError
         If the key cannot be read or made, or others could read it, too.
     """
+    if credential := _credential(f"{name}.key"):
+        return read_key(credential)
     with _locked_folder() as folder:
         path = folder / f"{name}.key"
         if not path.exists():
@@ -91,7 +97,7 @@ def own_key(name: str, roles: Collection[str]) -> Key:
                 _write(folder / "control.key", _new_key())
             if name != CONTROL:
                 _add_key(folder, path, name, roles)
-        return _read_key(path)
+        return read_key(path)
 
 
 def user_key() -> Key:
@@ -118,6 +124,11 @@ def refusal(control: str, name: str, roles: Collection[str]) -> str:
     )
 
 
+def key_text(key: Key) -> str:
+    """Return the content of a key's file."""
+    return json.dumps(asdict(key), indent=1) + "\n"
+
+
 def how_to_add(roles: Collection[str]) -> str:
     """Return what makes a key with some roles, for messages about a key that is missing."""
     options = "".join(f" --role {role}" for role in roles)
@@ -132,13 +143,15 @@ def read_guests() -> dict[str, Guest]:
     UserError
         If the list cannot be read, or others could change it.
     """
+    if credential := _credential(_ALLOWED):
+        return _read_guests(credential)
     with _locked_folder() as folder:
-        return _read_guests(folder)
+        return _read_guests(folder / _ALLOWED)
 
 
 def guests_file() -> Path:
     """Return the file that ``read_guests`` reads; a change puts another in its place."""
-    return key_folder() / "allowed"
+    return _credential(_ALLOWED) or key_folder() / _ALLOWED
 
 
 def add_guest(name: str, roles: Collection[str], path: Path) -> None:
@@ -163,11 +176,11 @@ def revoke_guest(name: str) -> None:
         If there is no key of that name.
     """
     with _locked_folder() as folder:
-        guests = _read_guests(folder)
+        guests = _read_guests(folder / _ALLOWED)
         kept = {public: guest for public, guest in guests.items() if guest.name != name}
         if len(kept) == len(guests):
             raise UserError(f"no key is called {name!r}; 'kouxing keys list' shows all")
-        _write(folder / "allowed", _lines(kept))
+        _write(folder / _ALLOWED, _lines(kept))
 
 
 def save_guests(guests: Guests) -> None:
@@ -182,8 +195,8 @@ def save_guests(guests: Guests) -> None:
     """
     with _locked_folder() as folder:
         is_controls = (folder / "control.key").exists()
-        if not is_controls and _read_guests(folder) != guests:
-            _write(folder / "allowed", _lines(guests))
+        if not is_controls and _read_guests(folder / _ALLOWED) != guests:
+            _write(folder / _ALLOWED, _lines(guests))
 
 
 def may_follow(guest: Guest, topic: bytes) -> bool:
@@ -198,7 +211,7 @@ def _new_key(control: str = "") -> str:
     import zmq  # noqa: PLC0415 (commands that talk to nobody start without)
 
     public, secret = (part.decode() for part in zmq.curve_keypair())
-    return json.dumps(asdict(Key(public, secret, control or public)), indent=1) + "\n"
+    return key_text(Key(public, secret, control or public))
 
 
 def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> None:
@@ -210,16 +223,23 @@ def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> Non
             raise UserError(
                 f"{role!r} is no role; use client, operator, service:KIND or subscriber:SESSION"
             )
-    guests = _read_guests(folder)
+    guests = _read_guests(folder / _ALLOWED)
     if any(guest.name == name for guest in guests.values()):
         raise UserError(f"a key is called {name!r}; first 'kouxing keys revoke {name}'")
-    text = _new_key(_read_key(folder / "control.key").public)
+    text = _new_key(read_key(folder / "control.key").public)
     _write(path, text)
     guests[json.loads(text)["public"]] = Guest(name, tuple(roles))
-    _write(folder / "allowed", _lines(guests))
+    _write(folder / _ALLOWED, _lines(guests))
 
 
-def _read_key(path: Path) -> Key:
+def read_key(path: Path) -> Key:
+    """Return the key in a file.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read, or others could read it, too.
+    """
     try:
         key = Key(**json.loads(_read(path)))
         if all(_PUBLIC.fullmatch(part) for part in (key.public, key.secret, key.control)):
@@ -229,8 +249,7 @@ def _read_key(path: Path) -> Key:
     raise UserError(f"{path} is no key file; without it a new key is made on control's machine")
 
 
-def _read_guests(folder: Path) -> dict[str, Guest]:
-    path = folder / "allowed"
+def _read_guests(path: Path) -> dict[str, Guest]:
     if not path.exists():
         return {}
     guests = {}
@@ -264,17 +283,27 @@ def _locked_folder() -> Iterator[Path]:
         os.close(descriptor)
 
 
+def _credential(name: str) -> Path | None:
+    """Return a file that whoever started this process gives it, if it does."""
+    folder = os.environ.get("CREDENTIALS_DIRECTORY")
+    path = Path(folder, name) if folder else None
+    return path if path and path.exists() else None
+
+
 def _check_private(path: Path, mode: int) -> None:
+    """Refuse what others can read; root may give a credential to this process's group."""
     about = path.stat()
-    if about.st_uid != os.geteuid():
+    is_given = path.parent == Path(os.environ.get("CREDENTIALS_DIRECTORY", ""))
+    owners, others = ({0, os.geteuid()}, 0o037) if is_given else ({os.geteuid()}, 0o077)
+    if about.st_uid not in owners:
         raise UserError(f"{path} belongs to another user; keys must be your own")
-    if about.st_mode & 0o077:
+    if about.st_mode & others:
         raise UserError(f"others can read {path}; 'chmod {mode:o} {path}', then start again")
 
 
 def _read(path: Path) -> str:
-    _check_private(path, 0o600)
     try:
+        _check_private(path, 0o600)
         return path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: cannot be read: {error}") from None

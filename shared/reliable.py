@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
+from collections.abc import Callable
 
 from shared.bus import Socket
 from shared.keys import NOBODY, Peer
@@ -24,7 +25,7 @@ class ReliableSender:
     def __init__(self, socket: Socket, session: str, epoch: int) -> None:
         self._socket = socket
         self._session = session
-        self._epoch = epoch
+        self.epoch = epoch
         self._next = 1
         self._waiting: deque[Message] = deque()  # the owner watches its length, the backlog
         self._progress_s = 0.0
@@ -42,7 +43,7 @@ class ReliableSender:
     def send(self, message: Message, now_s: float) -> Message:
         """Send a message with the next number; return it as it was sent."""
         numbered = dataclasses.replace(
-            message, session=self._session, epoch=self._epoch, sequence=self._next
+            message, session=self._session, epoch=self.epoch, sequence=self._next
         )
         self._next += 1
         if not self._waiting:
@@ -51,11 +52,13 @@ class ReliableSender:
         self._socket.send(numbered)
         return numbered
 
-    def acknowledge(self, up_to: int, now_s: float) -> None:
-        """Forget the messages that the receiver has."""
+    def acknowledge(self, up_to: int, now_s: float) -> list[Message]:
+        """Forget the messages that the receiver has; return them."""
+        known = []
         while self._waiting and self._waiting[0].sequence <= up_to:
-            self._waiting.popleft()
+            known.append(self._waiting.popleft())
             self._progress_s = now_s
+        return known
 
     def tick(self, now_s: float) -> int:
         """Send the waiting messages again after too long without progress; return their number."""
@@ -68,11 +71,24 @@ class ReliableSender:
 
 
 class ReliableReceiver:
-    """The receiving end for one session: each message once and in order."""
+    """The receiving end for one session: each message once and in order.
 
-    def __init__(self, socket: Socket, session: str) -> None:
+    Parameters
+    ----------
+    socket
+        ROUTER that the messages come through.
+    session
+        Name of the session.
+    answer
+        Makes an acknowledgement with what it tells beside the sequence number.
+    """
+
+    def __init__(
+        self, socket: Socket, session: str, answer: Callable[[], Acknowledge] = Acknowledge
+    ) -> None:
         self._socket = socket
         self._session = session
+        self._answer = answer
         self._epoch = -1
         self._last = 0
         self._acknowledged = 0
@@ -91,21 +107,24 @@ class ReliableReceiver:
             self._last = message.sequence - 1
             self._acknowledged = self._last
         if message.sequence != self._last + 1:
-            self._send_acknowledgement()  # so that the sender knows which are missing
+            self.acknowledge()  # so that the sender knows which are missing
             return False
         self._last = message.sequence
         if self._last - self._acknowledged >= ACKNOWLEDGE_EVERY:
-            self._send_acknowledgement()
+            self.acknowledge()
         return True
 
     def tick(self) -> None:
         """Acknowledge messages that came since the last acknowledgement."""
         if self._last > self._acknowledged:
-            self._send_acknowledgement()
+            self.acknowledge()
 
-    def _send_acknowledgement(self) -> None:
+    def acknowledge(self) -> None:
+        """Tell the sender of the last message, if there is one, what has come."""
+        if self._peer is NOBODY:
+            return
         self._acknowledged = self._last
-        self._socket.send(
-            Acknowledge(session=self._session, epoch=self._epoch, sequence=self._last),
-            to=self._peer,
+        acknowledgement = dataclasses.replace(
+            self._answer(), session=self._session, epoch=self._epoch, sequence=self._last
         )
+        self._socket.send(acknowledgement, to=self._peer)

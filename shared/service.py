@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
+import math
 import os
 import secrets
 import signal
@@ -17,17 +18,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from shared.bus import Bus, Received, Socket
-from shared.clock import ClockOffset, now_ns
+from shared.clock import ClockOffset, now_ns, was_stopped
 from shared.config import ServiceConfig
 from shared.connections import raise_file_limit
 from shared.endpoints import is_loopback, split_endpoint, with_key
 from shared.errors import UserError
 from shared.keys import Guest, Peer, own_key, refusal, save_guests
 from shared.logs import LOG, RateLimit, configure
-from shared.metrics import Metrics
+from shared.metrics import BusyShare, Metrics, memory_mb
+from shared.prometheus import MetricsServer
 from shared.wire.codec import BadMessage
 from shared.wire.control import (
     AllowedKeys,
@@ -40,16 +43,34 @@ from shared.wire.control import (
     UseLips,
 )
 from shared.wire.message import Message
-from shared.wire.session import ChooseExpressiveness, Done, Error, ErrorCode, Express
+from shared.wire.session import AddShapes, ChooseExpressiveness, Done, Error, ErrorCode, Express
 
-HEARTBEAT_S = 0.5
+HEARTBEAT_S = 0.25
+SESSIONS_A_BEAT = 16  # of a worker, in turn: a heartbeat costs the same however many it serves
+STOOD_STILL_S = 0.8  # without a heartbeat: control may have given its sessions to others
+ANSWER_LIMIT_S = 0.5  # for control to say so
+LOAD_PERIOD_S = 2.0
 TICK_S = 0.01
 TURN_S = 0.05  # for one socket's messages, before other sockets, ticks and heartbeats
 UNANSWERED_S = 10.0  # without an answer to heartbeats it is worth asking why
 DRAIN_LIMIT_S = 5.0
+HAND_OVER_S = 1.5  # of it, for other workers to take the sessions of one that stops
+ALIVE_S = 5.0  # without a tick the loop hangs
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # its process number; the underscore: no setting
 
 Handler = Callable[[Any, Peer], None]
+
+
+@dataclass(slots=True)
+class _Served:
+    """A session as control last described it, with what was chosen since."""
+
+    start: StartSession
+    expressions_end_s: float
+
+    def present_start(self, now_s: float) -> StartSession:
+        """Return what another service would have to be told now."""
+        return replace(self.start, hold_s=max(0.0, self.expressions_end_s - now_s))
 
 
 class Service:
@@ -58,7 +79,7 @@ class Service:
     A subclass says its role and the endpoints it needs, fills in ``endpoints`` with those it
     provides, calls ``register`` for its own sockets, and overrides ``start_session``,
     ``stop_session``, ``flush_session``, ``use_lips``, ``express``, ``choose_expressiveness``,
-    ``session_inputs``, ``on_tick``, ``on_drain``.
+    ``add_shapes``, ``session_inputs``, ``gauges``, ``on_tick``, ``on_drain``.
     """
 
     name: ClassVar[str]
@@ -66,14 +87,17 @@ class Service:
     needs: ClassVar[tuple[str, ...]] = ()  # names of the endpoints it must be told
     client_roles: ClassVar[tuple[str, ...]] = ()  # of its key, beside that of the service
 
-    def __init__(self, config: ServiceConfig, *, control: bool = True) -> None:
+    def __init__(
+        self, config: ServiceConfig, *, control: bool = True, extra_connections: int = 0
+    ) -> None:
         self.config = config
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
         self.roles = (f"service:{self.name}", *self.client_roles)
         self.key = None if config.insecure else own_key(self.name, self.roles)
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
-        self.bus = Bus(self.key)
+        self.bus = Bus(self.key, extra_connections=extra_connections)
         self.metrics = Metrics()
+        self.went_on_s = -math.inf  # when it went on after the process had been stopped
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # what it provides, by name
         self.language = ""  # of the phones that it recognises
@@ -85,9 +109,17 @@ class Service:
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
         self._paused: set[Socket] = set()
         self._stop_requested = False
+        self._hands_over_until_s = 0.0
         self._beat_due_s = 0.0
+        self._beat_sent_s = time.monotonic()
+        self._num_named = 0  # sessions in the heartbeats before
+        self._sent_ns = self._answered_ns = 0  # newest heartbeat, and the newest that was answered
         self._answered_s = time.monotonic()
+        self._control_instance = ""  # that answered last
+        self._served: dict[str, _Served] = {}
         self._tick_due_s = 0.0
+        self._busy = BusyShare(LOAD_PERIOD_S, time.monotonic())
+        self.session_at_work = ""  # whose message is being handled; a crash is its
         self.control: Socket | None = None
         if control:
             self.control = self.bus.connect_dealer(self.control_endpoint)
@@ -97,11 +129,12 @@ class Service:
                     HeartbeatSeen: self._on_heartbeat_seen,
                     AllowedKeys: self._on_allowed_keys,
                     StartSession: self._on_start,
-                    StopSession: lambda message, _: self.stop_session(message.session),
+                    StopSession: self._on_stop,
                     FlushNow: lambda message, _: self.flush_session(message.session),
-                    UseLips: lambda message, _: self.use_lips(message.session, message.lips),
-                    Express: lambda message, _: self.express(message),
-                    ChooseExpressiveness: lambda message, _: self.choose_expressiveness(message),
+                    UseLips: self._on_use_lips,
+                    Express: self._on_express,
+                    ChooseExpressiveness: self._on_choose_expressiveness,
+                    AddShapes: self._on_add_shapes,
                     Error: self._on_error,
                     Done: lambda _message, _sender: None,
                 },
@@ -128,6 +161,9 @@ class Service:
     def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
         """Let the mouth of a session move more or less, if it is made here."""
 
+    def add_shapes(self, message: AddShapes) -> None:
+        """Publish sets of shapes of a session, if its face is made here."""
+
     def on_start(self) -> None:
         """Begin what needs the loop; called once, before the service says that it is ready."""
 
@@ -147,6 +183,10 @@ class Service:
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return the sessions it takes part in and how far their input has come."""
+        return {}
+
+    def gauges(self) -> dict[str, float]:
+        """Return more figures of this moment, by name, for heartbeats and Prometheus."""
         return {}
 
     def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
@@ -176,10 +216,14 @@ class Service:
             self._paused.remove(socket)
             self._poller.add(socket)
 
-    def session_started(self, start: StartSession) -> None:
-        """Tell control that this service serves a session now."""
+    def session_started(self, start: StartSession, media_time: int = 0) -> None:
+        """Tell control that this service serves a session now.
+
+        ``media_time`` is up to where its phones are final here, in samples at 16 kHz.
+        """
         if self.control is not None:
-            self.control.send(Done(session=start.session, request=start.request))
+            done = Done(session=start.session, request=start.request, media_time=media_time)
+            self.control.send(done)
 
     def warn(self, reason: str, text: str, session: str = "") -> None:
         """Count a problem, and log it at a limited rate."""
@@ -189,7 +233,15 @@ class Service:
 
     def step(self, timeout_s: float) -> None:
         """Handle what has arrived, waiting up to the timeout, then tick."""
-        for socket in self.wait(timeout_s):
+        begin_s = time.monotonic()
+        self._busy.waits(begin_s)
+        sockets = self.wait(timeout_s)
+        now_s = time.monotonic()
+        self._busy.works(now_s)
+        if was_stopped(begin_s, timeout_s):
+            self.went_on_s = now_s
+        self._ask_what_changed()
+        for socket in sockets:
             handlers = self._handlers.get(socket)
             if handlers is None:  # closed by a handler in this round
                 continue
@@ -198,6 +250,7 @@ class Service:
                 self._dispatch(socket, handlers, received)
                 if time.monotonic() > turn_ends_s:
                     break
+        self._ask_what_changed()  # it may have stood still meanwhile, too
         now_s = time.monotonic()
         if now_s >= self._tick_due_s:
             self._tick_due_s = now_s + TICK_S
@@ -222,12 +275,20 @@ class Service:
         """Run until a signal asks for the end, then drain."""
         self._install_signals()
         self.on_start()
+        server = self._serve_metrics()
         gc.collect()
         gc.freeze()  # a full collection would stop the loop for 100 ms
         self.announce_ready()
         while not self.stopping:
             self.step(TICK_S)
         self.drain()
+        if server is not None:
+            server.close()
+
+    @property
+    def hands_over(self) -> bool:
+        """Whether other workers may still take the sessions of this one, which stops."""
+        return time.monotonic() < self._hands_over_until_s
 
     def announce_ready(self) -> None:
         """Register with control and log it."""
@@ -241,9 +302,11 @@ class Service:
 
     def drain(self) -> None:
         """Finish work in progress within the deadline and close every socket."""
-        deadline_s = time.monotonic() + DRAIN_LIMIT_S
+        begin_s = time.monotonic()
+        self._hands_over_until_s = begin_s + HAND_OVER_S
         self._stop_requested = True
-        while not self.on_drain() and time.monotonic() < deadline_s:
+        self._beat(whole=True)  # control gives the sessions to others while they still go on here
+        while not self.on_drain() and time.monotonic() < begin_s + DRAIN_LIMIT_S:
             self.step(TICK_S)
         self.on_stopped()
         self._beat()
@@ -251,6 +314,19 @@ class Service:
         LOG.info("stopped")
 
     # --- inside ----------------------------------------------------------------------------------
+
+    def _ask_what_changed(self) -> None:
+        """Learn, before more is published, what control has decided if this stood still."""
+        if time.monotonic() - self._beat_sent_s <= STOOD_STILL_S:
+            return
+        self._beat(whole=True)
+        if self.control is None:
+            return
+        end_s = time.monotonic() + ANSWER_LIMIT_S  # it may be away
+        while self._answered_ns < self._sent_ns and (left_s := end_s - time.monotonic()) > 0:
+            self.control.wait(left_s)
+            for received in self.control.receive():
+                self._dispatch(self.control, self._handlers[self.control], received)
 
     def _install_signals(self) -> None:
         def on_signal(number: int, _frame: object) -> None:
@@ -277,20 +353,40 @@ class Service:
             return
         handler = handlers.get(type(message))
         if handler is None:
-            self.warn("unexpected", f"dropped a {message.kind} message: not expected here")
+            text = f"dropped a {message.kind} message: not expected here"
+            self.warn("unexpected", text, message.session)
             if received.sender.address:
                 text = f"{message.kind} is not understood on this socket"
                 socket.send(Error(code=ErrorCode.BAD_MESSAGE, text=text), to=received.sender)
             return
         self.metrics.count(f"in_{message.kind.replace('-', '_')}")
+        self.session_at_work = message.session
         try:
             handler(message, received.sender)
         except OSError as error:
             if error.errno not in (errno.EMFILE, errno.ENFILE):
                 raise
             self.warn("files", f"{message.kind}: {error.strerror}", message.session)
+        self.session_at_work = ""
 
-    def _beat(self) -> None:
+    def _serve_metrics(self) -> MetricsServer | None:
+        if not self.config.metrics_port:
+            return None
+        self._tick_due_s = time.monotonic()
+        return MetricsServer(
+            self.config.metrics_host,
+            self.config.metrics_port,
+            self.metrics,
+            self.name,
+            is_alive=lambda: time.monotonic() < self._tick_due_s + ALIVE_S,
+        )
+
+    def _beat(self, *, whole: bool = False) -> None:
+        """Send a heartbeat, with the whole of the sessions or with some in turn."""
+        self._beat_sent_s, self._sent_ns = time.monotonic(), now_ns()
+        sessions, load = self.session_inputs(), self._busy.share(time.monotonic())
+        for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
+            self.metrics.set(name, value)
         self.on_heartbeat_due(
             Heartbeat(
                 service=self.name,
@@ -302,16 +398,28 @@ class Service:
                 delay_ms=self.delay_ms,
                 lips=self.lips,
                 state="draining" if self._stop_requested else "ready",
-                sent_ns=now_ns(),
+                sent_ns=self._sent_ns,
                 endpoints=self.endpoints,
+                load=load,
                 metrics={
                     **self.metrics.snapshot(time.monotonic()),
                     "cpu_s": time.process_time(),
+                    "memory_mb": memory_mb(),
                     "clock_offset_ms": -self.clock_offset.offset_ms,
                 },
-                sessions=self.session_inputs(),
+                sessions=self._named_sessions(sessions, whole=whole),
             )
         )
+
+    def _named_sessions(
+        self, inputs: dict[str, SessionInput], *, whole: bool
+    ) -> dict[str, SessionInput]:
+        if whole or self.role != "worker" or len(inputs) <= SESSIONS_A_BEAT:
+            return inputs
+        names = list(inputs)
+        begin = self._num_named % len(names)
+        self._num_named = begin + SESSIONS_A_BEAT
+        return {name: inputs[name] for name in (names + names)[begin : self._num_named]}
 
     def _ask_why_unanswered(self, now_s: float) -> None:
         if self.control is not None and now_s - self._answered_s > UNANSWERED_S:
@@ -326,7 +434,13 @@ class Service:
 
     def _on_heartbeat_seen(self, seen: HeartbeatSeen, _sender: Peer) -> None:
         self._answered_s = time.monotonic()
+        self._answered_ns = seen.sent_ns
         self.clock_offset.update(seen.sent_ns, seen.received_ns, seen.replied_ns, now_ns())
+        is_another = self._control_instance not in ("", seen.control)
+        self._control_instance = seen.control
+        if is_another and "audio" in self.endpoints and self.control is not None:
+            for served in self._served.values():  # which it does not know yet
+                self.control.send(served.present_start(time.monotonic()))
 
     def _on_allowed_keys(self, allowed: AllowedKeys, _sender: Peer) -> None:
         guests = {key: Guest(each.name, tuple(each.roles)) for key, each in allowed.keys.items()}
@@ -338,6 +452,7 @@ class Service:
         if self._stop_requested:
             return
         try:
+            self._served[start.session] = _Served(start, time.monotonic() + start.hold_s)
             if self.start_session(start):
                 self.session_started(start)
         except UserError as error:
@@ -346,6 +461,31 @@ class Service:
                 self.control.send(
                     Error(session=start.session, code=ErrorCode.TIMEOUT, text=str(error))
                 )
+
+    def _on_stop(self, stop: StopSession, _sender: Peer) -> None:
+        self._served.pop(stop.session, None)
+        self.stop_session(stop.session)
+
+    def _on_use_lips(self, use: UseLips, _sender: Peer) -> None:
+        if served := self._served.get(use.session):
+            served.start = replace(served.start, lips=use.lips)
+        self.use_lips(use.session, use.lips)
+
+    def _on_express(self, message: Express, _sender: Peer) -> None:
+        if served := self._served.get(message.session):
+            served.start = replace(served.start, expressions=message.expressions)
+            served.expressions_end_s = time.monotonic() + message.hold_s
+        self.express(message)
+
+    def _on_choose_expressiveness(self, message: ChooseExpressiveness, _sender: Peer) -> None:
+        if served := self._served.get(message.session):
+            served.start = replace(served.start, expressiveness=message.expressiveness)
+        self.choose_expressiveness(message)
+
+    def _on_add_shapes(self, message: AddShapes, _sender: Peer) -> None:
+        if served := self._served.get(message.session):
+            served.start = replace(served.start, shapes=message.shapes)
+        self.add_shapes(message)
 
     def _on_error(self, error: Error, _sender: Peer) -> None:
         self.warn(error.code, f"control: {error.text}", error.session)
@@ -365,6 +505,7 @@ def run_service(make: Callable[[], Service], section: str, log_level: str) -> in
         return 2
     try:
         service.run()
-    except UserError as error:  # while running it is no mistake of the user: crash and restart
-        raise RuntimeError(str(error)) from error
+    except Exception:  # a UserError too: while running it is no mistake of the user
+        LOG.critical("internal error", exc_info=True, extra={"session": service.session_at_work})
+        return 1
     return 0

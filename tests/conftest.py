@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from bisect import bisect
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from xdist.scheduler import LoadScopeScheduling
 from tests.system import System
 
 STARTS_SERVICES = {"bench", "e2e", "process"}  # folders whose tests start services
+PARTS = ("e2e/test_co", "e2e/test_o")  # where the second and the third third of them begin
 
 settings.register_profile(
     "kouxing", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -21,11 +24,25 @@ settings.load_profile("kouxing")
 
 
 class FileScheduling(LoadScopeScheduling):  # type: ignore[misc] # untyped
-    """Each file's tests run in one process, and all that start services in the same one."""
+    """Each file's tests run in one process, and all that start services in three."""
 
     def _split_scope(self, nodeid: str) -> str:
         file = nodeid.partition("::")[0]
-        return "services" if Path(file).parts[1] in STARTS_SERVICES else file
+        _, folder, *_, name = Path(file).parts
+        if folder not in STARTS_SERVICES:
+            return file
+        return f"services {bisect(PARTS, f'{folder}/{name}')}"
+
+
+def pytest_configure() -> None:
+    """Let services and those who wait for them come first where a fourth process tests the rest."""
+    if os.environ.get("PYTEST_XDIST_WORKER") == "gw3":
+        os.nice(10)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the tests that start services, which take longest."""
+    items.sort(key=lambda item: Path(item.nodeid).parts[1] not in STARTS_SERVICES)
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> FileScheduling:

@@ -17,6 +17,7 @@ class Mesh:
     vertices: NDArray[Any]
     triangles: NDArray[Any]
     targets: dict[str, NDArray[Any]] = field(default_factory=dict)
+    normals: NDArray[Any] | None = None
     uv: NDArray[Any] | None = None
     colors: NDArray[Any] | None = None  # (V, 3), linear
     texture: bytes = b""  # PNG
@@ -48,6 +49,8 @@ def write_glb(path: Path, meshes: list[Mesh], **rest: Any) -> Path:
 
     for mesh in meshes:
         attributes = {"POSITION": accessor(mesh.vertices.astype("<f4"), "VEC3", 5126)}
+        if mesh.normals is not None:
+            attributes["NORMAL"] = accessor(mesh.normals.astype("<f4"), "VEC3", 5126)
         if mesh.uv is not None:
             attributes["TEXCOORD_0"] = accessor(mesh.uv.astype("<f4"), "VEC2", 5126)
         if mesh.colors is not None:

@@ -22,9 +22,10 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.message import Message
 from shared.wire.session import (
+    AddShapes,
     ChooseExpressiveness,
     ChooseLips,
     CloseSession,
@@ -37,7 +38,16 @@ from shared.wire.session import (
     SessionMoved,
     SessionOpened,
 )
-from shared.wire.speech import Acknowledge, EndOfPhones, Lips, Phone, Progress, Speech
+from shared.wire.speech import (
+    Acknowledge,
+    EndOfPhones,
+    Lips,
+    Phone,
+    Progress,
+    ResumeFace,
+    Speech,
+    Stalled,
+)
 
 COMMON = {"session": "demo", "epoch": 1, "sequence": 7, "media_time": 16000}
 FAPS = np.arange(68, dtype="<f4").tobytes()
@@ -153,4 +163,8 @@ SAMPLES: tuple[Message, ...] = (
             "D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs": AllowedKey(name="laptop", roles=["client"])
         }
     ),
+    Stalled(**COMMON),  # type: ignore[arg-type]
+    ResumeFace(**COMMON, frame=50, faps=FAPS),  # type: ignore[arg-type]
+    Shapes(**COMMON, set="vrm", weights=np.arange(12, dtype="<f4").tobytes()),  # type: ignore[arg-type]
+    AddShapes(session="demo", request="r7", shapes=["arkit", "vrm"]),
 )

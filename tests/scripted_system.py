@@ -17,7 +17,7 @@ from services.control.service import ControlService
 from services.recognizer.config import RecognizerConfig
 from services.synthesizer.config import SynthesizerConfig
 from shared.config import variable
-from shared.face.faps import MASK_BYTES
+from shared.face.faps import FAP_NUMBER, MASK_BYTES
 from shared.keys import Peer
 from shared.service import Service
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
@@ -28,6 +28,7 @@ from shared.wire.speech import Phone
 from tests.system import ROOT
 
 FRAME = 320  # samples; 20 ms
+CLICK_EVERY = 25 * FRAME  # samples; 0.5 s
 LOOK_AHEAD_MS = 60
 
 
@@ -47,6 +48,7 @@ class ScriptedRecognizer(Service):
         self.pcm: dict[str, bytes] = {}
         self.starts: dict[str, StartSession] = {}
         self.finished: set[str] = set()
+        self.flushed: list[str] = []
         self.register(
             self.audio,
             {
@@ -59,6 +61,9 @@ class ScriptedRecognizer(Service):
     def start_session(self, start: StartSession) -> bool:
         self.starts[start.session] = start
         return True
+
+    def flush_session(self, session: str) -> None:
+        self.flushed.append(session)
 
     def _on_audio(self, chunk: AudioChunk, _sender: Peer) -> None:
         self.pcm[chunk.session] = self.pcm.get(chunk.session, b"") + chunk.pcm
@@ -98,12 +103,16 @@ class System:
 
     def __init__(self) -> None:
         local = "tcp://127.0.0.1:*"
-        self.control = ControlService(ControlConfig(commands=local, events=local))
+        self.control = ControlService(
+            ControlConfig(commands=local, events=local, lost_after_s=10.0, max_load=1000.0)
+        )
         self.address = self.control.endpoints["commands"]
         control = self.address.partition(" ")[0]
         self.synthesizer = ScriptedSynthesizer(control)
         self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(control)
         self.shown: NDArray[np.float32] | None = None  # the face that is published; None: nothing
+        self.flash: NDArray[np.float32] | None = None  # shown now and then, while sound clicks
+        self.look_ahead_ms = LOOK_AHEAD_MS  # a frame comes so long after its sound
         self.symbol = "a"
         self.session = ""
         self._media_time = 0
@@ -150,18 +159,20 @@ class System:
         if start is None:
             return
         self._sequence += 1
-        tone = 3000 * np.sin(2 * np.pi * 200 / 16000 * (self._media_time + np.arange(FRAME)))
         stamp: dict[str, Any] = {
             "session": self.session,
             "epoch": start.epoch,
             "sequence": self._sequence,
         }
         phones, faps = self.recognizer.phones, self.synthesizer.faps
-        pcm = tone.astype("<i2").tobytes()
+        pcm = self._sound().tobytes()
         phones.send(Sound(**stamp, media_time=self._media_time, pcm=pcm))
         self._media_time += FRAME
-        frame_time = self._media_time - LOOK_AHEAD_MS * 16
+        frame_time = self._media_time - self.look_ahead_ms * 16
         if frame_time >= 0:
+            if self.flash is not None:
+                shown = (self.flash if frame_time % CLICK_EVERY < CLICK_EVERY / 2 else shown).copy()
+                shown[FAP_NUMBER["head_yaw"] - 1] = frame_time % 16000  # every picture is another
             values = shown.astype("<f4").tobytes()
             faps.send(
                 FapFrame(**stamp, media_time=frame_time, values=values, mask=bytes(MASK_BYTES))
@@ -178,6 +189,15 @@ class System:
                     final=True,
                 )
             )
+
+    def _sound(self) -> NDArray[np.int16]:
+        """Return the next samples, of a tone, or of clicks when a flash has half begun."""
+        times = self._media_time + np.arange(FRAME)
+        if self.flash is not None:
+            sound = np.where((times + FRAME // 2) % CLICK_EVERY == 0, 20000.0, 0.0)
+        else:
+            sound = 3000 * np.sin(2 * np.pi * 200 / 16000 * times)
+        return sound.astype(np.int16)
 
 
 class Gateway:

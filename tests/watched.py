@@ -12,6 +12,7 @@ from typing import Self
 from rich.console import Console
 
 from services.cli.supervisor import Supervisor
+from services.kinds import more_workers, read_settings
 from shared.client import Client
 from shared.keys import control_endpoint
 from tests.system import own_environment
@@ -20,13 +21,14 @@ from tests.system import own_environment
 class Watched:
     """A supervisor on ports of its own, which watches as in ``kouxing run``: beside other work."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, workers: int = 1) -> None:
         environment = own_environment(folder)
         self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
         self.page = f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/"
         self.shown = io.StringIO()
         console = Console(file=self.shown, width=200)
-        self.supervisor = Supervisor([], folder, console, environment)
+        more = more_workers(read_settings(), workers)
+        self.supervisor = Supervisor([], folder, console, environment, more=more)
 
     def __enter__(self) -> Self:
         try:

@@ -163,6 +163,22 @@ def turns(time_s: Array, values: Array) -> Turns:
     return Turns(int(np.sum(direction[1:] != direction[:-1])), float(time_s[-1] - time_s[0]))
 
 
+def rms_jerk(curves: Sequence[Array], rate_hz: float) -> float | None:
+    """Root mean square of the third derivative of some curves, units of theirs a second cubed.
+
+    The smoother a motion, the less; None where there are no four frames.
+
+    Parameters
+    ----------
+    curves
+        Shape (num_frames,) each.
+    rate_hz
+        Of their frames.
+    """
+    jerks = np.concatenate([np.zeros(0), *(np.diff(curve, n=3) for curve in curves)]) * rate_hz**3
+    return float(np.sqrt(np.mean(jerks**2))) if len(jerks) else None
+
+
 def speed_in(pauses_s: Array, time_s: Array, values: Array) -> Speed:
     """Measure how fast a curve moves within pauses.
 

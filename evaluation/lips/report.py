@@ -50,30 +50,32 @@ def _table(title: str, columns: Mapping[str, Cell], scores: Sequence[LipScore]) 
     for column in ("clips; scheme, delay in ms", *columns):
         table.add_column(column, no_wrap=True)
     for group, members in groupby(scores, lambda score: score.group):
-        shown = list(members)
-        num_clips = max(score.num_clips for score in shown)
+        rows = list(members)
+        num_clips = max(score.num_clips for score in rows)
         table.add_row(f"[bold]{group}: {num_clips}[/bold]")
-        for score in shown:
+        for score in rows:
             delay = "" if score.delay_ms is None else f", {score.delay_ms:.0f}"
             table.add_row(f"  {score.scheme}{delay}", *(cell(score) for cell in columns.values()))
         table.add_section()
     return table
 
 
-def _of_curves(figure: Callable[[CurveScore], float | None], form: str = ".2f") -> Cell:
+def of_curves(figure: Callable[[CurveScore], float | None], form: str = ".2f") -> Cell:
     """Return a cell with a figure of opening, width and jaw."""
 
     def cell(score: LipScore) -> str:
         curves = [score.curves.get(measure) for measure in MEASURES]
-        return " ".join(_figure(figure(curve) if curve else None, form) for curve in curves)
+        return " ".join(shown(figure(curve) if curve else None, form) for curve in curves)
 
     return cell
 
 
-def _of_opening(figure: Callable[[CurveScore], float | None], form: str = ".2f") -> Cell:
+def of_opening(figure: Callable[[CurveScore], float | None], form: str = ".2f") -> Cell:
+    """Return a cell with a figure of the opening."""
+
     def cell(score: LipScore) -> str:
         opening = score.curves.get("opening")
-        return _figure(figure(opening) if opening else None, form)
+        return shown(figure(opening) if opening else None, form)
 
     return cell
 
@@ -83,9 +85,9 @@ def _of_hits(hits: Callable[[LipScore], HitScore]) -> dict[str, Cell]:
     return {
         "met": lambda score: f"{hits(score).met}/{hits(score).real}",
         "true": lambda score: f"{hits(score).true}/{hits(score).made}",
-        "recall": lambda score: _figure(hits(score).recall),
-        "precision": lambda score: _figure(hits(score).precision),
-        "F1": lambda score: _figure(hits(score).f1),
+        "recall": lambda score: shown(hits(score).recall),
+        "precision": lambda score: shown(hits(score).precision),
+        "F1": lambda score: shown(hits(score).f1),
     }
 
 
@@ -93,26 +95,27 @@ def _of_pauses(made: str, real: str) -> Cell:
     """Return a cell with figures of the made and of the real lips."""
 
     def cell(score: LipScore) -> str:
-        figures = (_figure(getattr(score.pauses, name), ".0f") for name in (made, real))
+        figures = (shown(getattr(score.pauses, name), ".0f") for name in (made, real))
         return "{} ({})".format(*figures)
 
     return cell
 
 
-def _figure(value: float | None, form: str = ".2f") -> str:
+def shown(value: float | None, form: str = ".2f") -> str:
+    """Return a figure as a cell shows it."""
     return "-" if value is None else format(value, form)
 
 
 TABLES: dict[str, dict[str, Cell]] = {
     "Correlation of opening, width, jaw": {
-        "everything": _of_curves(lambda curve: curve.correlation),
-        "in speech": _of_curves(lambda curve: curve.correlation_in_speech),
-        "without drift": _of_curves(lambda curve: curve.correlation_without_drift),
+        "everything": of_curves(lambda curve: curve.correlation),
+        "in speech": of_curves(lambda curve: curve.correlation_in_speech),
+        "without drift": of_curves(lambda curve: curve.correlation_without_drift),
     },
     "Opening, width, jaw: error in FAP units, lag in ms (above 0: late)": {
-        "error": _of_curves(lambda curve: curve.rmse, ".0f"),
-        "best lag": _of_curves(lambda curve: curve.best_lag_ms, "+.0f"),
-        "correlation there": _of_curves(lambda curve: curve.best_correlation),
+        "error": of_curves(lambda curve: curve.rmse, ".0f"),
+        "best lag": of_curves(lambda curve: curve.best_lag_ms, "+.0f"),
+        "correlation there": of_curves(lambda curve: curve.best_correlation),
     },
     "Closures: real ones met, made ones that are true, within 40 ms": {
         **_of_hits(lambda score: score.closures),
@@ -123,13 +126,13 @@ TABLES: dict[str, dict[str, Cell]] = {
         lambda score: score.lip_to_teeth
     ),
     "Turns of opening, width, jaw a second": {
-        "made": _of_curves(lambda curve: curve.turns_per_s, ".1f"),
-        "made, at 50 Hz": _of_curves(lambda curve: curve.turns_per_s_at_50_hz, ".1f"),
-        "real": _of_curves(lambda curve: curve.real_turns_per_s, ".1f"),
+        "made": of_curves(lambda curve: curve.turns_per_s, ".1f"),
+        "made, at 50 Hz": of_curves(lambda curve: curve.turns_per_s_at_50_hz, ".1f"),
+        "real": of_curves(lambda curve: curve.real_turns_per_s, ".1f"),
     },
     "Time from real openings to made ones, ms": {
-        "p50": lambda score: _figure(score.opening_delay_p50_ms, "+.0f"),
-        "p95": lambda score: _figure(score.opening_delay_p95_ms, "+.0f"),
+        "p50": lambda score: shown(score.opening_delay_p50_ms, "+.0f"),
+        "p95": lambda score: shown(score.opening_delay_p95_ms, "+.0f"),
         "met": lambda score: f"{score.openings_met}/{score.openings}",
     },
     "Pauses, made (real): FAP units/s of opening; ms from last sound to shut lips": {
@@ -141,17 +144,17 @@ TABLES: dict[str, dict[str, Cell]] = {
     },
 }
 COMPARED_COLUMNS: dict[str, Cell] = {
-    "in speech": _of_curves(lambda curve: curve.correlation_in_speech),
-    "closures F1": lambda score: _figure(score.closures.f1),
-    "F1 in speech": lambda score: _figure(score.closures_in_speech.f1),
-    "lag": _of_opening(lambda curve: curve.best_lag_ms, "+.0f"),
+    "in speech": of_curves(lambda curve: curve.correlation_in_speech),
+    "closures F1": lambda score: shown(score.closures.f1),
+    "F1 in speech": lambda score: shown(score.closures_in_speech.f1),
+    "lag": of_opening(lambda curve: curve.best_lag_ms, "+.0f"),
 }
 SPEAKER_COLUMNS: dict[str, Cell] = {
-    "all": _of_opening(lambda curve: curve.correlation),
-    "speech": _of_opening(lambda curve: curve.correlation_in_speech),
-    "lag": _of_opening(lambda curve: curve.best_lag_ms, "+.0f"),
+    "all": of_opening(lambda curve: curve.correlation),
+    "speech": of_opening(lambda curve: curve.correlation_in_speech),
+    "lag": of_opening(lambda curve: curve.best_lag_ms, "+.0f"),
     "closures": lambda score: f"{score.closures.met}/{score.closures.real}",
-    "F1": lambda score: _figure(score.closures.f1),
-    "turns": _of_opening(lambda curve: curve.turns_per_s, ".1f"),
-    "real": _of_opening(lambda curve: curve.real_turns_per_s, ".1f"),
+    "F1": lambda score: shown(score.closures.f1),
+    "turns": of_opening(lambda curve: curve.turns_per_s, ".1f"),
+    "real": of_opening(lambda curve: curve.real_turns_per_s, ".1f"),
 }

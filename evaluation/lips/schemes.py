@@ -27,10 +27,11 @@ from corpora.scoring import is_emitted
 from evaluation.lips.measures import is_near
 from services.live_chain import sound_events
 from services.recognizer.acoustic.acoustic_model import AcousticModel
+from services.recognizer.config import RecognizerConfig
 from services.recognizer.lip_source import LipFrameStream, LipsFromSound, delay_for
 from services.recognizer.offline import recognize
 from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import Face
+from services.synthesizer.face import Face, Frame
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from services.synthesizer.lips.lip_model import LipModel
 from services.synthesizer.offline import synthesize
@@ -115,13 +116,14 @@ def live_events(
     samples: NDArray[np.float32],
     lips: LipsFromSound | None,
     delays_s: Sequence[float],
+    config: RecognizerConfig | None = None,
 ) -> dict[float, list[SoundEvent]]:
     """Return what ``sound_events`` returns for a face of each delay; the recognizer runs once."""
     if lips is None:
-        return dict.fromkeys(delays_s, sound_events(model, samples))
+        return dict.fromkeys(delays_s, sound_events(model, samples, config=config))
     chosen = {delay_s: delay_for(lips.delays_s, delay_s) for delay_s in delays_s}
     several = _SeveralDelays(lips, sorted(set(chosen.values())))
-    events = sound_events(model, samples, several)
+    events = sound_events(model, samples, several, config=config)
     return {
         delay_s: [
             event
@@ -192,7 +194,12 @@ def live_frames(
 ) -> Array:
     """Frames (num_frames, 68) that the live chain makes of sound events, without idle motion."""
     face = Face(lips, frame_rate_hz=frame_rate_hz, delay_s=delay_s)
-    return np.array([faps for event in events for _, faps in face.accept(event)], dtype=float)
+    return np.array([faps for _, faps in animate_live(face, events)], dtype=float)
+
+
+def animate_live(face: Face, events: Sequence[SoundEvent]) -> list[Frame]:
+    """All frames that a face makes of sound events."""
+    return [frame for event in events for frame in face.accept(event)]
 
 
 def once_the_next_begins(events: Sequence[SoundEvent]) -> list[SoundEvent]:

@@ -1,6 +1,7 @@
-"""Hostile peers of a socket, as ZeroMQ's wire protocol (ZMTP 3) lets them be.
+"""Hostile peers: of a socket, as ZeroMQ's wire protocol (ZMTP 3) lets them be, and of the page.
 
-None needs a key or knows a session; each stops by itself, at the latest after the given time.
+Those of ``ALLOWED`` have a key that is allowed, the others need none; none knows a session. Each
+stops by itself, at the latest after the given time.
 """
 
 from __future__ import annotations
@@ -10,6 +11,10 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+
+import zmq
+
+from shared.keys import Key, user_key
 
 MORE, LONG, COMMAND = 1, 2, 4  # flags of a frame
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -176,3 +181,66 @@ def hold_connections(port: int, _kind: str, seconds: float) -> None:
     """Hold more connections than a process takes."""
     with many_connections(port, 1500):
         time.sleep(seconds)
+
+
+def hold_half_requests(port: int, _kind: str, seconds: float) -> None:
+    """Hold more half requests than a web server should."""
+    with many_connections(port, 300) as connections:
+        for connection in connections:
+            with contextlib.suppress(OSError):  # refused meanwhile
+                connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
+        time.sleep(seconds)
+
+
+def hold_thousands(port: int, _kind: str, seconds: float) -> None:
+    """Connect thousands of times."""
+    with many_connections(port, 4000):
+        time.sleep(seconds)
+
+
+PAGE: dict[str, Attack] = {
+    "300 half requests": hold_half_requests,
+    "4000 connections": hold_thousands,
+}
+
+AllowedAttack = Callable[[str, float], None]  # of an endpoint, for some seconds
+
+
+def connect(raw: zmq.Socket[bytes], endpoint: str, key: Key) -> None:
+    """Connect a socket as any program does that has a key."""
+    address, raw.curve_serverkey = endpoint.encode().split()
+    raw.curve_publickey, raw.curve_secretkey = key.public.encode(), key.secret.encode()
+    raw.connect(address.decode())
+
+
+def _sends(kind: int, part: bytes, num_parts: int = 1) -> AllowedAttack:
+    """Return an attack that sends the same message again and again, or ever new subscriptions.
+
+    ZeroMQ sends no message that is not complete, so that one without end is not among them.
+    """
+
+    def attack(endpoint: str, seconds: float) -> None:
+        with zmq.Context() as context, context.socket(kind) as raw:
+            raw.sndtimeo, raw.linger = 100, int(1000 * seconds)
+            connect(raw, endpoint, user_key())
+            number, end_s = 0, time.monotonic() + seconds
+            while time.monotonic() < end_s:
+                number += 1
+                last = part + (b"%08d" % number if kind == zmq.XSUB else b"")
+                with contextlib.suppress(zmq.Again):
+                    raw.send_multipart([part] * (num_parts - 1) + [last])
+
+    return attack
+
+
+ALLOWED = {  # by a key that is allowed
+    f"with a key: {name}": attack
+    for name, attack in {
+        "a message of 2500 large parts": _sends(zmq.DEALER, b"x" * 60_000, 2500),
+        "a message of 300000 small parts": _sends(zmq.DEALER, b"x" * 300, 300_000),
+        "messages of 100000 empty parts": _sends(zmq.DEALER, b"", 100_000),
+        "messages of the largest size": _sends(zmq.DEALER, b"x" * 65_000),
+        "small messages": _sends(zmq.DEALER, b"x" * 10),
+        "very many subscriptions": _sends(zmq.XSUB, b"\x01" + b"x" * 110),
+    }.items()
+}

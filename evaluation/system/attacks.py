@@ -3,18 +3,18 @@
 The services run as under ``kouxing run``, on ports of their own. For each attack a session is
 streamed in real time, before, during and after it. The attacker is a process of its own that begins
 again as soon as it was cut; the first row is a process that only spins, for the attacker needs a
-processor, too. It has no key: where all have one its handshake fails, where none has it may speak.
+processor, too. Without a key its handshake fails where all have one; where none has it may speak.
+Other attackers have a key that control lets in.
 """
 
 from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import os
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -24,19 +24,27 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.attackers import FLOODS, SUBSCRIPTIONS, TARGETS, Attack, hold_connections
+from evaluation.system.attackers import (
+    ALLOWED,
+    FLOODS,
+    PAGE,
+    SUBSCRIPTIONS,
+    TARGETS,
+    Attack,
+    hold_connections,
+)
 from evaluation.system.latency import percentiles, stream
 from evaluation.system.memory import Memory
-from services.cli.supervisor import Supervisor
-from services.kinds import KINDS, free_addresses
+from evaluation.system.systems import LocalSystem
+from services.kinds import KINDS
 from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
 from shared.connections import BAN_S
 from shared.errors import UserError
-from shared.keys import control_endpoint
 
 PHASE_S = 3.0
+SLACK_S = 0.5  # in which a session opens
 RETURN_S = 3.0  # for memory to come back
 ATTACKED = {  # sockets, by whether others have keys; then nobody else gets far
     False: ("commands", "audio", "faps"),
@@ -67,33 +75,31 @@ def measure(path: Path, console: Console) -> list[Damage]:
         If the file is no audio or the services cannot start.
     """
     samples, rate_hz = read_audio(path)
-    sound = np.resize(samples, (round(3 * PHASE_S * rate_hz), samples.shape[1]))
+    sound = np.resize(samples, (round((3 * PHASE_S + 2 * SLACK_S) * rate_hz), samples.shape[1]))
     return [damage for keys in (False, True) for damage in _measure(sound, rate_hz, keys, console)]
 
 
 def _measure(
     sound: NDArray[np.float32], rate_hz: int, keys: bool, console: Console
 ) -> list[Damage]:
-    environment = {
-        **free_addresses(),
-        "KOUXING_DRIVER_VIEW": "none",
-        "KOUXING_INSECURE": str(not keys),
-        "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
-    }
-    control = control_endpoint(environment["KOUXING_CONTROL"], insecure=not keys)
-    with tempfile.TemporaryDirectory() as folder:
-        supervisor = Supervisor([], Path(folder), console, environment)
-        try:
-            supervisor.start()
-            supervisor.wait_ready(control)
-            _p95_ms(control, sound, rate_hz)  # what runs for the first time is slow
-            numbers = [supervisor.process_number(service) for service in KINDS]
-            return [
-                _damage(keys, attack, target, numbers, environment, sound, rate_hz)
-                for attack, target in _attacks(ATTACKED[keys])
-            ]
-        finally:
-            supervisor.stop()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        LocalSystem(Path(folder), console, insecure=not keys) as system,
+    ):
+        _p95_ms(system.control, sound, rate_hz)  # what runs for the first time is slow
+        numbers = [system.supervisor.process_number(service) for service in KINDS]
+        endpoints = _endpoints(system.control)
+        return [
+            _damage(keys, attack, target, numbers, endpoints, sound, rate_hz)
+            for attack, target in _attacks(keys)
+        ]
+
+
+def _endpoints(control: str) -> dict[str, str]:
+    """Return where everything is bound, with its key, by name."""
+    with Client(control) as client:
+        services = client.status().services
+    return {name: each for state in services for name, each in state.endpoints.items()}
 
 
 def show(damages: list[Damage], console: Console) -> None:
@@ -112,14 +118,21 @@ def show(damages: list[Damage], console: Console) -> None:
     console.print(table)
 
 
-def _attacks(targets: Iterable[str]) -> Iterator[tuple[str, str]]:
+def _attacks(keys: bool) -> Iterator[tuple[str, str]]:
+    """Yield each attack and the socket that it attacks."""
     yield "none, but a busy processor", ""
-    for target in targets:
+    for target in ATTACKED[keys]:
         for attack in FLOODS:
             yield attack, target
     for attack in SUBSCRIPTIONS:
         yield attack, "faps"
     yield "very many connections", "audio"
+    if keys:
+        for attack in ALLOWED:
+            targets = ("faps",) if "subscriptions" in attack else ("commands", "audio")
+            yield from ((attack, target) for target in targets)
+        for attack in PAGE:
+            yield attack, "page"
 
 
 def _damage(
@@ -127,14 +140,14 @@ def _damage(
     attack: str,
     target: str,
     numbers: list[int],
-    environment: Mapping[str, str],
+    endpoints: Mapping[str, str],
     sound: NDArray[np.float32],
     rate_hz: int,
 ) -> Damage:
-    control = control_endpoint(environment["KOUXING_CONTROL"], insecure=not keys)
-    _wait_until_let_in(control)
+    control = endpoints["commands"]
+    wait_until_let_in(control)
     memories = [Memory(number) for number in numbers]
-    with _attacker(attack, target, environment):
+    with _attacker(attack, target, endpoints.get(target, "")):
         p95_ms = _p95_ms(control, sound, rate_hz)
     growth_mb = max(memory.growth_mb for memory in memories)
     time.sleep(RETURN_S)
@@ -142,7 +155,7 @@ def _damage(
     return Damage(keys, attack, target, growth_mb, kept_mb, *p95_ms)
 
 
-def _wait_until_let_in(control: str) -> None:
+def wait_until_let_in(control: str) -> None:
     """Wait while faults count against this address."""
     for _ in range(2 * BAN_S):
         with contextlib.suppress(UserError), Client(control) as client:
@@ -155,24 +168,22 @@ def _p95_ms(control: str, sound: NDArray[np.float32], rate_hz: int) -> list[floa
     """Return the delay before, during and after the attack, of a session that lasts throughout."""
     with Client(control) as client:
         times_s, delays_s, _ = stream(client, sound, rate_hz, SynthesizerConfig().delay_ms / 1e3)
-    phases = [delays_s[times_s // PHASE_S == phase] * 1e3 for phase in range(3)]
+    ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SLACK_S])
+    phases = [delays_s[np.digitize(times_s, ends_s) == phase] * 1e3 for phase in range(3)]
     return [percentiles(delays_ms)["p95"] if delays_ms.size else None for delays_ms in phases]
 
 
 @contextlib.contextmanager
-def _attacker(attack: str, target: str, environment: Mapping[str, str]) -> Iterator[None]:
+def _attacker(attack: str, target: str, endpoint: str) -> Iterator[None]:
     """Let a process attack in the second phase of the three."""
-    port, kind = 0, ""
-    if target:
-        service, setting, kind = TARGETS[target]
-        port = int(environment[f"KOUXING_{service.upper()}_{setting}"].rpartition(":")[2])
     context = multiprocessing.get_context("spawn")
     begins = context.Event()
-    process = context.Process(target=_attack, args=(attack, port, kind, begins), daemon=True)
+    arguments = (attack, target, endpoint, begins)
+    process = context.Process(target=_attack, args=arguments, daemon=True)
     process.start()
     timers = [
-        threading.Timer(PHASE_S, begins.set),
-        threading.Timer(2 * PHASE_S, process.terminate),
+        threading.Timer(PHASE_S + SLACK_S, begins.set),
+        threading.Timer(2 * PHASE_S + SLACK_S, process.terminate),
     ]
     for timer in timers:
         timer.start()
@@ -184,13 +195,22 @@ def _attacker(attack: str, target: str, environment: Mapping[str, str]) -> Itera
         process.join()
 
 
-def _attack(attack: str, port: int, kind: str, begins: Event) -> None:
-    """Attack for ever, once it begins; without a port only spin."""
+def _attack(attack: str, target: str, endpoint: str, begins: Event) -> None:
+    """Attack for ever, once it begins; without an endpoint only spin."""
     attacks: dict[str, Attack] = {
         **FLOODS,
         **SUBSCRIPTIONS,
+        **PAGE,
         "very many connections": hold_connections,
     }
+    begins.wait()
     while True:
-        if port:
-            attacks[attack](port, kind, 1.0)
+        if not endpoint:
+            continue
+        with contextlib.suppress(OSError):  # refused
+            if attack in ALLOWED:
+                ALLOWED[attack](endpoint, 1.0)
+            else:
+                address = endpoint.partition(" ")[0].rstrip("/")
+                kind = TARGETS[target][2] if target in TARGETS else ""
+                attacks[attack](int(address.rpartition(":")[2]), kind, 1.0)

@@ -14,7 +14,6 @@ CPU time is measured by the processes' own clocks, per second of audio.
 from __future__ import annotations
 
 import math
-import os
 import tempfile
 import time
 from dataclasses import dataclass
@@ -25,13 +24,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from services.cli.supervisor import Supervisor
-from services.kinds import free_addresses
+from evaluation.system.systems import LocalSystem
 from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
 from shared.errors import UserError
-from shared.keys import control_endpoint
 from shared.wire.face import EndOfFaps, FapFrame
 
 CHUNK_S = 0.02
@@ -58,29 +55,19 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
         If the file is no audio or the services cannot start.
     """
     samples, rate_hz = read_audio(path)
-    environment = {
-        **free_addresses(),
-        "KOUXING_DRIVER_VIEW": "none",
-        "KOUXING_INSECURE": "false",
-        "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
-    }
-    control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
     delay_s = SynthesizerConfig().delay_ms / 1e3
-    with tempfile.TemporaryDirectory() as folder:
-        supervisor = Supervisor([], Path(folder), console, environment)
-        try:
-            supervisor.start()
-            supervisor.wait_ready(control)
-            with Client(control) as client:
-                before = _cpu_s(client)
-                delays = [
-                    stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)[1:]
-                    for _ in range(num_repeats)
-                ]
-                time.sleep(1.0)  # until the last heartbeats
-                after = _cpu_s(client)
-        finally:
-            supervisor.stop()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        LocalSystem(Path(folder), console) as system,
+        Client(system.control) as client,
+    ):
+        before = _cpu_s(client)
+        delays = [
+            stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)[1:]
+            for _ in range(num_repeats)
+        ]
+        time.sleep(1.0)  # until the last heartbeats
+        after = _cpu_s(client)
     audio_s = num_repeats * len(samples) / rate_hz
     to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
     return Latency(

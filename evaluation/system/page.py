@@ -1,9 +1,9 @@
-"""How the page draws, and its delay from the voice to the picture, in a headless Chromium.
+"""How the page draws, and what it makes late, in a headless Chromium.
 
 The services run as under ``kouxing run``, on ports of their own; the processor draws, with
 SwiftShader. First the face only idles, then a microphone hears a recording again and again. The
 page measures itself (``window.kouxing.state``): the delay ends with the display's tick after a
-picture is drawn.
+picture is drawn. At last the recording is heard, with clicks in it: how far from their pictures?
 """
 
 from __future__ import annotations
@@ -16,19 +16,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from evaluation.system import sync
 from evaluation.system.chromium import Chromium
-from services.cli.supervisor import Supervisor
-from services.kinds import free_addresses
+from evaluation.system.live import speak
+from evaluation.system.systems import LocalSystem
+from services.recognizer.front_end.resample import to_16_khz
 from shared.audio_file import read_audio
+from shared.client import Client
+from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
-from shared.keys import control_endpoint
 
 SIZE_PX = (1100, 800)
 SETTLE_S = 12.0  # until the page has found how finely it can draw, and for how long to wait
 MEASURE_S = 15.0
+CLICK_EVERY = MEDIA_RATE_HZ // 2  # samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +49,16 @@ class Drawing:
     load: float  # average of this machine's processes that run, over a minute
 
 
-def measure(path: Path, console: Console) -> dict[str, Drawing]:
-    """Start the services and a browser; return the figures, idling and speaking.
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """How the page draws, idling and with its microphone, and how sound and picture meet."""
+
+    drawings: dict[str, Drawing]
+    offsets: sync.Offsets
+
+
+def measure(path: Path, console: Console) -> Figures:
+    """Start the services and a browser; return the figures.
 
     Raises
     ------
@@ -53,36 +66,30 @@ def measure(path: Path, console: Console) -> dict[str, Drawing]:
         If the file is no audio, the services cannot start, or no Chromium is installed.
     """
     samples, rate_hz = read_audio(path)
-    environment = {
-        **free_addresses(),
-        "KOUXING_DRIVER_VIEW": "none",
-        "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
-    }
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with wave.open(str(folder / "voice.wav"), "wb") as voice:
             voice.setparams((samples.shape[1], 2, rate_hz, 0, "NONE", ""))
             voice.writeframes((samples * 32767).astype("<i2").tobytes())
-        supervisor = Supervisor([], folder, console, environment)
-        try:
-            supervisor.start()
-            supervisor.wait_ready(control_endpoint(environment["KOUXING_CONTROL"], insecure=False))
+        with LocalSystem(folder, console) as system:
             browser = Chromium(folder / "profile", SIZE_PX, folder / "voice.wav")
             try:
-                return _measure(browser, f"http://127.0.0.1:{environment['KOUXING_GATEWAY_PORT']}/")
+                sync.install(browser)
+                drawings = _draw(browser, system.supervisor.page_address(system.control))
+                with Client(system.control) as client:
+                    offsets = _hear(browser, client, to_16_khz(samples, rate_hz))
+                return Figures(drawings, offsets)
             except TimeoutError as error:
                 raise UserError(f"the page did not get there: {error}") from None
             finally:
                 browser.close()
-        finally:
-            supervisor.stop()
 
 
-def show(drawings: dict[str, Drawing], console: Console) -> None:
-    """Print the figures as a table."""
+def show(figures: Figures, console: Console) -> None:
+    """Print the figures as tables."""
     columns = ("pictures per s", "size", "ms", "CPU ms", "voice to frame", "to picture", "load")
     table = Table("page of {} x {}".format(*SIZE_PX), *columns)
-    for name, drawing in drawings.items():
+    for name, drawing in figures.drawings.items():
         delays = (drawing.voice_to_frame_ms, drawing.voice_to_picture_ms)
         table.add_row(
             name,
@@ -94,15 +101,43 @@ def show(drawings: dict[str, Drawing], console: Console) -> None:
             f"{drawing.load:.1f}",
         )
     console.print(table)
+    sync.show(figures.offsets, console)
 
 
-def _measure(browser: Chromium, url: str) -> dict[str, Drawing]:
+def _draw(browser: Chromium, url: str) -> dict[str, Drawing]:
     browser.command("Page.navigate", url=url)
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
     idle = _drawing(browser)
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.voiceToPictureMs !== null")
-    return {"idle": idle, "microphone": _drawing(browser)}
+    drawings = {"idle": idle, "microphone": _drawing(browser)}
+    browser.click("microphone")
+    browser.wait_for("!window.kouxing.state.microphone && window.kouxing.state.sound === 'on'")
+    return drawings
+
+
+def _hear(browser: Chromium, client: Client, voice: NDArray[np.float32]) -> sync.Offsets:
+    """Let a voice be heard, softly, and clicks; return how far they are from their pictures.
+
+    Raises
+    ------
+    UserError
+        If none is heard near its picture.
+    """
+    sound = np.resize(0.1 * voice / np.abs(voice).max(), round((SETTLE_S + MEASURE_S) * 16000))
+    sound[CLICK_EVERY::CLICK_EVERY] = 0.6
+    session = client.open_session(encoding="f32le")
+    browser.wait_for(f"window.kouxing.state.session === '{session.name}'")
+    sync.begin(browser)
+    speak([session], sound)
+    session.close()
+    clicks_ms, pictures = sync.read(browser)
+    seen_ms = sync.passages_ms(pictures, CLICK_EVERY)
+    settled_ms = clicks_ms[clicks_ms - clicks_ms[:1] >= 1e3 * SETTLE_S]
+    offsets = sync.offsets_ms(settled_ms, seen_ms)
+    if not offsets:
+        raise UserError("no click is heard near its picture; this machine is too busy")
+    return sync.summary(offsets)
 
 
 def _drawing(browser: Chromium) -> Drawing:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from evaluation.system.live import CHUNK
 from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
 from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.front_end.resample import to_16_khz
@@ -21,7 +22,6 @@ from shared.clock import MEDIA_RATE_HZ
 
 MODELS = ("neural", "blocks")
 NUM_SESSIONS = (1, 16)
-_CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 
 
 def measure(path: Path) -> dict[str, float]:
@@ -56,9 +56,9 @@ def _cpu_s(
     starts = np.arange(num_sessions) * len(samples) // num_sessions
     sounds = [np.roll(samples, -start) for start in starts]
     begin_s = time.process_time()
-    for at in range(0, len(samples), _CHUNK):
+    for at in range(0, len(samples), CHUNK):
         tasks = [
-            stream.process([(at, sound[at : at + _CHUNK])])
+            stream.process([(at, sound[at : at + CHUNK])])
             for stream, sound in zip(streams, sounds, strict=True)
         ]
         run_scoring_tasks(model, tasks)

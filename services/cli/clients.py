@@ -16,7 +16,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from services.cli.running_system import find_control
-from services.cli.terminal import CONSOLE, JsonFile, VoiceFile, print_message, write_json
+from services.cli.terminal import (
+    CONSOLE,
+    CurveForm,
+    JsonFile,
+    VoiceFile,
+    print_message,
+    write_json,
+)
 from services.kinds import read_settings
 from shared.config import ServiceConfig
 from shared.errors import UserError
@@ -41,7 +48,11 @@ class Shown(StrEnum):
 
 def speak(
     source: Annotated[
-        str, typer.Argument(metavar="FILE|-|mic", help="'-': raw int16 from standard input.")
+        str,
+        typer.Argument(
+            metavar="FILE|-|mic|monitor",
+            help="'-': raw int16, or WAV, from standard input; 'monitor': what this machine plays.",
+        ),
     ],
     session: Annotated[str, typer.Option(help="Name of the session.")] = "",
     record: Annotated[
@@ -51,19 +62,28 @@ def speak(
     fast: Annotated[
         bool, typer.Option("--fast", help="As fast as possible, not in real time.")
     ] = False,
+    device: Annotated[
+        str,
+        typer.Option(help="Part of the name of the 'mic' or 'monitor'; 'kouxing devices' lists."),
+    ] = "",
     rate: Annotated[int, typer.Option(help="Sample rate of '-', Hz.")] = 16000,
     channels: Annotated[int, typer.Option(help="Channels of '-'.")] = 1,
     voice: VoiceFile = None,
     control: Control = "",
 ) -> None:
-    """Stream a file, standard input or the microphone to a running system."""
+    """Stream a file, standard input, a microphone or what is played to a running system."""
     from services.cli.streaming import stream
     from services.recognizer.voice import read_profile
-    from shared.audio_file import microphone, open_audio, raw_audio
+    from shared.audio_file import open_audio, raw_audio
+    from shared.sound_devices import microphone, monitor
 
     profile = b"" if voice is None else read_profile(voice)
+    if device and source not in ("mic", "monitor"):
+        raise UserError("--device names a microphone or a monitor: kouxing speak mic --device NAME")
     if source == "mic":
-        audio = microphone()
+        audio = microphone(device)
+    elif source == "monitor":
+        audio = monitor(device)
     elif source == "-":
         audio = raw_audio(sys.stdin.buffer, rate, channels)
     else:
@@ -84,6 +104,18 @@ def speak(
         print_message(f"wrote {summary.video}")
 
 
+def devices() -> None:
+    """List what 'kouxing speak mic' and 'kouxing speak monitor' can name with --device."""
+    from shared.sound_devices import sound_devices
+
+    table = Table("kind", "name", "speak it", box=box.SIMPLE)
+    for device in sound_devices():
+        source = "mic" if device.kind == "mic" else "monitor"
+        command = f'kouxing speak {source} --device "{device.name}"'
+        table.add_row(device.kind, escape(device.name), escape(command))
+    Console().print(table)
+
+
 def listen(
     session: Annotated[
         str,
@@ -94,14 +126,41 @@ def listen(
     ] = Shown.FAPS,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Record the FAP frames to a .fap or .jsonl file."),
+        typer.Option("--output", "-o", help="Record the frames to a .fap, .csv or .jsonl file."),
     ] = None,
+    form: Annotated[
+        CurveForm,
+        typer.Option("--as", help="Values of the frames; printed, shapes are lines of JSON."),
+    ] = CurveForm.FAPS,
     control: Control = "",
 ) -> None:
     """Print or record what a session shows, until it ends."""
     from services.cli.follow import follow
 
-    follow(_session_name(session), output, show, control_address(control))
+    follow(_session_name(session), output, show, form, control_address(control))
+
+
+def send(
+    targets: Annotated[
+        list[str],
+        typer.Argument(metavar="URL...", help="Programs that show the face, as vmc://HOST:PORT."),
+    ],
+    session: Annotated[
+        str, typer.Option(help="Name of the session; without it, always the newest.")
+    ] = "",
+    control: Control = "",
+) -> None:
+    """Send the face to avatars in other programs: VMC, Live Link Face, OSC, VTube Studio."""
+    from services.cli.send import send_to
+    from services.senders.target import parse_target
+
+    config = read_settings().load(ServiceConfig)
+    send_to(
+        [parse_target(url) for url in targets],
+        _session_name(session),
+        control_address(control),
+        config.idle_motion_seed,
+    )
 
 
 def express(

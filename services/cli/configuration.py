@@ -32,7 +32,8 @@ A value comes from, weakest first:
 
 Every service also has the keys of `[common]`. They can be set for all services, in the table
 `[common]` or as `KOUXING_<KEY>`, and for one service, which counts more. A key, table or variable
-that is not listed here is an error.
+that is not listed here is an error. What is separated by spaces may also be a list in the file:
+`senders = ["vmc://", "vts://"]`.
 
 `kouxing config` prints all keys with their present values and where each came from, as a TOML file;
 `kouxing config recognizer --set min_confidence=0.8` does so for one service.

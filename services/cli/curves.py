@@ -11,11 +11,11 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.cli.offline import CurveForm
+from services.cli.terminal import CurveForm
 from shared.errors import UserError
-from shared.face.blendshapes import ARKIT_NAMES, OCULUS_NAMES, arkit_weights, oculus_weights
 from shared.face.fap_file import FapAnimation, write_fap
 from shared.face.faps import FAPS
+from shared.face.shapes import SHAPE_SETS
 
 if TYPE_CHECKING:
     from services.cli.motion import Motion
@@ -25,16 +25,6 @@ CURVE_SUFFIXES = (".fap", ".csv", ".jsonl", ".glb")
 _FORMS_OF_SUFFIX = {
     ".fap": (CurveForm.FAPS,),
     ".glb": (CurveForm.FAPS, CurveForm.ARKIT),
-}
-_NAMES = {
-    CurveForm.FAPS: tuple(fap.name for fap in FAPS),
-    CurveForm.ARKIT: ARKIT_NAMES,
-    CurveForm.OCULUS: OCULUS_NAMES,
-}
-_WEIGHTS: dict[CurveForm, Callable[[Values], Values]] = {
-    CurveForm.FAPS: lambda faps: faps,
-    CurveForm.ARKIT: arkit_weights,
-    CurveForm.OCULUS: oculus_weights,
 }
 
 
@@ -90,29 +80,47 @@ def write_curves(motion: Motion, output: Path, form: CurveForm, head: str) -> No
 
         export_glb(load_head(head), output, motion.frames, as_arkit=form is CurveForm.ARKIT)
         return
-    rows = [(time_s, _WEIGHTS[form](faps)) for time_s, faps in motion.frames]
     try:
         with output.open("w", encoding="utf-8", newline="") as file:
-            if suffix == ".csv":
-                _write_csv(file, _NAMES[form], rows)
-            else:
-                file.writelines(
-                    json_line(time_s, number, values, form) + "\n"
-                    for number, (time_s, values) in enumerate(rows)
-                )
+            write = row_writer(file, suffix, form)
+            for number, (time_s, faps) in enumerate(motion.frames):
+                write(time_s, number, faps)
     except OSError as error:
         raise UserError(f"{output}: cannot be written: {error.strerror}") from None
 
 
-def json_line(time_s: float, number: int, values: Values, form: CurveForm = CurveForm.FAPS) -> str:
-    """Write a frame as a line of JSON: FAPs in the order of their numbers, else by name."""
-    rounded = [round(float(value), 2 if form is CurveForm.FAPS else 4) for value in values]
-    named = rounded if form is CurveForm.FAPS else dict(zip(_NAMES[form], rounded, strict=True))
-    return json.dumps({"time_s": time_s, "sequence": number, form.value: named})
+def row_writer(file: IO[str], suffix: str, form: CurveForm) -> Callable[[float, int, Values], None]:
+    """Begin a table of values; return what writes a row of it.
 
+    Parameters
+    ----------
+    file
+        Text file.
+    suffix
+        ``.csv``, else lines of JSON: FAPs in the order of their numbers, shapes by name.
+    form
+        What the values are.
 
-def _write_csv(file: IO[str], names: tuple[str, ...], rows: list[tuple[float, Values]]) -> None:
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["time_s", *names])
-    for time_s, values in rows:
-        writer.writerow([f"{time_s:.3f}", *(f"{value:.4g}" for value in values)])
+    Returns
+    -------
+    Function of the media time in seconds, the frame's number, and its FAPs (68,).
+    """
+    shapes = SHAPE_SETS.get(form)
+    names = shapes.names if shapes else tuple(fap.name for fap in FAPS)
+    table = csv.writer(file, lineterminator="\n")
+
+    def write_csv(time_s: float, _number: int, values: Values) -> None:
+        table.writerow([f"{time_s:.3f}", *(f"{value:.4g}" for value in values)])
+
+    def write_json(time_s: float, number: int, values: Values) -> None:
+        rounded = [round(float(value), 4 if shapes else 2) for value in values]
+        named = dict(zip(names, rounded, strict=True)) if shapes else rounded
+        line = {"time_s": time_s, "sequence": number, form.value: named}
+        file.write(json.dumps(line) + "\n")
+
+    if suffix == ".csv":
+        table.writerow(["time_s", *names])
+    write = write_csv if suffix == ".csv" else write_json
+    return lambda time_s, number, faps: write(
+        time_s, number, shapes.weights(faps) if shapes else faps
+    )

@@ -1,11 +1,11 @@
-"""Prints or records what a session shows: FAP frames, syllables or phones."""
+"""Prints or records what a session shows: FAPs or shapes, syllables or phones."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.cli.clients import Shown
-from services.cli.curves import json_line
-from services.cli.terminal import CONSOLE, check_output, print_message
-from shared.client import Client
+from services.cli.curves import check_curves, row_writer
+from services.cli.terminal import CONSOLE, CurveForm, check_output, print_message
+from shared.client import Client, Refused
 from shared.clock import to_seconds
 from shared.errors import UserError
 from shared.face.fap_file import FapAnimation, write_fap
@@ -28,6 +28,7 @@ from shared.wire.control import SessionState
 from shared.wire.events import phone_of
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
+from shared.wire.session import ErrorCode
 from shared.wire.speech import Phone
 
 OPEN_POLL_S = 0.2
@@ -36,10 +37,9 @@ SHOWN_FAPS = (3, 4, 5, 6, 16, 17)  # of a printed frame: jaw, lips, corner, prot
 LEGEND = "the columns, FAPs: " + ", ".join(f"{n} {FAPS[n - 1].name}" for n in SHOWN_FAPS)
 
 Followed = TypeVar("Followed", bound=Message)
-Line = TypeVar("Line")
 
 
-def follow(session: str, output: Path | None, shown: Shown, control: str) -> None:
+def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, control: str) -> None:
     """Follow a session from now on to its end.
 
     Parameters
@@ -47,63 +47,66 @@ def follow(session: str, output: Path | None, shown: Shown, control: str) -> Non
     session
         Its name; empty: the newest that is open, or else the next.
     output
-        File for the FAP frames; None: print what ``shown`` says.
+        File for the frames; None: print what ``shown`` says.
+    form
+        What the values of frames are.
 
     Raises
     ------
     UserError
         If control does not answer or the file cannot be written.
     """
-    if output is not None and output.suffix not in (".fap", ".jsonl"):
-        raise UserError(f"{output}: unknown kind of file; write to .fap or .jsonl")
-    if output is not None and shown is not Shown.FAPS:
-        raise UserError(f"--show {shown} is for the terminal; a file takes FAP frames")
-    check_output(output)
+    _check(output, shown, form)
     with Client(control) as client:
         state = _wait_for_session(session, client)
         session = state.session
         try:
             if shown is not Shown.FAPS:
                 inventory = load_inventory(state.language or DEFAULT_LANGUAGE)
-                rows = _phone_rows(_messages(Phone, state, client), shown, inventory)
-                num_lines = _print(rows, sys.stdout, str)
-            elif output is None:
-                CONSOLE.print(LEGEND, markup=False, highlight=False)
-                num_lines = _print(_messages(FapFrame, state, client), sys.stdout, _as_row)
-            elif output.suffix == ".jsonl":
-                with output.open("w", encoding="utf-8") as file:
-                    num_lines = _print(_messages(FapFrame, state, client), file, _as_json)
+                num_lines = _print(_phone_rows(_messages(Phone, state, client), shown, inventory))
             else:
-                frames = list(_messages(FapFrame, state, client))
-                num_lines = _write_fap(output, session, frames)
+                num_lines = _take_frames(_messages(FapFrame, state, client), session, output, form)
         except OSError as error:
             raise UserError(f"{output}: cannot be written: {error.strerror}") from None
-    unit = "FAP frames" if shown is Shown.FAPS else shown.value
+    unit = "frames" if shown is Shown.FAPS else shown.value
     print_message(f"session {session} ended: {num_lines} {unit}")
     if output is not None:
         print_message(f"wrote {output}")
 
 
+def _check(output: Path | None, shown: Shown, form: CurveForm) -> None:
+    """Refuse what does not fit together."""
+    if shown is not Shown.FAPS and (output is not None or form is not CurveForm.FAPS):
+        raise UserError(f"--show {shown} is for the terminal; --output and --as take frames")
+    if output is not None and output.suffix not in (".fap", ".csv", ".jsonl"):
+        raise UserError(f"{output}: unknown kind of file; write to .fap, .csv or .jsonl")
+    check_output(output)
+    if output is not None:
+        check_curves(output, form)
+
+
 def _wait_for_session(name: str, client: Client) -> SessionState:
     """Return an open session of that name (empty: the newest), once there is one."""
-    found = _find_session(name, client)
+    found = find_session(name, client)
     if found is None:
         wanted = f"session {name}" if name else "a session"
         opener = f"speak my.wav --session {name}" if name else "speak my.wav"
         print_message(f"waiting for {wanted} to open, as with kouxing {opener}; Ctrl-C ends")
     while found is None:
         time.sleep(OPEN_POLL_S)
-        found = _find_session(name, client)
+        found = find_session(name, client)
     return found
 
 
-def _find_session(name: str, client: Client) -> SessionState | None:
+def find_session(name: str, client: Client) -> SessionState | None:
     """Return an open session that is published; None if there is none."""
-    published = [
-        state
-        for state in client.status().sessions
-        if name in ("", state.session) and "faps" in state.endpoints
-    ]
+    try:
+        sessions = client.status(name).sessions
+    except Refused as refused:
+        if refused.code != ErrorCode.UNKNOWN_SESSION:
+            raise
+        return None
+    published = [state for state in sessions if "faps" in state.endpoints]
     return min(published, key=lambda state: state.age_s, default=None)
 
 
@@ -122,7 +125,7 @@ def _messages(kind: type[Followed], state: SessionState, client: Client) -> Iter
     try:
         while not follower.has_ended:
             if not loop.step(SILENT_S):
-                found = _find_session(state.session, client)
+                found = find_session(state.session, client)
                 if found is None:
                     return
                 if found.endpoints != endpoints:
@@ -148,20 +151,39 @@ def _phone_rows(
                 yield f"{each.onset_s:9.3f} s  {each.duration_s:6.3f} s  {text}"
 
 
-def _print(lines: Iterable[Line], out: IO[str], form: Callable[[Line], str]) -> int:
+def _take_frames(
+    frames: Iterator[FapFrame], session: str, output: Path | None, form: CurveForm
+) -> int:
+    """Print or record frames; return their number."""
+    if output is None and form is CurveForm.FAPS:
+        CONSOLE.print(LEGEND, markup=False, highlight=False)
+        return _print(map(_as_row, frames))
+    if output is None:
+        return _write_rows(frames, sys.stdout, ".jsonl", form)
+    if output.suffix == ".fap":
+        return _write_fap(output, session, list(frames))
+    with output.open("w", encoding="utf-8", newline="") as file:
+        return _write_rows(frames, file, output.suffix, form)
+
+
+def _print(lines: Iterable[str]) -> int:
     num_lines = 0
     for num_lines, line in enumerate(lines, start=1):  # noqa: B007 - the count is the answer
-        out.write(form(line) + "\n")
-        out.flush()
+        print(line, flush=True)
     return num_lines
+
+
+def _write_rows(frames: Iterable[FapFrame], file: IO[str], suffix: str, form: CurveForm) -> int:
+    write = row_writer(file, suffix, form)
+    num_rows = 0
+    for num_rows, frame in enumerate(frames, start=1):  # noqa: B007 - the count is the answer
+        write(to_seconds(frame.media_time), frame.sequence, _values(frame))
+        file.flush()
+    return num_rows
 
 
 def _values(frame: FapFrame) -> NDArray[np.float32]:
     return np.frombuffer(frame.values, "<f4").astype(np.float32)
-
-
-def _as_json(frame: FapFrame) -> str:
-    return json_line(to_seconds(frame.media_time), frame.sequence, _values(frame))
 
 
 def _as_row(frame: FapFrame) -> str:

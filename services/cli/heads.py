@@ -24,10 +24,12 @@ app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")
 
 @app.command("export")
 def export_head(
-    glb: Annotated[Path, typer.Argument(help="File to write (.glb).")],
+    glb: Annotated[
+        Path, typer.Argument(metavar="FILE", help="File to write: .glb, or .vrm for an avatar.")
+    ],
     head: HeadName = DEFAULT_HEAD,
 ) -> None:
-    """Write a head as a GLB with a morph target for every FAP."""
+    """Write a head for an engine: a GLB of FAPs and ARKit shapes, or a VRM 1.0 avatar."""
     from services.driver.head.glb_export import export_glb
     from services.driver.render.scene import load_head
 

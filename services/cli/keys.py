@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 from pathlib import Path
 from typing import Annotated
 
@@ -12,14 +13,26 @@ from rich.markup import escape
 from rich.table import Table
 
 from services.cli.terminal import print_message
-from shared.keys import CLIENT, add_guest, key_folder, read_guests, revoke_guest, user_key
+from services.kinds import KINDS
+from shared.keys import (
+    CLIENT,
+    add_guest,
+    key_folder,
+    own_key,
+    read_guests,
+    revoke_guest,
+    user_key,
+)
 
 app = typer.Typer(no_args_is_help=True, help="Who may connect to the services.")
 
 
 @app.command()
 def init() -> None:
-    """Make the keys of a system on this machine, as whatever starts first does."""
+    """Make all keys of a system on this machine: of its services and of your commands."""
+    for kind in KINDS.values():
+        service = pkgutil.resolve_name(kind.service)
+        own_key(kind.name, (f"service:{kind.name}", *service.client_roles))
     user_key()
     print_message(f"the keys are in {key_folder()}")
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from services.cli import clients, configuration, offline, run
+from services.cli import clients, cluster, configuration, offline, run
 from services.cli.heads import app as head_app
 from services.cli.keys import app as keys_app
 from services.cli.services import service_command
@@ -76,8 +76,9 @@ def kouxing(
 
 
 for command in (
-    run.run, clients.speak, offline.render, offline.lips, clients.listen, clients.express,
-    offline.phones, offline.align, clients.status, configuration.config,
+    run.run, clients.speak, offline.render, offline.lips, clients.listen, clients.send,
+    clients.express, offline.phones, offline.align, clients.devices, clients.status,
+    cluster.cluster, configuration.config,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(head_app, name="head")

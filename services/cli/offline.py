@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from services.cli.heads import DEFAULT_HEAD, HeadName
-from services.cli.terminal import CONSOLE, VoiceFile, print_message, write_output
+from services.cli.terminal import CONSOLE, CurveForm, VoiceFile, print_message, write_output
 from services.driver.config import Framing
 from shared.errors import UserError
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
@@ -25,14 +25,6 @@ class PhoneFormat(StrEnum):
     CSV = "csv"
     JSON = "json"
     TEXTGRID = "textgrid"
-
-
-class CurveForm(StrEnum):
-    """What the values of a curve file are."""
-
-    FAPS = "faps"
-    ARKIT = "arkit"
-    OCULUS = "oculus"
 
 
 class Timing(StrEnum):

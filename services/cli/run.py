@@ -18,7 +18,7 @@ from services.cli.services import ConfigFile
 from services.cli.terminal import CONSOLE, command_name, print_message
 from services.control.config import ControlConfig
 from services.driver.config import DriverConfig
-from services.kinds import KINDS, available_addresses, read_settings
+from services.kinds import KINDS, available_addresses, more_workers, read_settings
 from shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
 from shared.endpoints import WILDCARDS, split_endpoint
 from shared.errors import UserError
@@ -41,6 +41,14 @@ def run(
     port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port of the page, instead of 8080.")
     ] = None,
+    workers: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=64,
+            help="Recognizers and synthesizers; of two or more one that fails is replaced at once.",
+        ),
+    ] = 1,
     assignments: Annotated[
         list[str] | None,
         typer.Option(
@@ -72,7 +80,8 @@ def run(
     }
     insecure = settings.load(ControlConfig).insecure
     client_control = control_endpoint(control, insecure=insecure)
-    supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment)
+    more = more_workers(settings, workers)
+    supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment, more=more)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
     for remark in _remarks_on_ports(settings, addresses, control):

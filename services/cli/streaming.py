@@ -26,6 +26,8 @@ QUEUE_WAIT_S = 0.005
 END_LIMIT_S = 30.0  # for the last frames after the last sample
 STATUS_S = 1.0  # between questions to control
 DRIVER_LIMIT_S = 20.0  # for a driver to be back that was lost, as on a busy machine
+PIPE_PAUSE_S = 0.2  # without sound; then a pipe's next sound is not late, but comes after a pause
+PIPE_CLOCK = 0.999  # so that a pipe from a device whose clock is fast does not fill
 QUIET_PEAK = 1e-3  # below this (-60 dBFS) a file is called silent
 
 
@@ -137,7 +139,8 @@ def _send_all(
     """Send everything; return seconds sent, the share of clipped samples and the peak."""
     num_sent = clipped = 0
     peak = 0.0
-    begin_s = time.monotonic()
+    is_pipe = source.duration_s is None
+    due_s = time.monotonic()  # when the next block is spoken
     try:
         for block in source.blocks:
             _send_with_retry(functools.partial(session.send, block))
@@ -146,9 +149,11 @@ def _send_all(
             peak = max(peak, float(np.abs(block).max()))
             face.update(0.0)
             _check_errors(session, events, console)
-            if paced and source.duration_s is not None:
-                sent_s = num_sent / source.sample_rate_hz
-                time.sleep(max(0.0, begin_s + sent_s - time.monotonic()))
+            if paced and not source.is_live:
+                if is_pipe and time.monotonic() > due_s + PIPE_PAUSE_S:
+                    due_s = time.monotonic()  # it goes on after a pause
+                due_s += len(block) / source.sample_rate_hz * (PIPE_CLOCK if is_pipe else 1.0)
+                time.sleep(max(0.0, due_s - time.monotonic()))
     except KeyboardInterrupt:
         console.print("stopping")
     duration_s = num_sent / source.sample_rate_hz

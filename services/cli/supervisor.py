@@ -10,20 +10,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO
 
 from rich.console import Console
 
-from services.kinds import KINDS
+from services.kinds import KINDS, kind_of
 from shared.client import Client
 from shared.errors import UserError
 from shared.service import DRAIN_LIMIT_S, PARENT_VARIABLE
 
-BACKOFF_S = (0.2, 5.0)  # first and longest wait before a crashed service starts again
+BACKOFF_S = (0.2, 5.0)  # least and longest wait before a service that crashed twice starts again
 CHECK_EVERY_S = 0.2
 STEADY_S = 30.0  # after which a crash counts as the first one again
+STANDBY_S = 3.0  # after the newest start, so that it has the processor for itself
 USER_ERROR = 2  # exit status of a service that was configured wrongly
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
@@ -39,6 +41,11 @@ class Supervisor:
         One log of JSON lines a service; warnings also go to the console.
     environment
         Added to this process's own.
+    services
+        Which to run.
+    more
+        Additions to the environment for more workers of their kinds, by name, as
+        ``services.kinds.more_workers`` returns them.
     """
 
     def __init__(
@@ -47,24 +54,31 @@ class Supervisor:
         log_folder: Path,
         console: Console,
         environment: Mapping[str, str] | None = None,
+        *,
+        services: Collection[str] = tuple(KINDS),
+        more: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
+        self._more = more or {}
+        self._services = (*services, *self._more)
         self._arguments = arguments
         self._log_folder = log_folder
         self._console = console
         self._environment = {**os.environ, **ONE_THREAD, **(environment or {})}
         self._environment[PARENT_VARIABLE] = str(os.getpid())
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._standby: subprocess.Popen[bytes] | None = None  # becomes what crashes next
         self._started_s: dict[str, float] = {}
-        self._wait_s = dict.fromkeys(KINDS, BACKOFF_S[0])
+        self._wait_s = dict.fromkeys(self._services, 0.0)
         self._due_s: dict[str, float] = {}
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
+        self._ended = threading.Event()  # a service has ended
         self._failure: UserError | None = None
         log_folder.mkdir(parents=True, exist_ok=True)
 
     def start(self) -> None:
         """Start every service."""
-        for service in KINDS:
+        for service in self._services:
             self._spawn(service)
 
     def wait_ready(self, control: str, deadline_s: float = 120.0) -> None:
@@ -80,8 +94,8 @@ class Supervisor:
             while time.monotonic() < end_s:
                 self.check()
                 with contextlib.suppress(UserError):
-                    ready = {service.service for service in client.status().services}
-                    if ready >= set(KINDS):
+                    ready = Counter(service.service for service in client.status().services)
+                    if ready >= Counter(map(kind_of, self._services)):
                         return
                 time.sleep(0.1)
         raise UserError(f"the services did not start; their logs are in {self._log_folder}")
@@ -111,7 +125,9 @@ class Supervisor:
                 raise self._failure
 
     def _watch(self) -> None:
-        while not self._stopping.wait(CHECK_EVERY_S):
+        while not self._stopping.is_set():
+            self._ended.wait(CHECK_EVERY_S)
+            self._ended.clear()
             try:
                 self.check()
             except UserError as error:
@@ -135,17 +151,21 @@ class Supervisor:
                 raise UserError(f"{service} cannot start; see above")
             del self._processes[service]
             if now_s - self._started_s[service] > STEADY_S:
-                self._wait_s[service] = BACKOFF_S[0]
+                self._wait_s[service] = 0.0
             wait_s = self._wait_s[service]
-            self._wait_s[service] = min(2 * wait_s, BACKOFF_S[1])
+            self._wait_s[service] = min(max(2 * wait_s, BACKOFF_S[0]), BACKOFF_S[1])
             self._due_s[service] = now_s + wait_s
+            when = f"in {wait_s:g} s" if wait_s else "at once"
             self._console.print(
-                f"[yellow]{service} ended with status {status}; starting it again in {wait_s:g} s"
+                f"[yellow]{service} ended with status {status}; starting it again {when}"
             )
         for service, due_s in list(self._due_s.items()):
             if now_s >= due_s:
                 del self._due_s[service]
                 self._spawn(service)
+        all_settled = now_s > max(self._started_s.values()) + STANDBY_S
+        if self._watcher is not None and self._standby is None and all_settled:
+            self._standby = self._run("standby", stdin=subprocess.PIPE)
 
     def process_number(self, service: str) -> int:
         """Return the process number of a running service."""
@@ -166,22 +186,57 @@ class Supervisor:
                 process.kill()
                 process.wait()
         self._processes.clear()
+        if self._standby is not None:
+            with self._standby as process:
+                process.kill()
 
     def _spawn(self, service: str) -> None:
-        process = subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", f"services.{service}", *self._arguments],
-            env=self._environment,
-            stdin=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C reaches the supervisor alone, which asks in order
+        kind, environment = kind_of(service), self._more.get(service, {})
+        process = self._told_to_become(kind, environment) or self._run(
+            kind, self._arguments, environment
         )
         self._processes[service] = process
         self._started_s[service] = time.monotonic()
+        follow = threading.Thread(target=self._follow, args=(service, process), daemon=True)
+        follow.start()
+
+    def _told_to_become(
+        self, kind: str, environment: Mapping[str, str]
+    ) -> subprocess.Popen[bytes] | None:
+        """Let the process that stands by be a service; return it, or None where it cannot."""
+        process, self._standby = self._standby, None
+        if process is None or process.stdin is None:
+            return None
+        order = {"service": kind, "arguments": self._arguments, "environment": {**environment}}
+        try:
+            with process.stdin as pipe:
+                pipe.write(json.dumps(order).encode() + b"\n")
+        except BrokenPipeError:  # it has ended itself
+            with process:
+                return None
+        return process
+
+    def _run(
+        self,
+        module: str,
+        arguments: Collection[str] = (),
+        environment: Mapping[str, str] | None = None,
+        stdin: int = subprocess.DEVNULL,
+    ) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(  # noqa: S603 - our own module
+            [sys.executable, "-m", f"services.{module}", *arguments],
+            env={**self._environment, **(environment or {})},
+            stdin=stdin,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C reaches the supervisor alone, which asks in order
+        )
+
+    def _follow(self, service: str, process: subprocess.Popen[bytes]) -> None:
+        """Write a service's log until it ends, and say so at once."""
         if process.stderr is not None:
-            follow = threading.Thread(
-                target=self._follow_log, args=(service, process.stderr), daemon=True
-            )
-            follow.start()
+            self._follow_log(service, process.stderr)
+        process.wait()
+        self._ended.set()
 
     def _follow_log(self, service: str, stream: IO[bytes]) -> None:
         with stream, (self._log_folder / f"{service}.log").open("ab") as log:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -12,12 +13,22 @@ import typer
 from rich.console import Console
 
 from shared.errors import UserError
+from shared.face.shape_names import ShapeSetName
 
 CONSOLE = Console(stderr=True)
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the figures here.")]
 VoiceFile = Annotated[
     Path | None, typer.Option("--voice", help="The speaker's own mouth, from kouxing adapt.")
 ]
+
+
+class CurveForm(StrEnum):
+    """What the values of a face's curves are."""
+
+    FAPS = "faps"
+    ARKIT = ShapeSetName.ARKIT
+    OCULUS = ShapeSetName.OCULUS
+    VRM = ShapeSetName.VRM
 
 
 def print_message(text: str) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import Field
 
 from shared.config import BoundEndpoint, ServiceConfig
+from shared.endpoints import is_loopback, own_address, split_endpoint
 
 
 class ControlConfig(ServiceConfig):
@@ -16,9 +17,17 @@ class ControlConfig(ServiceConfig):
     """Where control takes commands."""
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
     """Where control publishes events."""
-    max_sessions: Annotated[int, Field(ge=1, le=2000)] = 64
+    max_sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 64
     """Sessions that may be open at once; of one key, three quarters of them."""
+    max_load: Annotated[float, Field(ge=0.1, le=1000)] = 0.8
+    """Share of a worker's time that sessions may take; the rest is for those that move."""
     idle_limit_s: Annotated[float, Field(ge=1, le=86400)] = 60.0
     """Seconds without audio after which a session is closed."""
-    lost_after_s: Annotated[float, Field(ge=1, le=3600)] = 3.0
+    lost_after_s: Annotated[float, Field(ge=0.5, le=3600)] = 0.9
     """Seconds without heartbeat after which a service counts as lost."""
+
+    @property
+    def own_host(self) -> str:
+        """The host at which all others find control, so that its events are found there, too."""
+        host, _ = split_endpoint(self.control, "control")
+        return own_address() if is_loopback(host) else host

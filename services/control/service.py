@@ -3,33 +3,37 @@
 Li et al. 2011, section 2: the control module initialises the others, passes messages between them
 and keeps them in step. Audio, phones and FAPs never pass through it.
 
+A control that starts again asks nobody: services tell it the sessions that they serve.
+
 Reacts to: open-session, close-session, flush-session, choose-lips, express,
-choose-expressiveness, status-request (clients), heartbeat, done, speech, recorded, error
-(services).
+choose-expressiveness, add-shapes, status-request (clients), heartbeat, done, start-session, speech,
+recorded, error (services).
 Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
-allowed-keys, start-session, stop-session, flush-now, use-lips, express, choose-expressiveness
-(services), event, session-moved (subscribers).
+allowed-keys, start-session, stop-session, flush-now, use-lips, express, choose-expressiveness,
+add-shapes (services), event, session-moved (subscribers).
 """
 
 from __future__ import annotations
 
+import heapq
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
 from services.control.config import ControlConfig
-from services.control.registry import PROVIDERS, Refusal, Registry
+from services.control.registry import PROVIDERS, Refusal, Registry, ServiceRecord
 from services.control.sessions import SessionRecord, Sessions
 from shared.bus import COMMANDS
 from shared.clock import now_ns
-from shared.endpoints import reachable, split_endpoint, with_key
+from shared.endpoints import split_endpoint, with_key
 from shared.errors import UserError
 from shared.keys import NOBODY, Peer
 from shared.logs import LOG
 from shared.service import Handler, Service
+from shared.wire.codec import encoded_size
 from shared.wire.control import (
     AllowedKey,
     AllowedKeys,
@@ -40,6 +44,8 @@ from shared.wire.control import (
     HeartbeatSeen,
     Recorded,
     ServiceState,
+    SessionState,
+    StartSession,
     StatusReport,
     StatusRequest,
     StopSession,
@@ -47,6 +53,7 @@ from shared.wire.control import (
 )
 from shared.wire.message import Message
 from shared.wire.session import (
+    AddShapes,
     ChooseExpressiveness,
     ChooseLips,
     CloseSession,
@@ -56,6 +63,7 @@ from shared.wire.session import (
     Express,
     FlushSession,
     OpenSession,
+    SessionMoved,
 )
 from shared.wire.speech import Speech
 from shared.zap import Zap
@@ -63,8 +71,14 @@ from shared.zap import Zap
 STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session
 REPLACE_LIMIT_S = 20.0  # for another worker to take the place of a lost one
-EXCUSED_S = 0.5  # without a tick: then control was busy or stopped, not the others
+EXCUSED_S = 0.1  # without a tick: then control was busy or stopped, not the others
 MAX_ANSWERS = 1000  # kept for repeated requests
+MOVED_AGAIN_S = (1.0, 2.0, 4.0, 8.0)  # when a client is told again: its connection may have broken
+TAKEOVER_S = 5.0  # in which a control that has just started learns what runs already
+MAX_DEFERRED = 1000  # requests that wait for that
+PAGE_BYTES = 512 * 1024  # of a status report, whose largest state leaves it within a message
+FIRST_SESSION = 2**32  # number of the first session in the pages of a status report
+MAY_BE_EARLY = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)
 Request = (
     OpenSession
     | CloseSession
@@ -72,6 +86,7 @@ Request = (
     | ChooseLips
     | Express
     | ChooseExpressiveness
+    | AddShapes
     | StatusRequest
 )
 
@@ -83,19 +98,25 @@ class ControlService(Service):
     role = "control"
 
     def __init__(self, config: ControlConfig) -> None:
-        super().__init__(config, control=False)
-        self._registry = Registry(config.lost_after_s)
+        super().__init__(config, control=False, extra_connections=config.max_sessions)
+        self._registry = Registry(config.lost_after_s, config.max_load)
         self._sessions = Sessions(self._registry, config.max_sessions)
         self._idle_limit_s = config.idle_limit_s
         self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
         self._num_events = 0
         self._ticked_s = time.monotonic()
+        self._to_tell_again: list[tuple[float, str, SessionMoved]] = []  # a heap, by time
+        self._takeover_end_s = self._ticked_s + TAKEOVER_S
+        self._takes_over = True  # what an earlier control placed
+        self._returning: dict[str, StartSession] = {}  # sessions that miss a service still
+        self._observed: dict[str, Collection[str]] = {}  # sessions that observers follow meanwhile
+        self._deferred: list[tuple[Handler, Request, Peer]] = []
         self._told_version = (0, 0)  # of the allowed keys
         self._commands = self.bus.bind_router(config.commands, "control.commands", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         own = self.key.public if self.key else ""
         self.endpoints = {
-            name: with_key(reachable(socket.endpoint, config.advertise, f"control.{name}"), own)
+            name: with_key(config.reachable(socket.endpoint), own)
             for name, socket in (("commands", self._commands), ("events", self._events))
         }
         self.register(
@@ -105,11 +126,15 @@ class ControlService(Service):
                 CloseSession: self._request_handler(self._close, "client"),
                 FlushSession: self._request_handler(self._flush, "client"),
                 ChooseLips: self._request_handler(self._choose_lips, "client"),
-                Express: self._request_handler(self._pass_on, "client", "operator"),
-                ChooseExpressiveness: self._request_handler(self._pass_on, "client", "operator"),
+                Express: self._request_handler(self._express, "client", "operator"),
+                ChooseExpressiveness: self._request_handler(
+                    self._choose_expressiveness, "client", "operator"
+                ),
+                AddShapes: self._request_handler(self._add_shapes, "client", "operator"),
                 StatusRequest: self._request_handler(self._status),
                 Heartbeat: self._on_heartbeat,
                 Done: self._service_handler(self._on_started),
+                StartSession: self._service_handler(self._on_served),
                 Speech: self._service_handler(self._on_speech),
                 Recorded: self._service_handler(self._on_recorded),
                 Error: self._service_handler(self._on_service_error),
@@ -121,6 +146,10 @@ class ControlService(Service):
         """Register control itself like any other service."""
         self._registry.add(heartbeat, NOBODY, time.monotonic())
 
+    def gauges(self) -> dict[str, float]:
+        """Return how many sessions and services there are."""
+        return {"sessions": len(self._sessions), "services": len(self._registry)}
+
     def on_tick(self, now_s: float) -> None:
         """Look for services without heartbeat, sessions that hang, and keys that changed."""
         pause_s, self._ticked_s = now_s - self._ticked_s, now_s
@@ -128,12 +157,20 @@ class ControlService(Service):
             self._registry.excuse(pause_s)
         if self.bus.zap is not None:
             self._tell_new_keys(self.bus.zap)
+        if self._takes_over and now_s > self._takeover_end_s:
+            self._end_takeover()
+        for connection in self._commands.ended():
+            if instance := self._registry.instance_at(connection):
+                self._service_lost(instance, "its connection closed")
         for instance in self._registry.silent(now_s):
             self._service_lost(instance, "no heartbeat")
-        for record in self._sessions:
-            lost = self._sessions.lost_workers(record)
-            if lost and now_s - record.started_s > REPLACE_LIMIT_S:
-                self._end(record, f"{', '.join(lost)} is lost and no other took its place")
+        while self._to_tell_again and self._to_tell_again[0][0] <= now_s:
+            self._tell_again(heapq.heappop(self._to_tell_again)[2])
+        for record in self._sessions.unsettled():
+            if record.lost:
+                if now_s - record.started_s > REPLACE_LIMIT_S:
+                    lost = ", ".join(sorted(record.lost))
+                    self._end(record, f"{lost} is lost and no other took its place")
             elif record.waiting_for and now_s - record.started_s > START_LIMIT_S:
                 self._give_up_waiting(record)
             else:
@@ -150,7 +187,7 @@ class ControlService(Service):
         zap.refresh()
         if zap.version != self._told_version:
             self._told_version = zap.version
-            for _, record in self._registry.sorted():
+            for record in self._registry.sorted():
                 if record.heartbeat.role == "worker":
                     self._tell_keys(zap, record.peer)
 
@@ -181,12 +218,15 @@ class ControlService(Service):
                 self._check_role(sender, *roles)
                 reply = handle(message, sender)
             except Refusal as refusal:
+                if refusal.code in MAY_BE_EARLY and self._defer(on_request, message, sender):
+                    return
                 self.metrics.count(f"refused_{refusal.code}")
                 reply = Error(
                     session=message.session,
                     code=refusal.code,
                     text=refusal.text,
                     request=message.request,
+                    retry_after_s=refusal.retry_after_s,
                 )
             if reply is not None:
                 self._reply(sender, message.request, reply)
@@ -209,13 +249,16 @@ class ControlService(Service):
                 self._answers.popitem(last=False)
         self._commands.send(reply, to=sender)
 
-    def _open(self, message: OpenSession, sender: Peer) -> None:
-        starting = (record for record in self._sessions if not record.announced)
-        if any((record.client, record.opening) == (sender, message) for record in starting):
-            return  # the same request again while the services start
+    def _open(self, message: OpenSession, sender: Peer) -> Message | None:
+        known = self._sessions.opened_by(message, sender)
+        if known is not None and known.restored:
+            return self._sessions.opened_message(known, self.endpoints["events"])
+        if known is not None and not known.announced:
+            return None  # the same request again while the services start
         record = self._sessions.open(message, sender, time.monotonic())
         LOG.info("session opened", extra={"session": record.name})
-        self._start(record)
+        self._start(record, record.waiting_for)
+        return None
 
     def _close(self, message: CloseSession, _sender: Peer) -> Message:
         self._end(self._sessions.owned(message.session, message.token), "closed by its client")
@@ -234,28 +277,69 @@ class ControlService(Service):
         self._send_to_participants(record, use)
         return Done(session=message.session, request=message.request)
 
-    def _pass_on(self, message: Express | ChooseExpressiveness, _sender: Peer) -> Message:
-        self._send_to_participants(self._sessions.find(message.session), message)
+    def _express(self, message: Express, _sender: Peer) -> Message:
+        record = self._sessions.find(message.session)
+        record.expressions = message.expressions
+        record.expressions_end_s = time.monotonic() + message.hold_s
+        self._send_to_participants(record, message)
+        return Done(session=message.session, request=message.request)
+
+    def _choose_expressiveness(self, message: ChooseExpressiveness, _sender: Peer) -> Message:
+        record = self._sessions.find(message.session)
+        record.expressiveness = message.expressiveness
+        self._send_to_participants(record, message)
+        return Done(session=message.session, request=message.request)
+
+    def _add_shapes(self, message: AddShapes, _sender: Peer) -> Message:
+        record = self._sessions.find(message.session)
+        record.shapes = list(dict.fromkeys([*record.shapes, *message.shapes]))
+        self._send_to_participants(record, replace(message, shapes=record.shapes))
         return Done(session=message.session, request=message.request)
 
     def _status(self, message: StatusRequest, _sender: Peer) -> Message:
+        """Return one page; sessions are numbered from ``FIRST_SESSION`` on, after the services."""
         now_s = time.monotonic()
-        return StatusReport(
-            request=message.request,
-            services=[
-                ServiceState(
-                    service=record.heartbeat.service,
-                    instance=instance,
-                    role=record.heartbeat.role,
-                    state=record.heartbeat.state,
-                    age_s=now_s - record.received_s,
-                    clock_offset_ms=record.heartbeat.metrics.get("clock_offset_ms", 0.0),
-                    endpoints=record.heartbeat.endpoints,
-                    metrics=record.heartbeat.metrics,
+        if message.session:
+            record = self._sessions.find(message.session)
+            instances = self._sessions.participants(record)
+            return StatusReport(
+                request=message.request,
+                services=[self._service_state(self._registry[each], now_s) for each in instances],
+                sessions=[self._sessions.state(record, now_s)],
+            )
+        services: list[ServiceState] = []
+        sessions: list[SessionState] = []
+        num_bytes = 0
+        for number, each in self._status_from(message.after):
+            if isinstance(each, SessionRecord):
+                sessions.append(self._sessions.state(each, now_s))
+                num_bytes += encoded_size(sessions[-1])
+            else:
+                services.append(self._service_state(each, now_s))
+                num_bytes += encoded_size(services[-1])
+            if num_bytes > PAGE_BYTES:
+                return StatusReport(
+                    request=message.request, services=services, sessions=sessions, next=number + 1
                 )
-                for instance, record in self._registry.sorted()
-            ],
-            sessions=[self._sessions.state(record, now_s) for record in self._sessions],
+        return StatusReport(request=message.request, services=services, sessions=sessions)
+
+    def _status_from(self, number: int) -> Iterator[tuple[int, ServiceRecord | SessionRecord]]:
+        if number < FIRST_SESSION:
+            yield from enumerate(self._registry.sorted()[number:], number)
+        for record in self._sessions.since(number - FIRST_SESSION):
+            yield FIRST_SESSION + record.number, record
+
+    def _service_state(self, record: ServiceRecord, now_s: float) -> ServiceState:
+        heartbeat = record.heartbeat
+        return ServiceState(
+            service=heartbeat.service,
+            instance=heartbeat.instance,
+            role=heartbeat.role,
+            state=record.state,
+            age_s=self._registry.age_s(heartbeat.instance, now_s),
+            clock_offset_ms=record.metrics.get("clock_offset_ms", 0.0),
+            endpoints=heartbeat.endpoints,
+            metrics=dict(record.metrics),
         )
 
     # --- from the services ---------------------------------------------------------------------
@@ -268,7 +352,8 @@ class ControlService(Service):
             if instance:
                 handle(message, instance)
             else:
-                self.warn("no-service", f"dropped a {message.kind} message: from no service")
+                text = f"dropped a {message.kind} message: from no service"
+                self.warn("no-service", text, message.session)
 
         return on_message
 
@@ -277,48 +362,74 @@ class ControlService(Service):
         try:
             self._check_role(sender, f"service:{heartbeat.service}")
             self._registry.check(heartbeat, sender)
-            if heartbeat.role == "worker":
-                heartbeat = replace(heartbeat, endpoints=_keyed_endpoints(heartbeat, sender.key))
+            is_other = self._registry.differs(heartbeat, sender)
+            if is_other or heartbeat.instance not in self._registry:
+                _check_endpoints(heartbeat)
         except Refusal as refusal:
             self.warn(refusal.code, f"{heartbeat.instance}: {refusal.text}")
             self._commands.send(Error(code=refusal.code, text=refusal.text), to=sender)
             return
-        if self._registry.differs(heartbeat):
+        if is_other:
             self._service_lost(heartbeat.instance, "it started again")
         is_new = heartbeat.instance not in self._registry
         if is_new and heartbeat.state == "draining":
+            for session in heartbeat.sessions:  # those that others have taken over
+                self._check_session(session, heartbeat, sender)
             return
+        displaced = self._registry.displaced_by(heartbeat, sender) if is_new else ""
         self._registry.add(heartbeat, sender, time.monotonic())
-        self._commands.send(
-            HeartbeatSeen(sent_ns=heartbeat.sent_ns, received_ns=received_ns, replied_ns=now_ns()),
-            to=sender,
-        )
+        if self._takes_over and heartbeat.role == "observer":
+            self._observed[heartbeat.instance] = heartbeat.sessions.keys()
         if is_new:
             if self.bus.zap is not None and heartbeat.role == "worker":
                 self._tell_keys(self.bus.zap, sender)
-            self._on_new_service(heartbeat)
+            is_back = self._registry.is_back(heartbeat.instance, sender) and not is_other
+            self._on_new_service(heartbeat, sender, displaced, is_back=is_back)
         for session in heartbeat.sessions:
             self._check_session(session, heartbeat, sender)
+        self._commands.send(  # last: a service that stood still has learnt by then what changed
+            HeartbeatSeen(
+                sent_ns=heartbeat.sent_ns,
+                received_ns=received_ns,
+                replied_ns=now_ns(),
+                control=self.instance,
+            ),
+            to=sender,
+        )
         if heartbeat.state == "draining":
             self._service_lost(heartbeat.instance, STOPPED)
 
-    def _on_new_service(self, heartbeat: Heartbeat) -> None:
-        """Give a new service the sessions that miss a worker, or those that it observes."""
+    def _on_new_service(
+        self, heartbeat: Heartbeat, sender: Peer, displaced: str, *, is_back: bool
+    ) -> None:
+        """Give a new service the sessions that miss a worker, or those that it observes.
+
+        One that was taken for lost goes on with its own, as if nothing had been.
+        """
         self._publish(EventName.SERVICE_READY, detail=f"{heartbeat.service} {heartbeat.instance}")
-        for instance in self._registry.displaced_by(heartbeat):
-            self._service_lost(instance, f"{heartbeat.instance} took its place")
-        for record in self._sessions:
-            if self._sessions.lost_workers(record):
+        if displaced:
+            self._service_lost(displaced, f"{heartbeat.instance} took its place")
+        untold = []
+        if is_back:
+            untold = self._sessions.take_back(heartbeat.instance)
+        self._restore_returning()
+        for record in self._sessions.unsettled():
+            if record.lost:
                 self._replace(record)
-            elif heartbeat.role == "observer":
-                start = self._sessions.start_message(record)
-                self._commands.send(start, to=self._registry[heartbeat.instance].peer)
+        if heartbeat.role == "observer":
+            untold = [each for each in self._sessions if each.name not in heartbeat.sessions]
+        for record in untold:
+            self._commands.send(self._sessions.start_message(record, time.monotonic()), to=sender)
 
     def _check_session(self, session: str, heartbeat: Heartbeat, sender: Peer) -> None:
         """Stop a session that a service should not serve, and end one without input."""
         record = self._sessions.get(session)
-        if record is None or heartbeat.instance not in self._sessions.participants(record):
-            # of an earlier run of control, just closed, or served by another now
+        if record is None and self._takes_over:
+            return
+        if record is not None and heartbeat.instance in record.lost:
+            return  # nobody else serves it yet
+        if record is None or not self._sessions.takes_part(record, heartbeat.instance):
+            # just closed, or served by another now
             self._commands.send(StopSession(session=session), to=sender)
         elif self._sessions.take_input(record, heartbeat) > self._idle_limit_s:
             self._end(record, f"no audio for {self._idle_limit_s:g} s")
@@ -326,7 +437,7 @@ class ControlService(Service):
     def _on_started(self, done: Done, instance: str) -> None:
         record = self._sessions.get(done.session)
         if record is not None and done.request == record.start_request:
-            record.waiting_for.discard(instance)
+            self._start(record, self._sessions.take_started(record, instance, done.media_time))
             self._announce_if_started(record)
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
@@ -343,10 +454,61 @@ class ControlService(Service):
     def _on_service_error(self, error: Error, _instance: str) -> None:
         self._publish(EventName.ERROR, error.session, detail=f"{error.code}: {error.text}")
 
+    # --- sessions of an earlier control --------------------------------------------------------
+
+    def _defer(self, handle: Handler, message: Request, sender: Peer) -> bool:
+        """Keep a request about what is not known yet; return False if there is no point."""
+        if not self._takes_over or len(self._deferred) >= MAX_DEFERRED:
+            return False
+        self._deferred.append((handle, message, sender))
+        return True
+
+    def _handle_deferred(self) -> None:
+        deferred, self._deferred = self._deferred, []
+        for handle, message, sender in deferred:
+            handle(message, sender)
+
+    def _on_served(self, start: StartSession, instance: str) -> None:
+        """Take over a session that a recognizer serves since before this control started."""
+        own = self._registry[instance].heartbeat.endpoints.get("audio")
+        if not self._takes_over or own is None or start.endpoints.get("audio") != own:
+            self.warn("no-takeover", f"{instance} may not bring this session", start.session)
+        elif self._sessions.get(start.session) is None:
+            self._returning[start.session] = start
+            self._restore_returning()
+
+    def _restore_returning(self) -> None:
+        """Take over the sessions whose workers all run, at the end of the time all others, too."""
+        for name, start in list(self._returning.items()):
+            is_complete = all(self._registry.provider(*each) for each in start.endpoints.items())
+            if is_complete or not self._takes_over:
+                del self._returning[name]
+                self._restore(start)
+        self._handle_deferred()
+
+    def _restore(self, start: StartSession) -> None:
+        record = self._sessions.restore(start, time.monotonic())
+        LOG.info("session taken over", extra={"session": record.name})
+        uninformed = {
+            instance
+            for instance in self._registry.observers()
+            if record.name not in self._observed.get(instance, ())
+        }
+        self._start(record, record.waiting_for | uninformed)  # workers: if some knew a later epoch
+        if record.lost:
+            self._replace(record)
+
+    def _end_takeover(self) -> None:
+        self._takes_over = False
+        self._restore_returning()
+        self._observed.clear()
+
     # --- sessions ------------------------------------------------------------------------------
 
-    def _start(self, record: SessionRecord) -> None:
-        self._send_to_participants(record, self._sessions.start_message(record))
+    def _start(self, record: SessionRecord, instances: set[str]) -> None:
+        start = self._sessions.start_message(record, time.monotonic())
+        for instance in instances:
+            self._commands.send(start, to=self._registry[instance].peer)
 
     def _send_to_participants(self, record: SessionRecord, message: Message) -> None:
         for instance in self._sessions.participants(record):
@@ -358,7 +520,7 @@ class ControlService(Service):
         A new session waits for the observers, so that they miss nothing of it. One that moved goes
         on at once: its client still has audio to send again.
         """
-        if self._sessions.lost_workers(record):
+        if record.lost:
             return
         if not record.announced and not record.waiting_for:
             record.announced, record.moved = True, False
@@ -371,6 +533,15 @@ class ControlService(Service):
             self._commands.send(moved, to=record.client)
             self._events.send(moved)
             self._publish(EventName.SESSION_MOVED, record.name)
+            now_s = time.monotonic()
+            for delay_s in MOVED_AGAIN_S:
+                heapq.heappush(self._to_tell_again, (now_s + delay_s, record.name, moved))
+
+    def _tell_again(self, moved: SessionMoved) -> None:
+        """Tell a client again where its session is, unless that has changed."""
+        record = self._sessions.get(moved.session)
+        if record is not None and record.epoch == moved.epoch:
+            self._commands.send(moved, to=record.client)
 
     def _give_up_waiting(self, record: SessionRecord) -> None:
         """Go on without the observers that did not start a session, but not without a worker."""
@@ -391,7 +562,7 @@ class ControlService(Service):
 
     def _replace(self, record: SessionRecord) -> None:
         if self._sessions.replace(record, time.monotonic()):
-            self._start(record)
+            self._start(record, record.waiting_for - record.held_back)
 
     def _service_lost(self, instance: str, reason: str) -> None:
         self._registry.remove(instance)
@@ -399,15 +570,12 @@ class ControlService(Service):
             logging.INFO if reason == STOPPED else logging.WARNING, "lost %s: %s", instance, reason
         )
         self._publish(EventName.SERVICE_LOST, detail=f"{instance}: {reason}")
-        for record in self._sessions:
-            record.waiting_for.discard(instance)
-            if instance in record.workers.values():
-                record.started_s = time.monotonic()
-                self._replace(record)
+        for record in self._sessions.lose(instance, time.monotonic()):
+            self._replace(record)
 
     def _end(self, record: SessionRecord, reason: str) -> None:
         self._send_to_participants(record, StopSession(session=record.name, epoch=record.epoch))
-        self._sessions.remove(record)
+        self._sessions.remove(record, time.monotonic())
         self._publish(EventName.SESSION_CLOSED, record.name, detail=reason)
         LOG.info("session closed: %s", reason, extra={"session": record.name})
 
@@ -415,6 +583,7 @@ class ControlService(Service):
         self, name: EventName, session: str = "", *, detail: str = "", media_time: int = 0
     ) -> None:
         self._num_events += 1
+        self.metrics.count(f"event_{name}")
         self._events.send(
             Event(
                 session=session,
@@ -432,14 +601,16 @@ def _asker(sender: Peer, request: str) -> tuple[Peer, int, str]:
     return sender, sender.connection, request
 
 
-def _keyed_endpoints(heartbeat: Heartbeat, key: str) -> dict[str, str]:
-    """Return what a worker provides with its key, once others may connect there.
+def _check_endpoints(heartbeat: Heartbeat) -> None:
+    """Check that a worker may provide what it does, and that others can connect there.
 
     Raises
     ------
     Refusal
         If an endpoint is none, or another kind of service provides it.
     """
+    if heartbeat.role != "worker":
+        return
     if not heartbeat.endpoints:
         raise Refusal(ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides")
     for name, endpoint in heartbeat.endpoints.items():
@@ -453,4 +624,3 @@ def _keyed_endpoints(heartbeat: Heartbeat, key: str) -> dict[str, str]:
         if "*" in (host, port):
             text = f"{name}: {endpoint!r} names no host or port to connect to"
             raise Refusal(ErrorCode.BAD_MESSAGE, text)
-    return {name: with_key(each, key) for name, each in heartbeat.endpoints.items()}

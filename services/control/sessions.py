@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 import secrets
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import count
+from operator import attrgetter
 
 from services.control.registry import Refusal, Registry
+from shared.face.shapes import SHAPE_SETS
 from shared.keys import Peer
 from shared.wire.control import Heartbeat, SessionState, StartSession
 from shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
@@ -21,40 +25,74 @@ class SessionRecord:
     """One session."""
 
     name: str
+    number: int  # grows from session to session
     token: str
     opening: OpenSession
     client: Peer  # on control's socket
     opened_s: float
     started_s: float  # when its services were last told to start it, or one was lost
-    workers: dict[str, str]  # instance by endpoint
+    workers: dict[str, str]  # instance by endpoint; one that is lost, too
     endpoints: dict[str, str]  # address by endpoint
     language: str  # of the phones; empty if no worker states one
     delay_ms: float  # how much later than its sound a FAP frame is made
     lips: str  # the lip model that moves the mouth; empty if no worker states one
     waiting_for: set[str]  # instances that have not started it yet
+    held_back: set[str] = field(default_factory=set)  # of them, those to be told after the others
+    lost: set[str] = field(default_factory=set)  # of its workers
     epoch: int = 1  # counts its placements
     announced: bool = False  # the client was told that it is open
     moved: bool = False  # placed again, and the client was not told yet
+    restored: bool = False  # it was opened at an earlier control
     speaking: bool = False
-    next_sequence: int = 1  # of the first audio message that no recognizer is known to have
+    expressiveness: float = 0.0  # that was chosen; 0: none was
+    expressions: dict[str, float] = field(default_factory=dict)  # that the face shows
+    expressions_end_s: float = 0.0  # when these begin to fade
+    shapes: list[str] = field(default_factory=list)  # sets that are published
+    next_sequence: int = 1  # of the first audio message that a new recognizer would need
     resume_sequence: int = 0  # where a new recognizer begins; 0: it is the old one
+    media_time: int = 0  # up to where its phones are known to be final
 
     @property
     def start_request(self) -> str:
         """The request that its services confirm when they have started it."""
         return f"start-{self.name}-{self.epoch}"
 
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing is due for it before something happens."""
+        return self.announced and not (self.moved or self.waiting_for or self.lost)
+
 
 class Sessions:
-    """The open sessions, by name."""
+    """The open sessions, by name; indexed, so that only few of them are ever walked over."""
 
     def __init__(self, registry: Registry, max_sessions: int) -> None:
         self._registry = registry
         self._max_sessions = max_sessions
         self._records: dict[str, SessionRecord] = {}
+        self._numbers = count()
+        self._unsettled: dict[str, SessionRecord] = {}
+        self._of_worker: dict[str, dict[str, SessionRecord]] = {}
+        self._num_of_key: Counter[str] = Counter()
+        self._of_request: dict[tuple[Peer, str], SessionRecord] = {}
 
     def __iter__(self) -> Iterator[SessionRecord]:
         return iter(list(self._records.values()))
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def since(self, number: int) -> list[SessionRecord]:
+        """Return the sessions from a number on; those that open later have greater ones."""
+        records = list(self._records.values())
+        return records[bisect_left(records, number, key=attrgetter("number")) :]
+
+    def unsettled(self) -> list[SessionRecord]:
+        """Return the sessions that wait for a service, or whose client must be told something."""
+        for record in list(self._unsettled.values()):
+            if record.is_settled:
+                del self._unsettled[record.name]
+        return list(self._unsettled.values())
 
     def get(self, name: str) -> SessionRecord | None:
         """Return a session, None if there is none of that name."""
@@ -78,15 +116,16 @@ class Sessions:
             raise Refusal(
                 ErrorCode.TOO_MANY_SESSIONS, f"{self._max_sessions} sessions are open already"
             )
-        of_key = sum(record.client.key == client.key for record in self._records.values())
+        of_key = self._num_of_key[client.key]
         if client.key and of_key >= math.ceil(KEY_SHARE * self._max_sessions):
             raise Refusal(
                 ErrorCode.TOO_MANY_SESSIONS,
                 f"{of_key} sessions of your key are open already; the rest is for other keys",
             )
-        workers = self._registry.place({}, self._load())
+        workers = self._registry.place({}, now_s, may_refuse=opening.paced)
         record = SessionRecord(
             name=name,
+            number=next(self._numbers),
             token=secrets.token_urlsafe(24),
             opening=opening,
             client=client,
@@ -98,13 +137,69 @@ class Sessions:
             delay_ms=self._registry.delay_ms(workers.values()),
             lips=self._registry.lips(workers.values()),
             waiting_for={*workers.values()} | self._registry.observers(),
+            shapes=list(dict.fromkeys(opening.shapes)),
         )
-        self._records[name] = record
+        self._add(record, now_s)
         return record
 
-    def remove(self, record: SessionRecord) -> None:
+    def restore(self, start: StartSession, now_s: float) -> SessionRecord:
+        """Take a session over that was placed by an earlier control.
+
+        Its workers are those at its endpoints; where there is none, it is lost.
+        """
+        found = {name: self._registry.provider(name, at) for name, at in start.endpoints.items()}
+        workers = {name: instance or f"lost-{name}" for name, instance in found.items()}
+        running = {*found.values()} - {""}
+        record = SessionRecord(
+            name=start.session,
+            number=next(self._numbers),
+            token=start.token,
+            opening=OpenSession(
+                session=start.session,
+                request=start.client_request,
+                encoding=start.encoding,
+                sample_rate_hz=start.sample_rate_hz,
+                num_channels=start.num_channels,
+                record=start.record,
+                paced=start.paced,
+                voice=start.voice,
+                shapes=start.shapes,
+            ),
+            client=Peer(start.client, start.client_key),
+            opened_s=now_s,
+            started_s=now_s,
+            workers=workers,
+            endpoints=start.endpoints,
+            language=start.language,
+            delay_ms=start.delay_ms,
+            lips=start.lips,
+            waiting_for=running,
+            lost={*workers.values()} - running,
+            epoch=start.epoch,
+            announced=True,
+            restored=True,
+            expressiveness=start.expressiveness,
+            expressions=start.expressions,
+            expressions_end_s=now_s + start.hold_s,
+            shapes=start.shapes,
+            media_time=start.media_time,
+        )
+        self._add(record, now_s)
+        return record
+
+    def remove(self, record: SessionRecord, now_s: float) -> None:
         """Forget a session."""
         del self._records[record.name]
+        self._unsettled.pop(record.name, None)
+        self._num_of_key[record.client.key] -= 1
+        self._of_request.pop((record.client, record.opening.request), None)
+        self._set_workers(record, {}, now_s)
+
+    def opened_by(self, opening: OpenSession, client: Peer) -> SessionRecord | None:
+        """Return the session that a client opened by this very request, None if none was."""
+        record = self._of_request.get((client, opening.request))
+        same = record is not None and replace(record.opening, session=opening.session) == opening
+        return record if same else None
 
     def owned(self, session: str, token: str) -> SessionRecord:
         """Return a session whose token is given.
@@ -136,31 +231,75 @@ class Sessions:
 
     def participants(self, record: SessionRecord) -> set[str]:
         """Return the running services that take part: the session's workers and all observers."""
-        workers = {instance for instance in record.workers.values() if instance in self._registry}
-        return workers | self._registry.observers()
+        return ({*record.workers.values()} - record.lost) | self._registry.observers()
 
-    def lost_workers(self, record: SessionRecord) -> list[str]:
-        """Return the session's workers that do not run any more."""
-        return sorted({i for i in record.workers.values() if i not in self._registry})
+    def takes_part(self, record: SessionRecord, instance: str) -> bool:
+        """Return whether a service is one of a session's participants."""
+        return self._registry.is_observer(instance) or (
+            instance in record.workers.values() and instance not in record.lost
+        )
+
+    def lose(self, instance: str, now_s: float) -> list[SessionRecord]:
+        """Note that a service is lost; return the sessions that miss a worker now."""
+        for record in self._unsettled.values():
+            record.waiting_for.discard(instance)
+        records = list(self._of_worker.get(instance, {}).values())
+        for record in records:
+            record.lost.add(instance)
+            record.started_s = now_s
+            self._unsettled[record.name] = record
+        return records
+
+    def take_back(self, instance: str) -> list[SessionRecord]:
+        """Note that a lost worker was none; return the sessions that it may not have been told."""
+        records = [
+            record
+            for record in self._of_worker.get(instance, {}).values()
+            if instance in record.lost
+        ]
+        for record in records:
+            record.lost.remove(instance)
+        untold = [record for record in records if record.moved or not record.announced]
+        for record in untold:
+            record.waiting_for.add(instance)
+        return untold
 
     def take_input(self, record: SessionRecord, heartbeat: Heartbeat) -> float:
         """Note how far a service is with the session's input; return for how long it had none."""
         state = heartbeat.sessions[record.name]
+        record.media_time = max(record.media_time, state.media_time)
         if heartbeat.instance != record.workers["audio"]:
             return 0.0
         record.next_sequence = max(record.next_sequence, state.sequence + 1)
         return state.idle_s
 
+    def take_started(self, record: SessionRecord, instance: str, media_time: int) -> set[str]:
+        """Note that a service serves a session; return those that can be told now, after it."""
+        record.waiting_for.discard(instance)
+        record.media_time = max(record.media_time, media_time)
+        if record.waiting_for & {*record.workers.values()} > record.held_back:
+            return set()
+        held_back, record.held_back = record.held_back, set()
+        return held_back
+
     def replace(self, record: SessionRecord, now_s: float) -> bool:
-        """Place a session again after workers were lost; return success."""
-        kept = {name: i for name, i in record.workers.items() if i in self._registry}
+        """Place a session again after workers were lost; return success.
+
+        A new recognizer beside a synthesizer that stays is told after that one, which knows up to
+        where there are phones.
+        """
+        kept = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
-            workers = self._registry.place(kept, self._load(), record.language)
+            workers = self._registry.place(kept, now_s, record.language)
         except Refusal:
             return False
-        if workers["audio"] != record.workers["audio"]:
+        record.held_back = set()
+        if "audio" not in kept:
             record.resume_sequence = record.next_sequence
-        record.workers = workers
+            if "faps" in kept:
+                record.held_back = {workers["audio"]}
+        record.lost = set()
+        self._set_workers(record, workers, now_s)
         record.endpoints = self._registry.endpoints(workers)
         record.delay_ms = self._registry.delay_ms(workers.values())
         record.epoch += 1
@@ -171,8 +310,9 @@ class Sessions:
 
     # --- messages ------------------------------------------------------------------------------
 
-    def start_message(self, record: SessionRecord) -> StartSession:
+    def start_message(self, record: SessionRecord, now_s: float) -> StartSession:
         """Return what the services of a session are told."""
+        hold_s = record.expressions_end_s - now_s
         return StartSession(
             session=record.name,
             epoch=record.epoch,
@@ -188,6 +328,14 @@ class Sessions:
             delay_ms=record.delay_ms,
             lips=record.lips,
             voice=record.opening.voice,
+            expressiveness=record.expressiveness,
+            expressions=record.expressions if hold_s > 0 else {},
+            hold_s=max(0.0, hold_s),
+            shapes=record.shapes,
+            client=record.client.address,
+            client_key=record.client.key,
+            client_request=record.opening.request,
+            media_time=record.media_time,
         )
 
     def opened_message(self, record: SessionRecord, events: str) -> SessionOpened:
@@ -200,6 +348,7 @@ class Sessions:
             events=events,
             language=record.language,
             frame_rate_hz=self._registry.frame_rate_hz(record.workers.values()),
+            shapes={name: list(SHAPE_SETS[name].names) for name in record.shapes},
             audio=record.endpoints["audio"],
             phones=record.endpoints["phones"],
             faps=record.endpoints["faps"],
@@ -230,7 +379,24 @@ class Sessions:
 
     # --- inside --------------------------------------------------------------------------------
 
-    def _load(self) -> Counter[str]:
-        return Counter(
-            instance for record in self._records.values() for instance in {*record.workers.values()}
-        )
+    def _add(self, record: SessionRecord, now_s: float) -> None:
+        workers, record.workers = record.workers, {}
+        self._records[record.name] = record
+        self._unsettled[record.name] = record
+        self._num_of_key[record.client.key] += 1
+        self._of_request[record.client, record.opening.request] = record
+        self._set_workers(record, workers, now_s)
+
+    def _set_workers(self, record: SessionRecord, workers: dict[str, str], now_s: float) -> None:
+        before, after = {*record.workers.values()}, {*workers.values()}
+        for instance in before - after:
+            of_worker = self._of_worker[instance]
+            del of_worker[record.name]
+            self._registry.load(instance).leave(now_s, paced=record.opening.paced)
+            if not of_worker:
+                del self._of_worker[instance]
+                self._registry.forget_load(instance)
+        record.workers = workers
+        for instance in after - before:
+            self._of_worker.setdefault(instance, {})[record.name] = record
+            self._registry.load(instance).place(now_s, paced=record.opening.paced)

@@ -126,7 +126,11 @@ class DriverService(Service):
         if start.record:
             handlers[Sound] = self._on_sound
         follower = SessionFollower(
-            self, start.session, handlers, on_complete=lambda: self.session_started(session.start)
+            self,
+            start.session,
+            handlers,
+            live=start.paced,
+            on_complete=lambda: self.session_started(session.start),
         )
         session = _Session(start, follower)
         return session

@@ -12,6 +12,12 @@ from aiohttp.typedefs import Handler, Middleware
 
 from shared.endpoints import is_loopback
 
+_PREFLIGHT = {
+    "Access-Control-Allow-Methods": "GET, POST, DELETE",
+    "Access-Control-Allow-Headers": "Authorization, Content-Type",
+}
+_READABLE = {"Access-Control-Expose-Headers": "Location"}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Access:
@@ -25,15 +31,27 @@ class Access:
     """Origins of other pages that may connect."""
 
     def guard(self, private: Collection[str]) -> Middleware:
-        """Return what refuses requests; paths of ``private`` also need origin and token."""
+        """Return what refuses requests; paths of ``private`` also need origin and token.
+
+        Pages of other origins that may connect can read the answers (CORS).
+        """
 
         @web.middleware
         async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
             self._check_host(request)
-            if request.path in private:
+            if request.method == "OPTIONS":  # what browsers ask first for a page of another origin
                 self._check_origin(request)
-                self._check_token(request)
-            return await handler(request)
+                return web.Response(status=204, headers={**_PREFLIGHT, **self._cors(request)})
+            resource = request.match_info.route.resource
+            pattern = resource.canonical if resource is not None else ""
+            if request.path not in private and pattern not in private:
+                return await handler(request)
+            self._check_origin(request)
+            self._check_token(request)
+            response = await handler(request)
+            if not response.prepared:
+                response.headers.update(self._cors(request))
+            return response
 
         return guard
 
@@ -58,8 +76,15 @@ class Access:
             )
             raise web.HTTPForbidden(text=text)
 
+    def _cors(self, request: web.Request) -> dict[str, str]:
+        origin = request.headers.get("Origin", "")
+        if origin not in self.allowed_origins:
+            return {}
+        return {"Access-Control-Allow-Origin": origin, "Vary": "Origin", **_READABLE}
+
     def _check_token(self, request: web.Request) -> None:
-        given = request.query.get("token", "")
+        bearer = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        given = request.query.get("token", bearer)
         if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
-            text = "the token is missing or wrong; 'kouxing run' shows the whole address\n"
+            text = "the token is missing or wrong; the command that serves the page shows it\n"
             raise web.HTTPForbidden(text=text)

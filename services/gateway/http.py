@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Collection
 from pathlib import Path
 
 from aiohttp import WSCloseCode, web
+from aiohttp.typedefs import Handler
 
 import shared.face
 from services.gateway.access import Access
@@ -107,7 +108,7 @@ def make_application(
         middlewares=[access.guard({route.path for route in routes})],
         client_max_size=MAX_UPLOAD_BYTES,
     )
-    application.on_response_prepare.append(_add_headers)
+    application.on_response_prepare.append(add_headers)
 
     async def serve_page(request: web.Request) -> web.StreamResponse:
         return _page_file(request.match_info.get("name", "index.html"), page_asset, frame_ancestors)
@@ -127,7 +128,15 @@ def make_application(
     return application
 
 
-async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
+def make_socket_application(serve: Handler, access: Access) -> web.Application:
+    """Return an application that is nothing but one WebSocket, under no path."""
+    application = web.Application(middlewares=[access.guard({"/"})])
+    application.router.add_get("/", serve)
+    return application
+
+
+async def add_headers(_request: web.Request, response: web.StreamResponse) -> None:
+    """Forbid browsers what no answer of this server needs."""
     response.headers.update(_HEADERS)
 
 

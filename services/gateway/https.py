@@ -43,17 +43,6 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     return context
 
 
-def own_address() -> str:
-    """Return the address by which this machine's network reaches it, as far as is known."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # RFC 5737; nothing is sent
-            address: str = probe.getsockname()[0]
-        except OSError:
-            return socket.gethostname()
-    return address
-
-
 def own_names() -> tuple[str, str]:
     """Return the names that this machine goes by in its own network."""
     name = socket.gethostname()

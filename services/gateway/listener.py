@@ -29,8 +29,8 @@ _CHECK_S = 1.0
 _RETRY_S = 1.0  # when the system has no descriptor left
 
 
-def bind(host: str, port: int) -> socket.socket:
-    """Return a listening socket.
+def bind(host: str, port: int, key: str = "gateway.port") -> socket.socket:
+    """Return a listening socket; ``key`` is where the port was configured.
 
     Raises
     ------
@@ -43,10 +43,10 @@ def bind(host: str, port: int) -> socket.socket:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             raise UserError(
-                f"gateway.port: {port} is in use on {host}; choose another (0: any free one)"
+                f"{key}: {port} is in use on {host}; choose another (0: any free one)"
             ) from None
         if error.errno == errno.EACCES:
-            raise UserError(f"gateway.port: {port} needs privileges; choose 1024 or more") from None
+            raise UserError(f"{key}: {port} needs privileges; choose 1024 or more") from None
         raise UserError(
             f"gateway.host: cannot listen on {host!r}: {error.strerror}; "
             "use 127.0.0.1, or an address of this host"

@@ -16,7 +16,9 @@ class Kind(Enum):
 
     TEXT = "text"
     FRAME = "frame"
+    SHAPES = "shapes"  # of a frame
     REST = "rest"  # the face while no session moves it
+    REST_SHAPES = "rest shapes"
     SOUND = "sound"
 
 
@@ -50,7 +52,9 @@ class Outbox:
         room = {
             Kind.SOUND: 0,
             Kind.FRAME: NUM_FRAMES_KEPT,
+            Kind.SHAPES: NUM_FRAMES_KEPT,
             Kind.REST: 1,
+            Kind.REST_SHAPES: 1,
             Kind.TEXT: NUM_TEXTS_KEPT,
         }
         kept: deque[tuple[Kind, str | bytes]] = deque()

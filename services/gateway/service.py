@@ -9,33 +9,31 @@ audio-chunk (recognizer).
 from __future__ import annotations
 
 import asyncio
+import ipaddress
+import math
 import secrets
+import socket
+import ssl
 import time
 from collections.abc import Coroutine
 from dataclasses import dataclass, replace
-from pathlib import Path
-from urllib.parse import quote
 
 from aiohttp import web
 
 from services.gateway import http, wire
-from services.gateway.access import Access
 from services.gateway.config import GatewayConfig
-from services.gateway.https import own_address, own_names, tls_context
+from services.gateway.entrance import make_entrance
 from services.gateway.learn_mouth import MouthLearner
 from services.gateway.listener import Listener, bind
-from services.gateway.microphone import (
-    SAMPLE_TEXT,
-    Microphones,
-    OwnSessions,
-    Sample,
-    error_text,
-)
+from services.gateway.microphone import SAMPLE_TEXT, Microphones, Sample
 from services.gateway.outbox import Kind
+from services.gateway.own_sessions import OwnSessions, error_text
+from services.gateway.sending import Sending
 from services.gateway.viewers import Viewers
+from services.gateway.vosk import VoskClients
+from services.gateway.whip import WhipClients
 from shared.bus import Socket
 from shared.clock import to_samples
-from shared.endpoints import WILDCARDS, is_address, is_loopback
 from shared.errors import UserError
 from shared.face.idle_motion import REST_RATE_HZ, RestingFace
 from shared.follower import SessionFollower
@@ -52,7 +50,9 @@ from shared.wire.session import ChooseExpressiveness, Done, Error, Express
 from shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
-STATUS_LOST_S = 3.0
+STATUS_LOST_S = 3.0  # after which it is asked again
+MISSING_S = 2.0  # after which a service that does not run is told: control may be new itself
+CONTROL_MISSING_S = 8.0  # the same of control, which may start again unnoticed
 
 
 @dataclass(slots=True)
@@ -62,6 +62,7 @@ class _Session:
     start: StartSession
     follower: SessionFollower
     syllables: SyllableTrack
+    silence: str  # the phone of a pause
 
 
 class GatewayService(Service):
@@ -77,28 +78,15 @@ class GatewayService(Service):
 
     def __init__(self, config: GatewayConfig) -> None:
         listening = bind(config.host, config.port)
+        vosk_listening = (
+            bind(config.host, config.vosk_port, "gateway.vosk_port") if config.vosk_port else None
+        )
         self._runner = asyncio.Runner()
         self._loop = self._runner.get_loop()
         self._is_waiting = False
         super().__init__(config)
-        host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
-        port = listening.getsockname()[1]
-        token = config.token or (secrets.token_urlsafe(16) if config.certificate else "")
-        names = {host, *own_names(), *config.names.split()}
-        tls = None
-        if config.certificate:
-            tls = tls_context(Path(config.certificate), [*sorted(names), "localhost", "127.0.0.1"])
-        self._listener = Listener(
-            listening,
-            tls,
-            on_refused=lambda address: self.warn(
-                "connections", f"refused a connection of {address}: there are too many"
-            ),
-            on_bad_request=lambda: self.warn("bad-http", "dropped a request: it is no HTTP"),
-        )
-        address = f"{f'[{host}]' if ':' in host else host}:{port}"
-        secret = f"#token={quote(token)}" if token else ""
-        self.endpoints = {"page": f"{'https' if tls else 'http'}://{address}/{secret}"}
+        entrance = make_entrance(config, listening.getsockname()[1])
+        self.endpoints = {"page": entrance.url}
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
         self._viewers = Viewers(
@@ -111,33 +99,46 @@ class GatewayService(Service):
         )
         self._own_sessions = OwnSessions(self.control_endpoint, self.key, self.warn)
         self._microphones = Microphones(self._web_sockets, self._own_sessions)
+        self._vosk_clients = VoskClients(self._web_sockets, self._own_sessions)
+        bound = listening.getsockname()[0]
+        self._whip_clients = WhipClients(
+            self._own_sessions,
+            self._viewers,
+            [] if ipaddress.ip_address(bound).is_unspecified else [bound],
+        )
         self._mouth_learner = MouthLearner()
-        self._routes = (
+        self._sending = Sending(config.senders, config.idle_motion_seed)
+        routes = (
             web.get("/viewer", self._viewers.serve),
             web.get("/microphone", self._microphones.serve),
+            web.get("/vosk", self._vosk_clients.serve),
+            web.post("/whip", self._whip_clients.serve_offer),
+            web.delete("/whip/{name}", self._whip_clients.serve_end),
             web.post("/learn-mouth", self._mouth_learner.serve),
+            web.get("/senders", self._sending.show),
+            web.post("/senders", self._sending.change),
         )
-        self._application = http.make_application(
+        application = http.make_application(
             page_asset=config.head,
-            access=Access(
-                is_own_host=lambda name: (
-                    is_loopback(name)
-                    or name in names
-                    or (not is_loopback(config.host) and is_address(name))
-                ),
-                token=token,
-                allowed_origins=config.allowed_origins.split(),
-            ),
+            access=entrance.access,
             frame_ancestors=config.frame_ancestors,
-            routes=self._routes,
+            routes=routes,
         )
+        paths = {route.path for route in routes}
+        self._listeners = [(self._make_listener(listening, entrance.tls), application, paths)]
+        if vosk_listening is not None:
+            application = http.make_socket_application(self._vosk_clients.serve, entrance.access)
+            self._listeners.append(
+                (self._make_listener(vosk_listening, entrance.tls), application, {"/"})
+            )
         self._tasks: set[asyncio.Task[None]] = set()
         self._sample: tuple[Sample, asyncio.Task[None]] | None = None  # while it is spoken
         self._sample_characters: Characters = ()  # once they are needed
         self._closing: asyncio.Task[None] | None = None
         self._resting_face = RestingFace(config.idle_motion_seed)
         self._rest_due_s = 0.0
-        self._report_s = 0.0
+        self._report_s = -math.inf
+        self._complete_s = -math.inf  # when the newest report came that named all services
         self._request_s = 0.0
         self._commands = self.bus.connect_dealer(self.control_endpoint)
         self.register(
@@ -145,7 +146,9 @@ class GatewayService(Service):
             {
                 StatusReport: lambda report, _: self._on_report(report),
                 Done: lambda _message, _sender: None,
-                Error: lambda error, _: self.warn(error.code, f"control says: {error.text}"),
+                Error: lambda error, _: self.warn(
+                    error.code, f"control says: {error.text}", error.session
+                ),
             },
         )
 
@@ -153,8 +156,8 @@ class GatewayService(Service):
 
     def on_start(self) -> None:
         """Serve HTTP."""
-        start = self._listener.start(self._application, {route.path for route in self._routes})
-        self._loop.run_until_complete(start)
+        for listener, application, unlimited in self._listeners:
+            self._loop.run_until_complete(listener.start(application, unlimited))
 
     def wait(self, timeout_s: float) -> list[Socket]:
         """Run HTTP until messages arrive or the time is over."""
@@ -180,16 +183,30 @@ class GatewayService(Service):
         """Close every browser's connection; the last frames of their microphones still come."""
         if self._closing is None:
             self._closing = self._begin(self._web_sockets.close_all())
+            self._begin(self._whip_clients.close_all())
             self._mouth_learner.close()
             if self._sample is not None:
                 self._sample[1].cancel()
         is_busy = self._mouth_learner.is_learning or self._sample is not None
-        return self._closing.done() and not is_busy and not self._web_sockets
+        is_connected = self._web_sockets or self._whip_clients
+        return self._closing.done() and not is_busy and not is_connected
 
     def on_stopped(self) -> None:
-        """End HTTP."""
-        self._loop.run_until_complete(self._listener.stop())
+        """End HTTP, and what is sent to other programs."""
+        self._sending.close()
+        for listener, *_ in self._listeners:
+            self._loop.run_until_complete(listener.stop())
         self._runner.close()
+
+    def _make_listener(self, listening: socket.socket, tls: ssl.SSLContext | None) -> Listener:
+        return Listener(
+            listening,
+            tls,
+            on_refused=lambda address: self.warn(
+                "connections", f"refused a connection of {address}: there are too many"
+            ),
+            on_bad_request=lambda: self.warn("bad-http", "dropped a request: it is no HTTP"),
+        )
 
     def _on_input(self) -> None:
         if self._is_waiting:
@@ -221,6 +238,8 @@ class GatewayService(Service):
         self._viewers.remove_session(session)
         self._own_sessions.on_closed(session)
         self._begin(self._microphones.close_session(session))
+        self._begin(self._vosk_clients.close_session(session))
+        self._begin(self._whip_clients.close_session(session))
 
     def use_lips(self, session: str, lips: str) -> None:
         """Tell the viewers of a session that another lip model moves the mouth."""
@@ -242,14 +261,18 @@ class GatewayService(Service):
         if now_s - self._request_s > (STATUS_S if answered else STATUS_LOST_S):
             self._request_s = now_s
             self._commands.send(StatusRequest(request=secrets.token_hex(8)))
-        if now_s - self._report_s > STATUS_LOST_S:
+        if now_s - self._report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
 
     def _on_report(self, report: StatusReport) -> None:
         self._report_s = time.monotonic()
         running = {state.service for state in report.services if state.state == "ready"}
         needed = ("recognizer", "synthesizer")
-        self._viewers.set_missing(tuple(service for service in needed if service not in running))
+        missing = tuple(service for service in needed if service not in running)
+        if not missing:
+            self._complete_s = self._report_s
+        if not missing or self._report_s > self._complete_s + MISSING_S:
+            self._viewers.set_missing(missing)
 
     def _express(self, session: str, expressions: wire.Expressions) -> None:
         self._commands.send(
@@ -280,30 +303,34 @@ class GatewayService(Service):
                 Sound: self._on_sound,
                 Speech: self._on_speech,
             },
+            live=start.paced,
             on_complete=lambda: self.session_started(session.start),
             on_restart=lambda: self._restart(session),
         )
         is_sample = self._sample is not None and self._sample[0].session == start.session
         characters = self._sample_characters if is_sample else ()
-        track = SyllableTrack(self._inventory(start.language), characters)
-        session = _Session(start, follower, track)
+        inventory = self._inventory(start)
+        track = SyllableTrack(inventory, characters)
+        session = _Session(start, follower, track, inventory.silence)
         return session
 
-    def _inventory(self, language: str) -> PhoneInventory:
+    def _inventory(self, start: StartSession) -> PhoneInventory:
         try:
-            return load_inventory(language or DEFAULT_LANGUAGE)
+            return load_inventory(start.language or DEFAULT_LANGUAGE)
         except UserError as error:  # it is only about captions
-            self.warn("language", str(error))
+            self.warn("language", str(error), start.session)
             return load_inventory()
 
     def _restart(self, session: _Session) -> None:
         """Begin a session anew for its viewers: it goes on in another epoch."""
         session.syllables.reset()
+        self._vosk_clients.on_restart(session.start.session)
         self._viewers.add_session(session.start.session, session.follower.epoch, session.start.lips)
 
     def _on_frame(self, frame: FapFrame) -> None:
-        message = wire.binary(wire.FAP_TYPE, frame.epoch, frame.media_time, frame.values)
-        self._viewers.forward(frame.session, Kind.FRAME, message)
+        self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values)
+        if frame.session == self._viewers.newest:
+            self._sending.accept(frame.media_time, frame.values)
 
     def _on_sound(self, sound: Sound) -> None:
         message = wire.binary(wire.SOUND_TYPE, sound.epoch, sound.media_time, sound.pcm)
@@ -320,7 +347,10 @@ class GatewayService(Service):
             final=phone.final,
         )
         self._viewers.forward(phone.session, Kind.TEXT, message)
-        for syllable in self._sessions[phone.session].syllables.accept(phone_of(phone)):
+        session, recognised = self._sessions[phone.session], phone_of(phone)
+        is_silence = phone.symbol == session.silence
+        self._vosk_clients.on_phone(phone.session, recognised, is_silence=is_silence)
+        for syllable in session.syllables.accept(recognised):
             message = wire.text(
                 "syllable",
                 index=syllable.index,
@@ -332,6 +362,7 @@ class GatewayService(Service):
             self._viewers.forward(phone.session, Kind.TEXT, message)
 
     def _on_speech(self, speech: Speech) -> None:
+        self._vosk_clients.on_speech(speech.session, active=speech.active)
         message = wire.text("speech", active=speech.active, media_time=speech.media_time)
         self._viewers.forward(speech.session, Kind.TEXT, message)
 

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import re
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from aiohttp import WSMsgType, web
@@ -15,6 +15,7 @@ from services.gateway import wire
 from services.gateway.http import WebSockets
 from services.gateway.outbox import Kind, Outbox
 from services.gateway.pace import COMMAND_S, Pace
+from services.gateway.shape_view import ShapeView, parse_shape_view
 from shared.errors import UserError
 from shared.metrics import Metrics
 
@@ -34,6 +35,7 @@ class Viewer:
     """One browser that looks on."""
 
     chosen: str  # the session it asked for; empty: the newest
+    shapes: ShapeView | None  # that it gets beside FAP frames
     outbox: Outbox = field(default_factory=Outbox)
     shown: tuple[str, int] | None = None  # session and epoch that it was notified of last
 
@@ -119,9 +121,21 @@ class Viewers:
 
     def forward(self, session: str, kind: Kind, message: str | bytes) -> None:
         """Send a message to the viewers of a session."""
-        for viewer in self._viewers:
-            if viewer.shown is not None and viewer.shown[0] == session:
-                self._put(viewer, kind, message)
+        for viewer in self._viewers_of(session):
+            self._put(viewer, kind, message)
+
+    def show_frame(self, session: str, epoch: int, media_time: int, faps: bytes) -> None:
+        """Send the viewers of a session a frame of its face."""
+        message = wire.binary(wire.FAP_TYPE, epoch, media_time, faps)
+        self.forward(session, Kind.FRAME, message)
+        viewers = self._viewers_of(session)
+        self._put_shapes(viewers, Kind.SHAPES, "weights", epoch, media_time, faps)
+
+    @property
+    def newest(self) -> str:
+        """The session that is shown to who chose none; empty if there is none."""
+        names = (name for name in reversed(self._sessions) if name != self._sample)
+        return next(names, self._sample)
 
     @property
     def is_anybody_there(self) -> bool:
@@ -133,25 +147,40 @@ class Viewers:
         message = wire.binary(wire.REST_TYPE, 0, 0, faps)
         for viewer in self._viewers:
             self._put(viewer, Kind.REST, message)
+        self._put_shapes(self._viewers, Kind.REST_SHAPES, "rest", 0, 0, faps)
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one viewer until it leaves."""
         chosen = request.query.get("session", "")
         if chosen and not _SESSION.fullmatch(chosen):
             raise web.HTTPBadRequest(text="session: up to 64 letters, digits, '-' and '_'\n")
+        try:
+            shapes = parse_shape_view(request.query)
+        except UserError as error:
+            raise web.HTTPBadRequest(text=f"{error}\n") from None
         if len(self._viewers) >= MAX_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"{MAX_VIEWERS} viewers are looking already\n")
-        viewer = Viewer(chosen)
+        viewer = Viewer(chosen, shapes)
         self._viewers.add(viewer)
         try:
             async with self._web_sockets.accept(request) as browser:
                 _limit_send_buffer(request)
-                self._put(viewer, Kind.TEXT, self._status())
-                self._notify_viewer(viewer)
+                self._welcome(viewer)
                 await self._converse(viewer, browser)
         finally:
             self._viewers.discard(viewer)
         return browser
+
+    @contextlib.contextmanager
+    def join(self, session: str, shapes: ShapeView | None) -> Iterator[Outbox]:
+        """Let somebody look at a session who is sent messages by other means."""
+        viewer = Viewer(session, shapes)
+        self._viewers.add(viewer)
+        try:
+            self._welcome(viewer)
+            yield viewer.outbox
+        finally:
+            self._viewers.discard(viewer)
 
     async def _converse(self, viewer: Viewer, browser: web.WebSocketResponse) -> None:
         writer = asyncio.create_task(_write(browser, viewer.outbox))
@@ -196,14 +225,19 @@ class Viewers:
             self._put(viewer, Kind.TEXT, wire.error_text(str(error)))
         self._notify_viewer(viewer)
 
+    def _welcome(self, viewer: Viewer) -> None:
+        self._put(viewer, Kind.TEXT, self._status())
+        if viewer.shapes is not None:
+            self._put(viewer, Kind.TEXT, viewer.shapes.hello())
+        self._notify_viewer(viewer)
+
     def _notify_viewers(self) -> None:
         for viewer in self._viewers:
             self._notify_viewer(viewer)
 
     def _notify_viewer(self, viewer: Viewer) -> None:
         """Say which session the viewer sees now, if it is another than before."""
-        newest = (name for name in reversed(self._sessions) if name != self._sample)
-        name = viewer.chosen or next(newest, self._sample)
+        name = viewer.chosen or self.newest
         session = self._sessions.get(name)
         shown = (name, session.epoch) if session else None
         if shown != viewer.shown:
@@ -217,6 +251,26 @@ class Viewers:
                 sample=session is not None and name == viewer.chosen == self._sample,
             )
             self._put(viewer, Kind.TEXT, message)
+
+    def _viewers_of(self, session: str) -> list[Viewer]:
+        return [each for each in self._viewers if each.shown and each.shown[0] == session]
+
+    def _put_shapes(
+        self,
+        viewers: Iterable[Viewer],
+        kind: Kind,
+        shown: str,
+        epoch: int,
+        media_time: int,
+        faps: bytes,
+    ) -> None:
+        """Send the viewers that asked for shapes a frame in these."""
+        messages: dict[ShapeView, str | bytes] = {}
+        for viewer in viewers:
+            if (view := viewer.shapes) is not None:
+                if view not in messages:
+                    messages[view] = view.message(shown, epoch, media_time, faps)
+                self._put(viewer, kind, messages[view])
 
     def _put(self, viewer: Viewer, kind: Kind, message: str | bytes) -> None:
         num_dropped = viewer.outbox.put(kind, message)

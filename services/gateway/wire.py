@@ -11,6 +11,7 @@ import json
 import struct
 from dataclasses import dataclass
 
+from services.gateway.sound_format import RATES_HZ, SoundFormat, check_text
 from shared.errors import UserError
 from shared.face.expressions import DEFAULT_HOLD_S, check_expressions, check_expressiveness
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
@@ -19,9 +20,9 @@ _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
 SOUND_TYPE = 2  # payload: int16, 16 kHz mono
 REST_TYPE = 3  # payload: as of FAP_TYPE, for who sees no frames of a session
+SHAPES_TYPE = 4  # payload: float32 weights of a set of shapes, of a frame
+REST_SHAPES_TYPE = 5  # payload: likewise of the face at rest
 
-SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
-RATES_HZ = (8000, 48000)
 MAX_SKIPPED = 600 * RATES_HZ[1]  # samples; 10 minutes
 
 
@@ -42,17 +43,11 @@ def error_text(reason: str, code: str = "refused") -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hello:
-    """The format of the audio that a browser's microphone will send."""
+    """What a microphone says first."""
 
-    sample_rate_hz: int
-    num_channels: int
-    encoding: str  # s16le or f32le
+    sound: SoundFormat
+    is_ahead: bool  # the sound may come before its time: it waits and goes on in real time
     voice: bytes  # of the speaker, for lips from sound; empty: anybody's
-
-    @property
-    def frame_bytes(self) -> int:
-        """Size of one sample of all channels."""
-        return SAMPLE_BYTES[self.encoding] * self.num_channels
 
 
 def parse_hello(message: str) -> Hello:
@@ -64,19 +59,25 @@ def parse_hello(message: str) -> Hello:
         Naming the field that is missing or out of range.
     """
     fields = parse_object(message)
-    rate_hz, num_channels = fields.get("sample_rate_hz"), fields.get("num_channels", 1)
-    encoding = fields.get("encoding", "s16le")
-    if type(rate_hz) is not int or not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
-        raise UserError(f"sample_rate_hz must be a whole number of {RATES_HZ[0]} to {RATES_HZ[1]}")
-    if type(num_channels) is not int or num_channels not in (1, 2):
-        raise UserError("num_channels must be 1 or 2")
-    if not isinstance(encoding, str) or encoding not in SAMPLE_BYTES:
-        raise UserError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
     return Hello(
-        sample_rate_hz=rate_hz,
-        num_channels=num_channels,
-        encoding=encoding,
+        sound=parse_sound_format(fields),
+        is_ahead=bool(fields.get("ahead")),
         voice=_parse_voice(fields.get("voice", "")),
+    )
+
+
+def parse_sound_format(fields: dict[str, object]) -> SoundFormat:
+    """Return the format of the sound that a message describes.
+
+    Raises
+    ------
+    UserError
+        Naming the field that is missing or out of range.
+    """
+    return SoundFormat(
+        sample_rate_hz=fields.get("sample_rate_hz"),  # type: ignore[arg-type] # it is checked there
+        num_channels=fields.get("num_channels", 1),  # type: ignore[arg-type]
+        encoding=fields.get("encoding", "s16le"),  # type: ignore[arg-type]
     )
 
 
@@ -95,6 +96,7 @@ class MicrophoneCommand:
     """A command between the chunks of a browser's microphone."""
 
     flush: bool  # interrupt: audio not yet shown is dropped
+    eof: bool  # no more audio comes
     num_skipped: int  # samples of each channel that it left out
     lips: str  # the lip model that is to move the mouth; empty: as before
 
@@ -108,12 +110,16 @@ def parse_command(message: str) -> MicrophoneCommand:
         If it is no JSON object, the number of samples is out of range, or there is no such lip
         model.
     """
+    check_text(message, "binary messages of samples, or a JSON object")
     fields = parse_object(message)
     num_skipped = fields.get("skip", 0)
     if type(num_skipped) is not int or not 0 <= num_skipped <= MAX_SKIPPED:
         raise UserError(f"skip must be a whole number of 0 to {MAX_SKIPPED}")
     return MicrophoneCommand(
-        flush=bool(fields.get("flush")), num_skipped=num_skipped, lips=parse_lips(fields)
+        flush=bool(fields.get("flush")),
+        eof=bool(fields.get("eof")),
+        num_skipped=num_skipped,
+        lips=parse_lips(fields),
     )
 
 

@@ -2,45 +2,57 @@
 
 Reacts to: audio-chunk, end-of-audio (clients), start-session, stop-session, flush-now (control),
 acknowledge (synthesizer).
-Emits: phone, lips, speech, progress, end-of-phones (synthesizer, acknowledged), the same phones,
-lips and speech with the sound itself (followers), speech (control), error (clients).
+Emits: phone, lips, speech, progress, stalled, resume-face, end-of-phones (synthesizer,
+acknowledged), the same phones, lips and speech with the sound itself (followers), speech (control),
+acknowledge, error (clients).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import secrets
 import time
+from collections import deque
 from collections.abc import Sequence
 
 from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from services.recognizer.acoustic.load import load_live_model
+from services.recognizer.audio_order import AudioMessage, AudioOrder
 from services.recognizer.config import RecognizerConfig
 from services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
+from services.recognizer.link import SynthesizerLink
 from services.recognizer.lip_source import LipsFromSound
 from services.recognizer.lips import lips_for
 from services.recognizer.recognizer import warm_up
+from services.recognizer.resumption import WARM_UP_S, Resumption
 from services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Waveform
 from shared.bus import Socket
-from shared.clock import MEDIA_RATE_HZ, to_samples
-from shared.endpoints import reachable
+from shared.clock import MEDIA_RATE_HZ, to_samples, to_seconds
 from shared.errors import UserError
-from shared.keys import Peer
+from shared.keys import NOBODY, Peer
 from shared.logs import LOG
+from shared.metrics import give_back_memory
 from shared.phones.events import LipFrame, Phone, SpeechChange
-from shared.reliable import ReliableSender
+from shared.phones.final_time import FinalTime
 from shared.service import Service
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import SessionInput, StartSession
-from shared.wire.events import message_of
+from shared.wire.events import SpeechMessage, event_of, message_of
 from shared.wire.message import Message
 from shared.wire.session import Error, ErrorCode
-from shared.wire.speech import Acknowledge
+from shared.wire.speech import Acknowledge, EndOfPhones, Stalled
 
 MAX_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 MAX_BACKLOG = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 MAX_BACKLOG_S = 5.0  # for so long; then the session's link is given up for the others' sake
 MAX_QUEUED_S = 0.3  # of audio, of all sessions, that is processed together
+MAX_UNPACED_S = 0.06  # of a session that is not paced, while another is: live audio waits for it
+ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
+GIVE_BACK_S = 10.0  # after the end of a session: sessions of different lengths leave holes
+STALL_S = 0.2  # a live client silent for so long has stalled
+MAX_TICK_S = 0.05  # of silence between two ticks; more, and this process did not listen
+MAX_NEEDED = 5000  # messages of audio that a client keeps
 
 
 class _Session:
@@ -50,10 +62,20 @@ class _Session:
         self.start = start
         self.first_epoch = start.epoch  # when this recognizer took the session
         self.stream = stream
-        self.link: ReliableSender | None = None
-        self.sequence_in = 0
+        self.resumption: Resumption | None = None  # of a session that another has lost
+        self.has_begun = False  # some audio came
+        self.final = FinalTime()  # up to where the synthesizer knows that phones are final
+        # Audio messages that another recognizer would need: number and where the sound ends.
+        self.needed: deque[tuple[int, int]] = deque(maxlen=MAX_NEEDED)
+        self.num_needless = 0  # number of the newest one that none would
+        self.link = SynthesizerLink()
+        self.client = NOBODY  # who sent the newest audio
+        self.order = AudioOrder()
+        self.acknowledge_s: float | None = None  # when that is due to the client
+        self.acknowledged_s = 0.0  # when it was sent last
         self.sequence_out = 0
         self.last_audio_s = time.monotonic()
+        self.silent_s = 0.0  # for how long this process listened and no audio came
         self.voice_refusal = ""  # why the client's voice is not used, if it was not told yet
         self.finished = False
         self.num_gaps = 0  # of the stream's, counted
@@ -72,13 +94,15 @@ class RecognizerService(Service):
         self._config = config
         self._sessions: dict[str, _Session] = {}
         self._queued: dict[str, list[Chunk]] = {}  # by session, not yet processed
-        self._queued_s = 0.0
+        self._give_back_s = math.inf  # when the memory of sessions that have ended is given back
+        self._queued_share = 0.0  # of what is processed together
+        self._ticked_s = time.monotonic()
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
         self.endpoints = {
-            "audio": reachable(self._audio.endpoint, config.advertise, "recognizer.audio"),
-            "phones": reachable(self._phones.endpoint, config.advertise, "recognizer.phones"),
+            "audio": config.reachable(self._audio.endpoint),
+            "phones": config.reachable(self._phones.endpoint),
         }
         self._model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
         self.language = self._model.inventory.language
@@ -89,7 +113,7 @@ class RecognizerService(Service):
                 "mouth; with synthesizer.lips=dynamic-visemes they have the delay that suits them"
             )
         warm_up(self._model)
-        self.register(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_end})
+        self.register(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_audio})
         self.register(self._phones, {})
 
     def step(self, timeout_s: float) -> None:
@@ -101,18 +125,21 @@ class RecognizerService(Service):
         """Make a stream, or after a crash of the synthesizer give the old one a new link."""
         self._process_queued()
         session = self._sessions.get(start.session)
+        is_new = False
         if session is None or session.start.token != start.token:
             lips, voice_refusal = self._lips_of(start)
             session = _Session(start, self._new_stream(start, lips))
             session.voice_refusal = voice_refusal
+            if start.media_time:
+                silence = self._model.inventory.silence
+                session.resumption = Resumption(to_seconds(start.media_time), silence)
             self._sessions[start.session] = session
-        if session.link is None or session.start.epoch != start.epoch:
+            is_new = True
+        if is_new or session.start.epoch != start.epoch:
             session.start = start
-            owed = session.link.waiting if session.link is not None else ()
             socket = self._connect(start.endpoints["phone_input"])
-            session.link = ReliableSender(socket, start.session, start.epoch)
-            for message in owed:
-                session.link.send(message, time.monotonic())
+            session.link.connect(socket, start.session, start.epoch, time.monotonic())
+            self._leave_synthesizers()
         return True
 
     def _lips_of(self, start: StartSession) -> tuple[LipsFromSound | None, str]:
@@ -140,21 +167,31 @@ class RecognizerService(Service):
     def stop_session(self, session: str) -> None:
         """Forget a session."""
         self._process_queued()
-        self._sessions.pop(session, None)
+        if self._sessions.pop(session, None) is not None:
+            self._give_back_s = min(self._give_back_s, time.monotonic() + GIVE_BACK_S)
 
     def flush_session(self, session: str) -> None:
         """Drop the speech under way; the next audio starts again."""
         self._process_queued()
         found = self._sessions.get(session)
         if found is not None:
+            found.link.forget()
             self._emit(found, found.stream.flush())
 
     def on_tick(self, now_s: float) -> None:
-        """Repeat what the synthesizer did not acknowledge, and let audio wait if it is behind."""
+        """Acknowledge audio, tell who is silent, repeat what the synthesizer did not acknowledge.
+
+        Audio waits if the synthesizer is behind.
+        """
+        if now_s >= self._give_back_s:
+            self._give_back_s = math.inf
+            give_back_memory()
+        self._find_stalled(now_s)
         any_late = False
         for name, session in self._sessions.items():
-            if session.link is None:
-                continue
+            self._take_in_order(session, session.order.tick(now_s), session.client)
+            if session.acknowledge_s is not None and now_s >= session.acknowledge_s:
+                self._acknowledge(session, now_s)
             self.metrics.count("resent", session.link.tick(now_s))
             if session.link.backlog <= MAX_BACKLOG:
                 session.late_since_s = None
@@ -163,30 +200,110 @@ class RecognizerService(Service):
             session.late_since_s = session.late_since_s or now_s
             if now_s - session.late_since_s > MAX_BACKLOG_S:
                 self.warn("no-link", "the synthesizer takes no phones; they are dropped", name)
-                session.link = None
+                session.link.disconnect()
         self.pause(self._audio, paused=any_late)
 
-    def on_drain(self) -> bool:
-        """Finish every utterance and wait until the synthesizer has it."""
-        self._process_queued()
+    def _find_stalled(self, now_s: float) -> None:
+        """Tell the synthesizer whose live client sends nothing.
+
+        Only the time counts in which this process listened: neither what it did not read yet, nor
+        that it was too busy to read, is a client's silence.
+        """
+        tick_s, self._ticked_s = min(now_s - self._ticked_s, MAX_TICK_S), now_s
+        if self._queued or self._audio.wait(0.0):
+            return
         for session in self._sessions.values():
+            before_s, session.silent_s = session.silent_s, session.silent_s + tick_s
+            has_stalled = before_s <= STALL_S < session.silent_s
+            if has_stalled and session.start.paced and not session.finished:
+                media_time = max(session.stream.media_time, session.start.media_time)
+                session.link.send(Stalled(media_time=media_time), now_s)
+
+    def on_drain(self) -> bool:
+        """Let others take the sessions; finish those that nobody takes, to the last message."""
+        self._process_queued()
+        sessions = self._sessions.values()
+        if self.hands_over and not all(session.finished for session in sessions):
+            return False
+        for session in sessions:
             self._finish(session)
-        return all(s.link is None or s.link.backlog == 0 for s in self._sessions.values())
+        return all(session.link.backlog == 0 for session in sessions)
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return how far the audio of each session has come."""
         now_s = time.monotonic()
         return {
-            name: SessionInput(idle_s=now_s - session.last_audio_s, sequence=session.sequence_in)
+            name: SessionInput(
+                idle_s=now_s - session.last_audio_s,
+                sequence=session.num_needless,
+                media_time=to_samples(session.final.time_s),
+            )
             for name, session in self._sessions.items()
+        }
+
+    def gauges(self) -> dict[str, float]:
+        """Return how much waits: sound to be processed, and messages to be acknowledged."""
+        backlogs = [each.link.backlog for each in self._sessions.values()]
+        queued_s = sum(
+            len(part) / self._sessions[name].start.sample_rate_hz
+            for name, chunks in self._queued.items()
+            for _, part in chunks
+        )
+        return {
+            "queued_audio_seconds": queued_s,
+            "unacknowledged_messages": max(backlogs, default=0),
         }
 
     # --- from clients ----------------------------------------------------------------------------
 
-    def _on_audio(self, chunk: AudioChunk, sender: Peer) -> None:
-        session = self._admit(chunk, sender)
+    def _on_audio(self, message: AudioMessage, sender: Peer) -> None:
+        session = self._admit(message, sender)
         if session is None:
             return
+        now_s = time.monotonic()
+        session.client = sender
+        if message.sequence <= session.order.last:
+            self.metrics.count("repeated")
+            in_order = []
+        else:
+            session.last_audio_s, session.silent_s = now_s, 0.0
+            in_order = session.order.accept(message, now_s)
+        self._take_in_order(session, in_order, sender)
+        if message.acknowledge:
+            is_awaited = not in_order or session.finished  # also by who repeats or left a hole
+            due_s = now_s if is_awaited else session.acknowledged_s + ACKNOWLEDGE_EVERY_S
+            session.acknowledge_s = min(session.acknowledge_s or due_s, due_s)
+
+    def _take_in_order(
+        self, session: _Session, messages: Sequence[AudioMessage], sender: Peer
+    ) -> None:
+        """Take what is in order; what is refused counts as taken."""
+        for message in messages:
+            if message.media_time > MAX_MEDIA_TIME:
+                text = f"media_time {message.media_time} is no sample index at 16 kHz; count from 0"
+                self._refuse(message, sender, ErrorCode.BAD_AUDIO, text)
+            elif session.finished:
+                text = f"session {message.session!r} has ended; open another"
+                self._refuse(message, sender, ErrorCode.FINISHED, text)
+            elif isinstance(message, AudioChunk):
+                self._take_chunk(session, message, sender)
+            else:
+                self._process_queued()
+                self._finish(session)
+
+    def _acknowledge(self, session: _Session, now_s: float) -> None:
+        """Tell the client which audio it need not send again."""
+        session.acknowledge_s, session.acknowledged_s = None, now_s
+        self._audio.send(
+            Acknowledge(
+                session=session.start.session,
+                epoch=session.start.epoch,
+                sequence=session.order.last,
+            ),
+            to=session.client,
+        )
+
+    def _take_chunk(self, session: _Session, chunk: AudioChunk, sender: Peer) -> None:
         if session.voice_refusal:
             self._refuse(chunk, sender, ErrorCode.BAD_VOICE, session.voice_refusal)
             session.voice_refusal = ""
@@ -197,13 +314,22 @@ class RecognizerService(Service):
             self._refuse(chunk, sender, ErrorCode.BAD_AUDIO, str(error))
             return
         rate_hz = start.sample_rate_hz
-        piece = round(MAX_QUEUED_S * rate_hz)
+        media_time = chunk.media_time
+        end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
+        session.needed.append((chunk.sequence, end))
+        if session.resumption is not None and not session.has_begun:
+            media_time, samples = session.resumption.on_grid((media_time, samples), rate_hz)
+            session.has_begun = len(samples) > 0
+            if not session.has_begun:
+                return
+        hurries = not start.paced and any(each.start.paced for each in self._sessions.values())
+        piece = round((MAX_UNPACED_S if hurries else MAX_QUEUED_S) * rate_hz)
         for begin in range(0, max(1, len(samples)), piece):  # a long chunk must not hold others up
             part = samples[begin : begin + piece]
-            media_time = chunk.media_time + begin * MEDIA_RATE_HZ // rate_hz
-            self._queued.setdefault(chunk.session, []).append((media_time, part))
-            self._queued_s += len(part) / rate_hz
-            if self._queued_s >= MAX_QUEUED_S:
+            part_time = media_time + begin * MEDIA_RATE_HZ // rate_hz
+            self._queued.setdefault(chunk.session, []).append((part_time, part))
+            self._queued_share += len(part) / piece
+            if self._queued_share >= 1.0:
                 self._process_queued()
                 self.beat_if_due()
 
@@ -217,21 +343,15 @@ class RecognizerService(Service):
             session.stream.process(chunks)
             for session, chunks in zip(sessions, self._queued.values(), strict=True)
         ]
-        self._queued, self._queued_s = {}, 0.0
+        self._queued, self._queued_share = {}, 0.0
         for session, outputs in zip(sessions, run_scoring_tasks(self._model, tasks), strict=True):
             self._emit(session, outputs)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps)
             session.num_gaps = session.stream.num_gaps
         self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
 
-    def _on_end(self, end: EndOfAudio, sender: Peer) -> None:
-        self._process_queued()
-        session = self._admit(end, sender)
-        if session is not None:
-            self._finish(session)
-
-    def _admit(self, message: AudioChunk | EndOfAudio, sender: Peer) -> _Session | None:
-        """Return the session if the sender may write to it, in order."""
+    def _admit(self, message: AudioMessage, sender: Peer) -> _Session | None:
+        """Return the session if the sender may write to it."""
         session = self._sessions.get(message.session)
         if session is None:
             text = f"there is no session {message.session!r} here; open it at control"
@@ -239,20 +359,12 @@ class RecognizerService(Service):
         elif not secrets.compare_digest(session.start.token.encode(), message.token.encode()):
             text = f"the token is not that of session {message.session!r}"
             self._refuse(message, sender, ErrorCode.BAD_TOKEN, text)
-        elif session.finished:
-            text = f"session {message.session!r} has ended; open another"
-            self._refuse(message, sender, ErrorCode.FINISHED, text)
-        elif message.media_time > MAX_MEDIA_TIME:
-            text = f"media_time {message.media_time} is no sample index at 16 kHz; count from 0"
+        elif message.sequence == 0:
+            text = "the message has no sequence; number audio messages from 1"
             self._refuse(message, sender, ErrorCode.BAD_AUDIO, text)
         elif 0 < message.epoch < session.first_epoch:  # meant for the recognizer before this one
             self.metrics.count("other_epoch")
-        elif message.sequence <= session.sequence_in:
-            text = f"sequence {message.sequence} came after {session.sequence_in}; it must grow"
-            self._refuse(message, sender, ErrorCode.REPLAYED, text)
         else:
-            session.sequence_in = message.sequence
-            session.last_audio_s = time.monotonic()
             return session
         return None
 
@@ -273,9 +385,11 @@ class RecognizerService(Service):
 
     def _emit(self, session: _Session, outputs: Sequence[StreamOutput]) -> None:
         now_s = time.monotonic()
+        if session.resumption is not None:
+            outputs = session.resumption.pass_on(outputs)
         for output in outputs:
             message = _message_of(output)
-            if session.link is not None and not isinstance(output, Waveform):
+            if not isinstance(output, Waveform):
                 session.link.send(message, now_s)
             if isinstance(output, Phone | LipFrame | SpeechChange | Waveform):
                 session.sequence_out += 1
@@ -290,10 +404,28 @@ class RecognizerService(Service):
             self.register(socket, {Acknowledge: self._on_acknowledge, Error: self._on_error})
         return self._synthesizers[endpoint]
 
+    def _leave_synthesizers(self) -> None:
+        """Close the sockets to synthesizers that no session has any more."""
+        used = {each.start.endpoints["phone_input"] for each in self._sessions.values()}
+        for endpoint in self._synthesizers.keys() - used:
+            self.unregister(self._synthesizers.pop(endpoint))
+
     def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
         session = self._sessions.get(ack.session)
-        if session is not None and session.link is not None and ack.epoch == session.start.epoch:
-            session.link.acknowledge(ack.sequence, time.monotonic())
+        if session is not None:
+            for message in session.link.acknowledge(ack, time.monotonic()):
+                _note_known(session, message)
+
+
+def _note_known(session: _Session, message: Message) -> None:
+    """Note what the synthesizer knows, and which audio is needless therefore."""
+    if isinstance(message, EndOfPhones):
+        session.num_needless = session.order.last
+    elif isinstance(message, SpeechMessage):
+        session.final.accept(event_of(message))
+        needed_from = to_samples(max(0.0, session.final.time_s - WARM_UP_S))
+        while session.needed and session.needed[0][1] <= needed_from:
+            session.num_needless, _ = session.needed.popleft()
 
 
 def _message_of(output: StreamOutput) -> Message:

@@ -1,8 +1,8 @@
 """The synthesizer as a service: phones and lips in, FAP frames out.
 
-Reacts to: phone, lips, speech, progress, end-of-phones (recognizer), start-session, stop-session,
-flush-now, use-lips, express, choose-expressiveness (control).
-Emits: fap-frame, end-of-faps (followers), acknowledge (recognizer).
+Reacts to: phone, lips, speech, progress, stalled, resume-face, end-of-phones (recognizer),
+start-session, stop-session, flush-now, use-lips, express, choose-expressiveness, add-shapes
+(control). Emits: fap-frame, shapes, end-of-faps (followers), acknowledge (recognizer).
 
 Frames are clocked by the audio that was processed, so a system under load is late, never wrong, and
 audio faster than real time gives the same frames. Only when a live stream stalls does the wall
@@ -11,28 +11,38 @@ clock take over, to lead the face to rest.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from services.synthesizer.config import SynthesizerConfig
 from services.synthesizer.face import REST_S, Face, Frame
 from services.synthesizer.lips.load import load_lip_model
-from shared.bus import PHONES
+from shared.bus import PHONES, Socket
 from shared.clock import to_samples, to_seconds
-from shared.endpoints import key_of, reachable
+from shared.endpoints import key_of
 from shared.face.faps import MASK_BYTES, NUM_FAPS
+from shared.face.shapes import SHAPE_SETS
 from shared.keys import Peer
 from shared.logs import LOG
 from shared.phones.events import EndOfSound, Phone, Progress
+from shared.phones.final_time import FinalTime
 from shared.phones.inventory import load_inventory
 from shared.reliable import ReliableReceiver
 from shared.service import Service
 from shared.wire.control import SessionInput, StartSession
-from shared.wire.events import SPEECH_MESSAGES, SpeechMessage, event_of
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.session import ChooseExpressiveness, Express
+from shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
+from shared.wire.session import AddShapes, ChooseExpressiveness, Express
+from shared.wire.speech import Acknowledge, ResumeFace, Stalled
 
-STALL_S = 0.2  # a live stream silent for so long has stalled
+SILENCE_S = 2.0  # a live stream without a word from its recognizer for so long has stalled
+AGAIN_S = 3.0  # for which followers of a session that has moved here may still be on their way
+MADE_UP_S = 0.2  # of frames without sound, when they are late
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
@@ -40,16 +50,41 @@ MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little"
 class _Session:
     """One session: its face, and its place among messages."""
 
-    def __init__(self, start: StartSession, face: Face, receiver: ReliableReceiver) -> None:
+    def __init__(self, start: StartSession, face: Face, input_socket: Socket) -> None:
         self.start = start
         self.face = face
-        self.receiver = receiver
-        self.epoch_in = 1  # of the newest message from the recognizer
-        self.last_input_s = time.monotonic()
-        self.relaxed_s = 0.0  # until when frames were made without audio
+        self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledge)
+        self.epoch_in = 0  # of the newest message from the recognizer; 0: there is none
+        self.relaxes_s = time.monotonic() + SILENCE_S  # from when on frames come without sound
         self.sequence_out = 0
-        self.media_time = 0  # of the newest frame
+        self.shown: FapFrame | None = None  # the newest frame
+        self.final = FinalTime()
         self.finished = False
+        self._resumed_s = -math.inf  # when it took another synthesizer's place
+        self.since_then: list[FapFrame | Shapes | EndOfFaps] = []  # published of late
+
+    def resume(self, media_time: int, frame: int, faps: NDArray[np.float32] | None) -> None:
+        """Go on behind the newest frame of another synthesizer."""
+        self._resumed_s = time.monotonic()
+        self.sequence_out = frame
+        self.face.resume(to_seconds(media_time), frame, faps)
+
+    @property
+    def just_resumed(self) -> bool:
+        """Whether its followers may still be on their way here."""
+        return time.monotonic() < self._resumed_s + AGAIN_S
+
+    @property
+    def media_time(self) -> int:
+        """Media time of the newest frame, samples at 16 kHz."""
+        return self.shown.media_time if self.shown is not None else 0
+
+    def _acknowledge(self) -> Acknowledge:
+        if self.shown is None:
+            return Acknowledge()
+        return Acknowledge(
+            media_time=self.media_time, frame=self.shown.sequence, faps=self.shown.values
+        )
 
 
 class SynthesizerService(Service):
@@ -65,41 +100,43 @@ class SynthesizerService(Service):
         self.delay_ms = config.delay_ms
         self.lips = config.lips
         self._sessions: dict[str, _Session] = {}
+        self._dropped_s = 0.0  # when frames were dropped that nobody takes
         self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input", PHONES)
-        self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps")
+        self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_joined)
         self.endpoints = {
-            "phone_input": reachable(
-                self._input.endpoint, config.advertise, "synthesizer.phone_input"
-            ),
-            "faps": reachable(self._faps.endpoint, config.advertise, "synthesizer.faps"),
+            "phone_input": config.reachable(self._input.endpoint),
+            "faps": config.reachable(self._faps.endpoint),
         }
         load_lip_model(name=config.lips)  # the first session waits for nothing
-        self.register(self._input, dict.fromkeys(SPEECH_MESSAGES, self._on_input))
+        self.register(self._input, dict.fromkeys(LINK_MESSAGES, self._on_input))
         self.register(self._faps, {})
 
     def start_session(self, start: StartSession) -> bool:
         """Make a face at rest; a session that moved here again keeps its own."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
-            receiver = ReliableReceiver(self._input, start.session)
-            session = _Session(start, self._new_face(start), receiver)
+            session = _Session(start, self._new_face(start), self._input)
             self._sessions[start.session] = session
         session.start = start
-        return True
+        self.session_started(start, to_samples(session.final.time_s))
+        return False
 
     def _new_face(self, start: StartSession) -> Face:
-        return Face(
+        face = Face(
             load_lip_model(start.language, start.lips or self._config.lips),
             frame_rate_hz=self.frame_rate_hz,
             delay_s=self._config.delay_ms / 1e3,
             idle_motion_seed=self._config.idle_motion_seed,
-            expressiveness=self._config.expressiveness,
+            expressiveness=start.expressiveness or self._config.expressiveness,
         )
+        if start.expressions:
+            face.express(start.expressions, start.hold_s)
+        return face
 
     def stop_session(self, session: str) -> None:
         """Forget a session."""
         found = self._sessions.pop(session, None)
-        if found is not None and not found.finished:
+        if found is not None and not found.finished and not self.stopping:  # then another goes on
             self._end(found)
 
     def flush_session(self, session: str) -> None:
@@ -126,53 +163,92 @@ class SynthesizerService(Service):
         if found is not None:
             found.face.choose_expressiveness(message.expressiveness)
 
+    def add_shapes(self, message: AddShapes) -> None:
+        """Publish sets of shapes from the next frame on."""
+        found = self._sessions.get(message.session)
+        if found is not None:
+            found.start = replace(found.start, shapes=message.shapes)
+
     def on_tick(self, now_s: float) -> None:
-        """Acknowledge, and lead faces to rest whose live stream has stalled."""
+        """Acknowledge, lead faces to rest whose live stream has stalled, drop what grows old."""
+        if now_s > self._dropped_s + 1.0:
+            self._dropped_s = now_s
+            live = [name for name, session in self._sessions.items() if session.start.paced]
+            self._faps.drop_stopped((FapFrame, Shapes), live)
         for session in self._sessions.values():
             session.receiver.tick()
-            is_stalled = now_s - session.last_input_s > STALL_S
-            if session.start.paced and not session.finished and is_stalled:
+            if session.start.paced and not session.finished:
                 self._relax(session, now_s)
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Name the sessions served, so that control can say which of them are no more."""
-        return dict.fromkeys(self._sessions, SessionInput())
+        """Return up to where the phones of each session are final."""
+        return {
+            name: SessionInput(media_time=to_samples(session.final.time_s))
+            for name, session in self._sessions.items()
+        }
 
     def on_drain(self) -> bool:
-        """Lead every face to rest and end its stream."""
-        for session in self._sessions.values():
-            if not session.finished:
-                num_frames = round(REST_S * self.frame_rate_hz)
-                self._publish(session, session.face.relax(num_frames))
-                self._end(session)
+        """Let others take the sessions; lead the faces that nobody takes to rest, and end them."""
+        unfinished = [session for session in self._sessions.values() if not session.finished]
+        if unfinished and self.hands_over:
+            return False
+        for session in unfinished:
+            self._publish(session, session.face.relax(round(REST_S * self.frame_rate_hz)))
+            self._end(session)
         return True
 
     def _relax(self, session: _Session, now_s: float) -> None:
-        begin_s = max(session.relaxed_s, session.last_input_s + STALL_S)
-        num_frames = int((now_s - begin_s) * self.frame_rate_hz)
+        # a process that stood still does not make up for it
+        session.relaxes_s = max(session.relaxes_s, now_s - MADE_UP_S)
+        num_frames = int((now_s - session.relaxes_s) * self.frame_rate_hz)
         if num_frames > 0:
-            session.relaxed_s = begin_s + num_frames / self.frame_rate_hz
+            session.relaxes_s += num_frames / self.frame_rate_hz
             # Media time stands still with the audio; the sequence number goes on.
             self._publish(session, session.face.relax(num_frames))
+            session.receiver.acknowledge()
 
     # --- from the recognizer ---------------------------------------------------------------------
 
-    def _on_input(self, message: SpeechMessage, sender: Peer) -> None:
+    def _on_input(self, message: LinkMessage, sender: Peer) -> None:
+        session = self._admit(message, sender)
+        if session is None:
+            return
+        now_s = time.monotonic()
+        session.relaxes_s = now_s if isinstance(message, Stalled) else now_s + SILENCE_S
+        if message.epoch != session.epoch_in:
+            self._enter_epoch(session, message)
+        if not isinstance(message, Stalled | ResumeFace):
+            self._accept(session, message)
+
+    def _enter_epoch(self, session: _Session, message: LinkMessage) -> None:
+        """Let a face go on: with another recognizer, or where another synthesizer's face was."""
+        if session.epoch_in:
+            session.face.restart()
+        elif isinstance(message, ResumeFace):
+            session.resume(message.media_time, message.frame, np.frombuffer(message.faps, "<f4"))
+        elif message.epoch > 1:  # both were lost, and nobody knows how far the other face came
+            time_s = to_seconds(message.media_time)
+            session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
+        session.epoch_in = message.epoch
+
+    def _admit(self, message: LinkMessage, sender: Peer) -> _Session | None:
+        """Return the session of a message if that is its recognizer's next one."""
         session = self._sessions.get(message.session)
         if session is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)
-            return
-        if sender.key != key_of(session.start.endpoints.get("phones", "")):
+        elif sender.key != key_of(session.start.endpoints.get("phones", "")):
             self.warn(
                 "foreign", "phones from another than the session's recognizer", message.session
             )
-            return
-        if message.epoch != session.start.epoch:  # sent again until control has told both ends
+        elif message.epoch != session.start.epoch:  # sent again until control has told both ends
             self.metrics.count("other_epoch")
-            return
-        if not session.receiver.accept(message, sender):
+        elif not session.receiver.accept(message, sender):
             self.metrics.count("repeated")
-            return
+        else:
+            return session
+        return None
+
+    def _accept(self, session: _Session, message: SpeechMessage) -> None:
         event = event_of(message)
         language = session.start.language
         if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
@@ -180,10 +256,7 @@ class SynthesizerService(Service):
             self.warn("unknown-phone", text, message.session)
             return
         started_s = time.perf_counter()
-        session.last_input_s = time.monotonic()
-        if message.epoch != session.epoch_in:  # after a crash, which restarts the count of phones
-            session.face.restart(to_seconds(message.media_time))
-        session.epoch_in = message.epoch
+        session.final.accept(event)
         self._publish(session, session.face.accept(event))
         if isinstance(event, Progress):
             self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
@@ -195,13 +268,14 @@ class SynthesizerService(Service):
     def _end(self, session: _Session) -> None:
         session.finished = True
         session.sequence_out += 1
-        self._faps.send(
+        self._send(
+            session,
             EndOfFaps(
                 session=session.start.session,
                 epoch=session.start.epoch,
                 sequence=session.sequence_out,
                 media_time=session.media_time,
-            )
+            ),
         )
         LOG.info("end of frames", extra={"session": session.start.session})
 
@@ -209,14 +283,41 @@ class SynthesizerService(Service):
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
             session.sequence_out += 1
-            session.media_time = to_samples(time_s)
-            self._faps.send(
-                FapFrame(
-                    session=session.start.session,
-                    epoch=session.start.epoch,
-                    sequence=session.sequence_out,
-                    media_time=session.media_time,
-                    values=faps.astype("<f4").tobytes(),
-                    mask=MASK,
-                )
+            session.shown = FapFrame(
+                session=session.start.session,
+                epoch=session.start.epoch,
+                sequence=session.sequence_out,
+                media_time=to_samples(time_s),
+                values=faps.astype("<f4").tobytes(),
+                mask=MASK,
             )
+            self._send(session, session.shown)
+            for name in session.start.shapes:
+                self._send_shapes(session, name, faps)
+
+    def _send_shapes(self, session: _Session, name: str, faps: NDArray[np.float32]) -> None:
+        self._send(
+            session,
+            Shapes(
+                session=session.start.session,
+                epoch=session.start.epoch,
+                sequence=session.sequence_out,
+                media_time=session.media_time,
+                set=name,
+                weights=SHAPE_SETS[name].weights(faps).astype("<f4").tobytes(),
+            ),
+        )
+
+    def _send(self, session: _Session, message: FapFrame | Shapes | EndOfFaps) -> None:
+        self._faps.send(message)
+        if session.just_resumed:
+            session.since_then.append(message)
+        else:
+            session.since_then.clear()
+
+    def _on_joined(self, session: str) -> None:
+        """Publish again what came before the followers of a moved session were here."""
+        found = self._sessions.get(session)
+        if found is not None and found.just_resumed:
+            for message in found.since_then:
+                self._faps.send(message)

@@ -7,8 +7,8 @@ the listener, and those of somebody who pauses to think do so less (Kendon 1967)
 about a degree, slower than 1.5 Hz; breath, 14 times a minute, moves the head by a third of one.
 When the head turns, the eyes turn back (vestibulo-ocular reflex).
 
-Everything follows from the seed and the time: the same times, in whatever portions, give the same
-face.
+Everything follows from the seed, the time and the states, and of these only the newest count: who
+begins in the midst soon shows the same face as who has shown it from the beginning.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _BLINK_MEDIAN_S = 3.0
 _BLINK_LOG_SD = 0.5
 _BLINK_MIN_S = 0.6
 _LID_FALL_S, _LID_SHUT_S, _LID_RISE_S = 0.08, 0.03, 0.16
-_UPPER_LID, _LOWER_LID = 900.0, 150.0  # together a little over the open eye's 1024
+UPPER_LID, LOWER_LID = 900.0, 150.0  # together a little over the open eye's 1024
 
 _FIXATION_MEAN_S = 1.4
 _FIXATION_MIN_S = 0.3
@@ -75,7 +75,8 @@ class IdleMotion:
     """
 
     def __init__(self, seed: int = 0) -> None:
-        waves, self._blink_rng, self._gaze_rng = (
+        self._seed = seed
+        waves, self._blink_rng, self._fixation_rng = (
             np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)
         )
         # pink-like noise as a sum of sines: a pure function of time
@@ -93,7 +94,9 @@ class IdleMotion:
         self._blink_s = self._draw_blink(0.0)
         self._gaze_from = self._gaze_to = np.zeros(2)
         self._saccade_s, self._saccade_length_s = 0.0, 0.03
-        self._next_saccade_s = self._draw_fixation(0.0)
+        self._fixation = 0  # number of it
+        self._fixation_end_s = self._draw_fixation(0.0)
+        self._reaction_s = math.inf  # when the gaze follows another state
 
     def apply(
         self, faps: NDArray[np.float32], time_s: float, state: State = State.LISTENING
@@ -104,7 +107,7 @@ class IdleMotion:
         """
         if state is not self._state:
             self._state = state
-            self._next_saccade_s = min(self._next_saccade_s, time_s + _REACTION_S)
+            self._reaction_s = min(self._reaction_s, time_s + _REACTION_S)
         elapsed_s = max(time_s - self._time_s, 0.0)
         self._time_s = time_s
         goal = _LISTENING_HEAD if state is State.LISTENING else 1.0
@@ -121,15 +124,15 @@ class IdleMotion:
         faps[_EYES_YAW] += yaw - head[1]
         faps[_LIDS_UPPER] += _LID_PER_GAZE * (pitch - head[0])
         # from wherever an expression has put the lids
-        faps[_LIDS_UPPER] += lid * (_UPPER_LID - faps[_LIDS_UPPER])
-        faps[_LIDS_LOWER] += lid * (_LOWER_LID - faps[_LIDS_LOWER])
+        faps[_LIDS_UPPER] += lid * (UPPER_LID - faps[_LIDS_UPPER])
+        faps[_LIDS_LOWER] += lid * (LOWER_LID - faps[_LIDS_LOWER])
 
     def _draw_blink(self, after_s: float) -> float:
         interval_s = _BLINK_MEDIAN_S * math.exp(_BLINK_LOG_SD * self._blink_rng.standard_normal())
         return after_s + max(interval_s, _BLINK_MIN_S)
 
     def _draw_fixation(self, after_s: float) -> float:
-        return after_s + _FIXATION_MIN_S + float(self._gaze_rng.exponential(_FIXATION_MEAN_S))
+        return after_s + _FIXATION_MIN_S + float(self._fixation_rng.exponential(_FIXATION_MEAN_S))
 
     def _lid(self, time_s: float) -> float:
         """How far the lids are shut, 0 to 1."""
@@ -142,19 +145,32 @@ class IdleMotion:
 
     def _gaze(self, time_s: float) -> NDArray[np.float64]:
         """Yaw (to the left) and pitch (downwards) of the gaze in space."""
-        while time_s >= self._next_saccade_s:
-            is_on_listener = self._gaze_rng.random() < _ON_LISTENER[self._state]
-            sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
-            target_deg = np.clip(
-                self._gaze_rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG
-            )
-            self._gaze_from, self._gaze_to = self._gaze_to, target_deg * _DEGREE
-            size_deg = float(np.linalg.norm(self._gaze_to - self._gaze_from)) / _DEGREE
-            self._saccade_s = self._next_saccade_s
-            self._saccade_length_s = 0.021 + 0.0022 * size_deg
-            self._next_saccade_s = self._draw_fixation(self._saccade_s)
+        if time_s >= min(self._fixation_end_s, self._reaction_s):
+            saccade_s = self._reaction_s
+            while time_s >= self._fixation_end_s:
+                saccade_s, self._fixation = self._fixation_end_s, self._fixation + 1
+                self._fixation_end_s = self._draw_fixation(saccade_s)
+            self._reaction_s = math.inf
+            self._look_at(self._target(), saccade_s)
+        return self._gaze_at(time_s)
+
+    def _gaze_at(self, time_s: float) -> NDArray[np.float64]:
         done = _smooth_step((time_s - self._saccade_s) / self._saccade_length_s)
         return self._gaze_from + done * (self._gaze_to - self._gaze_from)
+
+    def _look_at(self, target: NDArray[np.float64], saccade_s: float) -> None:
+        if np.array_equal(target, self._gaze_to):
+            return
+        self._gaze_from, self._gaze_to = self._gaze_at(saccade_s), target
+        size_deg = float(np.linalg.norm(target - self._gaze_from)) / _DEGREE
+        self._saccade_s, self._saccade_length_s = saccade_s, 0.021 + 0.0022 * size_deg
+
+    def _target(self) -> NDArray[np.float64]:
+        """Where this fixation rests in the state of now: the same for the same fixation."""
+        rng = np.random.default_rng([self._seed, self._fixation])
+        is_on_listener = rng.random() < _ON_LISTENER[self._state]
+        sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
+        return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * _DEGREE
 
 
 class RestingFace:

@@ -16,6 +16,7 @@ class AudioChunk(Message):
 
     token: Name
     pcm: Annotated[bytes, Meta(max_length=MAX_AUDIO_BYTES)]  # interleaved, little-endian
+    acknowledge: bool = False  # the client reads acknowledgements, and sends again what is lost
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +24,7 @@ class EndOfAudio(Message):
     """No more audio will come; the services finish the session."""
 
     token: Name
+    acknowledge: bool = False  # as in AudioChunk
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

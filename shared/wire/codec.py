@@ -48,6 +48,11 @@ def encode(message: Message) -> list[bytes]:
     return [topic(type(message), message.session), _ENCODER.encode(message)]
 
 
+def encoded_size(structure: object) -> int:
+    """Return the bytes that a structure takes in the body of a message."""
+    return len(_ENCODER.encode(structure))
+
+
 def decode(parts: Sequence[bytes]) -> Message:
     """Return the message in two parts.
 

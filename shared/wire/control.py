@@ -9,21 +9,29 @@ from typing import Annotated
 from msgspec import Meta
 
 from shared.wire.message import (
+    Address,
     ChosenLips,
     Count,
     Delay,
     Encoding,
     EndpointMap,
+    ExpressionMap,
+    ExpressivenessOrNone,
     FrameRate,
+    HoldTime,
     LanguageName,
     LipsOrNone,
     Message,
     MetricMap,
     Name,
+    NameOrNone,
     Nanoseconds,
     NumChannels,
     SampleRate,
+    Samples,
     SessionName,
+    ShapeSets,
+    Share,
     Text,
     VoiceProfile,
 )
@@ -50,9 +58,10 @@ class EventName(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusRequest(Message):
-    """Asks for the state of the whole system."""
+    """Asks for the state of the whole system, or of one session and its services."""
 
     request: Name
+    after: Count = 0  # where the page before has ended
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -87,8 +96,9 @@ class StatusReport(Message):
     """The answer to a status request."""
 
     request: Name
-    services: Annotated[list[ServiceState], Meta(max_length=1000)]
+    services: Annotated[list[ServiceState], Meta(max_length=10000)]
     sessions: Annotated[list[SessionState], Meta(max_length=10000)]
+    next: Count = 0  # what to ask for the next page with; 0: this is the last
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,7 +106,8 @@ class SessionInput:
     """How far a service is with the input of one session."""
 
     idle_s: Annotated[float, Meta(ge=0)] = 0.0  # since its last input
-    sequence: Count = 0  # of the newest audio message; 0 where a service takes no audio
+    sequence: Count = 0  # newest audio message not needed any more; 0 where none is taken
+    media_time: Samples = 0  # up to where the session's phones are final
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,6 +127,7 @@ class Heartbeat(Message):
     frame_rate_hz: FrameRate = 0.0  # of the FAP frames that it makes
     delay_ms: Delay = 0.0  # how much later than its sound it makes a FAP frame
     lips: LipsOrNone = ""  # the lip model that it uses until a client chooses one
+    load: Share = 0.0  # of the last seconds in which its loop was busy
     metrics: MetricMap = field(default_factory=dict)
     sessions: Annotated[dict[SessionName, SessionInput], Meta(max_length=10000)] = field(
         default_factory=dict
@@ -129,6 +141,7 @@ class HeartbeatSeen(Message):
     sent_ns: Nanoseconds  # echoed
     received_ns: Nanoseconds  # control's clock
     replied_ns: Nanoseconds  # control's clock
+    control: NameOrNone = ""  # instance of control; another than before has just started
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,7 +161,11 @@ class AllowedKeys(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartSession(Message):
-    """Control tells a service to serve a session (again, with a greater epoch, after a crash)."""
+    """Control tells a service to serve a session (again, with a greater epoch, after a crash).
+
+    Phones whose middle lies before ``media_time`` are known already. A recognizer sends this back
+    to a control that has just started, which knows the session from it.
+    """
 
     request: Name
     token: Name
@@ -162,6 +179,13 @@ class StartSession(Message):
     delay_ms: Delay = 0.0  # how much later than its sound a FAP frame is made
     lips: LipsOrNone = ""  # the lip model that moves the mouth at first
     voice: VoiceProfile = b""  # of the speaker, for the recognizer's lips
+    expressiveness: ExpressivenessOrNone = 0.0  # that was chosen; 0: none was
+    expressions: ExpressionMap = field(default_factory=dict)  # that the face shows at first
+    hold_s: HoldTime = 0.0  # that these stay before they fade
+    shapes: ShapeSets = field(default_factory=list)  # sets that are published beside FAP frames
+    client: Address = b""  # what the client calls itself at control
+    client_key: NameOrNone = ""  # its public key; empty where all is plain
+    client_request: NameOrNone = ""  # its open-session
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import TypeAlias, get_args
 
 import numpy as np
 
 from shared.clock import duration_to_samples, to_samples, to_seconds
 from shared.phones import events
 from shared.wire.message import Message
-from shared.wire.speech import EndOfPhones, Lips, Phone, Progress, Speech
+from shared.wire.speech import EndOfPhones, Lips, Phone, Progress, ResumeFace, Speech, Stalled
 
 SpeechMessage: TypeAlias = Phone | Lips | Speech | Progress | EndOfPhones
-SPEECH_MESSAGES: tuple[type[Message], ...] = (Phone, Lips, Speech, Progress, EndOfPhones)
+LinkMessage: TypeAlias = SpeechMessage | Stalled | ResumeFace  # from recognizer to synthesizer
+LINK_MESSAGES: tuple[type[Message], ...] = get_args(LinkMessage)
 
 
 def message_of(event: events.SoundEvent) -> SpeechMessage:

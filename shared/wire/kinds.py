@@ -16,9 +16,10 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.message import Message
 from shared.wire.session import (
+    AddShapes,
     ChooseExpressiveness,
     ChooseLips,
     CloseSession,
@@ -31,7 +32,16 @@ from shared.wire.session import (
     SessionMoved,
     SessionOpened,
 )
-from shared.wire.speech import Acknowledge, EndOfPhones, Lips, Phone, Progress, Speech
+from shared.wire.speech import (
+    Acknowledge,
+    EndOfPhones,
+    Lips,
+    Phone,
+    Progress,
+    ResumeFace,
+    Speech,
+    Stalled,
+)
 
 MESSAGES: dict[str, type[Message]] = {
     cls.kind: cls
@@ -69,11 +79,15 @@ MESSAGES: dict[str, type[Message]] = {
         Express,
         ChooseExpressiveness,
         AllowedKeys,
+        Stalled,
+        ResumeFace,
+        Shapes,
+        AddShapes,
     )
 }
 
 # The session's endpoint that publishes each kind.
 PUBLISHER_OF: dict[type[Message], str] = {
     **dict.fromkeys((Phone, Lips, Speech, Sound), "phones"),
-    **dict.fromkeys((FapFrame, EndOfFaps), "faps"),
+    **dict.fromkeys((FapFrame, Shapes, EndOfFaps), "faps"),
 }

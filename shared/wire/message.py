@@ -22,6 +22,7 @@ from shared.face.expressions import (
 )
 from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from shared.face.shape_names import MAX_SHAPES, ShapeSetName
 
 VERSION = 2
 DOCUMENT = "proto/PROTOCOL.md"
@@ -32,6 +33,8 @@ MAX_MESSAGE_BYTES = 1024 * 1024
 Version = Annotated[int, Meta(ge=1, le=65535)]
 SessionName = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
 Name = Annotated[str, Meta(min_length=1, max_length=128)]
+NameOrNone = Annotated[str, Meta(max_length=128)]  # empty: none
+Address = Annotated[bytes, Meta(max_length=255)]  # of a ROUTER's peer
 Text = Annotated[str, Meta(max_length=2000)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Samples = Annotated[int, Meta(ge=0, le=2**53)]
@@ -51,13 +54,21 @@ Strength = Annotated[float, Meta(ge=0, le=1)]
 ExpressionMap = Annotated[dict[KnownExpression, Strength], Meta(max_length=len(ExpressionName))]
 HoldTime = Annotated[float, Meta(ge=0, le=MAX_HOLD_S)]  # s
 ExpressivenessAmount = Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)]
+ExpressivenessOrNone = Annotated[float, Meta(ge=0, le=MAX_EXPRESSIVENESS)]  # 0: not chosen
 VoiceProfile = Annotated[bytes, Meta(max_length=MAX_VOICE_BYTES)]  # empty: anybody's
 Endpoint = Annotated[str, Meta(max_length=256)]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]
+FapValuesOrNone = Annotated[bytes, Meta(max_length=4 * NUM_FAPS)]  # empty: not told
+KnownShapes = Annotated[str, Meta(pattern=f"^({'|'.join(ShapeSetName)})$")]
+ShapeSets = Annotated[list[KnownShapes], Meta(max_length=len(ShapeSetName))]
+ShapeNames = Annotated[list[Name], Meta(max_length=MAX_SHAPES)]
+ShapeNameMap = Annotated[dict[Name, ShapeNames], Meta(max_length=16)]
+ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 LipValues = Annotated[bytes, Meta(min_length=4 * len(MOUTH_FAPS), max_length=4 * len(MOUTH_FAPS))]
 FapMask = Annotated[bytes, Meta(min_length=MASK_BYTES, max_length=MASK_BYTES)]
 EndpointMap = Annotated[dict[Name, Endpoint], Meta(max_length=16)]
 Probability = Annotated[float, Meta(ge=0, le=1)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
@@ -21,8 +21,11 @@ from shared.wire.message import (
     LanguageName,
     Message,
     Name,
+    NameOrNone,
     NumChannels,
     SampleRate,
+    ShapeNameMap,
+    ShapeSets,
     Text,
     VoiceProfile,
 )
@@ -35,11 +38,11 @@ class ErrorCode(StrEnum):
     BAD_AUDIO = "bad-audio"
     BAD_TOKEN = "bad-token"  # noqa: S105 - no password
     BAD_VOICE = "bad-voice"
+    BUSY = "busy"
     FINISHED = "finished"
     NO_SERVICE = "no-service"
     NO_VIDEO = "no-video"
     NOT_ALLOWED = "not-allowed"
-    REPLAYED = "replayed"
     SESSION_EXISTS = "session-exists"
     TIMEOUT = "timeout"
     TOO_MANY_SERVICES = "too-many-services"
@@ -58,6 +61,7 @@ class OpenSession(Message):
     record: bool = False  # the driver writes a video named after the session
     paced: bool = True  # audio comes in real time; false: as fast as the services take it
     voice: VoiceProfile = b""  # of the speaker, for lips from sound
+    shapes: ShapeSets = field(default_factory=list)  # sets that are published beside FAP frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,10 +72,11 @@ class SessionOpened(Message):
     token: Name  # proves ownership when the client sends audio, flushes or closes
     audio: Endpoint  # ROUTER for the client's audio
     phones: Endpoint  # XPUB: phone, speech, sound
-    faps: Endpoint  # XPUB: fap-frame, end-of-faps
+    faps: Endpoint  # XPUB: fap-frame, shapes, end-of-faps
     events: Endpoint  # XPUB: event, session-moved
     language: LanguageName = ""  # of the phones
     frame_rate_hz: FrameRate = 0.0  # of the FAP frames
+    shapes: ShapeNameMap = field(default_factory=dict)  # names in each set that is published
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,8 +135,20 @@ class ChooseExpressiveness(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AddShapes(Message):
+    """Lets a session publish more sets of shapes; control tells the services all of them."""
+
+    request: Name
+    shapes: ShapeSets
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Done(Message):
-    """A request was carried out."""
+    """A request was carried out.
+
+    For a ``start-session``, ``media_time`` says up to where the session's phones are final at this
+    service; 0 where it keeps none.
+    """
 
     request: Name
 
@@ -140,13 +157,14 @@ class Done(Message):
 class Error(Message):
     """A request or message was refused, or something failed.
 
-    Kind and fields are the same in every version of the protocol, and a message of another version
-    is answered in that version, so that every client can read why it was refused.
+    Every version of the protocol keeps its kind and fields, and a message of another version is
+    answered in that version, so that every client can read why it was refused.
     """
 
     code: Name  # an ErrorCode, or one of a later build
     text: Text
-    request: Annotated[str, Meta(max_length=128)] = ""
+    request: NameOrNone = ""
+    retry_after_s: Annotated[float, Meta(ge=0, le=3600)] = 0.0  # 0: not stated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

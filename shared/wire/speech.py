@@ -1,4 +1,4 @@
-"""What the recognizer emits: voice activity, phones, lips, progress."""
+"""What the recognizer emits: voice activity, phones, lips, progress; and what the face answers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from msgspec import Meta
 
 from shared.wire.message import (
     Count,
+    FapValues,
+    FapValuesOrNone,
     LipDelay,
     LipValues,
     Message,
@@ -62,5 +64,24 @@ class EndOfPhones(Message):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Stalled(Message):
+    """The client sends no audio: the sound stands still at media_time until the next message."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResumeFace(Message):
+    """A new synthesizer goes on behind the newest frame of the one before, of media_time."""
+
+    frame: Count  # number of that frame
+    faps: FapValues  # its 68 float32, little-endian, in FAP units
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Acknowledge(Message):
-    """The receiver has every message of the session up to ``sequence``."""
+    """The receiver has every message of the session up to ``sequence``.
+
+    It also tells the newest frame, of media_time, for a ``ResumeFace``.
+    """
+
+    frame: Count = 0  # number of the newest frame; 0: there is none
+    faps: FapValuesOrNone = b""  # its 68 float32, little-endian, in FAP units

@@ -18,6 +18,7 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("evaluation.system.rendering.NUM_IMAGES", 10)
+    monkeypatch.setattr("evaluation.system.sessions.NUM_SESSIONS", (1, 2))
     monkeypatch.setattr("evaluation.system.page.SETTLE_S", 0.5)
     monkeypatch.setattr("evaluation.system.page.MEASURE_S", 2.0)
     figures = tmp_path / "latency.json"
@@ -29,7 +30,7 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     assert 0 < latency["chunk_to_frame_ms"]["p50"] <= latency["chunk_to_frame_ms"]["p95"]
     assert latency["sound_to_frame_ms"]["p50"] > latency["delay_ms"]
     assert set(latency["cpu_s_per_audio_s"]) >= {"recognizer", "synthesizer"}
-    kinds = [f"{number}{lips}" for number in (1, 16) for lips in ("", " with lips")]
+    kinds = [f"{number}{lips}" for number in (1, 2) for lips in ("", " with lips")]
     assert list(latency["sessions"]) == [
         f"{name}, {kind}" for name in ("neural", "blocks") for kind in kinds
     ]
@@ -40,6 +41,10 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     assert list(live) == ["deform", "upload", "draw", "read back"]
     assert list(video) == [*live, "encode"]
     assert rendering["asset_bytes"] > 500_000
-    assert list(latency["page"]) == ["idle", "microphone"]
-    assert all(drawing["pictures_per_s"] > 0 for drawing in latency["page"].values())
+    drawings = latency["page"]["drawings"]
+    assert list(drawings) == ["idle", "microphone"]
+    assert all(drawing["pictures_per_s"] > 0 for drawing in drawings.values())
+    offsets = latency["page"]["offsets"]
+    assert offsets["num_clicks"] > 0
+    assert offsets["p5_ms"] <= offsets["mean_ms"] <= offsets["p95_ms"]
     assert f"{latency['chunk_to_frame_ms']['p50']:.1f}" in result.stdout

@@ -15,10 +15,11 @@ from services.control.registry import CLIENT_NEEDS
 from services.control.service import Request
 from services.synthesizer.service import LOW_LEVEL_FAPS
 from shared.face.faps import FAPS, MOUTH_FAPS
+from shared.face.shapes import SHAPE_SETS
 from shared.phones.inventory import load_inventory
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.control import AllowedKey, EventName, ServiceState, SessionInput, SessionState
-from shared.wire.events import SPEECH_MESSAGES
+from shared.wire.events import LINK_MESSAGES
 from shared.wire.kinds import MESSAGES, PUBLISHER_OF
 from shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
 from shared.wire.schema import schema
@@ -169,7 +170,7 @@ def test_every_answer_is_in_the_document() -> None:
     assert asked - {"joined", "request"} == from_clients | {
         "heartbeat",
         "start-session",
-        *(cls.kind for cls in SPEECH_MESSAGES),
+        *(cls.kind for cls in LINK_MESSAGES),
     }
     assert answers < set(MESSAGES)
     assert errors - {"request"} == {*ErrorCode}
@@ -191,6 +192,12 @@ def test_every_fap_is_in_the_document() -> None:
 
 def test_every_unit_of_faps_is_in_the_document() -> None:
     assert {row[0] for row in table(section("FAPs"))} == {fap.fapu for fap in FAPS if fap.fapu}
+
+
+def test_every_shape_is_in_the_document() -> None:
+    assert table(section("Sets of shapes")) == [
+        [f"`{name}`", " ".join(shapes.names)] for name, shapes in SHAPE_SETS.items()
+    ]
 
 
 def test_every_phone_is_in_the_document_and_its_example_has_it() -> None:

@@ -52,9 +52,28 @@ def test_tables_have_the_same_shape() -> None:
     assert shapes[0] == shapes[1]
 
 
-def test_every_relative_link_leads_to_a_file() -> None:
-    for link in re.findall(r"\]\((?!http)([^)#]+)", "".join(ENGLISH + CHINESE)):
-        assert (ROOT / link).exists(), link
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/clients/*.md"), ROOT / "examples" / "README.md"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_relative_link_leads_to_a_file_and_a_heading_there(page: Path) -> None:
+    links = re.findall(r"\]\((?!http)([^)#]*)(?:#([^)]+))?\)", page.read_text("utf-8"))
+    for link, heading in links:
+        target = page.parent / link if link else page
+        assert target.exists(), link
+        if heading:
+            titles = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
+            anchors = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
+            assert heading in anchors, f"{link}#{heading}"
+
+
+def test_every_client_has_a_picture_and_numbered_steps() -> None:
+    for page in set((ROOT / "docs" / "clients").glob("*.md")):
+        text = page.read_text("utf-8")
+        if page.stem not in ("README", "troubleshooting"):
+            assert "![" in text, page.name
+            assert re.search(r"^4\. ", text, re.MULTILINE), page.name
+            assert f"({page.name})" in (page.parent / "README.md").read_text("utf-8")
 
 
 def test_they_lead_to_each_other() -> None:
@@ -63,7 +82,7 @@ def test_they_lead_to_each_other() -> None:
 
 
 def test_every_command_that_documents_name_exists() -> None:
-    text = "\n".join(path.read_text("utf-8") for path in (*ROOT.glob("*.md"), *ROOT.glob("*/*.md")))
+    text = "\n".join(path.read_text("utf-8") for path in [*PAGES, *ROOT.glob("*/*.md")])
     named = set(re.findall(r"(?:`|^    [^#\n]*?)kouxing ([a-z-]+)", text, re.MULTILINE))
     assert len(named) > 10
     assert named <= {*get_command(app).list_commands(None)}  # type: ignore[attr-defined]

@@ -14,7 +14,7 @@ from shared.audio_file import read_audio
 from shared.bus import Received
 from shared.client import Client, Session, Subscription
 from shared.wire.audio import Sound
-from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.message import Message
 from shared.wire.speech import Lips, Phone, Speech
 
@@ -24,6 +24,7 @@ KINDS: tuple[type[Message], ...] = (FapFrame, EndOfFaps, Phone, Lips, Speech, So
 @dataclass
 class Collected:
     frames: list[FapFrame] = field(default_factory=list)
+    shapes: list[Shapes] = field(default_factory=list)
     phones: list[Phone] = field(default_factory=list)
     lips: list[Lips] = field(default_factory=list)
     speech: list[Speech] = field(default_factory=list)
@@ -35,6 +36,8 @@ class Collected:
             match each.message:
                 case FapFrame() as frame:
                     self.frames.append(frame)
+                case Shapes() as shapes:
+                    self.shapes.append(shapes)
                 case Phone() as phone:
                     self.phones.append(phone)
                 case Lips() as lips:

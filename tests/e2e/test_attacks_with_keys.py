@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 
 import pytest
-import zmq
 
 from evaluation.system import attackers
+from evaluation.system.attacks import wait_until_let_in
 from evaluation.system.memory import Memory
-from shared.client import Session
-from shared.keys import user_key
-from tests.system import System, connect
+from shared.client import Client, Session
+from tests.system import System
 
 pytestmark = pytest.mark.e2e
 
@@ -30,49 +28,25 @@ def test_without_a_key_the_handshake_fails(system: System, witness: Session, tar
 
 
 @pytest.fixture
-def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
-    made: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    yield made
-    made.destroy(linger=0)
+def client(system: System) -> Iterator[Client]:
+    """A client of the same address, once that is let in again after the attack before."""
+    wait_until_let_in(system.control)
+    with Client(system.control) as made:
+        yield made
 
 
-def send_for_a_while(raw: zmq.Socket[bytes], data: bytes, flags: int) -> None:
-    raw.setsockopt(zmq.SNDTIMEO, 100)
-    end_s = time.monotonic() + SECONDS
-    number = 0
-    while time.monotonic() < end_s:
-        number += 1
-        try:
-            raw.send(data + (b"%08d" % number if data[:1] == b"\x01" else b""), flags)
-        except zmq.Again:
-            continue
-
-
-@pytest.mark.parametrize("part", [b"", b"x" * 300, b"x" * 60_000])
-@pytest.mark.parametrize("target", ["commands", "audio"])
-def test_a_key_that_is_allowed_may_not_send_a_message_without_end(
-    system: System,
-    witness: Session,
-    context: zmq.Context[zmq.Socket[bytes]],
-    target: str,
-    part: bytes,
+@pytest.mark.parametrize(
+    ("attack", "target"),
+    [
+        (attack, target)
+        for attack in attackers.ALLOWED
+        for target in (("faps",) if "subscriptions" in attack else ("commands", "audio"))
+    ],
+)
+def test_a_key_that_is_allowed_is_bounded(
+    system: System, witness: Session, attack: str, target: str
 ) -> None:
-    raw = context.socket(zmq.DEALER)
-    connect(raw, system.endpoints()[target], user_key())
     memory = Memory(system.processes[attackers.TARGETS[target][0]].pid)
-    send_for_a_while(raw, part, zmq.SNDMORE)
+    attackers.ALLOWED[attack](system.endpoints()[target], SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
-    raw.close()
-    assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
-
-
-def test_a_key_that_is_allowed_may_not_subscribe_without_end(
-    system: System, witness: Session, context: zmq.Context[zmq.Socket[bytes]]
-) -> None:
-    raw = context.socket(zmq.XSUB)
-    connect(raw, system.endpoints()["faps"], user_key())
-    memory = Memory(system.processes["synthesizer"].pid)
-    send_for_a_while(raw, b"\x01" + b"x" * 110, 0)
-    assert memory.growth_mb < MAX_GROWTH_MB
-    raw.close()
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb

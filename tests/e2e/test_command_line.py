@@ -20,6 +20,7 @@ import soundfile
 from shared.client import Client, Refused, Subscription
 from shared.face.fap_file import read_fap
 from shared.face.faps import FAP_NUMBER
+from shared.face.shapes import ARKIT
 from shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file, stream_into
 from tests.system import ROOT, VOWELS_FILE, System, free_port, kouxing
@@ -230,14 +231,15 @@ def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[s
 
 
 def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: Path) -> None:
-    recorded = tmp_path / "face.fap"
+    recorded, table = tmp_path / "face.fap", tmp_path / "face.csv"
     samples = samples_of_file(SENTENCE)
     waits = "waiting for session heard to open, as with kouxing speak my.wav --session heard"
     recorder = listening(system.control, "heard", "--output", recorded, says=waits)
+    shaper = listening(system.control, "heard", "--as", "arkit", "-o", table, says=waits)
     printer = listening(system.control, "heard", "--show", "syllables", says=waits)
     with Client(system.control) as client:
         session = client.open_session(session="heard", encoding="f32le", paced=False)
-        for listener in (recorder, printer):
+        for listener in (recorder, shaper, printer):
             assert listener.stderr is not None
             assert listener.stderr.readline() == "following session heard\n"
         sent = stream_into(session, samples, chunk=320)
@@ -247,6 +249,12 @@ def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: P
     animation = read_fap(recorded)
     assert animation.frame_rate_hz == 50
     np.testing.assert_allclose(animation.faps, sent.faps, atol=0.5)
+    _, log = shaper.communicate(timeout=100)
+    assert shaper.returncode == 0, log
+    weights = np.genfromtxt(table, delimiter=",", names=True)
+    assert weights.dtype.names == ("time_s", *ARKIT.names)
+    jaw = [ARKIT.weights(faps)[ARKIT.names.index("jawOpen")] for faps in sent.faps]
+    np.testing.assert_allclose(weights["jawOpen"], jaw, atol=1e-3)
     printed, log = printer.communicate(timeout=100)
     assert printer.returncode == 0, log
     spoken = [line.split()[-1] for line in printed.splitlines()]
@@ -276,6 +284,8 @@ def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> Non
     [
         (["listen", "two words"], "letters, digits"),
         (["listen", "heard", "-o", "face.txt"], ".jsonl"),
+        (["listen", "heard", "-o", "face.fap", "--as", "vrm"], "such a file holds faps"),
+        (["listen", "heard", "--show", "phones", "--as", "vrm"], "--as take frames"),
         (["listen", "heard", "-o", "nowhere/face.fap"], "mkdir -p nowhere"),
         (["speak", SENTENCE, "--session", "two words"], "letters, digits"),
         (["status", "--json", "nowhere/status.json"], "mkdir -p nowhere"),

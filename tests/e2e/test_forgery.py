@@ -205,7 +205,7 @@ def test_very_many_false_services_leave_the_status_readable(system: System, clie
     with Bus(own_key("lamp", ("service:lamp",))) as bus:
         stranger = bus.connect_dealer(system.control)
         metrics = {f"{number:0128}": 0.0 for number in range(64)}
-        for number in range(1200):
+        for number in range(MAX_SERVICES_OF_KEY + 100):
             heartbeat = replace(HEARTBEAT, service="lamp", instance=f"{number:0128}")
             stranger.send(replace(heartbeat, metrics=metrics))
         assert answer(stranger, Error).code == "too-many-services"

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.kinds import free_addresses
+from services.kinds import KINDS, free_addresses
+from shared.keys import key_folder, read_guests
 from tests.e2e.following import stream
 from tests.system import System, kouxing
 
 pytestmark = pytest.mark.e2e
-KINDS = ("recognizer", "synthesizer")
+WORKERS = ("recognizer", "synthesizer")
 
 
 def machine(folder: Path, name: str, role: str, file: str) -> Path:
@@ -27,13 +28,24 @@ def machine(folder: Path, name: str, role: str, file: str) -> Path:
     return folder / name
 
 
+def test_init_makes_the_keys_of_all_services(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert kouxing("keys", "init").returncode == 0
+    roles = {guest.name: guest.roles for guest in read_guests().values()}
+    assert roles.keys() == {*KINDS, "client"} - {"control"}
+    assert roles["gateway"] == ("service:gateway", "client")
+    assert {path.stem for path in key_folder().glob("*.key")} == {*KINDS, "client"}
+
+
 def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
-    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1", **free_addresses(KINDS)}
+    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1", **free_addresses(WORKERS)}
     with System(["control"], tmp_path, settings=settings) as system:
-        for kind in KINDS:
+        for kind in WORKERS:
             own = machine(tmp_path, f"{kind}-host", f"service:{kind}", kind)
             system.start(kind, XDG_STATE_HOME=str(own))
         system.wait_ready()

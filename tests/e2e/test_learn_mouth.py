@@ -130,8 +130,9 @@ def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Brow
 
     assert browser.evaluate("window.kouxing.state.voice") == ""
     browser.click("lesson-keep")
-    browser.command("Page.reload")
-    browser.wait_for("window.kouxing?.state.connected && window.kouxing.state.voice !== ''")
+    browser.command("Page.navigate", url=browser.evaluate("location.href"))
+    browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
+    browser.wait_for("window.kouxing.state.voice !== ''")
     profile = base64.b64decode(browser.evaluate("window.kouxing.state.voice"))
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.microphone")

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import base64
 import io
+import socket
 import subprocess
 import sys
+import time
 import wave
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +22,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from evaluation.system import sync
 from evaluation.system.chromium import wait_until
 from shared.client import Client, Session
 from shared.face.faps import FAP_NUMBER, NUM_FAPS
@@ -50,6 +53,8 @@ def face(values: list[int]) -> NDArray[np.float32]:
 
 
 A_FACE, B_FACE = face(A_VALUES), face(B_VALUES)
+NUM_CLICKS = 8  # one after another that must fit
+MAX_GAP_MS = 70  # before a picture; a busy machine draws fewer, which tell less
 
 
 def write_tone(path: Path) -> None:
@@ -86,6 +91,7 @@ def browser(gateway: Gateway, tmp_path_factory: pytest.TempPathFactory) -> Itera
     folder = tmp_path_factory.mktemp("browser")
     write_tone(folder / "tone.wav")
     browser = Browser(folder, folder / "tone.wav")
+    sync.install(browser)
     yield browser
     browser.close()
 
@@ -216,13 +222,13 @@ def simulate(page: Browser, script: str) -> Any:
         """(async () => {
           const { Playout, FapTrack } = await import("/playout.js");
           const playout = new Playout();
-          let now = 1000, media = 0, numChanges = 0;
+          let now = 1000, media = 0;
           function frames(num, lateness) {
             for (let i = 0; i < num; i++) {
               now += 20; media += 320;
               playout.soundArrived(now, media - 320, 320);
               playout.frameArrived(now, media - 16 * lateness(i));
-              numChanges += playout.adjust(now);
+              playout.adjust(now);
             }
             return playout.delayMs;
           }
@@ -232,21 +238,22 @@ def simulate(page: Browser, script: str) -> Any:
     )
 
 
-def test_the_delay_follows_the_frames_by_halves_outside_a_dead_zone(page: Browser) -> None:
-    first, changes_first, near, changes_near, far, later = simulate(
+def test_the_delay_follows_the_frames_gliding_and_by_halves_from_afar(page: Browser) -> None:
+    first, soon, near, far, later = simulate(
         page,
         """
-        const first = frames(200, () => 100), changesFirst = numChanges;
-        const near = frames(1000, () => 125), changesNear = numChanges;
+        const first = frames(200, () => 100);
+        const soon = frames(100, () => 125), near = frames(1000, () => 125);
         const far = frames(25, () => 240);
-        return [first, changesFirst, near, changesNear, far, frames(1000, () => 240)];
+        return [first, soon, near, far, frames(1000, () => 240)];
         """,
     )
 
-    assert (first, changes_first) == (pytest.approx(120), 0)  # 100 + a FAP frame
-    assert (near, changes_near) == (pytest.approx(120), 0)  # an error of 22 ms is left alone
+    assert first == pytest.approx(120)  # 100 + a FAP frame
+    assert 0 < soon - first <= 10  # 5 ms a second
+    assert near == pytest.approx(145)
     assert far == pytest.approx(near, abs=70)  # half a second of bad network: at most half of it
-    assert later == pytest.approx(260, abs=30)
+    assert later == pytest.approx(260)
 
 
 def test_a_pause_of_the_sender_is_no_delay(page: Browser) -> None:
@@ -304,16 +311,82 @@ def test_sound_waits_for_a_click_where_the_browser_wants_one_and_then_meets_its_
     page.wait_for("window.kouxing.state.sound === 'on'")
     played = page.evaluate("window.kouxing.state.soundSamplesPlayed")
     page.wait_for(f"window.kouxing.state.soundSamplesPlayed > {played + 16000}")
+    page.wait_for("document.getElementById('delay').textContent.startsWith('sound waits')")
+    assert page.evaluate("window.kouxing.state.playoutDelayMs") > LOOK_AHEAD_MS - 20
+
+
+def test_a_button_delays_other_programs_as_much_as_this_sound(
+    system: System, session: Session, page: Browser
+) -> None:
+    if page.evaluate("window.kouxing.state.sound") != "on":
+        page.click("sound")
+    system.talk(session.name, A_FACE, "a")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind(("127.0.0.1", 0))
+        url = f"osc://127.0.0.1:{program.getsockname()[1]}"
+        page.click("open-settings")
+        page.evaluate(f"document.getElementById('send-to').value = {url!r}")
+        page.evaluate("document.getElementById('send').requestSubmit()")
+        page.wait_for("!document.getElementById('send-delay').hidden")
+        page.evaluate("document.getElementById('send-delay').click()")
+        page.wait_for("/ \\d+ ms later/.test(document.getElementById('programs').innerText)")
+        page.evaluate("document.querySelector('#programs button').click()")
+        page.wait_for("document.getElementById('programs').children.length === 0")
+    page.evaluate("document.getElementById('settings').hidePopover()")
+
+
+@pytest.mark.timeout(400)  # of a busy machine
+def test_clicks_are_heard_when_the_mouth_is_seen_to_open(
+    system: System, session: Session, page: Browser
+) -> None:
+    if page.evaluate("window.kouxing.state.sound") != "on":
+        page.click("sound")
+    page.wait_for("window.kouxing.state.sound === 'on'")
+    page.resize(160, 120)  # drawn quickly
+    system.flash = A_FACE
+    system.talk(session.name, B_FACE, "b")
+    sync.begin(page)
+    offsets: list[float] = []
 
     def is_in_sync() -> bool:
-        state = page.evaluate("window.kouxing.state")
-        delay_ms, sound_ms = state["playoutDelayMs"], state["soundMinusPictureMs"]
-        if delay_ms is None or sound_ms is None:  # the sound waits for more
+        time.sleep(0.5)  # to read is work for the page, too
+        clicks_ms, pictures = sync.read(page)
+        seen_ms, _, jaw = pictures.T
+        is_open = jaw > A_VALUES[0] / 2
+        opens = is_open[1:] & ~is_open[:-1] & (np.diff(seen_ms) < MAX_GAP_MS)
+        offsets[:] = sync.offsets_ms(clicks_ms, seen_ms[1:][opens])[-NUM_CLICKS:]
+        if len(offsets) < NUM_CLICKS:
             return False
         # 45 ms are detectable according to ITU-R BT.1359.
-        return bool(LOOK_AHEAD_MS - 20 < delay_ms < 400 and abs(sound_ms) < 45)
+        return abs(sum(offsets)) / NUM_CLICKS < 15 and max(map(abs, offsets)) < 45
 
-    wait_until(is_in_sync, 60)  # a busy machine takes some time
+    try:
+        wait_until(is_in_sync, 240)  # a busy machine takes some time
+    except TimeoutError:
+        raise AssertionError(offsets) from None
+    finally:
+        system.flash = None
+        page.resize(*SIZE_PX)
+
+
+@pytest.mark.timeout(400)  # of a busy machine
+def test_sound_keeps_to_its_picture_while_the_page_is_hidden(
+    system: System, session: Session, page: Browser
+) -> None:
+    if page.evaluate("window.kouxing.state.sound") != "on":
+        page.click("sound")
+    system.talk(session.name, A_FACE, "a")
+    page.wait_for("window.kouxing.state.soundMinusPictureMs !== null")
+    page.wait_for("window.kouxing.state.playoutDelayMs < 220", 120)  # a busy page waits for longer
+    page.evaluate(
+        "window.ticks = []; window.tick = requestAnimationFrame;"
+        "window.requestAnimationFrame = (act) => window.ticks.push(act)"
+    )
+    system.look_ahead_ms = 260
+    page.wait_for("window.kouxing.state.playoutDelayMs > 260")  # and nothing was drawn
+    page.wait_for("Math.abs(window.kouxing.state.soundMinusPictureMs) < 15")
+    system.look_ahead_ms = LOOK_AHEAD_MS
+    page.evaluate("window.requestAnimationFrame = window.tick; window.ticks.forEach(tick)")
 
 
 def test_the_face_goes_to_rest_when_the_stream_stalls_and_comes_back(

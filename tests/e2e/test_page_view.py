@@ -65,6 +65,30 @@ def test_the_token_is_used_and_taken_out_of_the_address(browser: Browser, gatewa
     browser.wait_for("!window.kouxing.state.microphone")
 
 
+def test_other_programs_are_sent_the_face_from_the_settings(
+    browser: Browser, gateway: Gateway
+) -> None:
+    visit(browser, f"{gateway.page}#token=a%2Bsecret")
+    browser.wait_for(READY)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind(("127.0.0.1", 0))
+        program.settimeout(60)
+        url = f"livelink://127.0.0.1:{program.getsockname()[1]}"
+        browser.click("open-settings")
+        browser.evaluate(f"document.getElementById('send-to').value = {url!r}")
+        browser.evaluate("document.getElementById('send').requestSubmit()")
+        assert program.recv(2000)[0] == 6  # of Live Link Face's version
+        browser.wait_for("/head, \\d+ frames/.test(document.getElementById('programs').innerText)")
+        browser.evaluate("document.querySelector('#programs button').click()")
+        browser.wait_for("document.getElementById('programs').children.length === 0")
+    browser.evaluate("document.getElementById('send-to').value = 'vmc://192.0.2.1'")
+    browser.evaluate("document.getElementById('send').requestSubmit()")
+    browser.wait_for(
+        "document.getElementById('send-problem').innerText.includes('another machine')"
+    )
+    browser.evaluate("document.getElementById('settings').hidePopover()")
+
+
 def test_the_bare_view_is_the_face_alone_on_a_transparent_background(
     browser: Browser, gateway: Gateway
 ) -> None:
@@ -191,7 +215,8 @@ def test_a_screen_reader_finds_names_and_is_not_flooded(browser: Browser, gatewa
         "Array.from(document.querySelectorAll('[role=status], [role=alert], output, [aria-live]'))"
         ".filter((each) => each.getAttribute('aria-live') !== 'off').map((each) => each.id)"
     )
-    assert live == ["turned", "state", "notice", "lesson-advice", "lesson-problem"]
+    told = ["turned", "state", "notice", "send-problem", "lesson-advice", "lesson-problem"]
+    assert live == told
     browser.evaluate("document.getElementById('settings').hidePopover()")
 
 

@@ -17,8 +17,9 @@ import pytest
 from PIL import Image
 
 from services.cli.heads import import_mesh
-from services.cli.offline import CurveForm, render
+from services.cli.offline import render
 from services.cli.run import head_environment
+from services.cli.terminal import CurveForm
 from services.driver.config import DriverConfig, Framing
 from services.driver.head.glb_export import export_glb
 from services.driver.head.head import Head
@@ -32,6 +33,7 @@ from shared.audio_file import read_audio
 from shared.errors import UserError
 from shared.face.fap_file import FapAnimation, read_fap, write_fap
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from shared.face.shapes import VRM
 from tests.glb_writer import write_glb
 from tests.meshes import meshes
 from tests.system import ROOT, VOWELS_FILE, free_port, kouxing
@@ -116,7 +118,7 @@ def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
         ("a.csv", {"text": "你好"}, "--text is for a sound"),
         ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit is for curves"),
         ("a.fap", {"form": CurveForm.ARKIT}, "such a file holds faps"),
-        ("a.glb", {"form": CurveForm.OCULUS}, "such a file holds faps or arkit"),
+        ("a.glb", {"form": CurveForm.OCULUS}, "such a file holds faps or arkit; for oculus write"),
         ("no/a.csv", {}, "cannot be written"),
         ("no/a.mp4", {}, "cannot be written"),
         ("no/a.png", {"size": "64x48"}, "cannot be written"),
@@ -143,6 +145,10 @@ def test_a_sound_becomes_curves(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in paths[".jsonl"].read_text().splitlines()]
     jaw = [line["arkit"]["jawOpen"] for line in lines]
     assert np.corrcoef(jaw, faps.faps[:, 2])[0, 1] > 0.8
+    render(paths[".fap"], paths[".csv"], form=CurveForm.VRM)
+    table = np.genfromtxt(paths[".csv"], delimiter=",", names=True)
+    assert table.dtype.names == ("time_s", *VRM.names)
+    assert np.ptp(table["aa"]) > 0.3
     with pytest.raises(UserError, match="curves are of one face"):
         render(SENTENCE, paths[".csv"], lips=list(LipModelName)[:2])
     with pytest.raises(UserError, match="--live knows no text"):

@@ -41,7 +41,7 @@ def test_it_runs_until_it_is_interrupted_and_is_found_whatever_its_ports(tmp_pat
         with contextlib.suppress(OSError):  # another program has it, which is as good
             stack.enter_context(socket.create_server(("127.0.0.1", 5550)))
         running = subprocess.Popen(
-            [*command, "--no-browser", "--port", "0"],
+            [*command, "--no-browser", "--port", "0", "--workers", "2"],
             env=environment,
             cwd=ROOT,
             stderr=subprocess.PIPE,
@@ -60,6 +60,8 @@ def test_it_runs_until_it_is_interrupted_and_is_found_whatever_its_ports(tmp_pat
             assert "kouxing" in answer.read().decode()
         spoken = kouxing("speak", SENTENCE, environment=environment)
         assert spoken.returncode == 0, spoken.stderr
+        shown = kouxing("status", environment=environment).stdout
+        assert (len(re.findall("recognizer-", shown)), len(re.findall("driver-", shown))) == (2, 1)
         running.send_signal(signal.SIGINT)
         _, log = running.communicate(timeout=60)
     assert running.returncode == 0, log

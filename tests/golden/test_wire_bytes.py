@@ -27,6 +27,11 @@ DIGESTS = {
     "version2-pitch.json": "31891c9db98db7a19deb2198869a4f42b05d2b41e1f0f7e885f2e82538d8b66a",
     "version2-voice.json": "1a748175ef62d82ae6c0be096aaaaf969ef9b9b309e68571e4dbaececb2d7289",
     "version2-keys.json": "9432071c81e53ca44db189787bb29affd77f3877cfb2fdb67a57f1ca721d6dbe",
+    "version2-failover.json": "ef41439c5cb92622a377f96bd751c144db8b9fc950ce54bca0227f1eb7f578de",
+    "version2-resume.json": "8e28a901814d98d5756a44f9586742ec5d99fe9132e2b011fb74b39ea3650e74",
+    "version2-audio.json": "d30442ccf40c9d67b261ab9e4b0779ae035150c71484b62345180cb6a046139c",
+    "version2-pages.json": "1f357c1fa65c5af61af8e85168ade64bb7c69083d3f66d4aa8eb08f7d5bf86ce",
+    "version2-shapes.json": "991008823cc7b9721e95e913f8cf99bd7e0acd3f2655571676cd9f04f860f0a6",
 }
 
 

@@ -21,15 +21,18 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import aiohttp
+import msgpack
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pythonosc.osc_bundle import OscBundle
 
 from services.gateway.microphone import SAMPLE, SAMPLE_TEXT
-from services.gateway.wire import REST_TYPE
+from services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
 from shared.bus import AUDIO_QUEUE_LENGTH, Bus
 from shared.clock import now_ns
 from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
+from shared.face.shapes import VRM
 from shared.keys import Peer
 from shared.wire.audio import AudioChunk, EndOfAudio, Sound
 from shared.wire.control import (
@@ -65,9 +68,9 @@ LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls so
 EPOCH = 3
 PATIENT = """
-from services.gateway import microphone
+from services.gateway import own_sessions
 from services.process import run_module
-microphone.LAST_FRAME_LIMIT_S = 600
+own_sessions.LAST_FRAME_LIMIT_S = 600
 run_module("gateway")
 """
 FACE = struct.pack(f"<{NUM_FAPS}f", *range(NUM_FAPS))
@@ -305,6 +308,16 @@ async def receive_of_session(browser: aiohttp.ClientWebSocketResponse) -> aiohtt
             return message
 
 
+async def receive_binary(browser: aiohttp.ClientWebSocketResponse, kind: int) -> bytes:
+    """Return the next binary message of a type."""
+    while True:
+        message = await browser.receive(60)
+        if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == kind:
+            found: bytes = message.data
+            return found
+        assert message.type in (aiohttp.WSMsgType.BINARY, aiohttp.WSMsgType.TEXT)
+
+
 async def receive_json(browser: aiohttp.ClientWebSocketResponse, kind: str) -> dict[str, Any]:
     """Return the next text message of a kind."""
     while True:
@@ -411,6 +424,52 @@ def test_a_session_reaches_its_viewers(system: ScriptedSystem, gateway: GatewayP
             assert (await receive_json(newest, "session"))["session"] is None
             await other.send_str("[[[[")
             assert (await receive_json(other, "error"))["code"] == "refused"
+
+    asyncio.run(look())
+
+
+def test_a_viewer_gets_shapes_in_the_form_it_asks_for(
+    system: ScriptedSystem, gateway: GatewayProcess
+) -> None:
+    page = f"{gateway.page}viewer?session=shaped&shapes=vrm"
+    weights = VRM.weights(np.frombuffer(FACE, "<f4"))
+
+    async def look() -> None:
+        async with (
+            aiohttp.ClientSession() as http,
+            http.ws_connect(page) as binary,
+            http.ws_connect(f"{page}&format=json") as text,
+            http.ws_connect(f"{page}&format=msgpack") as packed,
+        ):
+            for viewer in (binary, text, packed):
+                hello = await receive_json(viewer, "shapes")
+                assert (hello["set"], tuple(hello["names"])) == ("vrm", VRM.names)
+            assert len((await receive_binary(binary, REST_SHAPES_TYPE))[16:]) == 4 * len(VRM.names)
+            assert set((await receive_json(text, "rest"))["weights"]) == {*VRM.names}
+            system.do(lambda: system.start("shaped"))
+            await until(lambda: system.started == ["shaped"])
+            system.do(lambda: system.publish_all("shaped"))
+            assert (await receive_binary(binary, FAP_TYPE))[16:] == FACE
+            shapes = await receive_binary(binary, SHAPES_TYPE)
+            assert struct.unpack_from("<B3xId", shapes) == (SHAPES_TYPE, EPOCH, 320.0)
+            np.testing.assert_array_equal(np.frombuffer(shapes, "<f4", offset=16), weights)
+            frames = [await receive_json(text, "weights")]
+            while len(frames) < 2:
+                message = await packed.receive(60)
+                if message.type is aiohttp.WSMsgType.BINARY and message.data[0] >= 0x80:
+                    frames += [each for each in [msgpack.unpackb(message.data)] if each["epoch"]]
+            for frame in frames:
+                assert (frame["type"], frame["set"]) == ("weights", "vrm")
+                assert (frame["epoch"], frame["media_time"]) == (EPOCH, 320)
+                assert [*frame["weights"]] == [*VRM.names]
+                np.testing.assert_allclose([*frame["weights"].values()], weights, atol=1e-4)
+            system.do(
+                lambda: system.commands.send(StopSession(session="shaped"), to=system.gateway)
+            )
+            for wrong in ("shapes=face", "shapes=vrm&format=xml"):
+                async with http.get(f"{gateway.page}viewer?{wrong}") as answer:
+                    assert answer.status == 400
+                    assert "one of" in await answer.text()
 
     asyncio.run(look())
 
@@ -764,6 +823,50 @@ def test_a_voice_goes_with_the_microphones_session(
 
     asyncio.run(speak())
     assert system.voices == [profile]
+
+
+def test_the_page_sends_the_newest_face_to_another_program(
+    system: ScriptedSystem, gateway: GatewayProcess
+) -> None:
+    async def look(program: socket.socket) -> None:
+        url = f"osc://127.0.0.1:{program.getsockname()[1]}"
+        async with aiohttp.ClientSession() as http:
+            for command in (
+                {"start": "nonsense"}, {"start": "osc://192.0.2.1"}, {}, {"delay_ms": -1},
+                {"delay_ms": 10**400},
+            ):  # fmt: skip
+                async with http.post(f"{gateway.page}senders", json=command) as answer:
+                    assert answer.status == 422
+                    assert (await answer.json())["error"]
+            async with http.post(f"{gateway.page}senders", json={"start": url}) as answer:
+                assert [each["target"] for each in (await answer.json())["senders"]] == [url]
+            await until(lambda: time_sent(program) > 1.0)  # a face at rest
+            system.do(lambda: system.start("older"))
+            system.do(lambda: system.start("newer"))
+            await until(lambda: {"older", "newer"} <= {*system.started})
+            system.do(lambda: system.publish_all("older"))
+            system.do(lambda: system.publish_all("newer"))
+            await until(lambda: time_sent(program) == 320 / 16000)
+            async with http.get(f"{gateway.page}senders") as answer:
+                (state,) = (await answer.json())["senders"]
+            assert state["rate_hz"] > 0
+            assert (state["contents"], state["problem"]) == ("ARKit shapes and head", "")
+            assert state["delay_ms"] == 0
+            async with http.post(f"{gateway.page}senders", json={"delay_ms": 90}) as answer:
+                assert [each["delay_ms"] for each in (await answer.json())["senders"]] == [90]
+            async with http.post(f"{gateway.page}senders", json={"stop": url}) as answer:
+                assert await answer.json() == {"senders": [], "stopped": []}
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
+        program.bind(("127.0.0.1", 0))
+        asyncio.run(look(program))
+
+
+def time_sent(program: socket.socket) -> float:
+    """Return the time in the next frame, whose first message that is."""
+    while (first := next(iter(OscBundle(program.recv(2000))))).address != "/kouxing/time":
+        pass
+    return round(float(first.params[0]), 3)
 
 
 def test_sigterm_closes_with_a_reason_and_exits_0(own_gateway: GatewayProcess) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 import ssl
@@ -41,6 +42,7 @@ def gateway(certificate: Path) -> Iterator[Gateway]:
         names="face.example",
         allowed_origins="https://tool.example",
         frame_ancestors="https://tool.example https://other.example:8443",
+        senders=f"vmc://192.0.2.7 vts://127.0.0.1:{free_port()}",
     )
     wait_until(lambda: certificate.is_file() and certificate.read_bytes(), 60)
     yield gateway
@@ -56,13 +58,24 @@ UPGRADE = {
 
 
 def get(gateway: Gateway, certificate: Path, path: str, headers: dict[str, str]) -> HTTPResponse:
+    return ask(gateway, certificate, "GET", path, headers)
+
+
+def ask(
+    gateway: Gateway,
+    certificate: Path,
+    method: str,
+    path: str,
+    headers: dict[str, str],
+    body: str | None = None,
+) -> HTTPResponse:
     """Return the head of an answer."""
     tls = ssl.create_default_context(cafile=certificate)  # names are checked, too
     with contextlib.closing(
         HTTPSConnection("127.0.0.1", urlsplit(gateway.page).port, timeout=60, context=tls)
     ) as connection:
         wait_until(lambda: can_connect(connection), 60)
-        connection.request("GET", f"/{path}", headers=headers)
+        connection.request(method, f"/{path}", body, headers)
         return connection.getresponse()
 
 
@@ -74,7 +87,7 @@ def can_connect(connection: HTTPSConnection) -> bool:
     return True
 
 
-@pytest.mark.parametrize("path", ["viewer", "microphone", "learn-mouth"])
+@pytest.mark.parametrize("path", ["viewer", "microphone", "vosk", "whip", "learn-mouth", "senders"])
 def test_sessions_need_the_token(gateway: Gateway, certificate: Path, path: str) -> None:
     for query in ("", "?token=wrong"):
         assert get(gateway, certificate, path + query, UPGRADE).status == 403
@@ -90,6 +103,21 @@ def test_the_token_opens_and_the_page_itself_needs_none(
     assert page.headers["Content-Security-Policy"].endswith(ancestors)
 
 
+def test_whip_takes_the_token_as_its_clients_send_it_and_answers_pages_that_may_connect(
+    gateway: Gateway, certificate: Path
+) -> None:
+    headers = {"Origin": "https://tool.example"}
+    asked = ask(gateway, certificate, "OPTIONS", "whip", headers)
+    assert asked.status == 204
+    assert "Authorization" in asked.headers["Access-Control-Allow-Headers"]
+    evil = ask(gateway, certificate, "OPTIONS", "whip", {"Origin": "https://evil.example"})
+    assert evil.status == 403
+    for token, status in (("wrong", 403), ("secret", 404)):
+        given = {**headers, "Authorization": f"Bearer {token}"}
+        ended = ask(gateway, certificate, "DELETE", "whip/unknown", given)
+        assert ended.status == status
+
+
 @pytest.mark.parametrize(
     ("origin", "status"), [("https://tool.example", 101), ("https://evil.example", 403)]
 )
@@ -98,6 +126,23 @@ def test_only_pages_that_are_named_may_connect(
 ) -> None:
     headers = {**UPGRADE, "Origin": origin}
     assert get(gateway, certificate, "viewer?token=secret", headers).status == status
+
+
+@pytest.mark.parametrize(
+    ("url", "origin", "status"),
+    [
+        ("vmc://192.0.2.7", None, 200),  # of the configuration
+        ("vmc://192.0.2.7:39539", None, 422),
+        ("vmc://evil.example", None, 422),
+        ("vmc://127.0.0.1:39539", "https://evil.example", 403),
+    ],
+)
+def test_a_page_sends_to_this_machine_and_to_what_is_configured(
+    gateway: Gateway, certificate: Path, url: str, origin: str | None, status: int
+) -> None:
+    headers = {"Origin": origin} if origin else {}
+    body = json.dumps({"start": url})
+    assert ask(gateway, certificate, "POST", "senders?token=secret", headers, body).status == status
 
 
 @pytest.mark.parametrize(
@@ -131,6 +176,7 @@ def test_the_made_certificate_is_for_its_owner_alone(gateway: Gateway, certifica
         ({"HOST": "0.0.0.0"}, "gateway.certificate=kouxing.pem"),  # noqa: S104
         ({"CERTIFICATE": __file__}, "gateway.certificate: "),
         ({"CERTIFICATE": "/no/such/folder/new.pem"}, "No such file or directory"),
+        ({"SENDERS": "vmc://127.0.0.1 http://127.0.0.1"}, "vmc://127.0.0.1:39540, separated by"),
         ({"FRAME_ANCESTORS": "https://a.example; script-src *"}, "separated by spaces"),
     ],
 )

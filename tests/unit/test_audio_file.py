@@ -110,6 +110,22 @@ def test_raw_sound_may_come_in_odd_pieces() -> None:
     np.testing.assert_allclose(read.ravel() * 32768, values)
 
 
+@pytest.mark.parametrize(
+    ("subtype", "expected"), [("PCM_16", 0.25), ("FLOAT", 0.25), ("PCM_24", "expected PCM of 16")]
+)
+def test_a_pipe_may_bring_a_wav_header(subtype: str, expected: float | str) -> None:
+    file = io.BytesIO()
+    soundfile.write(file, np.full((3000, 2), 0.25), 24000, subtype=subtype, format="WAV")
+    file.seek(0)
+    if isinstance(expected, str):
+        with pytest.raises(UserError, match=expected):
+            raw_audio(file, 16000, 1)
+        return
+    source = raw_audio(file, 16000, 1)
+    assert (source.sample_rate_hz, source.num_channels) == (24000, 2)
+    np.testing.assert_array_equal(np.concatenate([*source.blocks])[:3000], expected)
+
+
 def _write_media(path: Path, codec: str, samples: np.ndarray, rate_hz: int) -> None:
     with av.open(path, "w") as container:
         stream = container.add_stream(codec, rate=rate_hz, layout="mono")

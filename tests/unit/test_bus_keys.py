@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from evaluation.system.attackers import connect
 from shared import connections
 from shared.bus import Bus, Socket
 from shared.endpoints import split_endpoint, with_key
@@ -19,7 +20,6 @@ from shared.wire.control import StatusRequest
 from shared.wire.face import FapFrame
 from shared.wire.message import Message
 from shared.wire.session import Joined
-from tests.system import connect
 
 pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"

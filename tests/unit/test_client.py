@@ -16,8 +16,17 @@ from shared.client import RESEND_S, Client, Session
 from shared.keys import Peer
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.message import Message
-from shared.wire.session import Error, ErrorCode, OpenSession, SessionMoved, SessionOpened
-from shared.wire.speech import Phone
+from shared.wire.session import (
+    CloseSession,
+    Done,
+    Error,
+    ErrorCode,
+    FlushSession,
+    OpenSession,
+    SessionMoved,
+    SessionOpened,
+)
+from shared.wire.speech import Acknowledge, Phone
 
 pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"
@@ -80,6 +89,12 @@ class Stage:
         while self.session.opened.epoch == 1:
             list(self.session.errors())
 
+    def acknowledge(self, recognizer: int, sequence: int, sender: Peer) -> None:
+        """Acknowledge audio, and wait until the client knows."""
+        self.audio[recognizer].send(Acknowledge(session="s", sequence=sequence), to=sender)
+        while self.session._acknowledged < sequence:
+            list(self.session.errors())
+
     def take(self, recognizer: int, count: int) -> list[AudioChunk]:
         return [next_of(AudioChunk, self.audio[recognizer])[0] for _ in range(count)]
 
@@ -119,12 +134,40 @@ def test_audio_goes_on_as_before_when_the_recognizer_is_the_same(stage: Stage) -
 
 
 def test_only_the_newest_audio_is_kept(stage: Stage) -> None:
-    stage.send(150)
-    stage.take(0, 150)
+    stage.send(149)
+    stage.take(0, 148)
+    stage.acknowledge(0, 149, next_of(AudioChunk, stage.audio[0])[1])
+    stage.send(1)
     stage.move(next_sequence=1)
     num_kept = round(RESEND_S / 0.1) + 1
     kept = stage.take(1, num_kept)
     assert [chunk.sequence for chunk in kept] == list(range(151 - num_kept, 151))
+
+
+def test_what_is_not_acknowledged_is_sent_again(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.send(5)
+    stage.take(0, 1)
+    _, sender = next_of(AudioChunk, stage.audio[0])
+    stage.take(0, 3)
+    stage.acknowledge(0, 2, sender)
+    monkeypatch.setattr(client_module, "ANSWER_S", (0.0, 0.0))
+    stage.session._answer_s = 0.0
+    stage.send(1)
+    first, other = next_of(AudioChunk, stage.audio[0])
+    assert (first.sequence, first.epoch) == (3, 1)
+    assert other.address != sender.address, "the old connection may be dead"
+
+
+def test_a_recognizer_that_acknowledges_nothing_gets_audio_once(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.session._answer_s = 0.0
+    stage.send(3)
+    assert [chunk.sequence for chunk in stage.take(0, 3)] == [1, 2, 3]
+    stage.send(1)
+    assert [chunk.sequence for chunk in stage.take(0, 1)] == [4]
 
 
 def test_subscriptions_follow(stage: Stage) -> None:
@@ -143,6 +186,47 @@ def test_subscriptions_follow(stage: Stage) -> None:
     assert output.wait(5.0)
     epochs = [r.message.epoch for r in output.receive() if isinstance(r.message, Phone)]
     assert epochs == [2]
+
+
+def flush(stage: Stage) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        flushing = pool.submit(stage.session.flush)
+        request, sender = next_of(FlushSession, stage.commands)
+        stage.commands.send(Done(session="s", request=request.request), to=sender)
+        flushing.result()
+
+
+def test_audio_from_before_an_interruption_is_not_sent_again(stage: Stage) -> None:
+    stage.send(3)
+    flush(stage)
+    stage.send(1)
+    stage.move(next_sequence=2)
+    assert [chunk.sequence for chunk in stage.take(1, 1)] == [4]
+    stage.send(1)
+    assert [chunk.sequence for chunk in stage.take(1, 1)] == [5]
+
+
+def test_a_session_that_is_flushed_while_it_moves_has_nothing_to_send(stage: Stage) -> None:
+    stage.send(3)
+    flush(stage)
+    stage.move(next_sequence=2)
+    assert not stage.audio[1].wait(0.1)
+    assert stage.session.finish()
+    assert next_of(EndOfAudio, stage.audio[1])[0].sequence == 4
+
+
+def test_a_session_is_closed_when_its_end_is_acknowledged(stage: Stage) -> None:
+    stage.send(1)
+    assert stage.session.finish()
+    stage.take(0, 1)
+    _, sender = next_of(EndOfAudio, stage.audio[0])
+    with ThreadPoolExecutor(1) as pool:
+        closing = pool.submit(stage.session.close)
+        assert not stage.commands.wait(0.2)
+        stage.audio[0].send(Acknowledge(session="s", sequence=2), to=sender)
+        request, client = next_of(CloseSession, stage.commands)
+        stage.commands.send(Done(session="s", request=request.request), to=client)
+        closing.result()
 
 
 def complain(stage: Stage) -> None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from services.cli import main as command_line
 from services.kinds import KINDS
+from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 
@@ -77,3 +78,11 @@ def test_the_command_line_imports_neither_training_nor_evaluation_nor_services()
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_without_ray_the_command_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "services.cli.ray_workers", raising=False)
+    ended = CliRunner().invoke(command_line.app, ["cluster"])
+    assert isinstance(ended.exception, UserError)
+    assert "pip install 'kouxing[cluster]'" in str(ended.exception)

@@ -14,7 +14,6 @@ from services.kinds import KINDS, free_addresses
 from services.recognizer.config import RecognizerConfig
 from services.synthesizer.config import SynthesizerConfig
 from shared.config import ServiceConfig, Settings
-from shared.endpoints import reachable
 from shared.errors import UserError
 
 pytestmark = pytest.mark.unit
@@ -62,6 +61,11 @@ def test_file_is_weaker_than_environment_is_weaker_than_command_line(tmp_path: P
     assert all_three.num_stable_frames == 5
 
 
+def test_a_list_in_a_file_is_its_items_separated_by_spaces(tmp_path: Path) -> None:
+    file = written(tmp_path, '[gateway]\nsenders = ["vmc://", "vts://?delay=120"]\n')
+    assert settings(file).load(GatewayConfig).senders == "vmc:// vts://?delay=120"
+
+
 def test_assignments_are_stronger_than_the_environment() -> None:
     types = {kind.name: kind.config_type for kind in KINDS.values()}
     environment = {"KOUXING_RECOGNIZER_NUM_STABLE_FRAMES": "4", "KOUXING_GATEWAY_PORT": "1"}
@@ -102,6 +106,7 @@ def test_every_value_tells_where_it_came_from(tmp_path: Path) -> None:
         (RecognizerConfig, "num_stable_frames", "many", "a whole number from 1 to 20"),
         (RecognizerConfig, "num_stable_frames", "0", "a whole number from 1 to 20"),
         (RecognizerConfig, "num_stable_frames", "2.9", "a whole number from 1 to 20"),
+        (RecognizerConfig, "advertise", "tcp://here", "a host name or address"),
         (RecognizerConfig, "audio", "5560", "an endpoint, tcp://HOST:PORT"),
         (RecognizerConfig, "audio", "tcp://127.0.0.1:99999", "an endpoint, tcp://HOST:PORT"),
         (RecognizerConfig, "control", "here", "an endpoint, tcp://HOST:PORT"),
@@ -134,7 +139,6 @@ def test_an_error_names_key_value_origin_and_what_is_allowed(
 @pytest.mark.parametrize(
     ("config_type", "key", "text", "named"),
     [
-        (RecognizerConfig, "audio", "tcp://0.0.0.0:5560", "recognizer.advertise: name the host"),
         (GatewayConfig, "host", "0.0.0.0", "gateway.host: 0.0.0.0"),  # noqa: S104
         (RecognizerConfig, "min_confidenc", "1", "the nearest is min_confidence"),
     ],
@@ -201,6 +205,14 @@ def test_the_variables_in_documents_are_known(name: str) -> None:
     settings(environment=dict.fromkeys(names, ""))
 
 
+def test_the_one_file_for_all_hosts_is_understood(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "hosts.md").read_text(encoding="utf-8")
+    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    given = settings(written(tmp_path, text))
+    control = given.load(ControlConfig)
+    assert control.reachable(control.commands) == given.load(RecognizerConfig).control
+
+
 def test_no_variable_sets_two_keys_of_a_service_kind() -> None:
     names = [
         f"{kind.name}_{key}".upper()
@@ -211,12 +223,38 @@ def test_no_variable_sets_two_keys_of_a_service_kind() -> None:
     assert len({*names, *common}) == len(names) + len(common)
 
 
+def test_a_proxy_may_encrypt_the_page() -> None:
+    wildcard = "0.0.0.0"  # noqa: S104
+    given = {"host": wildcard, "plain_http": "true"}
+    assert settings().load(GatewayConfig, given).host == wildcard
+
+
 def test_what_is_bound_to_every_address_is_told_by_the_advertised_one() -> None:
     environment = {"KOUXING_ADVERTISE": "face-host"}
     config = settings(environment=environment).load(
         SynthesizerConfig, {"faps": "tcp://0.0.0.0:5571"}
     )
-    assert reachable(config.faps, config.advertise, "faps") == "tcp://face-host:5571"
+    assert config.reachable(config.faps) == "tcp://face-host:5571"
+
+
+@pytest.mark.parametrize(
+    ("advertise", "bound", "told"),
+    [
+        ("203.0.113.7", "tcp://10.0.0.2:5571", "tcp://203.0.113.7:5571"),  # behind NAT
+        ("fd00::7", "tcp://0.0.0.0:5571", "tcp://[fd00::7]:5571"),
+        ("", "tcp://10.0.0.2:5571", "tcp://10.0.0.2:5571"),
+    ],
+)
+def test_the_advertised_address_is_known_or_told(advertise: str, bound: str, told: str) -> None:
+    synthesizer = SynthesizerConfig(advertise=advertise, control="tcp://127.0.0.9:5550")
+    assert synthesizer.reachable(bound) == told
+
+
+def test_control_is_found_where_everybody_looks_for_it() -> None:
+    environment = {"KOUXING_CONTROL": "tcp://face.example:5550"}
+    control = settings(environment=environment).load(ControlConfig)
+    assert control.reachable("tcp://0.0.0.0:5551") == "tcp://face.example:5551"
+    assert control.reachable("tcp://10.0.0.1:5551") == "tcp://10.0.0.1:5551"
 
 
 def test_free_addresses_cover_every_key_that_binds() -> None:

@@ -176,6 +176,24 @@ def test_a_message_of_another_connection_has_another_number(bus: Bus) -> None:
     assert len({*numbers, 0}) == 3
 
 
+def test_the_end_of_a_connection_is_told_by_its_number(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    port = port_of(audio)
+    with connected(port) as lasting:
+        for _ in range(3):  # a descriptor is used again
+            with connected(port) as connection:
+                connection.sendall(wire_bytes(chunk(1, 10)))
+                (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
+                assert not list(audio.ended())
+            end_s = time.monotonic() + 20
+            ended: list[int] = []
+            while not ended and time.monotonic() < end_s:
+                ended = list(audio.ended())
+            assert ended == [received.sender.connection]
+        lasting.sendall(wire_bytes(chunk(1, 10)))
+        assert collect(bus, audio, lambda all_: len(all_) == 1)
+
+
 def test_a_descriptor_that_is_used_again_is_not_cut() -> None:
     before, other = socket.socketpair()
     gone = Connection(before.fileno(), os.fstat(before.fileno()).st_ino)

@@ -196,12 +196,27 @@ def test_a_crowd_of_paths_stays_within_its_bound() -> None:
         assert 0 < confidence <= 1
         most = max(most, decoder._num_tokens)
         assert len(decoder._records) <= 2 * search._RECORD_CAPACITY
-        in_use = np.flatnonzero(decoder._token_of != search._NO_TOKEN)
-        assert sorted(decoder._context[: decoder._num_tokens]) == in_use.tolist()
+        contexts = decoder._context[: decoder._num_tokens]
+        assert len(np.unique(contexts)) == len(contexts)
+        table = search._token_table(len(language.graph.last_phone))
+        assert (table == search._NO_TOKEN).all(), "another search would find these tokens"
     assert most == search._MAX_TOKENS
     path = decoder.finish()
     assert (path[0].start, path[-1].end) == (0, 60)
     assert all(one.end == two.start for one, two in pairwise(path))
+
+
+def test_searches_that_take_turns_do_not_disturb_each_other() -> None:
+    model = topology(3, np.random.default_rng(0), crowded_language())
+    scores = np.random.default_rng(1).normal(scale=4.0, size=(2, 40, model.num_states))
+    together = [Decoder(model), Decoder(model)]
+    for one, two in scores.astype(np.float32).transpose(1, 0, 2):
+        together[0].accept(one)
+        together[1].accept(two)
+    for decoder, rows in zip(together, scores.astype(np.float32), strict=True):
+        alone = Decoder(model)
+        alone.advance(rows)
+        assert decoder.finish() == alone.finish()
 
 
 def test_path_since_gives_the_phones_before_the_last() -> None:

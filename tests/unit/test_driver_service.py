@@ -138,7 +138,7 @@ def test_one_of_two_sessions_is_shown_and_the_other_goes_on_being_recorded(stage
     assert stage.recorded[0].session == "filmed"
     assert stage.recorded[0].num_images == 26  # of 0 to 1 s at 25 Hz
     assert Path(stage.recorded[0].path).is_file()
-    assert stage.driver.session_inputs() == {"other": SessionInput()}
+    stage.step_until(lambda: stage.driver.session_inputs() == {"other": SessionInput()})
     assert stage.errors == []
 
 

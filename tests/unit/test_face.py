@@ -233,17 +233,52 @@ def test_an_overtaken_estimate_is_dropped() -> None:
     np.testing.assert_array_equal(values(advance(face, 1.0)), values(advance(other, 1.0)))
 
 
-def test_restart_begins_anew_anywhere() -> None:
-    face = make_face()
-    first = values(speak(face))
-    face.restart(0.0)
-    np.testing.assert_array_equal(values(speak(face)), first)
-    face.restart(1e6 + DELAY_S)
-    face.accept(phone(0, "a", 1e6, 0.2))
-    frames = advance(face, 1e6 + 0.24 + DELAY_S)
-    assert frames[0][0] == 1e6
-    assert len(frames) == 13
-    assert values(frames)[:, JAW].max() > 100.0
+def test_another_recognizer_that_tells_the_same_changes_nothing() -> None:
+    face, plain = make_face(), make_face()
+    frames, expected = speak(face), speak(plain)
+    face.restart()
+    face.accept(SpeechChange(active=True, time_s=0.3))
+    frames += advance(face, 0.6)  # known already
+    face.accept(phone(0, "a", 0.42, 0.6, final=False))  # was number 1
+    for each in (face, plain):
+        (frames if each is face else expected).extend(advance(each, 1.2))
+    assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in expected]
+    np.testing.assert_allclose(values(frames)[:, JAW], values(expected)[:, JAW], atol=30.0)
+    face.accept(phone(0, "a", 0.42, 0.85))
+    face.accept(phone(1, "i", 1.27, 0.1))
+    assert values(advance(face, 1.5))[:, JAW].max() > 100.0
+
+
+def test_a_phone_that_another_recognizer_does_not_confirm_is_withdrawn() -> None:
+    face, plain = make_face(), make_face()
+    for each in (face, plain):
+        speak(each)
+    face.restart()
+    face.accept(phone(0, "i", 0.4, 0.8))
+    plain.accept(phone(1, "i", 0.4, 0.8))
+    after, revised = (values(advance(each, 1.0)) for each in (face, plain))
+    np.testing.assert_allclose(after, revised, atol=1.0)
+
+
+def test_a_face_takes_the_place_of_another() -> None:
+    first, second, plain = (make_face(idle_motion_seed=5) for _ in range(3))
+    expected = speak(plain) + plain.relax(3) + advance(plain, 1.4)
+    shown = speak(first) + first.relax(3)
+    second.resume(shown[-1][0], len(shown), shown[-1][1])
+    assert speak(second) == []
+    frames = shown + advance(second, 1.4)
+    assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in expected]
+    step, usual = (np.abs(np.diff(values(each), axis=0)).max(axis=0) for each in (frames, expected))
+    assert (step <= 1.2 * usual).all()
+
+
+def test_a_face_that_knows_nothing_of_the_one_before_begins_behind_it() -> None:
+    face = make_face(idle_motion_seed=5)
+    face.resume(20.0, 1000)
+    frames = advance(face, 20.1 + DELAY_S)
+    assert frames[0][0] == pytest.approx(20.02)
+    plain = advance(make_face(idle_motion_seed=5), 9.0)[-1]
+    assert np.abs(frames[0][1] - plain[1]).max() > 0.0
 
 
 def test_a_long_gap_is_not_filled_with_frames() -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
+from shared import follower
 from shared.bus import Bus, Socket
 from shared.errors import UserError
 from shared.face.faps import MASK_BYTES, NUM_FAPS
 from shared.follower import PollingLoop, SessionFollower
 from shared.wire.audio import Sound
-from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.message import Message
 
 pytestmark = pytest.mark.unit
@@ -124,17 +126,116 @@ def test_a_session_that_moved_is_followed_to_its_new_publisher(studio: Studio) -
 
     studio.start(2, studio.other_faps)
     assert not studio.follower.is_complete
-    assert not studio.follower.has_ended
     studio.complete()
-    assert studio.epochs == [2]
     assert studio.num_completed == 2
     studio.received.clear()
     studio.faps.send(frame(7))  # where it was published before
-    studio.other_faps.send(frame(1, epoch=1))  # left over from before the restart
     studio.other_faps.send(frame(1, epoch=2))
+    studio.other_faps.send(frame(2, epoch=1))  # left over from before the restart
     studio.step_until(lambda: bool(studio.received))
     assert studio.received == [frame(1, epoch=2)]
+    assert studio.epochs == [2]
+    assert not studio.follower.has_ended
     assert studio.follower.num_missed == 0
+
+
+def test_nothing_is_missed_or_taken_twice_while_a_session_moves(studio: Studio) -> None:
+    studio.start(1)
+    studio.complete()
+    studio.received.clear()
+    sounds = [Sound(session="one", epoch=1, sequence=1 + n, pcm=b"\0\0") for n in range(4)]
+    studio.phones.send(sounds[0])  # still under way when the move is told
+    studio.start(2, studio.other_faps)
+    studio.phones.send(sounds[1])
+    while not studio.follower._confirmed:  # from here on phones come both ways
+        list(studio.phones.receive())
+        studio.loop.step(0.01)
+    studio.phones.send(sounds[2])
+    studio.complete()
+    studio.phones.send(sounds[3])
+    studio.step_until(lambda: sounds[3] in studio.received)
+    assert studio.received == sounds
+
+
+def test_one_publishers_new_epoch_drops_nothing_of_another(studio: Studio) -> None:
+    studio.start(1)
+    studio.complete()
+    studio.faps.send(frame(1, epoch=2))  # read before the sound that came sooner
+    studio.step_until(lambda: len(studio.received) == 1)
+    late = Sound(session="one", epoch=1, sequence=1, pcm=b"\0\0")
+    studio.phones.send(late)
+    studio.step_until(lambda: len(studio.received) == 2)
+    assert studio.received[1] == late
+    assert studio.follower.epoch == 2
+
+
+def test_what_the_connection_before_still_brings_is_taken_once(studio: Studio) -> None:
+    studio.start(1)
+    studio.complete()
+    studio.start(1)  # at the same addresses: the connection may be dead
+    studio.complete()
+    sounds = [Sound(session="one", epoch=1, sequence=1 + n, pcm=b"\0\0") for n in range(3)]
+    for sound in (sounds[0], sounds[2], sounds[1]):  # both ways, and one late
+        studio.phones.send(sound)
+    studio.step_until(lambda: len(studio.received) == 3)
+    assert studio.received == [sounds[0], sounds[2], sounds[1]]
+    studio.follower._leave_s = 0.0
+    studio.phones.send(dataclasses.replace(sounds[0], sequence=4))
+    studio.step_until(lambda: len(studio.received) == 4)
+    assert studio.follower._socket_before is None
+
+
+def test_what_waited_while_the_process_was_stopped_is_left_but_for_the_newest(
+    studio: Studio,
+) -> None:
+    studio.start(1)
+    studio.complete()
+    frames = [dataclasses.replace(frame(n, 1), media_time=320 * n) for n in range(1, 31)]
+    studio.faps.send(frames[0])
+    studio.step_until(lambda: len(studio.received) == 1)
+    studio.loop.went_on_s = time.monotonic()
+    for each in frames[1:-1]:
+        studio.faps.send(each)
+    end_s = time.monotonic() + 2 * follower.CATCH_UP_S
+    studio.step_until(lambda: time.monotonic() > end_s)
+    assert len(studio.received) == 1
+    studio.faps.send(frames[-1])
+    studio.step_until(lambda: frames[-1] in studio.received)
+    assert studio.received == [frames[0], *frames[-1 - follower.MAX_OLD :]]
+    assert studio.follower.num_missed == 28 - follower.MAX_OLD
+
+
+def test_a_frame_that_is_made_again_in_a_new_epoch_is_taken_once(studio: Studio) -> None:
+    studio.start(1)
+    studio.complete()
+    frames = [
+        dataclasses.replace(frame(sequence, epoch), media_time=media_time)
+        for sequence, epoch, media_time in ((1, 1, 0), (2, 1, 320), (2, 2, 320), (3, 2, 640))
+    ]
+    for each in frames:
+        studio.faps.send(each)
+    studio.step_until(lambda: frames[-1] in studio.received)
+    assert studio.received == [frames[0], frames[1], frames[3]]
+
+
+def test_shapes_share_the_number_of_their_frame_and_are_taken_once_of_each_set() -> None:
+    studio = Studio(FapFrame, Shapes)
+    studio.start(1)
+    studio.complete()
+    studio.start(1)  # everything comes both ways for a while
+    studio.complete()
+    sent: list[Message] = []
+    for sequence, epoch, media_time in ((1, 1, 0), (2, 1, 320), (2, 2, 320), (3, 2, 640)):
+        of_frame = dataclasses.replace(frame(sequence, epoch), media_time=media_time)
+        fields = {"session": "one", "epoch": epoch, "sequence": sequence, "media_time": media_time}
+        shapes = [Shapes(**fields, set=name, weights=b"") for name in ("arkit", "vrm")]  # type: ignore[arg-type]
+        sent += [of_frame, *shapes]
+    for message in sent:
+        studio.faps.send(message)
+    studio.step_until(lambda: sent[-1] in studio.received)
+    assert studio.received == sent[:6] + sent[9:]
+    studio.follower.close()
+    studio.bus.close()
 
 
 def test_a_publisher_may_tell_of_a_restart_before_control_does(studio: Studio) -> None:
@@ -142,7 +243,7 @@ def test_a_publisher_may_tell_of_a_restart_before_control_does(studio: Studio) -
     studio.complete()
     studio.faps.send(frame(8))
     studio.faps.send(EndOfFaps(session="one", epoch=1))
-    studio.faps.send(frame(1, epoch=2))
+    studio.faps.send(frame(9, epoch=2))
     studio.step_until(lambda: len(studio.received) == 3)
     assert studio.epochs == [2]
     assert not studio.follower.has_ended

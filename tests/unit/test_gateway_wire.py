@@ -8,6 +8,7 @@ import struct
 import pytest
 
 from services.gateway import wire
+from services.gateway.sound_format import SoundFormat
 from shared.errors import UserError
 from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
@@ -24,9 +25,9 @@ def test_binary_messages_have_an_aligned_header() -> None:
 def test_a_hello_describes_the_audio() -> None:
     hello = wire.parse_hello('{"sample_rate_hz": 44100, "num_channels": 2, "encoding": "f32le"}')
 
-    assert (hello.sample_rate_hz, hello.num_channels, hello.encoding) == (44100, 2, "f32le")
-    assert hello.frame_bytes == 8
-    assert wire.parse_hello('{"sample_rate_hz": 8000}').frame_bytes == 2
+    assert hello.sound == SoundFormat(sample_rate_hz=44100, num_channels=2, encoding="f32le")
+    assert hello.sound.frame_bytes == 8
+    assert wire.parse_hello('{"sample_rate_hz": 8000}').sound.frame_bytes == 2
     assert hello.voice == b""
     assert wire.parse_hello('{"sample_rate_hz": 8000, "voice": "YWJj"}').voice == b"abc"
 

@@ -17,16 +17,15 @@ from services.driver.head.head import Head, neutral_faps
 from services.driver.render.renderer import Renderer
 from services.driver.render.scene import camera, load_head
 from shared.errors import UserError
-from shared.face.blendshapes import ARKIT, ARKIT_NAMES, OCULUS_NAMES
 from shared.face.faps import NUM_FAPS
-from shared.face.high_level import VISEMES
+from shared.face.shapes import ARKIT, OCULUS
 from tests.glb_writer import Mesh, write_glb
 from tests.meshes import meshes
 
 pytestmark = pytest.mark.unit
 
-SHAPES = {name: ARKIT[row] for row, name in enumerate(ARKIT_NAMES)}
-VISEME_SHAPES = dict(zip(OCULUS_NAMES, VISEMES, strict=True))
+SHAPES = {name: ARKIT.basis[row] for row, name in enumerate(ARKIT.names)}
+VISEME_SHAPES = dict(zip(OCULUS.names, OCULUS.basis, strict=True))
 ORDER = np.random.default_rng(3).permutation(52)
 
 
@@ -71,7 +70,7 @@ def test_the_arkit_shapes_of_our_own_export_are_enough(own: Head, tmp_path: Path
     document, binary = chunks(path)
     for mesh in document["meshes"]:
         names = mesh.get("extras", {}).get("targetNames", [])
-        names[:] = [name if name in ARKIT_NAMES else f"x{row}" for row, name in enumerate(names)]
+        names[:] = [name if name in ARKIT.names else f"x{row}" for row, name in enumerate(names)]
     write_chunks(path, document, binary)
     head = read_glb(path)
     for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
@@ -88,8 +87,8 @@ def test_the_arkit_shapes_of_our_own_export_are_enough(own: Head, tmp_path: Path
     ids=["plain", "prefixed", "sides"],
 )
 def test_arkit_shapes_in_any_order(own: Head, tmp_path: Path, rename: Callable[[str], str]) -> None:
-    shapes = {rename(ARKIT_NAMES[row]): ARKIT[row] for row in ORDER}
-    shapes |= {"somethingElse": ARKIT[0]}
+    shapes = {rename(ARKIT.names[row]): ARKIT.basis[row] for row in ORDER}
+    shapes |= {"somethingElse": ARKIT.basis[0]}
     head = read_glb(write_glb(tmp_path / "my.glb", meshes(own, shapes)))
     for name in ("jawOpen", "mouthPucker", "mouthSmileLeft", "eyeBlinkRight", "browInnerUp"):
         assert off(head, own, SHAPES[name]) < 0.25, name
@@ -232,7 +231,7 @@ def add(document: dict[str, Any], binary: bytearray, array: Any, kind: str, comp
 @pytest.fixture
 def small(tmp_path: Path) -> Path:
     vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0.1, 0]])
-    targets = {name: np.full((4, 3), 0.001 * row) for row, name in enumerate(ARKIT_NAMES, start=1)}
+    targets = {name: np.full((4, 3), 0.001 * row) for row, name in enumerate(ARKIT.names, start=1)}
     targets["eyeBlinkLeft"], targets["eyeBlinkRight"] = np.zeros((2, 4, 3))
     targets["eyeBlinkLeft"][1], targets["eyeBlinkRight"][0] = 0.01, 0.01
     mesh = Mesh("face", vertices, np.array([[0, 1, 2], [1, 3, 2]]), targets)
@@ -362,7 +361,7 @@ def test_textures_that_are_none(tmp_path: Path, own: Head, texture: bytes, said:
 
 
 def test_too_few_names_are_told_with_what_there_is(tmp_path: Path, own: Head) -> None:
-    shapes = dict.fromkeys(("Fcl_MTH_A", "Fcl_MTH_I", "jawOpen"), ARKIT[0])
+    shapes = dict.fromkeys(("Fcl_MTH_A", "Fcl_MTH_I", "jawOpen"), ARKIT.basis[0])
     path = write_glb(tmp_path / "my.glb", meshes(own, shapes))
     said = r"1 of at least 12 ARKit shapes.*0 of at least 8 Oculus.*fclmtha.*jawopen.*Name them as"
     with pytest.raises(UserError, match=said):

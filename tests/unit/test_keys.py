@@ -112,6 +112,25 @@ def test_an_added_key_works_on_another_machine(
     assert read_guests() == {public: Guest("laptop", ("client",))}
 
 
+def test_a_credential_counts_instead_of_an_own_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key, guests = own_key("lamp", ("service:lamp",)), read_guests()
+    secrets = tmp_path / "secrets"
+    secrets.mkdir()
+    for name in ("lamp.key", "allowed"):
+        (key_folder() / name).rename(secrets / name)
+        (secrets / name).chmod(0o440)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "empty"))
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", f"{secrets}/")
+    assert own_key("lamp", ()) == key
+    assert read_guests() == guests
+    assert not key_folder().exists(), "nothing need be written"
+    (secrets / "lamp.key").chmod(0o444)
+    with pytest.raises(UserError, match="others can read"):
+        own_key("lamp", ())
+
+
 def test_on_controls_machine_only_commands_change_the_list(tmp_path: Path) -> None:
     add_guest("laptop", ("client",), tmp_path / "laptop.key")
     before = read_guests()

@@ -10,7 +10,14 @@ import socket
 import pytest
 
 from services.gateway.config import GatewayConfig
-from services.kinds import KINDS, ServiceKind, available_addresses, read_settings
+from services.kinds import (
+    KINDS,
+    ServiceKind,
+    available_addresses,
+    kind_of,
+    more_workers,
+    read_settings,
+)
 from shared.config import ServiceConfig
 from shared.errors import UserError
 from shared.service import Service
@@ -61,3 +68,18 @@ def test_port_0_is_a_free_port() -> None:
 
 def test_control_starts_first() -> None:
     assert next(iter(KINDS)) == "control"
+
+
+def test_more_workers_bind_other_ports_of_the_same_address() -> None:
+    settings = read_settings(
+        assignments={"recognizer.audio": "tcp://127.0.0.5:5560", "recognizer.instance": "ours"}
+    )
+    assert more_workers(settings, 1) == {}
+    more = more_workers(settings, 3)
+    assert list(more) == ["recognizer-2", "recognizer-3", "synthesizer-2", "synthesizer-3"]
+    assert more["recognizer-3"] == {
+        "KOUXING_RECOGNIZER_INSTANCE": "",
+        "KOUXING_RECOGNIZER_AUDIO": "tcp://127.0.0.5:*",
+        "KOUXING_RECOGNIZER_PHONES": "tcp://127.0.0.1:*",
+    }
+    assert {kind_of(name) for name in more} < KINDS.keys()

@@ -348,16 +348,6 @@ def test_without_any_lip_frame_the_visemes_move_the_mouth() -> None:
     assert np.abs(np.diff(values(frames, JAW))).max() < 150.0
 
 
-def test_a_restart_begins_anew() -> None:
-    face = make_face()
-    speak(face)
-    first = run(face, 0.0, 0.5, wave)
-    face.restart(0.0)
-    speak(face)
-    again = run(face, 0.0, 0.5, wave)
-    np.testing.assert_array_equal([f for _, f in first][:15], [f for _, f in again][:15])
-
-
 def test_a_track_passes_through_its_frames_without_a_corner() -> None:
     rng = np.random.default_rng(2)
     track, values = LipTrack(NEUTRAL), rng.normal(size=(8, len(MOUTH_FAPS)))

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from shared.metrics import WINDOW, Metrics
+from shared.metrics import WINDOW, BusyShare, Metrics
 
 pytestmark = pytest.mark.unit
 
@@ -32,3 +32,28 @@ def test_rates_are_taken_between_snapshots() -> None:
     metrics.count("frames", 25)
     assert metrics.snapshot(10.5)["frames_per_s"] == 50.0
     assert metrics.snapshot(11.0)["frames_per_s"] == 0.0
+
+
+def busy_share(until_s: float, work_s: float) -> BusyShare:
+    """Return the share of a loop that works for some time of each second, asked every 0.25 s."""
+    busy = BusyShare(2.0, 0.0)
+    for quarter in range(int(4 * until_s)):
+        if quarter % 4 == 0:
+            busy.works(quarter / 4)
+            busy.waits(quarter / 4 + work_s)
+        busy.share(quarter / 4 + 0.25)
+    return busy
+
+
+@pytest.mark.parametrize("work_s", [0.0, 0.1, 0.25])
+def test_the_busy_share_is_that_of_the_work(work_s: float) -> None:
+    assert busy_share(6.0, work_s).share(6.0) == pytest.approx(work_s, abs=0.03)
+
+
+def test_the_busy_share_forgets_what_was_long_ago_and_sees_work_under_way() -> None:
+    busy = busy_share(4.0, 0.2)
+    for quarter in range(1, 13):
+        last = busy.share(4.0 + quarter / 4)
+    assert last == 0.0
+    busy.works(7.0)
+    assert busy.share(9.0) == 1.0

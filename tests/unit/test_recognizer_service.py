@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from services.recognizer.acoustic.load import load_model, model_path
 from services.recognizer.config import RecognizerConfig
 from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
-from services.recognizer.service import MAX_QUEUED_S, RecognizerService
+from services.recognizer.service import MAX_QUEUED_S, MAX_UNPACED_S, RecognizerService
 from services.recognizer.stream import SpeechStream
 from services.recognizer.voice import Voice
 from shared.keys import Peer
@@ -81,6 +82,38 @@ def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(servic
     assert service.media_times[-1] == pytest.approx(
         MAX_AUDIO_BYTES, abs=320
     )  # 2 bytes at half the rate
+
+
+def test_live_audio_waits_for_little_of_what_is_not_paced(service: Watched) -> None:
+    service.start_session(start_of())
+    service.start_session(replace(start_of(), session="live", paced=True))
+    for number in range(1, 11):  # 0.2 s each
+        pcm = bytes(2 * RATE_HZ // 5)
+        chunk = AudioChunk(
+            session="s", token="t", sequence=number, media_time=3200 * (number - 1), pcm=pcm
+        )
+        service._on_audio(chunk, Peer())
+    service._process_queued()
+    service.beat_if_due()
+    times = [media_time for media_time in service.media_times if media_time]  # not the live one's
+    steps = [after - before for before, after in zip([0, *times], times, strict=False)]
+    assert max(steps) <= MAX_UNPACED_S * 16000 + 320
+    assert times[-1] > 30_000
+
+
+def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:
+    service.start_session(replace(start_of(), epoch=2, media_time=24_000))
+    for number in range(100):  # of 20 ms; the first three lie before the grid
+        chunk = AudioChunk(
+            session="s",
+            token="t",
+            sequence=9 + number,
+            media_time=9280 + 320 * number,
+            pcm=bytes(320),
+        )
+        service._on_audio(chunk, Peer())
+    service._process_queued()
+    assert service._sessions["s"].stream.next_media_time == 9280 + 100 * 320
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 
@@ -98,3 +99,15 @@ def test_a_greater_epoch_starts_anew_and_an_older_one_is_ignored(link: Link) -> 
     link.sender.send(Progress(level_db=0.0), now_s=0.0)
     link.carry(1)
     assert link.taken == [1, 2, 3, 1]
+
+
+def test_what_the_receiver_adds_goes_with_every_acknowledgement(link: Link) -> None:
+    told = Acknowledge(media_time=320, frame=2, faps=bytes(272))
+    receiver = ReliableReceiver(link.router, "s", lambda: told)
+    receiver.acknowledge()  # to nobody yet
+    send(link, 1)
+    for message, sender in arriving(link.router, 1):
+        assert receiver.accept(message, sender)
+    receiver.acknowledge()
+    for message, _ in arriving(link.dealer, 1):
+        assert message == replace(told, session="s", epoch=1, sequence=1)

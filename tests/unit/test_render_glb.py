@@ -13,8 +13,8 @@ import trimesh
 
 from services.driver.head.glb_export import export_glb
 from shared.errors import UserError
-from shared.face.blendshapes import ARKIT, ARKIT_NAMES
 from shared.face.faps import FAPS
+from shared.face.shapes import ARKIT
 from tests import heads
 
 pytestmark = pytest.mark.unit
@@ -96,7 +96,7 @@ def test_every_fap_is_a_target_or_a_rotation(document: dict[str, Any]) -> None:
         for name in mesh.get("extras", {}).get("targetNames", [])
     }
     turned = {name for name, fap in described.items() if "rotation" in fap}
-    assert (targets | turned) - set(ARKIT_NAMES) == set(described)
+    assert (targets | turned) - set(ARKIT.names) == set(described)
     names = {node["name"] for node in document["nodes"]}
     assert {described[name]["rotation"]["node"] for name in turned} <= names
 
@@ -130,10 +130,10 @@ def test_every_arkit_shape_is_a_target(document: dict[str, Any]) -> None:
         for mesh in document["meshes"]
         for name in mesh.get("extras", {}).get("targetNames", [])
     }
-    assert set(ARKIT_NAMES) <= targets
+    assert set(ARKIT.names) <= targets
     described = document["scenes"][0]["extras"]["kouxing"]["arkit"]
-    assert [shape["name"] for shape in described] == list(ARKIT_NAMES)
-    assert described[ARKIT_NAMES.index("jawOpen")]["faps"]["open_jaw"] > 0
+    assert [shape["name"] for shape in described] == list(ARKIT.names)
+    assert described[ARKIT.names.index("jawOpen")]["faps"]["open_jaw"] > 0
 
 
 def test_arkit_shapes_move_skin_teeth_tongue_and_eyes(document: dict[str, Any]) -> None:
@@ -145,7 +145,7 @@ def test_arkit_shapes_move_skin_teeth_tongue_and_eyes(document: dict[str, Any]) 
         ("eyeLookUpLeft", "eye_left", "3.5"),
     ):
         vertex = head.feature_points[point]
-        faps = ARKIT[ARKIT_NAMES.index(shape)]
+        faps = ARKIT.basis[ARKIT.names.index(shape)]
         wanted = (head.deform(faps) - head.vertices)[vertex]
         found = moved(document, part, shape)[vertex - head.part(part).vertices.start]
         np.testing.assert_allclose(found, wanted, atol=1e-5)
@@ -174,7 +174,7 @@ def read(document: dict[str, Any], binary: bytes, accessor: int) -> np.ndarray:
 def test_an_animation_moves_the_head_as_its_faps_do(tmp_path: Path, *, as_arkit: bool) -> None:
     head = heads.load("woman", "coarse")
     faps = np.zeros((3, 68), np.float32)
-    faps[1] = 0.5 * ARKIT[ARKIT_NAMES.index("jawOpen")]
+    faps[1] = 0.5 * ARKIT.basis[ARKIT.names.index("jawOpen")]
     faps[2, 48] = 0.1 / 1e-5  # the head turns by 0.1 rad
     path = tmp_path / "speaks.glb"
     export_glb(head, path, [(0.02 * k, row) for k, row in enumerate(faps)], as_arkit=as_arkit)
@@ -201,7 +201,7 @@ def test_an_animation_moves_the_head_as_its_faps_do(tmp_path: Path, *, as_arkit:
     fields = head.basis[3 * skin.vertices.start : 3 * skin.vertices.stop].T.toarray()
     for name, weight in zip(targets, weights[1], strict=True):
         if weight and as_arkit:
-            moved += weight * (ARKIT[ARKIT_NAMES.index(name)] @ fields).reshape(-1, 3)
+            moved += weight * (ARKIT.basis[ARKIT.names.index(name)] @ fields).reshape(-1, 3)
         elif weight:
             fap = next(fap for fap in FAPS if fap.name == name)
             moved += 1024 * weight * fields[fap.number - 1].reshape(-1, 3)

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
 from shared.bus import Bus
 from shared.config import ServiceConfig
-from shared.keys import Peer
-from shared.service import Service
-from shared.wire.control import Heartbeat
-from shared.wire.session import Done
+from shared.keys import NOBODY, Peer
+from shared.service import SESSIONS_A_BEAT, STOOD_STILL_S, Service
+from shared.wire.control import (
+    Heartbeat,
+    HeartbeatSeen,
+    SessionInput,
+    StartSession,
+    StopSession,
+    UseLips,
+)
+from shared.wire.session import AddShapes, ChooseExpressiveness, Done, Express
 from shared.wire.speech import Progress, Speech
 
 pytestmark = pytest.mark.unit
@@ -116,3 +125,188 @@ def test_an_open_service_that_others_reach_says_so(
     slow.endpoints = {"input": f"tcp://{address}:5570"}
     slow.announce_ready()
     assert ("insecure = true" in caplog.text) == warns
+
+
+class Worker(Service):
+    """Serves whatever it is told; notes what happens in which order."""
+
+    name = "worker"
+    role = "worker"
+
+    def __init__(self, control: str, num_sessions: int = 1) -> None:
+        super().__init__(ServiceConfig(insecure=True, control=control))
+        self.input = self.bus.bind_router("tcp://127.0.0.1:*", "worker.input")
+        self.endpoints = {"audio": self.input.endpoint}
+        self.happened: list[str] = []
+        self.names = [f"s{number}" for number in range(num_sessions)]
+        self.register(self.input, {Progress: lambda *_: self.happened.append("input")})
+
+    def stop_session(self, session: str) -> None:
+        self.happened.append(f"stop {session}")
+
+    def session_inputs(self) -> dict[str, SessionInput]:
+        return dict.fromkeys(self.names, SessionInput())
+
+
+class Control:
+    """Answers heartbeats as the process that it is said to be."""
+
+    def __init__(self) -> None:
+        self.bus = Bus()
+        self.socket = self.bus.bind_router("tcp://127.0.0.1:*", "control.commands")
+        self.instance = "control-1"
+        self.stops: list[str] = []  # what a heartbeat is answered with
+        self.beats: list[Heartbeat] = []
+        self.starts: list[StartSession] = []
+        self.peer = NOBODY
+
+    def answer(self) -> None:
+        assert self.socket.wait(20.0)
+        self.step()
+
+    def step(self) -> None:
+        for received in self.socket.receive():
+            self.peer = received.sender
+            match received.message:
+                case Heartbeat() as beat:
+                    self.beats.append(beat)
+                    for session in self.stops:
+                        self.socket.send(StopSession(session=session), to=self.peer)
+                    self.socket.send(
+                        HeartbeatSeen(
+                            sent_ns=beat.sent_ns,
+                            received_ns=0,
+                            replied_ns=0,
+                            control=self.instance,
+                        ),
+                        to=self.peer,
+                    )
+                case StartSession() as start:
+                    self.starts.append(start)
+
+
+@pytest.fixture
+def control() -> Iterator[Control]:
+    made = Control()
+    yield made
+    made.bus.close()
+
+
+@pytest.fixture
+def worker(control: Control) -> Iterator[Worker]:
+    made = Worker(control.socket.endpoint)
+    yield made
+    made.bus.close()
+
+
+def run_until(control: Control, worker: Worker, condition: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end_s
+        worker.step(0.01)
+        control.step()
+
+
+def test_one_that_stood_still_asks_control_before_it_goes_on(
+    control: Control, worker: Worker
+) -> None:
+    run_until(control, worker, lambda: bool(control.beats))
+    with Bus() as bus:
+        sender = bus.connect_dealer(worker.input.endpoint)
+        sender.send(Progress(level_db=0.0))
+        time.sleep(STOOD_STILL_S + 0.1)
+        control.stops = ["s0"]
+        answering = threading.Thread(target=control.answer)
+        answering.start()
+        worker.step(0.01)
+        answering.join()
+        run_until(control, worker, lambda: "input" in worker.happened)
+    assert worker.happened[:2] == ["stop s0", "input"]
+
+
+def test_one_that_stood_still_in_the_midst_of_its_work_asks_before_it_ticks(
+    control: Control, worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_until(control, worker, lambda: bool(control.beats))
+
+    control.stops = ["s0"]
+    answering = threading.Thread(target=control.answer)
+
+    def stand_still(*_: object) -> None:
+        time.sleep(STOOD_STILL_S + 0.1)
+        worker.happened.append("input")
+        answering.start()
+
+    worker._handlers[worker.input][Progress] = stand_still
+    monkeypatch.setattr(worker, "on_tick", lambda _now_s: worker.happened.append("tick"))
+    with Bus() as bus:
+        bus.connect_dealer(worker.input.endpoint).send(Progress(level_db=0.0))
+        while "input" not in worker.happened:
+            worker.step(0.01)
+    answering.join()
+    assert worker.happened[-3:] == ["input", "stop s0", "tick"]
+
+
+def test_one_that_stood_still_goes_on_though_control_is_away(worker: Worker) -> None:
+    with Bus() as bus:
+        sender = bus.connect_dealer(worker.input.endpoint)
+        sender.send(Progress(level_db=0.0))
+        time.sleep(STOOD_STILL_S + 0.1)
+        for _ in range(100):
+            worker.step(0.01)
+    assert worker.happened == ["input"]
+
+
+def test_a_new_control_is_told_the_sessions_with_what_was_chosen(
+    control: Control, worker: Worker
+) -> None:
+    run_until(control, worker, lambda: bool(control.beats))
+    start = StartSession(
+        session="s0", epoch=3, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
+        num_channels=1, record=False, paced=True, language="mandarin", endpoints={},
+    )  # fmt: skip
+    to = control.peer
+    control.socket.send(start, to=to)
+    control.socket.send(dataclasses.replace(start, session="s1"), to=to)
+    control.socket.send(StopSession(session="s1"), to=to)
+    control.socket.send(UseLips(session="s0", lips="learnt"), to=to)
+    control.socket.send(Express(session="s0", request="r", expressions={"joy": 1.0}), to=to)
+    control.socket.send(ChooseExpressiveness(session="s0", request="r", expressiveness=2.0), to=to)
+    control.socket.send(AddShapes(session="s0", request="r", shapes=["vrm"]), to=to)
+    run_until(control, worker, lambda: "stop s1" in worker.happened)
+    control.step()
+    assert not control.starts, "it knows them"
+    control.instance = "control-2"
+    run_until(control, worker, lambda: bool(control.starts))
+    (told,) = control.starts
+    assert (told.session, told.epoch, told.token) == ("s0", 3, "t")
+    assert (told.lips, told.expressiveness, told.expressions) == ("learnt", 2.0, {"joy": 1.0})
+    assert 0 < told.hold_s < 3
+    assert told.shapes == ["vrm"]
+
+
+def test_one_that_stops_says_so_before_it_finishes_its_sessions(control: Control) -> None:
+    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_A_BEAT)
+    run_until(control, worker, lambda: bool(control.beats))
+    seen: list[Heartbeat] = []
+
+    def finish() -> bool:
+        control.answer()
+        seen.extend(beat for beat in control.beats if beat.state == "draining")
+        return True
+
+    worker.on_drain = finish  # type: ignore[method-assign]
+    worker.drain()
+    assert seen
+    assert {*seen[0].sessions} == {*worker.names}
+
+
+def test_heartbeats_name_a_great_many_sessions_in_turn(control: Control) -> None:
+    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_A_BEAT + 10)
+    try:
+        run_until(control, worker, lambda: len(control.beats) >= 3)
+    finally:
+        worker.bus.close()
+    named = [name for beat in control.beats[:3] for name in beat.sessions]
+    assert len(named) == 3 * SESSIONS_A_BEAT
+    assert {*named} == {*worker.names}

@@ -8,12 +8,14 @@ import pytest
 
 from services.control.registry import Refusal, Registry
 from services.control.sessions import SessionRecord, Sessions
+from shared.face.shapes import ARKIT, VRM
 from shared.keys import Peer
 from shared.wire.control import Heartbeat, SessionInput
 from shared.wire.session import OpenSession
 
 pytestmark = pytest.mark.unit
 
+PEER = Peer(b"somebody")
 PROVIDES = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 NEEDS = {"recognizer": ["phone_input"], "synthesizer": []}
 
@@ -43,14 +45,18 @@ def observer(instance: str) -> Heartbeat:
 class Made:
     """A registry with one recognizer and one synthesizer, and no sessions yet."""
 
-    def __init__(self, max_sessions: int = 8) -> None:
-        self.registry = Registry(lost_after_s=3.0)
+    def __init__(self, max_sessions: int = 8, max_load: float = 1000.0) -> None:
+        self.registry = Registry(lost_after_s=3.0, max_load=max_load)
         self.sessions = Sessions(self.registry, max_sessions)
         for service in PROVIDES:
             self.add(worker(service, f"{service}-1"))
 
     def add(self, heartbeat: Heartbeat, now_s: float = 0.0) -> None:
         self.registry.add(heartbeat, Peer(heartbeat.instance.encode()), now_s)
+
+    def lose(self, instance: str) -> None:
+        self.registry.remove(instance)
+        self.sessions.lose(instance, 1.0)
 
     def open(self, name: str = "") -> SessionRecord:
         return self.sessions.open(OpenSession(session=name, request="r"), Peer(b"client"), 0.0)
@@ -78,20 +84,46 @@ def test_the_services_are_told_the_delay_of_the_face_and_its_lips(
     made: Made,
 ) -> None:
     record = made.open()
-    start = made.sessions.start_message(record)
+    start = made.sessions.start_message(record, 0.0)
     assert (start.delay_ms, start.lips) == (100.0, "dynamic-visemes")
     record.lips = "learnt"
-    made.registry.remove("synthesizer-1")
+    made.lose("synthesizer-1")
     made.add(dataclasses.replace(worker("synthesizer", "synthesizer-2"), delay_ms=40.0))
     assert made.sessions.replace(record, 1.0)
-    start = made.sessions.start_message(record)
+    start = made.sessions.start_message(record, 0.0)
     assert (start.delay_ms, start.lips) == (40.0, "learnt")
 
 
 def test_the_services_are_told_the_voice_of_the_speaker(made: Made) -> None:
     opening = OpenSession(request="r", voice=b"a voice")
     record = made.sessions.open(opening, Peer(b"client"), 0.0)
-    assert made.sessions.start_message(record).voice == b"a voice"
+    assert made.sessions.start_message(record, 0.0).voice == b"a voice"
+
+
+def test_what_was_chosen_for_the_face_is_told_to_those_that_take_it_over(made: Made) -> None:
+    record = made.open()
+    record.expressiveness = 1.8
+    record.expressions, record.expressions_end_s = {"joy": 0.5}, 10.0
+    record.shapes = ["vrm"]
+    start = made.sessions.start_message(record, 4.0)
+    assert (start.expressiveness, start.expressions, start.hold_s) == (1.8, {"joy": 0.5}, 6.0)
+    assert start.shapes == ["vrm"]
+    later = made.sessions.start_message(record, 11.0)
+    assert (later.expressions, later.hold_s) == ({}, 0.0)
+
+
+def test_the_client_is_told_the_names_of_the_shapes_it_asked_for(made: Made) -> None:
+    opening = OpenSession(request="r", shapes=["vrm", "arkit", "vrm"])
+    record = made.sessions.open(opening, Peer(b"client"), 0.0)
+    opened = made.sessions.opened_message(record, "tcp://control:events")
+    assert opened.shapes == {"vrm": [*VRM.names], "arkit": [*ARKIT.names]}
+
+
+def test_the_services_know_the_client_for_a_control_that_starts_again(made: Made) -> None:
+    client = Peer(b"client", "its key")
+    record = made.sessions.open(OpenSession(request="r9"), client, 0.0)
+    start = made.sessions.start_message(record, 0.0)
+    assert (start.client, start.client_key, start.client_request) == (b"client", "its key", "r9")
 
 
 def test_the_client_and_the_services_are_told_the_endpoints(made: Made) -> None:
@@ -101,7 +133,7 @@ def test_the_client_and_the_services_are_told_the_endpoints(made: Made) -> None:
     assert opened.phones == "tcp://recognizer-1:phones"
     assert opened.faps == "tcp://synthesizer-1:faps"
     assert (opened.language, opened.frame_rate_hz) == ("mandarin", 50.0)
-    start = made.sessions.start_message(record)
+    start = made.sessions.start_message(record, 0.0)
     assert start.endpoints["phone_input"] == "tcp://synthesizer-1:phone_input"
     assert start.language == "mandarin"
 
@@ -121,6 +153,7 @@ def test_a_missing_service_is_named(made: Made, service: str) -> None:
 
 def test_a_worker_of_an_unknown_kind_is_placed_where_another_needs_it(made: Made) -> None:
     gazing = dataclasses.replace(worker("synthesizer", "synthesizer-1"), needs=["gaze"])
+    made.lose("synthesizer-1")
     made.add(gazing)
     with pytest.raises(Refusal, match="provides 'gaze'"):
         made.open()
@@ -137,7 +170,7 @@ def test_a_worker_of_an_unknown_kind_is_placed_where_another_needs_it(made: Made
     record = made.open()
     assert record.workers["gaze"] == "eyes-1"
     assert "eyes-1" in record.waiting_for
-    assert made.sessions.start_message(record).endpoints["gaze"] == "tcp://eyes-1:gaze"
+    assert made.sessions.start_message(record, 0.0).endpoints["gaze"] == "tcp://eyes-1:gaze"
 
 
 def test_observers_of_any_kind_take_part(made: Made) -> None:
@@ -225,8 +258,8 @@ def test_a_session_moves_to_another_recognizer_and_goes_on_where_the_lost_one_wa
 ) -> None:
     record = made.open()
     take_input(made, record, sequence=120)
-    made.registry.remove("recognizer-1")
-    assert made.sessions.lost_workers(record) == ["recognizer-1"]
+    made.lose("recognizer-1")
+    assert record.lost == {"recognizer-1"}
     assert not made.sessions.replace(record, 1.0)
     assert made.sessions.state(record, 1.0).endpoints["audio"] == "tcp://recognizer-1:audio"
     made.add(worker("recognizer", "elsewhere"))
@@ -240,7 +273,7 @@ def test_a_session_moves_to_another_recognizer_and_goes_on_where_the_lost_one_wa
 def test_a_new_recognizer_that_has_no_audio_yet_does_not_set_the_session_back(made: Made) -> None:
     record = made.open()
     take_input(made, record, sequence=120)
-    made.registry.remove("recognizer-1")
+    made.lose("recognizer-1")
     made.add(worker("recognizer", "elsewhere"))
     made.sessions.replace(record, 1.0)
     take_input(made, record, sequence=0)
@@ -249,7 +282,7 @@ def test_a_new_recognizer_that_has_no_audio_yet_does_not_set_the_session_back(ma
 
 def test_a_session_moves_to_no_recognizer_of_another_language(made: Made) -> None:
     record = made.open()
-    made.registry.remove("recognizer-1")
+    made.lose("recognizer-1")
     made.add(dataclasses.replace(worker("recognizer", "elsewhere"), language="english"))
     assert not made.sessions.replace(record, 1.0)
 
@@ -257,7 +290,7 @@ def test_a_session_moves_to_no_recognizer_of_another_language(made: Made) -> Non
 def test_audio_goes_on_where_it_was_when_only_the_synthesizer_is_lost(made: Made) -> None:
     record = made.open()
     take_input(made, record, sequence=120)
-    made.registry.remove("synthesizer-1")
+    made.lose("synthesizer-1")
     made.add(worker("synthesizer", "synthesizer-2"))
     assert made.sessions.replace(record, 1.0)
     moved = made.sessions.moved_message(record)
@@ -274,21 +307,96 @@ def test_only_the_recognizer_knows_how_long_there_was_no_audio(made: Made) -> No
     assert made.sessions.take_input(record, beat) == 0.0
 
 
+def test_a_lost_worker_that_comes_back_keeps_its_sessions(made: Made) -> None:
+    record = made.open()
+    record.announced, record.waiting_for = True, set()
+    made.lose("recognizer-1")
+    assert not made.sessions.replace(record, 1.0), "there is no other"
+    assert made.sessions.unsettled() == [record]
+    assert "recognizer-1" not in made.sessions.participants(record)
+    made.add(worker("recognizer", "recognizer-1"))
+    assert made.registry.is_back("recognizer-1", Peer(b"recognizer-1"))
+    assert made.sessions.take_back("recognizer-1") == []
+    assert (record.epoch, made.sessions.unsettled()) == (1, [])
+    assert "recognizer-1" in made.sessions.participants(record)
+
+
+def test_a_lost_worker_is_told_again_what_it_may_have_missed(made: Made) -> None:
+    record = made.open()
+    made.lose("recognizer-1")
+    record.waiting_for.clear()
+    made.add(worker("recognizer", "recognizer-1"))
+    assert made.sessions.take_back("recognizer-1") == [record]
+    assert record.waiting_for == {"recognizer-1"}
+
+
+def test_another_process_under_the_name_of_a_lost_one_is_not_the_same(made: Made) -> None:
+    made.lose("recognizer-1")
+    assert not made.registry.is_back("recognizer-1", Peer(b"another"))
+
+
+def test_a_new_recognizer_is_told_after_the_synthesizer_up_to_where_there_are_phones(
+    made: Made,
+) -> None:
+    record = made.open()
+    made.lose("recognizer-1")
+    made.add(worker("recognizer", "recognizer-2"))
+    assert made.sessions.replace(record, 1.0)
+    assert record.waiting_for - record.held_back == {"synthesizer-1"}
+    assert made.sessions.take_started(record, "lamp-1", 0) == set()
+    assert made.sessions.take_started(record, "synthesizer-1", 48_000) == {"recognizer-2"}
+    assert made.sessions.start_message(record, 1.0).media_time == 48_000
+    assert made.sessions.take_started(record, "recognizer-2", 0) == set()
+    assert (record.waiting_for, record.media_time) == (set(), 48_000)
+
+
+def test_with_a_new_synthesizer_all_are_told_at_once_what_the_lost_one_last_said(
+    made: Made,
+) -> None:
+    record = made.open()
+    beat = dataclasses.replace(
+        worker("synthesizer", "synthesizer-1"),
+        sessions={record.name: SessionInput(media_time=32_000)},
+    )
+    made.sessions.take_input(record, beat)
+    made.lose("recognizer-1")
+    made.lose("synthesizer-1")
+    made.add(worker("recognizer", "recognizer-2"))
+    made.add(worker("synthesizer", "synthesizer-2"))
+    assert made.sessions.replace(record, 1.0)
+    assert not record.held_back
+    assert made.sessions.start_message(record, 1.0).media_time == 32_000
+
+
+def test_services_are_silent_in_the_order_of_their_heartbeats(made: Made) -> None:
+    made.add(worker("recognizer", "recognizer-1"), now_s=2.0)
+    assert made.registry.silent(2.5) == []
+    assert made.registry.silent(3.5) == ["synthesizer-1"]
+    made.registry.excuse(1.0)
+    assert made.registry.silent(3.5) == [], "control itself did not listen"
+    assert made.registry.silent(6.5) == ["synthesizer-1", "recognizer-1"]
+
+
 def test_a_worker_at_the_same_endpoints_displaces_the_one_that_crashed(made: Made) -> None:
     old = worker("recognizer", "recognizer-1")
     again = dataclasses.replace(old, instance="recognizer-9")
+    assert made.registry.displaced_by(again, PEER) == "recognizer-1"
+    assert not made.registry.displaced_by(old, PEER)
     made.add(again)
-    assert made.registry.displaced_by(again) == ["recognizer-1"]
+    made.lose("recognizer-1")
+    assert not made.registry.displaced_by(again, PEER)
 
 
 def test_observers_displace_no_other(made: Made) -> None:
     made.add(observer("lamp-1"))
-    made.add(observer("lamp-2"))
-    assert made.registry.displaced_by(observer("lamp-2")) == []
+    assert not made.registry.displaced_by(observer("lamp-2"), PEER)
 
 
 def test_an_instance_that_provides_something_else_now_is_another_one(made: Made) -> None:
     same = worker("recognizer", "recognizer-1", state="draining")
-    assert not made.registry.differs(same)
-    assert made.registry.differs(dataclasses.replace(same, endpoints={"audio": "tcp://new:1"}))
-    assert not made.registry.differs(worker("recognizer", "unknown"))
+    peer = Peer(b"recognizer-1")
+    assert not made.registry.differs(same, peer)
+    assert made.registry.differs(same, Peer(b"started again under its name"))
+    moved = dataclasses.replace(same, endpoints={"audio": "tcp://new:1"})
+    assert made.registry.differs(moved, peer)
+    assert not made.registry.differs(worker("recognizer", "unknown"), peer)

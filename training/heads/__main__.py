@@ -11,13 +11,13 @@ import tempfile
 from pathlib import Path
 
 from services.driver.head.head import ASSETS
-from shared.face import blendshapes
+from shared.face import shapes
 from training.heads.arkit_table import write_arkit_table
 from training.heads.assemble import Builder
 from training.heads.makehuman import MakeHuman, download
 from training.heads.people import PEOPLE
 
-ARKIT_TABLE = Path(blendshapes.__file__).with_name("arkit.tsv")
+ARKIT_TABLE = Path(shapes.__file__).with_name("arkit.tsv")
 
 
 def main() -> None:

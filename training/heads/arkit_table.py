@@ -15,9 +15,9 @@ w, l    weight of the teeth, and of small values
 ======  ====================================================  ======  =============
 
 Each shape may use the FAPs of its region only. Left and right are averaged. Deviations: MakeHuman's
-jawOpen is wider than any speaker's and counts 0.65; mouthClose takes the lips back to where they
-meet; the eyes turn by MakeHuman's angles; and the tongue comes out as far as its, but over the
-lower lip.
+jawOpen is wider than any speaker's and counts 0.65; eyeBlink is the lids as ``idle_motion`` shuts
+them, where MakeHuman's go on; mouthClose takes the lips back to where they meet; the eyes turn by
+MakeHuman's angles; and the tongue comes out as far as its, but over the lower lip.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS
+from shared.face.idle_motion import LOWER_LID, UPPER_LID
 from training.heads.assemble import Builder
 
 Float = NDArray[np.float64]
@@ -45,6 +46,7 @@ _REGIONS: dict[str, tuple[int, ...]] = {  # by the beginning of a shape's name; 
     "noseSneer": (8, 9, *range(31, 35), 41, 42, 55, 56, *range(61, 65)),
 }
 _JAW_OPEN = 0.65
+_BLINK = {19: UPPER_LID, 21: LOWER_LID}
 _LOOKS = {"In": (-43e3, 0.0), "Out": (43e3, 0.0), "Up": (0.0, -21e3), "Down": (0.0, 31e3)}
 _TONGUE_OUT = {44: 300.0, 45: 585.0, 46: 150.0}
 _TEETH_WEIGHT = 2e4
@@ -68,6 +70,10 @@ def write_arkit_table(builder: Builder, path: Path) -> None:
             right = int(name.endswith("Right"))
             yaw, pitch = _LOOKS[name.removeprefix("eyeLook").removesuffix(("Left", "Right")[right])]
             row[23 + right], row[25 + right] = (-yaw if right else yaw), pitch
+        elif name.startswith("eyeBlink"):
+            row[:] = 0.0
+            for fap, value in _BLINK.items():
+                row[fap + name.endswith("Right")] = value
         row[np.abs(row) < _LEAST] = 0.0
     table["mouthClose"] = -table["jawOpen"]
     table["mouthClose"][3] = 0.0

@@ -30,7 +30,7 @@ from scipy.signal import resample_poly
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from services.recognizer.acoustic.acoustic_model import AcousticModel
 from shared.errors import UserError
-from shared.face.blendshapes import OCULUS_NAMES
+from shared.face.shapes import OCULUS
 
 Array = NDArray[np.float64]
 Rows = Callable[[LipClip], Array]
@@ -38,7 +38,7 @@ Rows = Callable[[LipClip], Array]
 FOLDER = Path(__file__).parent
 ROW_S = 0.01
 _NODE_RATE_HZ = 48_000
-# The order of HeadAudio's outputs, in the names that `shared.face.blendshapes` has for them.
+# The order of HeadAudio's outputs, in the names that `shared.face.shapes` has for them.
 HEAD_AUDIO_VISEMES = "aa E ih oh ou PP SS TH DD FF kk nn RR CH sil".split()
 _SILENCE_AFTER_S = 0.5
 _NUM_CEPSTRA = 12
@@ -106,8 +106,8 @@ def head_audio_rows(clip: LipClip) -> Array:
 
 
 def oculus_order(weights: Array) -> Array:
-    """Bring HeadAudio's weights, (num_rows, 15), into the order of ``OCULUS_NAMES``."""
-    return weights[:, [HEAD_AUDIO_VISEMES.index(name) for name in OCULUS_NAMES]]
+    """Bring HeadAudio's weights, (num_rows, 15), into the order of ``OCULUS.names``."""
+    return weights[:, [HEAD_AUDIO_VISEMES.index(name) for name in OCULUS.names]]
 
 
 def wlipsync_rows(profile: dict[str, Any]) -> Rows:

@@ -9,7 +9,7 @@ node and of the scene says how a FAP becomes a weight or an angle:
 - angle in rad = FAP * 1e-5 about ``rotation.axis`` of the node ``rotation.node``; several on one
   node combine as yaw * pitch * roll.
 
-Nodes: ``kouxing`` > ``body`` (joint), ``garment``; ``body`` > ``head`` (joint) > ``eye_left``,
+Nodes: ``kouxing`` > ``body`` (joint) > ``garment``, ``head`` (joint) > ``eye_left``,
 ``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``;
 and ``skin``, a mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face
 looks along z.
@@ -19,6 +19,8 @@ vertices, for viewers without a graphics card; what is seen through keeps all of
 
 With a motion there is an animation ``speech`` of the weights of every mesh and of the nodes that
 turn; between its frames it is linear.
+
+A name that ends in ``.vrm`` makes it a VRM 1.0 avatar instead, see ``vrm``.
 """
 
 from __future__ import annotations
@@ -33,23 +35,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from services.driver.head import vrm
 from services.driver.head.head import ASSETS, Head, Part
+from services.driver.head.morphs import (
+    ARKIT_MORPHS,
+    AVATAR_MORPHS,
+    FAP_MORPHS,
+    Morph,
+    units_per_weight,
+)
 from services.driver.render import shaders
 from services.driver.render.renderer import BACKGROUND
 from services.driver.render.scene import camera
 from shared.errors import UserError
-from shared.face.blendshapes import ARKIT, ARKIT_NAMES, arkit_weights
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from shared.face.faps import FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
+from shared.face.shapes import ARKIT
 
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
 _COMPONENT = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
 _ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
 _MAX_SHORT_VERTICES = 65535  # more need indices of four bytes; 65535 itself is no index
-_MIN_SHIFT_M = 2e-5  # smaller displacements at one FAPU are left out,
-_MIN_SHAPE_SHIFT_M = 1e-4  # and smaller ones of an ARKit shape at weight 1
-_ANGLE_UNITS_PER_WEIGHT = 1 / RADIANS_PER_ANGLE_UNIT  # a weight of 1 is 1 rad
 
 _ROTATION_OF = {
     23: ("eye_left", (0, 1, 0)),
@@ -175,19 +182,22 @@ def export_glb(
     head
         The head; a fine one has more triangles.
     path
-        File to write.
+        File to write, ``.glb`` or ``.vrm``.
     motion
-        Frames of an animation: media time in seconds, FAPs (68,).
+        Frames of an animation: media time in seconds, FAPs (68,); none for a ``.vrm``.
     as_arkit
         Move the targets of ARKit's shapes, not those of the FAPs.
 
     Raises
     ------
     UserError
-        If the name does not end in ``.glb``, or the file cannot be written.
+        If the name ends otherwise, or the file cannot be written.
     """
-    if Path(path).suffix.lower() != ".glb":
-        raise UserError(f"{path}: give a name that ends in .glb")
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".glb", ".vrm"):
+        raise UserError(f"{path}: give a name that ends in .glb or .vrm")
+    is_avatar = suffix == ".vrm"
+    morphs = AVATAR_MORPHS if is_avatar else FAP_MORPHS + ARKIT_MORPHS
     document = _Document()
     sampler = document.add(
         "samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
@@ -202,18 +212,19 @@ def export_glb(
 
     nodes: dict[str, int] = {}
     for part in head.parts:
-        nodes[part.name] = _part_node(document, head, part, textures)
+        nodes[part.name] = _part_node(document, head, part, textures, morphs)
     carriers = {part.name: _carrier(head, part) for part in head.parts}
     on_head, on_body, skinned = (
         [nodes[name] for name, carrier in carriers.items() if carrier == kind]
         for kind in ("head", "body", "both")
     )
     nodes["head"] = document.add("nodes", _parent("head", on_head))
-    nodes["body"] = document.add("nodes", _parent("body", [nodes["head"]]))
+    nodes["body"] = document.add("nodes", _parent("body", [nodes["head"], *on_body]))
+    if is_avatar:
+        _add_skeleton(document, nodes)
+    root = nodes["hips" if is_avatar else "body"]
     extras = {"kouxing": _description(head)}
-    nodes["kouxing"] = document.add(
-        "nodes", _parent("kouxing", [nodes["body"], *on_body]) | {"extras": extras}
-    )
+    nodes["kouxing"] = document.add("nodes", _parent("kouxing", [root]) | {"extras": extras})
     identity = np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)).reshape(2, 16)
     matrices = document.accessor(identity, "MAT4", target=None)
     joints = [nodes["body"], nodes["head"]]
@@ -227,7 +238,32 @@ def export_glb(
         Path(path),
         scene=0,
         scenes=[{"name": head.name, "nodes": [nodes["kouxing"], *skinned], "extras": extras}],
+        **(_avatar(document, head, nodes) if is_avatar else {}),
     )
+
+
+def _add_skeleton(document: _Document, nodes: dict[str, int]) -> None:
+    """Hang the node ``body`` on an avatar's bones."""
+    every = document.json["nodes"]
+    for bone, parent, place in vrm.BONES:
+        if bone not in nodes:
+            nodes[bone] = document.add("nodes", {"name": bone})
+        every[nodes[bone]]["translation"] = place
+        if parent:
+            every[nodes[parent]].setdefault("children", []).append(nodes[bone])
+
+
+def _avatar(document: _Document, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
+    """Return what the file says beside its lists."""
+    bindings: dict[str, list[tuple[int, int]]] = {morph.name: [] for morph in AVATAR_MORPHS}
+    for number, node in enumerate(document.json["nodes"]):
+        if "mesh" in node:
+            names = document.json["meshes"][node["mesh"]]["extras"].get("targetNames", ())
+            for index, name in enumerate(names):
+                bindings[name].append((number, index))
+    x, y, z = head.eye_centres.mean(axis=0).tolist()
+    about = vrm.extension(head.name, nodes, bindings, (x, y, z), is_free=_is_own(head))
+    return {"extensionsUsed": ["VRMC_vrm"], "extensions": {"VRMC_vrm": about}}
 
 
 def _add_animation(
@@ -237,12 +273,12 @@ def _add_animation(
     times_s = np.array([time_s for time_s, _ in motion], np.float32)
     faps = np.array([faps for _, faps in motion], np.float32)  # (num_frames, 68)
     weights = {
-        fap.name: faps[:, fap.number - 1] / np.float32(_units_per_weight(fap.fapu)) for fap in FAPS
+        fap.name: faps[:, fap.number - 1] / np.float32(units_per_weight(fap.fapu)) for fap in FAPS
     }
     turned = {node for node, _ in _ROTATION_OF.values() if node in nodes}
     if as_arkit:
-        shapes = np.array([arkit_weights(row) for row in faps]).T
-        weights = dict(zip(ARKIT_NAMES, shapes, strict=True))
+        shapes = np.array([ARKIT.weights(row) for row in faps]).T
+        weights = dict(zip(ARKIT.names, shapes, strict=True))
         turned &= {"head"}  # ARKit's own shapes turn the eyes
     curves = {(node, "rotation"): _rotation(node, faps) for node in sorted(turned)}
     for name, node in nodes.items():
@@ -284,7 +320,13 @@ def _parent(name: str, children: list[int]) -> dict[str, Any]:
     return {"name": name} | ({"children": children} if children else {})
 
 
-def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, int]) -> int:
+def _part_node(
+    document: _Document,
+    head: Head,
+    part: Part,
+    textures: dict[str, int],
+    morphs: Sequence[Morph],
+) -> int:
     vertices = head.vertices[part.vertices]
     node: dict[str, Any] = {"name": part.name}
     if part.name in ("eye_left", "eye_right"):
@@ -325,7 +367,7 @@ def _part_node(document: _Document, head: Head, part: Part, textures: dict[str, 
     mesh: dict[str, Any] = {"name": part.name, "primitives": [primitive], "extras": {}}
     if len(coarse) < len(triangles) and not part.transparent:
         mesh["extras"]["coarse"] = add_indices(coarse)
-    targets, names = _targets(document, head, part)
+    targets, names = _targets(document, head, part, morphs)
     if targets:
         primitive["targets"] = targets
         mesh["weights"] = [0.0] * len(targets)
@@ -352,35 +394,30 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
     return material
 
 
-def _targets(document: _Document, head: Head, part: Part) -> tuple[list[dict[str, int]], list[str]]:
+def _targets(
+    document: _Document, head: Head, part: Part, morphs: Sequence[Morph]
+) -> tuple[list[dict[str, int]], list[str]]:
     """Morph targets of a part, and their names."""
     count = part.vertices.stop - part.vertices.start
     fields = head.basis[3 * part.vertices.start : 3 * part.vertices.stop].T.toarray()  # (68, 3 V)
-    shapes = ARKIT @ fields
+    shifts = np.array([morph.faps for morph in morphs]) @ fields
     targets: list[dict[str, int]] = []
     names = []
-
-    def add(name: str, shift: NDArray[np.float32], finest_m: float) -> None:
-        moved = np.flatnonzero(np.abs(shift).max(axis=1) > finest_m)
+    for morph, row in zip(morphs, shifts, strict=True):
+        shift = row.reshape(count, 3)
+        turn = np.where(_TURNS_EYES, morph.faps, 0).astype(np.float32)
+        if morph.turns_eyes and part.name.startswith("eye") and turn.any():
+            shift = shift + (head.deform(turn) - head.vertices)[part.vertices]
+        moved = np.flatnonzero(np.abs(shift).max(axis=1) > morph.min_shift_m)
         if len(moved):
             accessor = document.sparse_vectors(moved, shift[moved], count)
             targets.append({"POSITION": accessor})
-            names.append(name)
-
-    for fap in FAPS:
-        shift = fields[fap.number - 1] * np.float32(_units_per_weight(fap.fapu))
-        add(fap.name, shift.reshape(count, 3), _MIN_SHIFT_M)
-    for name, faps, shape in zip(ARKIT_NAMES, ARKIT, shapes, strict=True):
-        shift = shape.reshape(count, 3)
-        turn = np.where(_TURNS_EYES, faps, 0).astype(np.float32)
-        if part.name.startswith("eye") and turn.any():  # engines may know shapes alone
-            shift = shift + (head.deform(turn) - head.vertices)[part.vertices]
-        add(name, shift, _MIN_SHAPE_SHIFT_M)
+            names.append(morph.name)
     return targets, names
 
 
-def _units_per_weight(fapu: str) -> float:
-    return _ANGLE_UNITS_PER_WEIGHT if fapu == "AU" else FAP_UNITS_PER_FAPU
+def _is_own(head: Head) -> bool:
+    return (ASSETS / f"{head.name}.npz").is_file()
 
 
 def _description(head: Head) -> dict[str, Any]:
@@ -393,10 +430,9 @@ def _description(head: Head) -> dict[str, Any]:
         if node in turning:
             entry["rotation"] = {"node": node, "axis": axis}
         else:
-            entry["unitsPerWeight"] = _units_per_weight(fap.fapu)
+            entry["unitsPerWeight"] = units_per_weight(fap.fapu)
         faps.append(entry)
     view = camera(head)
-    own = (ASSETS / f"{head.name}.npz").is_file()
     return {
         "version": 1,
         "cel": head.cel,
@@ -414,8 +450,8 @@ def _description(head: Head) -> dict[str, Any]:
         "background": BACKGROUND[0],
         "visemes": _shapes(VISEME_NAMES, VISEMES),
         "expressions": _shapes(EXPRESSION_NAMES, EXPRESSIONS),
-        "arkit": _shapes(ARKIT_NAMES, ARKIT),
-    } | ({"licence": "CC0-1.0"} if own else {})
+        "arkit": _shapes(ARKIT.names, ARKIT.basis),
+    } | ({"licence": "CC0-1.0"} if _is_own(head) else {})
 
 
 def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:

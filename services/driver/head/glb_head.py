@@ -31,9 +31,8 @@ from services.driver.head.glb_pieces import plain, read_pieces
 from services.driver.head.head import Head, assemble
 from services.driver.head.pieces import Fields, Piece, pack, part_names
 from shared.errors import UserError
-from shared.face.blendshapes import ARKIT, ARKIT_NAMES, OCULUS_NAMES
 from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from shared.face.high_level import VISEMES
+from shared.face.shapes import ARKIT, OCULUS
 
 EYE_DISTANCE_M = 0.055  # to which a head is scaled
 # the units of an average face, in eye distances
@@ -93,11 +92,11 @@ def recognise(names: list[str]) -> Names:
     for name, fap in _FAP_NAMES.items():
         angle = fap.fapu == "AU"
         faps[name][fap.number - 1] = 1 / RADIANS_PER_ANGLE_UNIT if angle else FAP_UNITS_PER_FAPU
-    arkit = {plain(name): row.astype(float) for name, row in zip(ARKIT_NAMES, ARKIT, strict=True)}
-    oculus = {
-        "viseme" + plain(name): row.astype(float)
-        for name, row in zip(OCULUS_NAMES[1:], VISEMES[1:], strict=True)
-    }
+    arkit, oculus = (
+        {plain(name): row.astype(float) for name, row in zip(each.names, each.basis, strict=True)}
+        for each in (ARKIT, OCULUS)
+    )
+    oculus = {"viseme" + name: faps for name, faps in oculus.items() if faps.any()}
     # Ready Player Me writes the vowels so
     oculus |= {
         "viseme" + new: oculus["viseme" + old]

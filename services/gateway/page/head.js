@@ -3,15 +3,14 @@
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { coarsen } from "./coarse.js";
+import { findJoints, turnJoints } from "./joints.js";
 import { dim, drawsInSoftware, physicalMaterial, plainMaterial, release, studio } from "./materials.js";
 import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
 import { Pace } from "./pace.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
-const RADIANS_PER_UNIT = 1e-5;
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
-const TURN_ORDER = ["yaw", "pitch", "roll"]; // roll is applied first
 const LOOK_EVERY_MS = 2; // whether a picture is done
 const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
@@ -25,7 +24,7 @@ export class Head {
   #model = null; // in the scene
   #meshes = []; // that FAPs move
   #inMouth = []; // materials
-  #joints = []; // { node, rest, turns: [[FAP index, axis]] }
+  #joints = [];
   #faps = null; // to be taken on
   #front = new THREE.Vector3(); // where the camera stands at first
   #fovYDegrees = 22;
@@ -36,7 +35,6 @@ export class Head {
   #isFilmed = false;
   #size = [0, 0]; // on the page
   #numPictures = 0;
-  #turn = new THREE.Quaternion();
 
   /** @param canvas to draw into; @param overlay the element that covers its lower edge */
   constructor(canvas, overlay) {
@@ -72,7 +70,6 @@ export class Head {
     });
     this.#meshes = [];
     this.#inMouth = [];
-    this.#joints = [];
     this.#add(gltf);
   }
 
@@ -89,7 +86,7 @@ export class Head {
       if (IN_MOUTH.includes(node.name)) this.#inMouth.push(node.material);
       if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
     });
-    this.#findJoints(gltf.scene, about.faps);
+    this.#joints = findJoints(gltf.scene, about.faps);
     this.#scene.add(gltf.scene);
     this.#frame(about.camera);
   }
@@ -115,22 +112,16 @@ export class Head {
     for (const mesh of this.#meshes) mesh.pose(faps);
     const light = mouthLight(faps);
     for (const material of this.#inMouth) dim(material, light);
-    for (const { node, rest, turns } of this.#joints) {
-      node.quaternion.copy(rest);
-      for (const [index, axis] of turns) {
-        this.#turn.setFromAxisAngle(axis, faps[index] * RADIANS_PER_UNIT);
-        node.quaternion.multiply(this.#turn);
-      }
-    }
+    turnJoints(this.#joints, faps);
   }
 
   /**
    * Draw, if anything has changed, and if the picture before is done: a slow machine is to have
    * fewer pictures rather than a queue of late ones that block the page.
    *
-   * @param drawn called when this picture is done, if it is drawn
+   * @param seen called with when this picture is seen first, ms, if it is drawn
    */
-  draw(nowMs, drawn) {
+  draw(nowMs, seen) {
     if (!this.#stale || this.#isDrawing || !this.#pace.isDue(nowMs)) return;
     if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#resize(); // which blanks the canvas
     this.#stale = false;
@@ -142,8 +133,13 @@ export class Head {
     this.#whenDone(() => {
       this.#isDrawing = false;
       this.#numPictures++;
-      this.#pace.drew(begunMs, performance.now());
-      drawn();
+      const doneMs = performance.now();
+      this.#pace.drew(begunMs, doneMs);
+      requestAnimationFrame((tickMs) => {
+        const seenMs = Math.max(tickMs, doneMs); // a busy page hears of a tick after it
+        this.#pace.saw(nowMs, seenMs);
+        seen(seenMs);
+      });
     });
   }
 
@@ -164,6 +160,11 @@ export class Head {
     this.#camera.position.setFromSpherical(place).add(target);
     this.#controls.update();
     return { left: radToDeg(place.theta - front.theta), up: radToDeg(place.phi - front.phi) };
+  }
+
+  /** How long after it is drawn a picture is seen, ms, to the middle of the time for which it is. */
+  get untilSeenMs() {
+    return this.#pace.untilSeenMs;
   }
 
   /**
@@ -198,23 +199,6 @@ export class Head {
       }
     };
     setTimeout(look);
-  }
-
-  #findJoints(scene, faps) {
-    const byNode = new Map();
-    for (const { name, number, rotation } of faps) {
-      if (rotation) {
-        const turns = byNode.get(rotation.node) ?? [];
-        const order = TURN_ORDER.findIndex((word) => name.includes(word));
-        turns.push([number - 1, new THREE.Vector3(...rotation.axis), order]);
-        byNode.set(rotation.node, turns);
-      }
-    }
-    for (const [name, turns] of byNode) {
-      const node = scene.getObjectByName(name);
-      turns.sort((a, b) => a[2] - b[2]);
-      if (node) this.#joints.push({ node, rest: node.quaternion.clone(), turns });
-    }
   }
 
   #frame({ target, position, fovYDegrees }) {

@@ -1,23 +1,27 @@
 // The WebSocket to the gateway that brings everything to be seen and heard; proto/GATEWAY.md.
 
-import { socketUrl } from "./address.js";
 import { readMessage } from "./messages.js";
 
 const RETRY_MS = [300, 5000];
 
-/** Connects, and connects again by itself for as long as the page is open. */
+/** Connects, and connects again by itself until it is closed. */
 export class Link {
+  #address;
   #handlers;
   #chosen;
   #socket = null;
+  #retry = null;
   #retryMs = RETRY_MS[0];
 
   /**
+   * @param address gives the WebSocket's address for a session
    * @param {string} chosen session to look at; "" for the newest
    * @param handlers { state(connected), fap(mediaTime, values), sound(mediaTime, samples),
-   *   rest(values), text(object) }
+   *   rest(values), text(object) }; where the address asks for shapes, also weights(mediaTime, values)
+   *   and restWeights(values)
    */
-  constructor(chosen, handlers) {
+  constructor(address, chosen, handlers) {
+    this.#address = address;
     this.#chosen = chosen;
     this.#handlers = handlers;
     this.#connect();
@@ -34,8 +38,16 @@ export class Link {
     if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
   }
 
+  /** Disconnect for good. */
+  close() {
+    clearTimeout(this.#retry);
+    this.#socket.onclose = null;
+    this.#socket.close();
+    this.#handlers.state(false);
+  }
+
   #connect() {
-    const socket = new WebSocket(socketUrl("/viewer", { session: this.#chosen }));
+    const socket = new WebSocket(this.#address(this.#chosen));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.#retryMs = RETRY_MS[0];
@@ -44,7 +56,7 @@ export class Link {
     socket.onmessage = (event) => this.#receive(event.data);
     socket.onclose = () => {
       this.#handlers.state(false);
-      setTimeout(() => this.#connect(), this.#retryMs);
+      this.#retry = setTimeout(() => this.#connect(), this.#retryMs);
       this.#retryMs = Math.min(RETRY_MS[1], this.#retryMs * 2);
     };
     this.#socket = socket;
@@ -59,5 +71,7 @@ export class Link {
     if (message?.faps) this.#handlers.fap(message.mediaTime, message.faps);
     else if (message?.samples) this.#handlers.sound(message.mediaTime, message.samples);
     else if (message?.rest) this.#handlers.rest(message.rest);
+    else if (message?.weights) this.#handlers.weights(message.mediaTime, message.weights);
+    else if (message?.restWeights) this.#handlers.restWeights(message.restWeights);
   }
 }

@@ -1,5 +1,6 @@
 // Puts the page together: what arrives, when it is due, and what the buttons do.
 
+import { socketUrl } from "./address.js";
 import { Caption } from "./caption.js";
 import { Choices } from "./choices.js";
 import { element, setText } from "./elements.js";
@@ -13,10 +14,20 @@ import { Microphone } from "./microphone.js";
 import { Notice } from "./notice.js";
 import { FapTrack, Playout } from "./playout.js";
 import { Presence } from "./presence.js";
+import { Programs } from "./programs.js";
 import { Recent } from "./recent.js";
 import { Sound } from "./sound.js";
 import { Settings } from "./settings.js";
-import { delayText, drawingText, errorText, hint, stateKind, stateText, turnText } from "./status.js";
+import {
+  delayText,
+  drawingText,
+  errorText,
+  hint,
+  stateKind,
+  stateText,
+  turnText,
+  waitText,
+} from "./status.js";
 import { BACKGROUND, VideoRecorder } from "./video.js";
 import { VoiceStore } from "./voice.js";
 
@@ -27,6 +38,7 @@ const playout = new Playout();
 const track = new FapTrack();
 const meter = new LevelMeter();
 const presence = new Presence();
+const programs = new Programs(element("settings"));
 const delays = new Recent(DELAY_MS); // ms, from the own voice to the picture
 const frameDelays = new Recent(DELAY_MS); // ms, from the own voice to the arrival of its frame
 const sound = new Sound(onSoundState);
@@ -52,12 +64,13 @@ const faps = new Float32Array(NUM_FAPS);
 
 /** What the page knows, for whoever embeds or tests it: see proto/GATEWAY.md. */
 window.kouxing = {
+  onPicture: null, // called for each picture that is seen
   set readingS(seconds) {
     lesson.readingS = seconds;
   },
   get state() {
     const nowMs = performance.now();
-    const heardMs = sound.offsetMs(nowMs);
+    const heardMs = sound.offsetMs;
     return {
       connected,
       session,
@@ -66,6 +79,7 @@ window.kouxing = {
       faps: Array.from(faps),
       mediaTime: playout.mediaAt(nowMs),
       playoutDelayMs: playout.delayMs,
+      frameWaitMs: playout.frameWaitMs,
       voiceToFrameMs: frameDelays.percentile(0.5),
       voiceToPictureMs: delays.percentile(0.5),
       sound: sound.state,
@@ -93,7 +107,8 @@ function forget() {
   frameDelays.reset();
 }
 
-const link = new Link(new URLSearchParams(location.search).get("session") ?? "", {
+const toViewer = (chosen) => socketUrl("/viewer", { session: chosen });
+const link = new Link(toViewer, new URLSearchParams(location.search).get("session") ?? "", {
   state(isConnected) {
     connected = isConnected;
     wasConnected ||= connected;
@@ -103,18 +118,15 @@ const link = new Link(new URLSearchParams(location.search).get("session") ?? "",
   },
   fap(mediaTime, values) {
     const nowMs = performance.now();
-    const offsetMs = playout.offsetMs;
     if (track.push(mediaTime, values)) playout.frameArrived(nowMs, mediaTime);
     presence.frameArrived(nowMs);
     if (isLiveVoice(nowMs)) addAge(frameDelays, nowMs, mediaTime);
     numFrames++;
-    if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
   },
   sound(mediaTime, samples) {
     const nowMs = performance.now();
-    const offsetMs = playout.offsetMs;
     playout.soundArrived(nowMs, mediaTime, samples.length);
-    if (playout.offsetMs !== offsetMs) sound.align(nowMs, playout.offsetMs);
+    keepTime(nowMs);
     presence.soundArrived(nowMs);
     sound.push(mediaTime, samples);
     meter.push(mediaTime, samples);
@@ -169,18 +181,15 @@ let shownDb = SILENT_DB; // of the meter
 
 function draw(nowMs) {
   requestAnimationFrame(draw);
-  playout.isHeard = sound.isPlaying;
-  playout.outputLatencyMs = sound.outputLatencyMs;
-  playout.pictureMs = head?.drawing.pictureMs ?? 0;
-  const heardMs = sound.offsetMs(nowMs);
-  if (heardMs !== null) playout.follow(heardMs);
-  if (playout.adjust(nowMs)) sound.align(nowMs, playout.offsetMs);
+  playout.pictureMs = head?.untilSeenMs ?? 0;
+  keepTime(nowMs);
 
-  const mediaTime = playout.mediaAt(nowMs + playout.pictureMs); // when the picture is done
+  const mediaTime = playout.mediaAt(nowMs + playout.pictureMs); // when the picture is seen
   const shownTime = mediaTime === null ? null : track.sample(mediaTime, wanted);
   const hasChanged = mixFace(presence.update(nowMs, shownTime !== null));
   if (hasChanged && lesson.step === "closed") head?.pose(faps); // else the lesson has the machine
-  head?.draw(nowMs, () => requestAnimationFrame(() => measureDelay(shownTime)));
+  const shown = { mediaTime: shownTime, faps: faps.slice() };
+  head?.draw(nowMs, (seenMs) => pictureSeen(seenMs, shown));
 
   showLevel(mediaTime);
   if (mediaTime !== null) caption.show(mediaTime);
@@ -190,10 +199,19 @@ function draw(nowMs) {
   }
 }
 
-/** Measure how long ago the sound of a picture that is seen now was spoken, where that was here. */
-function measureDelay(shownTime) {
-  const nowMs = performance.now();
-  if (shownTime !== null && isLiveVoice(nowMs)) addAge(delays, nowMs, shownTime);
+/** Keep sound and picture in step; where the page is hidden and nothing drawn, as sound arrives. */
+function keepTime(nowMs) {
+  playout.isHeard = sound.isPlaying;
+  playout.outputLatencyMs = sound.outputLatencyMs;
+  playout.adjust(nowMs);
+  if (playout.offsetMs !== null) sound.align(nowMs, playout.offsetMs);
+}
+
+/** Measure how long ago the sound of a picture was spoken, where that was here. */
+function pictureSeen(seenMs, shown) {
+  const { mediaTime } = shown;
+  if (mediaTime !== null && isLiveVoice(seenMs)) addAge(delays, seenMs, mediaTime);
+  window.kouxing.onPicture?.({ seenMs, ...shown });
 }
 
 /** Whether what is shown is this browser's voice. */
@@ -230,7 +248,12 @@ function showState() {
   const delayMs = delays.percentile(0.5);
   element("status").dataset.state = stateKind({ connected, isLive });
   setText(element("state"), stateText({ connected, isLive, isInterrupted }));
-  setText(element("delay"), connected && isLive ? delayText(delayMs) : "");
+  const isHeard = connected && isLive && sound.state === "on";
+  const soundMs = isHeard ? playout.delayMs : null;
+  setText(element("delay"), connected && isLive ? delayText(delayMs, soundMs) : "");
+  const frameMs = isHeard ? playout.frameWaitMs : null;
+  setText(element("wait"), waitText(soundMs, frameMs));
+  programs.waitMs = frameMs;
   showDrawing();
   element("status").title = session === null ? "" : `session ${session}`;
   const isMicrophoneInterrupted = microphoneState === "interrupted";
@@ -280,7 +303,6 @@ function storage() {
 function onSoundState() {
   const button = element("sound");
   const isBlocked = sound.state === "blocked";
-  if (playout.offsetMs !== null) sound.align(performance.now(), playout.offsetMs);
   button.setAttribute("aria-pressed", sound.state === "on");
   button.classList.toggle("asks", isBlocked);
   setText(button.querySelector(".en"), isBlocked ? "Turn on sound" : "Sound");
@@ -392,7 +414,6 @@ element("record").onclick = async () => {
   } else if (head !== null) {
     head.film(BACKGROUND);
     video.start(element("head"), await sound.tap());
-    if (playout.offsetMs !== null) sound.align(performance.now(), playout.offsetMs);
   }
   element("record").setAttribute("aria-pressed", video.isRecording);
 };

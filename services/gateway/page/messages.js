@@ -4,6 +4,8 @@ export const NUM_FAPS = 68;
 const FAP_TYPE = 1;
 const SOUND_TYPE = 2;
 const REST_TYPE = 3;
+const SHAPES_TYPE = 4;
+const REST_SHAPES_TYPE = 5;
 const HEADER_BYTES = 16;
 
 /**
@@ -11,7 +13,8 @@ const HEADER_BYTES = 16;
  *
  * @param {ArrayBuffer} data
  * @returns { mediaTime, faps: Float32Array } for a FAP frame, { mediaTime, samples: Int16Array } for
- *   sound, { rest: Float32Array } for the face at rest, null for what a later gateway may send
+ *   sound, { rest: Float32Array } for the face at rest, { mediaTime, weights: Float32Array } for shapes
+ *   of a frame, { restWeights: Float32Array } for those at rest, null for what a later gateway may send
  */
 export function readMessage(data) {
   const header = new DataView(data);
@@ -23,6 +26,10 @@ export function readMessage(data) {
       return { mediaTime, samples: new Int16Array(data, HEADER_BYTES) };
     case REST_TYPE:
       return { rest: new Float32Array(data, HEADER_BYTES, NUM_FAPS) };
+    case SHAPES_TYPE:
+      return { mediaTime, weights: new Float32Array(data, HEADER_BYTES) };
+    case REST_SHAPES_TYPE:
+      return { restWeights: new Float32Array(data, HEADER_BYTES) };
     default:
       return null;
   }

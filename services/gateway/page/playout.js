@@ -7,11 +7,12 @@ export const SAMPLES_PER_MS = 16;
 const FRAME_MS = 20; // between two FAP frames: a face between them needs both
 const FIRST_DELAY_MS = 120; // before anything has been measured
 // The arrival that is waited for, of a hundred, the frames that a face between them needs, and the
-// error that is left alone: where sound is heard, which must never run dry or be heard to leap; and
-// where it is not, and a face that is a frame too old is seen by nobody.
-const HEARD = { percentile: 0.95, marginMs: FRAME_MS, deadZoneMs: 30 };
-const MUTE = { percentile: 0.8, marginMs: 0, deadZoneMs: 5 };
+// error that is left to gliding: where sound is heard, which must never run dry or be heard to
+// leap; and where it is not, and a face that is a frame too old is seen by nobody.
+const HEARD = { percentile: 0.95, marginMs: FRAME_MS, leapMs: 30 };
+const MUTE = { percentile: 0.8, marginMs: 0, leapMs: 5 };
 const ADJUST_EVERY_MS = 500;
+const GLIDE = 0.005; // of the pace: a twelfth of a semitone, which nobody hears
 const WINDOW_MS = 10000; // that the percentiles are taken over: a single hiccup must not count
 const ENOUGH = 20; // frames before the percentile is believed
 const JUMP_MS = 300; // a stream that is later, or earlier, by this: start again
@@ -22,23 +23,25 @@ const MAX_FRAMES = 1000;
 /**
  * The playout clock.
  *
- * Media time m is shown at m + offset on the page's clock. Sound reaches us as soon as it was
- * heard, its FAP frame some 60 to 100 ms later, so sound has to wait: the target of the offset is
- * the 95th percentile of (frame arrival - media time), plus one FAP frame, plus the time that a
- * picture takes. The difference between the page's clock and the sender's is in every lateness alike
- * and drops out. Without sound, as for one's own voice, the face waits less.
+ * Media time m is shown, and heard, at m + offset on the page's clock. Sound reaches us as soon as
+ * it was heard, its FAP frame some 60 to 100 ms later, so sound has to wait: the target of the offset
+ * is the 95th percentile of (frame arrival - media time), plus one FAP frame, plus the time until a
+ * picture is seen. The difference between the page's clock and the sender's is in every lateness
+ * alike and drops out. Without sound, as for one's own voice, the face waits less.
  *
- * The network's and the clocks' drift moves the target. Every half second, if the offset is off by
- * more than the dead zone (30 ms, unnoticeable: ITU-R BT.1359 puts detectability at 45 and 125 ms),
- * half of the error is corrected, so that one bad second is not answered by a leap.
+ * The network's and the clocks' drift moves the target. The offset glides after it, by 5 ms a second
+ * at most, which the sound follows by resampling. Only if it is off by more than 30 ms, half of the
+ * error is corrected at once, every half second, so that one bad second is not answered by a leap.
  */
 export class Playout {
   isHeard = true;
   outputLatencyMs = 0; // from the audio thread to the loudspeaker; sound must leave so much earlier
-  pictureMs = 0; // from a face to its picture; it must be drawn so much earlier
+  pictureMs = 0; // from a face until its picture is seen; it must be drawn so much earlier
   #offsetMs = null;
   #begunMs = 0; // when the first offset was set
-  #adjustedMs = 0;
+  #targetMs = null; // of the offset
+  #adjustedMs = 0; // when the target was set
+  #glidedMs = 0; // when the offset was moved
   #lateSinceMs = null; // when what arrives began to be too late
 
   constructor() {
@@ -48,6 +51,7 @@ export class Playout {
   /** Forget everything: another session, or the stream paused. */
   reset() {
     this.#offsetMs = null;
+    this.#targetMs = null;
     this.#lateSinceMs = null;
     // Each one's lateness: arrival - media time, ms.
     this.frames = new Recent(WINDOW_MS);
@@ -63,6 +67,12 @@ export class Playout {
   get delayMs() {
     if (this.#offsetMs === null || this.soundEnds.count === 0) return null;
     return this.#offsetMs - this.soundEnds.percentile(0.05);
+  }
+
+  /** How long after its arrival the picture of a frame is seen, ms; null before any. */
+  get frameWaitMs() {
+    if (this.#offsetMs === null || this.frames.count === 0) return null;
+    return this.#offsetMs - this.frames.percentile(0.5);
   }
 
   /** Media time that is due at a time, samples; null before anything arrived. */
@@ -88,31 +98,34 @@ export class Playout {
     this.#begin(nowMs, endMs + FIRST_DELAY_MS);
   }
 
-  /** Correct the offset if it is time to; return whether it changed. */
+  /** Move the offset towards its target; to be called again and again. */
   adjust(nowMs) {
-    if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return false;
-    if (this.frames.count < ENOUGH) return false;
+    this.#glide(nowMs);
+    if (this.#offsetMs === null || nowMs - this.#adjustedMs < ADJUST_EVERY_MS) return;
+    if (this.frames.count < ENOUGH) return;
     this.#adjustedMs = nowMs;
     if (this.frames.greatestSince(nowMs - ADJUST_EVERY_MS) < this.#offsetMs - JUMP_MS) {
       this.reset(); // what was held up on the way has come, and the stream is live again
-      return false;
+      return;
     }
-    const { percentile, marginMs, deadZoneMs } = this.isHeard ? HEARD : MUTE;
+    const { percentile, marginMs, leapMs } = this.isHeard ? HEARD : MUTE;
     let latestMs = this.frames.percentile(percentile) + this.pictureMs;
     if (this.isHeard && this.soundStarts.count) {
       // A long chunk of sound is as late as its first sample.
       const soundMs = this.soundStarts.percentile(percentile) + this.outputLatencyMs;
       latestMs = Math.max(latestMs, soundMs);
     }
-    const errorMs = latestMs + marginMs - this.#offsetMs;
-    if (Math.abs(errorMs) <= deadZoneMs) return false;
-    this.#offsetMs += errorMs / 2;
-    return true;
+    this.#targetMs = latestMs + marginMs;
+    const errorMs = this.#targetMs - this.#offsetMs;
+    if (Math.abs(errorMs) > leapMs) this.#offsetMs += errorMs / 2;
   }
 
-  /** Follow the sound card's clock, which is never quite the page's. */
-  follow(measuredOffsetMs) {
-    if (this.#offsetMs !== null) this.#offsetMs += 0.05 * (measuredOffsetMs - this.#offsetMs);
+  #glide(nowMs) {
+    const mostMs = GLIDE * (nowMs - this.#glidedMs);
+    this.#glidedMs = nowMs;
+    if (this.#targetMs === null) return;
+    const errorMs = this.#targetMs - this.#offsetMs;
+    this.#offsetMs += Math.max(-mostMs, Math.min(mostMs, errorMs));
   }
 
   /** Set the first offset: what had piled up before comes at once, and its end is the truest. */

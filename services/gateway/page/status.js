@@ -15,9 +15,28 @@ export function stateText({ connected, isLive, isInterrupted }) {
   return isInterrupted ? say({ en: "interrupted", zh: "中断" }) : say({ en: "waiting for speech", zh: "等待语音" });
 }
 
-/** Return the words for the delay from the voice to the picture; "" while it is not known. */
-export function delayText(delayMs) {
-  return delayMs === null ? "" : `${Math.round(delayMs / 10) * 10} ms`;
+/**
+ * Return the words for the delay from the own voice to the picture, or else for how long sound waits
+ * for its picture, ms; "" while neither is known.
+ */
+export function delayText(voiceMs, soundMs) {
+  if (voiceMs !== null) return `${tens(voiceMs)} ms`;
+  if (soundMs === null) return "";
+  return say({ en: `sound waits ${tens(soundMs)} ms`, zh: `声音延迟 ${tens(soundMs)} ms` });
+}
+
+/** Return the words for how long sound, and a frame, wait for their picture, ms; "" while unknown. */
+export function waitText(soundMs, frameMs) {
+  if (soundMs === null || frameMs === null) return "";
+  return say({
+    en: `Sound waits ${tens(soundMs)} ms for its picture. Another program's face fits this sound if its sender has delay=${tens(frameMs)}.`,
+    zh: `声音等画面 ${tens(soundMs)} ms。要让其他程序的脸与此声音同步，发送地址加 delay=${tens(frameMs)}。`,
+  });
+}
+
+/** Round to tens: what is shown changes with every frame, and nobody sees a few milliseconds. */
+export function tens(ms) {
+  return Math.round(ms / 10) * 10;
 }
 
 /** Return the words for how the head is drawn (Head.drawing); "" if as well as it can be. */
@@ -93,6 +112,7 @@ function missingHint(missing) {
 // What services refuse, by the code of the error; the English text says more.
 const REFUSALS = {
   "bad-audio": "音频有误",
+  busy: "人太多了：请稍后再试",
   "bad-voice": "学到的口型不适用于当前版本：请重新“学我的口型”",
   "no-service": "缺少服务：请运行 kouxing run",
   "session-exists": "同名会话已存在",

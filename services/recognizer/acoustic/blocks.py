@@ -58,6 +58,7 @@ from services.recognizer.acoustic.model_file import (
 )
 from services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
+    MAX_BATCH,
     MAX_POSITIONS,
     Floats,
     open_session,
@@ -72,7 +73,6 @@ _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # bef
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
-_MAX_BATCH = 16  # sessions in a run; more would only take memory
 _MAX_SIZE = 4096
 _MAX_CACHE_BYTES = 3_000_000  # of a session
 
@@ -112,15 +112,15 @@ class BlockModel:
         for stream, (_, frames) in zip(streams, work, strict=True):
             stream.take_frames(frames)
         while ready := [stream for stream in streams if stream.is_due]:
-            for start in range(0, len(ready), _MAX_BATCH):
-                self._run(ready[start : start + _MAX_BATCH])
+            for start in range(0, len(ready), MAX_BATCH):
+                self._run(ready[start : start + MAX_BATCH])
         return [stream.take_settled() for stream in streams]
 
     def _run(self, streams: Sequence[BlockStream]) -> None:
         log_posteriors, states, new = self.session.run([stream.block() for stream in streams])
         scores = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
-        for row, stream in enumerate(streams):
-            stream.take_outputs(scores[row], states[row], new[row])
+        for row, stream in enumerate(streams):  # copies: a row would keep all of them
+            stream.take_outputs(scores[row].copy(), states[row].copy(), new[row])
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
@@ -250,6 +250,7 @@ class BlockStream:
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
         self._nothing = no_scores(model.topology.num_states)
+        self._past: Past | None = None  # made when speech first comes
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
@@ -275,7 +276,8 @@ class BlockStream:
         """Go to the first row of the table of positions, with nothing before it."""
         self._row = 0  # of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
-        self._past: Past | None = None
+        if self._past is not None:
+            self._past.num_cached, self._past.state = 0, np.zeros_like(self._past.state)
 
     def take_frames(self, frames: Floats | None) -> None:
         """Take frames, (n, 80), or the segment's end, at which its last frame is repeated."""

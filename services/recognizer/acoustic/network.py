@@ -6,6 +6,7 @@ See :mod:`services.recognizer.acoustic.neural` for what it computes and
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ NUM_INPUTS = NUM_MELS
 WINDOW = 128  # positions that one attends to, itself included
 MAX_POSITIONS = 1500  # rows of the table of positions
 SEEN_FRAMES = 5  # feature frames that enter at one position
+MAX_BATCH = 16  # sessions in a run; more would only take memory
 FRAMES_PER_POSITION = 2  # feature frames from one position to the next
 
 _OUTPUTS = ["log_posteriors", "keys", "values"]
@@ -29,6 +31,7 @@ _MAX_LAYERS = 64
 _LONGEST_WAVE = 10_000.0  # of the sinusoids, over 2 pi
 
 Floats = NDArray[np.float32]
+Halves = NDArray[np.float16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +45,67 @@ class NetworkSizes:
 
 
 class KeyValueCache:
-    """Keys and values of some sessions' earlier positions, as the network takes them.
+    """Keys and values of a session's earlier positions, as the network takes them.
 
-    Each is a ring of ``WINDOW`` slots, in 16 bits.
+    Each is a ring of ``WINDOW`` slots, in 16 bits, shape (layers, 1, heads, WINDOW, size).
     """
 
-    def __init__(self, sizes: NetworkSizes, num_sessions: int) -> None:
-        layers, heads, size = sizes.num_layers, sizes.num_heads, sizes.head_size
-        self.keys = np.zeros((layers, num_sessions, heads, WINDOW, size), np.float16)
-        self.values = np.zeros_like(self.keys)
+    _numbers = itertools.count()
+
+    def __init__(self, sizes: NetworkSizes) -> None:
+        self.keys, self.values = _rings(sizes, 1)
+        self._number = next(self._numbers)
+        self._num_written = 0
+
+    @property
+    def state(self) -> tuple[int, int]:
+        """Tells this cache, with what it holds, from all others and from what it held before."""
+        return self._number, self._num_written
+
+    def write(self, slot: int, keys: Floats, values: Floats) -> None:
+        """Write a position's keys and values, each (layers, heads, size)."""
+        self.keys[:, 0, :, slot], self.values[:, 0, :, slot] = keys, values
+        self._num_written += 1
+
+
+class JointCache:
+    """The caches of the sessions in a run side by side, in memory that is used again and again.
+
+    What a row holds already is not copied once more: sessions that run together stay there.
+    """
+
+    def __init__(self, sizes: NetworkSizes) -> None:
+        self._sizes = sizes
+        self._keys, self._values = _rings(sizes, 0)
+        self._states: list[tuple[int, int] | None] = []  # of the caches in the rows
+
+    def join(self, caches: Sequence[KeyValueCache]) -> tuple[Halves, Halves]:
+        """Return keys and values, each (layers, sessions, heads, WINDOW, size)."""
+        if len(caches) == 1:
+            return caches[0].keys, caches[0].values
+        if len(self._states) < len(caches):
+            self._keys, self._values = _rings(self._sizes, len(caches))
+            self._states = [None] * len(caches)
+        for row, cache in enumerate(caches):
+            if self._states[row] != cache.state:
+                self._keys[:, row], self._values[:, row] = cache.keys[:, 0], cache.values[:, 0]
+                self._states[row] = cache.state
+        return self._keys[:, : len(caches)], self._values[:, : len(caches)]
+
+    def write(
+        self, caches: Sequence[KeyValueCache], slots: Sequence[int], keys: Floats, values: Floats
+    ) -> None:
+        """Write a position of the caches that were joined last; each (sessions, layers, ...)."""
+        for row, (cache, slot) in enumerate(zip(caches, slots, strict=True)):
+            cache.write(slot, keys[row], values[row])
+            if len(caches) > 1:
+                self._keys[:, row, :, slot], self._values[:, row, :, slot] = keys[row], values[row]
+                self._states[row] = cache.state
+
+
+def _rings(sizes: NetworkSizes, num_sessions: int) -> tuple[Halves, Halves]:
+    shape = (sizes.num_layers, num_sessions, sizes.num_heads, WINDOW, sizes.head_size)
+    return np.zeros(shape, np.float16), np.zeros(shape, np.float16)
 
 
 def position_table(width: int) -> Floats:

@@ -58,11 +58,13 @@ from services.recognizer.acoustic.model_file import (
     write_archive,
 )
 from services.recognizer.acoustic.network import (
+    MAX_BATCH,
     MAX_POSITIONS,
     NUM_INPUTS,
     SEEN_FRAMES,
     WINDOW,
     Floats,
+    JointCache,
     KeyValueCache,
     NetworkSession,
     past_masks,
@@ -109,6 +111,10 @@ class NeuralModel:
         return NetworkSession(self.network)
 
     @cached_property
+    def _joint(self) -> JointCache:
+        return JointCache(self.session.sizes)
+
+    @cached_property
     def positions(self) -> Floats:
         """Table of positions, shape (1500, width)."""
         return position_table(self.session.sizes.width)
@@ -122,7 +128,7 @@ class NeuralModel:
         return NeuralStream(self)
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
-        """Score frames of several streams in one batch; None ends a stream's segment.
+        """Score frames of several streams in batches; None ends a stream's segment.
 
         The streams advance in step, one position at a time.
         """
@@ -130,10 +136,8 @@ class NeuralModel:
         for stream, (_, frames) in zip(streams, work, strict=True):
             stream.take_frames(frames)
         while ready := [stream for stream in streams if stream.num_pending]:
-            ready.sort(key=lambda stream: (id(stream.cache), stream.row))
-            log_posteriors, keys, values = self.run(ready, self.output_layer)
-            for row, stream in enumerate(ready):
-                stream.take_outputs(log_posteriors[row], keys[row], values[row])
+            for start in range(0, len(ready), MAX_BATCH):
+                self._advance(ready[start : start + MAX_BATCH])
         scores = []
         for stream, (_, frames) in zip(streams, work, strict=True):
             rows = stream.new_log_posteriors(is_end=frames is None)
@@ -141,6 +145,13 @@ class NeuralModel:
             if frames is None:
                 stream.reset()
         return scores
+
+    def _advance(self, streams: Sequence[NeuralStream]) -> None:
+        log_posteriors, keys, values = self.run(streams, self.output_layer)
+        caches, slots = [stream.cache for stream in streams], [stream.slot for stream in streams]
+        self._joint.write(caches, slots, keys, values)
+        for row, stream in enumerate(streams):
+            stream.take_outputs(log_posteriors[row], values[row])
 
     def run(self, streams: Sequence[NeuralStream], output_layer: int) -> list[Floats]:
         """Run the network at the next position of every stream, with one of its output layers.
@@ -151,7 +162,7 @@ class NeuralModel:
             Log posteriors, (rows, 2, states); keys and values, (rows, layers, heads, size). The
             first rows are those of the streams.
         """
-        cache = _common_cache(streams)
+        all_keys, all_values = self._joint.join([stream.cache for stream in streams])
         rows = [*streams, streams[0]] if len(streams) < _MIN_ROWS else streams
         inputs = {
             "frames": np.stack([stream.next_frames() for stream in rows]),
@@ -159,7 +170,7 @@ class NeuralModel:
             "output_layer": np.array(output_layer),
             "past_mask": _PAST_MASKS[[min(stream.position, _PAST) for stream in streams]],
         }
-        for layer, (keys, values) in enumerate(zip(cache.keys, cache.values, strict=True)):
+        for layer, (keys, values) in enumerate(zip(all_keys, all_values, strict=True)):
             inputs[f"keys_{layer}"] = keys
             inputs[f"values_{layer}"] = values
         return self.session.run(inputs)
@@ -194,25 +205,6 @@ class NeuralModel:
         write_archive(path, arrays)
 
 
-def _common_cache(streams: Sequence[NeuralStream]) -> KeyValueCache:
-    """Return a cache whose rows are the streams', in order.
-
-    Streams that are mostly scored together share a cache already, so nothing is copied.
-    """
-    cache = streams[0].cache
-    if cache.keys.shape[1] == len(streams) and all(
-        stream.cache is cache and stream.row == row for row, stream in enumerate(streams)
-    ):
-        return cache
-    cache = KeyValueCache(streams[0].sizes, len(streams))
-    for row, stream in enumerate(streams):
-        cache.keys[:, row] = stream.cache.keys[:, stream.row]
-        cache.values[:, row] = stream.cache.values[:, stream.row]
-    for row, stream in enumerate(streams):
-        stream.cache, stream.row = cache, row
-    return cache
-
-
 class NeuralStream:
     """Scores of one speaker's speech, segment by segment.
 
@@ -228,6 +220,7 @@ class NeuralStream:
         self.sizes = model.session.sizes
         self.look_ahead_frames = model.look_ahead_frames
         self.provisional = no_scores(len(model.log_prior))
+        self.cache = KeyValueCache(self.sizes)  # what lies beyond a segment's positions is masked
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
@@ -245,7 +238,6 @@ class NeuralStream:
         self._num_scored = 0
         self._num_positions = 0  # done
         self._rows: list[Floats] = []  # log posteriors not yet returned, one array a frame
-        self.cache, self.row = KeyValueCache(self.sizes, 1), 0
 
     @property
     def num_pending(self) -> int:
@@ -256,6 +248,11 @@ class NeuralStream:
     def position(self) -> int:
         """Row of the next position in the table."""
         return self._num_positions % MAX_POSITIONS
+
+    @property
+    def slot(self) -> int:
+        """Place of the next position in the cache."""
+        return self.position % _PAST
 
     def take_frames(self, frames: Floats | None) -> None:
         """Take frames; None, at the end of the segment, repeats the last one as often as needed."""
@@ -276,21 +273,19 @@ class NeuralStream:
         """Return the frames at the next position, shape (400,)."""
         return self._frames[:SEEN_FRAMES].reshape(-1)
 
-    def take_outputs(self, log_posteriors: Floats, keys: Floats, values: Floats) -> None:
-        """Take the network's outputs at a position: log posteriors (2, states), keys and values."""
+    def take_outputs(self, log_posteriors: Floats, values: Floats) -> None:
+        """Take the network's outputs at a position: log posteriors (2, states), and values.
+
+        The values, (layers, heads, size), are in the cache already.
+        """
         first = 2 * self._num_positions + _PADDING - self.look_ahead_frames
         if first == 1 and self._num_positions == 0:
             self._rows.append(log_posteriors[0])  # frame 0, which no position scores
         self._rows += [row for number, row in enumerate(log_posteriors) if first + number >= 0]
-        slot = self.position % _PAST
-        self.cache.keys[:, self.row, :, slot] = keys
-        self.cache.values[:, self.row, :, slot] = values
         if self.on_position:
             self.on_position(self._frames[SEEN_FRAMES - 2 : SEEN_FRAMES], values)
         self._num_positions += 1
         self._frames = self._frames[2:]
-        if self.position == 0:  # the table has ended
-            self.cache, self.row = KeyValueCache(self.sizes, 1), 0
 
     def new_log_posteriors(self, *, is_end: bool) -> Floats:
         """Return the new log posteriors, (m, states); at the end those of all frames left."""

@@ -24,6 +24,7 @@ speech needs no endless memory.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,7 +40,7 @@ _NO_TOKEN = -1
 _IMPOSSIBLE = np.float32(-1e30)
 _BEAM = np.float32(20.0)  # of log scores; more changes nothing on development data
 _MAX_TOKENS = 4096  # speech needs fewer; sound without any speech in it may need more
-_RECORD_CAPACITY = 4 * _MAX_TOKENS
+_RECORD_CAPACITY = 4 * _MAX_TOKENS  # at least
 _MAX_CHAIN = MAX_ORDER + 1  # contexts from the longest to the empty one
 
 
@@ -66,6 +67,11 @@ class Decoder:
         self._graph = topology.phone_lm.graph
         self._silence = topology.inventory.index[topology.inventory.silence]
         self._max_states = int(np.diff(topology.first_state).max())
+        self._records = np.empty((_RECORD_CAPACITY, 3), dtype=np.int32)
+        self._context = np.empty(_MAX_TOKENS, dtype=np.int32)  # of each token
+        self._top = np.empty(_MAX_TOKENS, dtype=np.float32)
+        self._score = np.empty((_MAX_TOKENS, self._max_states), dtype=np.float32)
+        self._link = np.empty(self._score.shape, dtype=np.int32)
         self.reset()
 
     def reset(self) -> None:
@@ -75,14 +81,7 @@ class Decoder:
         self._last_shared = _NO_RECORD  # record of the last of them
         self._best = (0, 0)  # token, and state of its phone
         self._confidence = 0.0  # in the phone
-        self._records = np.empty((_RECORD_CAPACITY, 3), dtype=np.int32)
-        self._num_records = 0
-        self._context = np.zeros(_MAX_TOKENS, dtype=np.int32)  # of each token
-        self._token_of = np.full(len(self._graph.last_phone), _NO_TOKEN, dtype=np.int16)
-        self._num_tokens = 0
-        self._top = np.full(_MAX_TOKENS, _IMPOSSIBLE, dtype=np.float32)
-        self._score = np.full((_MAX_TOKENS, self._max_states), _IMPOSSIBLE, dtype=np.float32)
-        self._link = np.full(self._score.shape, _NO_RECORD, dtype=np.int32)
+        self._num_records = self._num_tokens = 0
 
     def go_on_from(self, other: Decoder) -> None:
         """Take over where another search of the same topology stands."""
@@ -91,11 +90,9 @@ class Decoder:
         if len(self._records) != len(other._records):
             self._records = np.empty_like(other._records)
         self._records[: other._num_records] = other._records[: other._num_records]
-        self._token_of[self._context[: self._num_tokens]] = _NO_TOKEN
         self._num_records, self._num_tokens = other._num_records, other._num_tokens
         for name in ("_context", "_top", "_score", "_link"):
             getattr(self, name)[: self._num_tokens] = getattr(other, name)[: self._num_tokens]
-        self._token_of[self._context[: self._num_tokens]] = np.arange(self._num_tokens)
 
     def accept(self, scores: NDArray[np.float32]) -> tuple[int, int, float]:
         """Take the state scores of one frame, shape (states,).
@@ -124,7 +121,7 @@ class Decoder:
                 scores[num_taken:],
                 self._num_tokens,
                 self._context,
-                self._token_of,
+                _token_table(len(graph.last_phone)),
                 self._top,
                 self._score,
                 self._link,
@@ -189,10 +186,12 @@ class Decoder:
         kept = kept[kept >= shared]
         new = np.full(self._num_records + 1, _NO_RECORD, dtype=np.int32)  # last: for _NO_RECORD
         new[kept] = np.arange(len(kept))
-        records = np.empty((len(kept) + _RECORD_CAPACITY, 3), dtype=np.int32)
-        records[: len(kept)] = self._records[kept]
-        records[: len(kept), 2] = new[records[: len(kept), 2]]
-        self._records, self._num_records = records, len(kept)
+        records = self._records[kept]
+        records[:, 2] = new[records[:, 2]]
+        if len(kept) + _MAX_TOKENS > len(self._records) // 2:
+            self._records = np.empty((len(kept) + _RECORD_CAPACITY, 3), dtype=np.int32)
+        self._records[: len(kept)] = records
+        self._num_records = len(kept)
         self._link[: self._num_tokens][live] = new[links]
         self._last_shared = int(new[shared])
 
@@ -208,6 +207,20 @@ class Decoder:
     def _end(self, record: int) -> int:
         """First frame after a record's phone."""
         return 0 if record == _NO_RECORD else int(self._records[record, 0])
+
+
+_tables = threading.local()
+
+
+def _token_table(num_contexts: int) -> NDArray[np.int16]:
+    """Return a table of no tokens by context, for one search at a time; it is left as it was.
+
+    All searches of a thread share it: it is larger than all else that a search keeps.
+    """
+    table: NDArray[np.int16] | None = getattr(_tables, "token_of", None)
+    if table is None or len(table) < num_contexts:
+        table = _tables.token_of = np.full(num_contexts, _NO_TOKEN, dtype=np.int16)
+    return table
 
 
 def segments_after(segments: list[Segment], frame: int) -> list[Segment]:
@@ -242,6 +255,8 @@ def _steps(
         confidence.
     """
     num_done, token, state, confidence = 0, 0, 0, 0.0
+    for number in range(num_tokens):
+        token_of[context[number]] = number
     while num_done < len(observed) and num_records + len(context) <= len(records):
         num_tokens, num_records, token, state, confidence = _step(
             frame + num_done,
@@ -257,6 +272,8 @@ def _steps(
             *constants,
         )
         num_done += 1
+    for number in range(num_tokens):
+        token_of[context[number]] = _NO_TOKEN
     return num_done, num_tokens, num_records, token, state, confidence
 
 

@@ -7,18 +7,25 @@ from functools import lru_cache
 
 from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.ferguson.model import FergusonLips
-from services.synthesizer.lips.ferguson.table import load_table
 from services.synthesizer.lips.learnt.model import LearntLips
 from services.synthesizer.lips.lip_model import LipModel
 from shared.errors import UserError
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 
+
+def _ferguson(inventory: PhoneInventory) -> LipModel:
+    # scipy.interpolate takes as long to import as all else: a synthesizer starts without it
+    from services.synthesizer.lips.ferguson.model import FergusonLips  # noqa: PLC0415
+    from services.synthesizer.lips.ferguson.table import load_table  # noqa: PLC0415
+
+    return FergusonLips(load_table(inventory), inventory)
+
+
 LIP_MODELS: dict[str, Callable[[PhoneInventory], LipModel]] = {
     LipModelName.DYNAMIC_VISEMES: lambda inventory: DynamicVisemes(load_parameters(), inventory),
     LipModelName.LEARNT: lambda inventory: LearntLips(DynamicVisemes(load_parameters(), inventory)),
-    LipModelName.FERGUSON: lambda inventory: FergusonLips(load_table(inventory), inventory),
+    LipModelName.FERGUSON: _ferguson,
 }
 
 

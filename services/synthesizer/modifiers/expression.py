@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 
 from services.synthesizer.modifiers.expressiveness import JAW, LOWER, OPEN, SHUT, UPPER
 from services.synthesizer.modifiers.modifier import Moment
-from shared.face.blendshapes import ARKIT, ARKIT_NAMES
 from shared.face.expressions import ExpressionName
 from shared.face.faps import NUM_FAPS
 from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from shared.face.shapes import ARKIT
 
 _EASE_S, _FADE_S = 0.09, 0.3  # time constants of each of two filters
 _FREE_S, _BIND_S = 0.15, 0.04  # time constant and time after which lips are free, and bound
@@ -46,7 +46,7 @@ _GESTURES = {
 EXPRESSION_FAPS: dict[str, NDArray[np.float32]] = {  # (68,) at full strength
     **dict(zip(EXPRESSION_NAMES[1:], EXPRESSIONS[1:], strict=True)),
     **{
-        name: ARKIT[[ARKIT_NAMES.index(shape) for shape in shapes]].sum(axis=0)
+        name: ARKIT.basis[[ARKIT.names.index(shape) for shape in shapes]].sum(axis=0)
         for name, shapes in _GESTURES.items()
     },
 }
@@ -68,6 +68,11 @@ class Expression:
         for name, strength in strengths.items():
             self._goal += np.float32(strength) * EXPRESSION_FAPS[name]
         self._held_s = hold_s if strengths else 0.0
+
+    @property
+    def free(self) -> float:
+        """How far lips are free of speech: 1 while nobody speaks, soon 0 when somebody does."""
+        return self._free
 
     def apply(self, faps: NDArray[np.float32], moment: Moment) -> None:
         """Add the expression to a frame, FAPs (68,), in place."""

@@ -40,6 +40,7 @@ _THINKING_S = (0.7, 2.5)  # of silence
 
 _BROW_SHARE, _BEAT_SHARE, _NOD_SHARE = 0.55, 0.7, 0.85  # of the occasions
 _LEAST = 0.5  # of a movement's size, at random
+_OCCASION_S = 0.2  # within which it is the same chance
 _BROW_HELD_S, _BEAT_HELD_S, _NOD_HELD_S = 0.22, 0.12, 0.2
 _FILTER_S = 0.08  # time constant of each of two filters
 _BROW = {  # FAP units of a full movement
@@ -67,7 +68,7 @@ class Life:
 
     def __init__(self, seed: int) -> None:
         self._idle = IdleMotion(seed)
-        self._rng = np.random.default_rng([seed, 1])
+        self._seed = seed
         self._levels: deque[tuple[float, float]] = deque()
         self._pitches: deque[tuple[float, float]] = deque()
         self._level_s = 0.0  # media time of the last level
@@ -99,7 +100,7 @@ class Life:
                 self._follow_level(time_s, level_db, now_s)
         if self._phrase_s > _PHRASE_S and before_s < _PHRASE_END_S <= self._silence_s:
             self._phrase_s = 0.0
-            self._move(self._head, _NOD_SHARE, _NOD_DEG, now_s + _NOD_HELD_S)
+            self._move(self._head, _NOD_SHARE, _NOD_DEG, now_s, _NOD_HELD_S)
         self._idle.apply(faps, now_s, self._state())
         faps[_BROWS] += np.float32(self._brow.at(now_s, step_s)) * _BROW_UNITS
         pitch = np.float32(self._head.at(now_s, step_s) * _DEGREE)
@@ -139,14 +140,18 @@ class Life:
         self._is_stressed = louder + self._raised > _STRESS
         if self._is_stressed and not was_stressed and now_s - self._stress_s > _STRESS_EVERY_S:
             self._stress_s = now_s
-            self._move(self._brow, _BROW_SHARE, 1.0, now_s + _BROW_HELD_S)
-            self._move(self._head, _BEAT_SHARE, _BEAT_DEG, now_s + _BEAT_HELD_S)
+            self._move(self._brow, _BROW_SHARE, 1.0, now_s, _BROW_HELD_S)
+            self._move(self._head, _BEAT_SHARE, _BEAT_DEG, now_s, _BEAT_HELD_S)
 
-    def _move(self, movement: _Movement, share: float, size: float, until_s: float) -> None:
-        """Begin a movement, or not, by chance."""
-        chance, scale = self._rng.random(2)
+    def _move(
+        self, movement: _Movement, share: float, size: float, now_s: float, held_s: float
+    ) -> None:
+        """Begin a movement, or not, by chance: at the same time always the same."""
+        occasion = round(now_s / _OCCASION_S)
+        draw = 2 * occasion + (movement is self._head)
+        chance, scale = np.random.default_rng([self._seed, 1, draw]).random(2)
         if chance < share:
-            movement.begin(size * (_LEAST + (1.0 - _LEAST) * float(scale)), until_s)
+            movement.begin(size * (_LEAST + (1.0 - _LEAST) * float(scale)), now_s + held_s)
 
 
 class _Movement:

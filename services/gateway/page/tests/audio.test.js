@@ -84,12 +84,28 @@ test("a new anchor waits until the sound has faded out", () => {
   assert.equal(heard.at(-1), 0.5, "and it goes on at the new place");
 });
 
-test("how much was played is told four times a second", () => {
+test("what is near is glided to, and no sample leaps", () => {
+  const player = playerWith(0);
+  const tone = Int16Array.from({ length: 16000 }, (_, i) => 16384 * Math.sin(0.3 * i));
+  player.port.onmessage({ data: { mediaTime: 0, samples: tone } });
+  play(player, 10);
+  player.port.onmessage({ data: { anchor: 40.25 } });
+  const heard = play(player, 100);
+  for (let i = 1; i < heard.length; i++) {
+    assert.ok(Math.abs(heard[i] - heard[i - 1]) < 0.16, `a click at ${i}`);
+  }
+  for (let i = heard.length - 100; i < heard.length; i++) {
+    const expected = 0.5 * Math.sin(0.3 * (10 * BLOCK + i + 40.25));
+    assert.ok(Math.abs(heard[i] - expected) < 0.005, `${heard[i]} for ${expected}`);
+  }
+});
+
+test("how much was played, and where it is, are told four times a second", () => {
   const player = playerWith(0);
   player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(16000).fill(1) } });
   play(player, 100);
   assert.equal(player.port.posted.length, 1);
-  assert.equal(player.port.posted[0], 12160);
+  assert.deepEqual(player.port.posted[0], { numPlayed: 12160, anchor: 0 });
 });
 
 class FakeSocket {

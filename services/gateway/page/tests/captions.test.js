@@ -3,7 +3,7 @@ import test from "node:test";
 import { LevelMeter, rms, SILENT_DB } from "../level.js";
 import { PhoneTrack } from "../phones.js";
 import { Presence } from "../presence.js";
-import { delayText, drawingText, hint, stateKind, stateText, turnText } from "../status.js";
+import { delayText, drawingText, hint, stateKind, stateText, turnText, waitText } from "../status.js";
 
 function track(...symbols) {
   const phones = new PhoneTrack();
@@ -118,7 +118,10 @@ test("the state is told in words, with the delay beside it", () => {
   assert.equal(stateKind(state), "live");
   assert.equal(stateKind({ ...state, isLive: false }), "waiting");
   assert.equal(stateKind({ ...state, connected: false }), "lost");
-  assert.deepEqual([delayText(null), delayText(123.4)], ["", "120 ms"]);
+  assert.deepEqual([delayText(null, null), delayText(123.4, 200)], ["", "120 ms"]);
+  assert.equal(delayText(null, 161), "sound waits 160 ms");
+  assert.equal(waitText(161, null), "");
+  assert.match(waitText(161, 94), /waits 160 ms .* delay=90\./);
 });
 
 test("what does not work is named with what happens next", () => {

@@ -14,6 +14,7 @@ class FakeWebSocket {
     FakeWebSocket.made.push(this);
   }
   send(text) { this.sent.push(JSON.parse(text)); }
+  close() {}
   open() {
     this.readyState = FakeWebSocket.OPEN;
     this.onopen();
@@ -37,9 +38,11 @@ test.beforeEach(() => {
   globalThis.location = { protocol: "http:", host: "localhost:8080", hash: "" };
 });
 
+const toViewer = (session) => socketUrl("/viewer", { session });
+
 function record() {
   const calls = [];
-  const names = ["state", "fap", "sound", "rest", "text"];
+  const names = ["state", "fap", "sound", "rest", "weights", "restWeights", "text"];
   const handlers = Object.fromEntries(names.map((name) => [name, (...args) => calls.push([name, ...args])]));
   return { calls, handlers };
 }
@@ -58,22 +61,29 @@ test("binary messages are frames or sound; others of a later gateway are left ou
   const sound = readMessage(binary(2, 320, Int16Array.of(1, -32768)));
   assert.deepEqual(sound, { mediaTime: 320, samples: Int16Array.of(1, -32768) });
   assert.deepEqual(readMessage(binary(3, 0, faps)), { rest: faps });
-  assert.equal(readMessage(binary(4, 0, new Uint8Array(4))), null);
+  const weights = Float32Array.of(0.5, 1);
+  assert.deepEqual(readMessage(binary(4, 320, weights)), { mediaTime: 320, weights });
+  assert.deepEqual(readMessage(binary(5, 0, weights)), { restWeights: weights });
+  assert.equal(readMessage(binary(6, 0, new Uint8Array(4))), null);
 });
 
 test("messages go to their handlers", () => {
   const { calls, handlers } = record();
-  new Link("", handlers);
+  new Link(toViewer, "", handlers);
   const [socket] = FakeWebSocket.made;
   socket.open();
   socket.onmessage({ data: binary(2, 320, Int16Array.of(5)) });
   socket.onmessage({ data: binary(9, 320, Int16Array.of(5)) });
   socket.onmessage({ data: binary(3, 0, new Float32Array(68)) });
+  socket.onmessage({ data: binary(4, 320, Float32Array.of(0.5)) });
+  socket.onmessage({ data: binary(5, 0, Float32Array.of(1)) });
   socket.onmessage({ data: '{"type": "end"}' });
   assert.deepEqual(calls, [
     ["state", true],
     ["sound", 320, Int16Array.of(5)],
     ["rest", new Float32Array(68)],
+    ["weights", 320, Float32Array.of(0.5)],
+    ["restWeights", Float32Array.of(1)],
     ["text", { type: "end" }],
   ]);
 });
@@ -81,7 +91,7 @@ test("messages go to their handlers", () => {
 test("it connects again by itself, ever more slowly, to the session chosen last", (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const { calls, handlers } = record();
-  const link = new Link("", handlers);
+  const link = new Link(toViewer, "", handlers);
   FakeWebSocket.made[0].open();
   link.follow("a b");
   assert.deepEqual(FakeWebSocket.made[0].sent, [{ follow: "a b" }]);
@@ -102,7 +112,20 @@ test("it connects again by itself, ever more slowly, to the session chosen last"
 });
 
 test("commands are left out while it is not connected", () => {
-  const link = new Link("", record().handlers);
+  const link = new Link(toViewer, "", record().handlers);
   link.send({ play: "sample" });
   assert.deepEqual(FakeWebSocket.made[0].sent, []);
+});
+
+test("closed, it stays so", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const { calls, handlers } = record();
+  const link = new Link(toViewer, "", handlers);
+  const [socket] = FakeWebSocket.made;
+  socket.open();
+  link.close();
+  assert.equal(socket.onclose, null);
+  t.mock.timers.tick(5000);
+  assert.equal(FakeWebSocket.made.length, 1);
+  assert.deepEqual(calls.at(-1), ["state", false]);
 });

@@ -47,6 +47,16 @@ test("a processor rests as long as it drew, and less where it would not hold 20 
   }
 });
 
+test("a picture is seen, in the middle, half as long after its tick as the one before was seen", () => {
+  const pace = new Pace(2, 2, false);
+  for (let nowMs = 0; nowMs < 5000; nowMs += 40) pace.saw(nowMs, nowMs + 30);
+  assert.ok(Math.abs(pace.untilSeenMs - 50) < 0.1, `${pace.untilSeenMs}`);
+  pace.saw(5000, 5400);
+  assert.ok(Math.abs(pace.untilSeenMs - 50) < 0.1, "a page that was busy once is no slow one");
+  pace.saw(5500, 60000);
+  assert.ok(Math.abs(pace.untilSeenMs - 50) < 0.1, "nor is one that was hidden");
+});
+
 test("one picture that took long changes nothing", () => {
   const pace = new Pace(0.5, 1, true);
   draw(pace, { fullMs: 80 });

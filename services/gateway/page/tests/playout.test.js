@@ -34,20 +34,23 @@ test("the difference between the clocks drops out", () => {
   assert.equal(there.mediaAt(1e6 + 6000), here.mediaAt(6000));
 });
 
-test("within the dead zone the offset stays", () => {
+test("a small error is glided away, which nobody hears", () => {
   const playout = new Playout();
-  stream(playout, { forMs: 5000 });
+  stream(playout, { forMs: 10000 });
   const before = playout.offsetMs;
-  stream(playout, { fromMs: 5000, forMs: 5000, frameMs: 95 });
-  assert.equal(playout.offsetMs, before);
+  stream(playout, { fromMs: 10000, forMs: 3000, frameMs: 100 });
+  const glidedMs = playout.offsetMs - before;
+  assert.ok(glidedMs > 9 && glidedMs <= 15, `${glidedMs}: 5 ms a second, once it is known`);
+  stream(playout, { fromMs: 13000, forMs: 5000, frameMs: 100 });
+  assert.ok(Math.abs(playout.offsetMs - before - 20) <= 0.1, `${playout.offsetMs - before}`);
 });
 
 test("one late frame moves nothing", () => {
   const playout = new Playout();
-  stream(playout, { forMs: 5000 });
+  stream(playout, { forMs: 10000 });
   const before = playout.offsetMs;
-  playout.frameArrived(5250, 4900 * SAMPLES_PER_MS);
-  assert.equal(playout.adjust(5600), false);
+  playout.frameArrived(10250, 9900 * SAMPLES_PER_MS);
+  playout.adjust(10600);
   assert.equal(playout.offsetMs, before);
 });
 
@@ -64,14 +67,6 @@ test("a leap ahead of media time starts again at once", () => {
   stream(playout, { forMs: 1000 });
   playout.soundArrived(1020, 60000 * SAMPLES_PER_MS, 320);
   assert.ok(playout.mediaAt(1020) > 59000 * SAMPLES_PER_MS);
-});
-
-test("the sound card's clock is followed slowly", () => {
-  const playout = new Playout();
-  stream(playout, { forMs: 1000 });
-  const before = playout.offsetMs;
-  playout.follow(before + 10);
-  assert.ok(Math.abs(playout.offsetMs - before - 0.5) < 1e-9);
 });
 
 test("the face between two frames is mixed of both", () => {

@@ -105,8 +105,9 @@ class ClosingPhones:
         known, known_s = self._phones.pop(phone.index, (None, now_s))
         if known is not None and known.final and not phone.final:
             phone = known
-        counts = phone.symbol in self._symbols or (
-            self._rule.other > 0.0 and phone.symbol != self._silence
+        counts = not phone.is_withdrawn and (
+            phone.symbol in self._symbols
+            or (self._rule.other > 0.0 and phone.symbol != self._silence)
         )
         if counts and math.isfinite(phone.onset_s + phone.duration_s):
             self._phones[phone.index] = (phone, known_s)

@@ -1,0 +1,23 @@
+import type { ShapeSet } from "./index.js";
+
+/**
+ * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`.
+ * Events: `load`, `error`, `session`, `phone`.
+ */
+export class KouxingFace extends HTMLElement {
+  /** What moves the model; null until it is loaded. */
+  readonly set: ShapeSet | "faps" | null;
+  /** What is shown: weights by name, or 68 FAPs; null until there is something. */
+  readonly shown: Record<string, number> | number[] | null;
+  /** Let the session be heard; call it from a click. */
+  turnSoundOn(): Promise<void>;
+  turnSoundOff(): void;
+  /** Play the recording to its end; an audio element may play its sound. */
+  play(audio?: HTMLAudioElement | null): Promise<void>;
+}
+
+declare global {
+  interface HTMLElementTagNameMap {
+    "kouxing-face": KouxingFace;
+  }
+}

@@ -1,0 +1,7 @@
+// A client of kouxing's gateway, for browsers and for Node 22 or newer.
+
+export { NUM_FAPS, readMessage } from "./page/messages.js";
+export { FapTrack, Playout } from "./page/playout.js";
+export { readRecording } from "./recording.js";
+export { Speaker } from "./speaker.js";
+export { Viewer } from "./viewer.js";

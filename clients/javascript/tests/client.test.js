@@ -1,0 +1,50 @@
+// The built package in Node, against the gateway at $GATEWAY.
+
+import assert from "node:assert/strict";
+import { readFile } from "node:fs/promises";
+import test from "node:test";
+import { Speaker, Viewer, readRecording } from "kouxing-client";
+
+const { GATEWAY, SPEECH } = process.env;
+
+test("recordings are lines of JSON or a table, of FAPs or shapes", () => {
+  const named = { names: ["jawOpen", "mouthClose"], frames: [[0, Float32Array.of(0.25, 1)], [320, Float32Array.of(0.5, 0)]] };
+  const json = [[0.25, 1], [0.5, 0]].map(([jawOpen, mouthClose], sequence) =>
+    JSON.stringify({ time_s: sequence / 50, sequence, arkit: { jawOpen, mouthClose } }),
+  );
+  assert.deepEqual(readRecording(json.join("\n") + "\n"), named);
+  assert.deepEqual(readRecording("time_s,jawOpen,mouthClose\n0.000,0.25,1\n0.020,0.5,0\n"), named);
+  const faps = { names: null, frames: [[0, Float32Array.of(7, 8)]] };
+  assert.deepEqual(readRecording('{"time_s": 0, "sequence": 0, "faps": [7, 8]}'), faps);
+  assert.deepEqual(readRecording("time_s,viseme,expression\n0,7,8\n"), faps);
+});
+
+test("what is spoken comes back as frames, shapes, phones and sound", async () => {
+  const wav = await readFile(SPEECH);
+  const speaker = await Speaker.open(GATEWAY, { sampleRateHz: wav.readUInt32LE(24), ahead: true });
+  const [faps, opened, symbols] = [[], [], []];
+  let numSamples = 0;
+  const handlers = {
+    frame: (mediaTime, values) => faps.push([mediaTime, values[2]]),
+    weights: (mediaTime, weights, names) => opened.push([mediaTime, weights[names.indexOf("jawOpen")]]),
+    phone: ({ symbol, final }) => final && symbols.push(symbol),
+    sound: (_, samples) => (numSamples += samples.length),
+  };
+  const viewer = new Viewer(GATEWAY, handlers, { session: speaker.session, shapes: "arkit" });
+  await viewer.ready;
+  const samples = new Int16Array(wav.buffer.slice(wav.indexOf("data") + 8));
+  await speaker.push(samples.subarray(0, 32000));
+  await speaker.finish();
+  viewer.close();
+  assert.ok(Math.max(...faps.map(([, jaw]) => jaw)) > 200);
+  assert.ok(Math.max(...opened.map(([, weight]) => weight)) > 0.1);
+  const [times, shapeTimes] = [faps, opened].map((frames) => frames.slice(0, 50).map(([time]) => time));
+  assert.deepEqual(shapeTimes, times);
+  assert.deepEqual(symbols.slice(0, 4), ["n", "i", "h", "ao"]);
+  assert.ok(numSamples > 30000);
+});
+
+test("a refusal says why", async () => {
+  await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
+  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /cannot be reached/);
+});

@@ -1,0 +1,52 @@
+"""Audio as a program has it, to PCM as it goes over the wire."""
+
+from __future__ import annotations
+
+import sys
+from array import array
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
+_CODES = {"s16le": "h", "f32le": "f"}
+_FULL_SCALE = 32767
+
+
+def to_pcm(audio: Any, encoding: str) -> bytes:
+    """Return PCM, interleaved.
+
+    Parameters
+    ----------
+    audio
+        Bytes that are PCM in the encoding already, or numbers (integers of 16 bits, or floats
+        within ±1) in an iterable or a buffer, of shape ``(n,)`` or ``(n, channels)``.
+    encoding
+        ``s16le`` or ``f32le``.
+    """
+    try:
+        view = memoryview(audio)
+    except TypeError:
+        return _pack(array("d", audio), encoding)
+    flat = memoryview(view.tobytes())  # of any number of dimensions
+    if view.format in ("B", "b", "c"):
+        return flat.tobytes()
+    return _pack(flat.cast(view.format), encoding)  # type: ignore[call-overload]
+
+
+def _pack(numbers: memoryview[Any] | array[float], encoding: str) -> bytes:
+    is_integer = isinstance(numbers, memoryview) and numbers.format == "h"
+    scaled: Iterable[float] = numbers
+    if encoding == "s16le" and not is_integer:
+        scaled = (round(_FULL_SCALE * max(-1.0, min(1.0, value))) for value in numbers)
+    elif encoding == "f32le" and is_integer:
+        scaled = (value / _FULL_SCALE for value in numbers)
+    packed = array(_CODES[encoding], scaled)
+    if sys.byteorder == "big":
+        packed.byteswap()
+    return packed.tobytes()
+
+
+def pieces(pcm: bytes, num_bytes: int) -> Iterator[bytes]:
+    """Yield PCM in pieces of at most some length."""
+    for begin in range(0, len(pcm), num_bytes):
+        yield pcm[begin : begin + num_bytes]

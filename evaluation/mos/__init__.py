@@ -1,0 +1,1 @@
+"""Listening tests: people judge videos of talking heads, and what their scores say."""

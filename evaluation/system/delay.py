@@ -1,0 +1,43 @@
+"""Returns each packet that is led to a TUN device some time later, in order.
+
+usage: python -m evaluation.system.delay DEVICE DELAY_MS JITTER_MS
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import select
+import struct
+import subprocess
+import sys
+import time
+from collections import deque
+
+MAX_PACKET_BYTES = 65_535
+_TUNSETIFF = 0x400454CA
+_IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
+
+
+def main(device: str, delay_s: float, jitter_s: float) -> None:
+    """Run until the process is ended."""
+    tun = os.open("/dev/net/tun", os.O_RDWR)
+    fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", device.encode(), _IFF_TUN | _IFF_NO_PI))
+    subprocess.run(["ip", "link", "set", device, "up"], check=True)  # noqa: S603, S607
+    chance = random.Random(0)  # noqa: S311 - no secret
+    waiting: deque[tuple[float, bytes]] = deque()  # when it is due, packet
+    due_s = 0.0
+    while True:
+        left_s = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
+        if select.select([tun], [], [], left_s)[0]:
+            packet = os.read(tun, MAX_PACKET_BYTES)
+            wait_s = delay_s + chance.uniform(-jitter_s, jitter_s)
+            due_s = max(due_s, time.monotonic() + wait_s)
+            waiting.append((due_s, packet))
+        while waiting and waiting[0][0] <= time.monotonic():
+            os.write(tun, waiting.popleft()[1])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], float(sys.argv[2]) / 1e3, float(sys.argv[3]) / 1e3)

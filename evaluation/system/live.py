@@ -1,0 +1,185 @@
+"""Live sessions at real pace, and what their subscribers see of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.bus import Bus, Socket
+from shared.client import Client, Session
+from shared.clock import MEDIA_RATE_HZ
+from shared.errors import UserError
+from shared.keys import Key
+from shared.wire.face import EndOfFaps, FapFrame
+from shared.wire.speech import Phone, Speech
+
+CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
+END_LIMIT_S = 15.0  # after the last sample the last frame must come within this time
+SLOWEST = 5.0  # times its length that sound may take that is not paced
+
+NUM_TRIES = 3
+
+
+@dataclass(slots=True)
+class Seen:
+    """What one subscriber saw of a session, in the order in which it came."""
+
+    frames: list[tuple[float, FapFrame]] = field(default_factory=list)  # arrival, s
+    phones: list[Phone] = field(default_factory=list)
+    speech: list[Speech] = field(default_factory=list)
+    ended: bool = False
+    error: str = ""  # why the session broke off
+    begin_s: float = 0.0  # when the first sample was due
+    live_until_s: float = 0.0  # when the last one was
+
+    @property
+    def faps(self) -> NDArray[np.float32]:
+        """FAPs of all frames, shape (frames, 68)."""
+        return np.array([np.frombuffer(frame.values, "<f4") for _, frame in self.frames])
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all frames and phones came, from one recognizer and synthesizer."""
+        last = {phone.index: phone for phone in self.phones}
+        frames = [frame.sequence for _, frame in self.frames]
+        return (
+            self.ended
+            and frames == [*range(1, len(frames) + 1)]
+            and sorted(last) == [*range(len(last))]
+            and all(phone.final for phone in last.values())
+            and {frame.epoch for _, frame in self.frames} == {1}
+        )
+
+    def final_phones(self, silence: str) -> list[Phone]:
+        """Return the final phones without silence and those withdrawn, of all epochs in order.
+
+        A new recognizer begins with a speech message; where it goes on, phones of earlier epochs
+        are void.
+        """
+        last = {(phone.epoch, phone.index): phone for phone in self.phones}
+        final = [phone for phone in last.values() if phone.final and phone.duration > 0]
+        begins = {each.epoch: each.media_time for each in self.speech if each.sequence == 1}
+        for epoch, begin in begins.items():
+            final = [
+                phone
+                for phone in final
+                if phone.epoch >= epoch or phone.media_time + phone.duration / 2 < begin
+            ]
+        final.sort(key=lambda phone: phone.media_time)
+        return [phone for phone in final if phone.symbol != silence]
+
+
+class Wire:
+    """All FAP frames of a session that any synthesizer publishes, of whatever epoch."""
+
+    def __init__(self, session: Session, endpoints: Sequence[str], key: Key) -> None:
+        self._bus = Bus(key)
+        self._socket: Socket = self._bus.connect_subscriber(*endpoints)
+        self._socket.subscribe(FapFrame, session.name)
+        self._epoch = 0
+        self.num_old = 0  # frames that came after the first of a later epoch
+
+    def take(self) -> None:
+        """Take what has come."""
+        for received in self._socket.receive():
+            frame = received.message
+            if isinstance(frame, FapFrame):
+                self.num_old += frame.epoch < self._epoch
+                self._epoch = max(self._epoch, frame.epoch)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._bus.close()
+
+
+def speak(
+    sessions: Sequence[Session],
+    sound: NDArray[np.float32],
+    *,
+    paced: bool = True,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> list[Seen]:
+    """Stream the same sound into sessions, each to its end; return what their openers saw.
+
+    Parameters
+    ----------
+    sessions
+        Open ones that take 32-bit floats at 16 kHz.
+    sound
+        Samples, shape (n,).
+    meanwhile
+        Called again and again.
+    """
+    speakers = [_Speaker(session, sound, paced=paced) for session in sessions]
+    while any(speaker.is_speaking for speaker in speakers):
+        for speaker in speakers:
+            speaker.step(0.005 if speaker is speakers[0] else 0.0)
+        meanwhile()
+    return [speaker.seen for speaker in speakers]
+
+
+def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
+    """Return what is seen of a sound without any fault, as fast as it is taken.
+
+    Raises
+    ------
+    UserError
+        If something of it is missing each time, as on a machine that is too busy.
+    """
+    for _ in range(NUM_TRIES):
+        session = client.open_session(encoding="f32le", paced=False)
+        (seen,) = speak([session], sound, paced=False)
+        session.close()
+        if seen.is_whole:
+            return seen
+    raise UserError("sound without a fault is not shown whole; this machine is too busy")
+
+
+class _Speaker:
+    def __init__(self, session: Session, sound: NDArray[np.float32], *, paced: bool) -> None:
+        self._session = session
+        self._output = session.subscribe(FapFrame, EndOfFaps, Phone, Speech)
+        self._chunks = [sound[at : at + CHUNK] for at in range(0, len(sound), CHUNK)]
+        self._num_sent = 0
+        self._paced = paced
+        self._has_finished = False
+        begin_s = time.monotonic()
+        length_s = len(sound) / MEDIA_RATE_HZ
+        self._give_up_s = begin_s + length_s * (1.0 if paced else SLOWEST) + END_LIMIT_S
+        self.seen = Seen(begin_s=begin_s, live_until_s=begin_s + length_s)
+
+    @property
+    def is_speaking(self) -> bool:
+        is_late = time.monotonic() > self._give_up_s
+        return not (self.seen.ended or self.seen.error or is_late)
+
+    def step(self, wait_s: float) -> None:
+        """Send what is due, and take what has come."""
+        while self._num_sent < self._num_due() and self._session.send(self._chunks[self._num_sent]):
+            self._num_sent += 1
+        if self._num_sent == len(self._chunks) and not self._has_finished:
+            self._has_finished = self._session.finish()
+        for error in self._session.errors():
+            self.seen.error = f"{error.code}: {error.text}"
+        self._output.wait(wait_s)
+        now_s = time.monotonic()
+        for received in self._output.receive():
+            match received.message:
+                case FapFrame() as frame:
+                    self.seen.frames.append((now_s, frame))
+                case Phone() as phone:
+                    self.seen.phones.append(phone)
+                case Speech() as speech:
+                    self.seen.speech.append(speech)
+                case EndOfFaps():
+                    self.seen.ended = True
+
+    def _num_due(self) -> int:
+        if not self._paced:
+            return len(self._chunks)
+        due = int((time.monotonic() - self.seen.begin_s) * MEDIA_RATE_HZ) // CHUNK
+        return min(due, len(self._chunks))

@@ -1,0 +1,183 @@
+"""Many speakers at once, from one process: each with a voice and a place in the text of its own."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluation.system.live import CHUNK
+from services.recognizer.front_end.resample import to_16_khz
+from shared.audio_file import read_audio
+from shared.client import Client, Refused, Session
+from shared.clock import MEDIA_RATE_HZ
+from shared.errors import UserError
+from shared.follower import PollingLoop, SessionFollower
+from shared.wire.face import FapFrame
+
+CHUNK_S = CHUNK / MEDIA_RATE_HZ
+VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, times those of the recording
+_PLACE = 0.618  # of the text, from one speaker to the next: no two are near each other
+_SHORT_S = 0.001  # which a poll cannot wait
+
+
+def read_text(paths: Sequence[Path]) -> NDArray[np.float32]:
+    """Return the recordings one after another, 16 kHz mono, shape (n,).
+
+    Raises
+    ------
+    UserError
+        If a file is no audio.
+    """
+    return np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
+
+
+def voiced(text: NDArray[np.float32], number: int) -> NDArray[np.float32]:
+    """Return what a speaker says: the text from a place of its own, in its own voice."""
+    begun = np.roll(text, -round(number * _PLACE * len(text)) % len(text))
+    voice = VOICES[number % len(VOICES)]
+    return begun if voice == 1.0 else to_16_khz(begun[:, None], round(MEDIA_RATE_HZ * voice))
+
+
+@dataclass(slots=True)
+class Spoken:
+    """A speaker's session, and when its frames came."""
+
+    session: Session
+    sound: bytes  # 16-bit samples, spoken again and again
+    begin_s: float = 0.0  # when the first sample was due, by ``time.perf_counter``
+    num_sent: int = 0  # chunks
+    num_full: int = 0  # of them, those that the queue did not take
+    num_rest: int = 0  # frames that lead to rest, as if the speaker were silent
+    arrived_s: dict[int, float] = field(default_factory=dict)  # by media time, first arrival
+
+    @property
+    def due_s(self) -> float:
+        """When the last sample of the next chunk is spoken."""
+        return self.begin_s + (self.num_sent + 1) * CHUNK_S
+
+    def send(self) -> None:
+        """Send the next chunk."""
+        size = 2 * CHUNK
+        at = self.num_sent * size % (len(self.sound) // size * size)
+        self.num_sent += 1
+        if not self.session.send_pcm(self.sound[at : at + size], CHUNK):
+            self.session.skip(CHUNK)
+            self.num_full += 1
+
+    def take(self, frame: FapFrame) -> None:
+        """Note that a frame came."""
+        if frame.media_time in self.arrived_s:
+            self.num_rest += 1
+        else:
+            self.arrived_s[frame.media_time] = time.perf_counter()
+
+    def delays_s(self, delay_s: float, from_s: float, until_s: float) -> Iterator[float]:
+        """Yield how long after their sound frames came, beyond the delay they are made with.
+
+        Of all frames whose sound was complete in a time, by the wall clock; those that did not
+        come count as if they had come at its end. A chunk counts as spoken when it is due, so a
+        client or a service that is late is not excused.
+        """
+        rate_hz = self.session.opened.frame_rate_hz
+        for number in range(int((until_s - self.begin_s) * rate_hz)):
+            media_time = round(number / rate_hz * MEDIA_RATE_HZ)
+            needed = -(-(media_time + round(delay_s * MEDIA_RATE_HZ)) // CHUNK)  # chunks
+            due_s = self.begin_s + max(1, needed) * CHUNK_S
+            if from_s <= due_s < until_s:
+                yield min(self.arrived_s.get(media_time, until_s), until_s) - due_s
+
+
+class Crowd:
+    """Sessions of one client, spoken into in real time, their chunks evenly spread.
+
+    Parameters
+    ----------
+    client
+        Opens the sessions, and closes them with its bus.
+    text
+        What is spoken, as from ``read_text``.
+    num_speakers
+        How many sessions are asked for.
+
+    Attributes
+    ----------
+    spoken
+        The sessions that were admitted.
+    refusals
+        How many were refused, by code.
+    lateness_s
+        How long after they were due chunks were sent.
+    """
+
+    def __init__(self, client: Client, text: NDArray[np.float32], num_speakers: int) -> None:
+        self._client = client
+        self._loop = PollingLoop(client.bus)
+        self._followers: list[SessionFollower] = []
+        self.spoken: list[Spoken] = []
+        self.refusals: dict[str, int] = {}
+        self.lateness_s: list[float] = []
+        self._turn = 0  # of the speakers
+        for number in range(num_speakers):
+            try:
+                session = client.open_session()
+            except Refused as refusal:
+                self.refusals[refusal.code] = self.refusals.get(refusal.code, 0) + 1
+                continue
+            self.spoken.append(self._follow(session, voiced(text, number)))
+        self._wait_until_followed()
+
+    def _follow(self, session: Session, sound: NDArray[np.float32]) -> Spoken:
+        pcm = np.round(np.clip(sound, -1.0, 1.0) * 32767).astype("<i2").tobytes()
+        spoken = Spoken(session, pcm)
+        follower = SessionFollower(self._loop, session.name, {FapFrame: spoken.take})
+        opened = session.opened
+        follower.start(opened.epoch, {"phones": opened.phones, "faps": opened.faps})
+        self._followers.append(follower)
+        return spoken
+
+    def _wait_until_followed(self, limit_s: float = 10.0) -> None:
+        end_s = time.monotonic() + limit_s
+        while not all(each.is_complete for each in self._followers):
+            if time.monotonic() > end_s:
+                raise UserError("a synthesizer did not confirm a subscription")
+            self._loop.step(0.1)
+
+    def start(self) -> None:
+        """Let all begin to speak."""
+        now_s = time.perf_counter()
+        for number, each in enumerate(self.spoken):
+            each.begin_s = now_s + CHUNK_S * number / len(self.spoken)
+
+    def speak_until(self, end_s: float) -> None:
+        """Speak and listen up to a time of ``time.perf_counter``."""
+        while (now_s := time.perf_counter()) < end_s:
+            if not self.spoken:
+                time.sleep(end_s - now_s)
+                return
+            speaker = self.spoken[self._turn]  # all chunks are equally long
+            left_s = min(speaker.due_s, end_s) - now_s
+            if left_s > _SHORT_S:
+                self._loop.step(left_s)
+            elif left_s > 0.0:
+                time.sleep(left_s)
+            else:
+                self.lateness_s.append(now_s - speaker.due_s)
+                speaker.send()
+                self._turn = (self._turn + 1) % len(self.spoken)
+                if self._turn == 0:
+                    for each in self.spoken:
+                        for _ in each.session.errors():
+                            pass  # what was refused is missing among the frames
+                    self._loop.step(0.0)
+
+    def close(self) -> None:
+        """End all sessions."""
+        for follower in self._followers:
+            follower.close()
+        for each in self.spoken:
+            each.session.close()

@@ -1,0 +1,289 @@
+"""Services to measure: on this host as under ``kouxing run``, or each on a host of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Protocol, Self
+
+from rich.console import Console
+
+from services.cli.supervisor import Supervisor
+from services.kinds import KINDS, free_addresses, more_workers, read_settings
+from shared.client import Client
+from shared.config import variable
+from shared.errors import UserError
+from shared.keys import CLIENT, Key, control_endpoint, read_key, user_key
+from shared.wire.control import StatusReport
+
+SPARE = "spare"  # instance of a second worker of a kind, and its host
+READY_S = 60.0
+ON_HOSTS = ("control", "recognizer", "synthesizer")
+PORTS = {  # where services are bound that have hosts of their own
+    "control": {"commands": 5550, "events": 5551},
+    "recognizer": {"audio": 5560, "phones": 5561},
+    "synthesizer": {"phone_input": 5570, "faps": 5571},
+}
+
+
+class System(Protocol):
+    """Running services, and where a client finds them."""
+
+    control: str  # address and key
+    key: Key  # of a client
+
+    def on_client(self) -> contextlib.AbstractContextManager[None]:
+        """Let this thread open its sockets where clients are."""
+
+    def process_of(self, session: str, service: str) -> int:
+        """Return the number of the process that serves a session."""
+
+
+class Hosts(Protocol):
+    """Where the services of a ``HostsSystem`` run, such as a ``Network``."""
+
+    def bound(self, host: str) -> str:
+        """Return the address that services of a host bind."""
+
+    def address(self, host: str, seen_from: str) -> str:
+        """Return the address of a host for those on another one."""
+
+    def command(self, host: str, *command: str) -> list[str]:
+        """Return the command that runs another one on a host."""
+
+    def on(self, host: str) -> contextlib.AbstractContextManager[None]:
+        """Let this thread open its sockets on a host."""
+
+    def cut(self, host: str) -> None:
+        """Let nothing pass from and to a host from now on."""
+
+    def mend(self) -> None:
+        """End all cuts."""
+
+
+class LocalSystem:
+    """Services on ports of their own of this host, and perhaps a second one of a kind.
+
+    A service that ends is started again, unless there is a second one.
+
+    Parameters
+    ----------
+    folder
+        Where their logs go.
+    services
+        Which run.
+    settings
+        Added to their environment.
+    beside
+        The kind of which there is a second one, or nothing.
+    insecure
+        Whether they run without keys.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        console: Console,
+        *,
+        services: Collection[str] = tuple(KINDS),
+        settings: Mapping[str, str] | None = None,
+        beside: str = "",
+        insecure: bool = False,
+    ) -> None:
+        environment = {
+            **free_addresses(services),
+            "KOUXING_DRIVER_VIEW": "none",
+            "KOUXING_INSECURE": str(insecure),
+            "LP_NUM_THREADS": os.environ.get("LP_NUM_THREADS", "1"),
+            **(settings or {}),
+        }
+        self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=insecure)
+        self.key = user_key()
+        self._beside = beside
+        self._spare = f"{beside}-2"
+        more = {
+            name: {**own, variable(beside, "instance"): SPARE}
+            for name, own in more_workers(read_settings(), 2).items()
+            if name == self._spare
+        }
+        self.supervisor = Supervisor([], folder, console, environment, services=services, more=more)
+
+    def __enter__(self) -> Self:
+        try:
+            self.supervisor.start()
+            self.supervisor.wait_ready(self.control)
+            if not self._beside:
+                self.supervisor.watch()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.supervisor.stop()
+
+    def on_client(self) -> contextlib.AbstractContextManager[None]:
+        """Do nothing: there is one host only."""
+        return contextlib.nullcontext()
+
+    def process_of(self, session: str, service: str) -> int:
+        """Return the number of the process that serves a session."""
+        is_spare = instance_of(self, session, service) == SPARE
+        return self.supervisor.process_number(self._spare if is_spare else service)
+
+
+class HostsSystem:
+    """Control, recognizer and synthesizer on a host each, and perhaps a second one of a kind.
+
+    Their keys are made on control's host and brought to the others, as docs/hosts.md says.
+    """
+
+    def __init__(self, logs: Path, states: Path, network: Hosts, beside: str = "") -> None:
+        self.network = network
+        self._logs = logs
+        self._states = states  # of each host, with its keys
+        self._services = {each: each for each in ON_HOSTS}  # by host
+        if beside:
+            self._services[SPARE] = beside
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        for host, service in self._services.items():
+            if host != "control":
+                self._bring_key(host, service, f"service:{service}")
+        self._bring_key(CLIENT, CLIENT, "client")
+        self.key = read_key(self._state(CLIENT) / "kouxing" / f"{CLIENT}.key")
+        self.control = f"{self._control_for(CLIENT)} {self.key.control}"
+
+    def __enter__(self) -> Self:
+        try:
+            for host in self._services:
+                self._start(host)
+            wait_until_ready(self, self._services)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self._processes.values():
+            process.terminate()
+        for process in self._processes.values():
+            process.wait()
+
+    def on_client(self) -> contextlib.AbstractContextManager[None]:
+        """Let this thread open its sockets on the client's host."""
+        return self.network.on(CLIENT)
+
+    def process_of(self, session: str, service: str) -> int:
+        """Return the number of the process that serves a session."""
+        return self._processes[self.host_of(session, service)].pid
+
+    def host_of(self, session: str, service: str) -> str:
+        """Return the host of the service that serves a session."""
+        return instance_of(self, session, service)
+
+    def _start(self, host: str) -> None:
+        service, address = self._services[host], self.network.bound(host)
+        addresses = {
+            variable(service, key): f"tcp://{address}:{port}"
+            for key, port in PORTS[service].items()
+        }
+        environment = {
+            "XDG_STATE_HOME": str(self._state(host)),
+            "KOUXING_CONTROL": self._control_for(host),
+            "KOUXING_ADVERTISE": self.network.address(host, CLIENT),
+            "KOUXING_INSECURE": "false",
+        }
+        command = self.network.command(host)
+        self._processes[host] = start(
+            service, host, self._logs, {**environment, **addresses}, command
+        )
+
+    def _control_for(self, host: str) -> str:
+        return f"tcp://{self.network.address('control', host)}:{PORTS['control']['commands']}"
+
+    def _bring_key(self, host: str, name: str, role: str) -> None:
+        """Make a key on control's host and copy it to another."""
+        subprocess.run(  # noqa: S603 - our own module
+            [sys.executable, "-m", "services", "keys", "add", host, "--role", role],
+            env={**os.environ, "XDG_STATE_HOME": str(self._state("control"))},
+            cwd=self._states,
+            stderr=subprocess.DEVNULL,
+            check=True,
+        )
+        folder = self._state(host) / "kouxing"
+        folder.mkdir(mode=0o700, parents=True)
+        (self._states / f"{host}.key").rename(folder / f"{name}.key")
+
+    def _state(self, host: str) -> Path:
+        return self._states / host
+
+
+def start(
+    service: str,
+    instance: str,
+    folder: Path,
+    environment: Mapping[str, str],
+    command: Iterable[str] = (),
+) -> subprocess.Popen[bytes]:
+    """Start a service whose log lines go to a file of its instance's name.
+
+    Parameters
+    ----------
+    command
+        What runs it, such as on another host.
+    """
+    with (folder / f"{instance}.log").open("wb") as log:
+        return subprocess.Popen(  # noqa: S603 - our own module
+            [*command, sys.executable, "-m", f"services.{service}"],
+            env={**os.environ, **environment, variable(service, "instance"): instance},
+            stderr=log,
+            start_new_session=True,
+        )
+
+
+def wait_until_ready(system: System, instances: Iterable[str]) -> None:
+    """Wait until control knows services.
+
+    Raises
+    ------
+    UserError
+        If it does not in time.
+    """
+    end_s = time.monotonic() + READY_S
+    while True:
+        with contextlib.suppress(UserError):  # control may not run yet
+            if {*instances} <= {each.instance for each in status(system).services}:
+                return
+        if time.monotonic() > end_s:
+            raise UserError("the services did not start")
+        time.sleep(0.1)
+
+
+def status(system: System) -> StatusReport:
+    """Return what control says."""
+    with system.on_client(), Client(system.control, key=system.key, deadline_s=2.0) as client:
+        return client.status()
+
+
+def instance_of(system: System, session: str, service: str) -> str:
+    """Return the instance of a service that serves a session."""
+    report = status(system)
+    workers = {
+        worker
+        for each in report.sessions
+        if each.session == session
+        for worker in each.workers.values()
+    }
+    return next(
+        (
+            each.instance
+            for each in report.services
+            if each.service == service and each.instance in workers
+        ),
+        "",
+    )

@@ -1,0 +1,130 @@
+"""A program that answers as VTube Studio does, after the public document of its API."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from types import TracebackType
+
+from aiohttp import WSMsgType, web
+
+Answer = tuple[str, dict[str, object]]  # kind and data
+PARAMETERS = ("MouthOpen", "MouthSmile", "EyeOpenLeft", "FaceAngleX", "MousePositionX")
+
+
+class VTubeStudioStub:
+    """A server at a free port (or a given one), in a thread of its own.
+
+    Attributes
+    ----------
+    requests
+        Kinds of the messages that came, without those of frames.
+    frames
+        The parameters of each frame, by name.
+    arrived_s
+        When each of them came, by ``time.perf_counter``.
+    token
+        The one that is valid; empty: none is, and whoever had one may do nothing any more.
+    is_asking
+        Whether the user has not yet answered a question.
+    """
+
+    def __init__(self, port: int = 0, *, user_allows: bool = True, token: str = "") -> None:
+        self.port = port
+        self.requests: list[str] = []
+        self.frames: list[dict[str, float]] = []
+        self.arrived_s: list[float] = []
+        self._user_allows = user_allows
+        self.token = token
+        self.is_asking = False
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+
+    def __enter__(self) -> VTubeStudioStub:
+        self._thread.start()
+        asyncio.run_coroutine_threadsafe(self._serve(), self._loop).result()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _serve(self) -> None:
+        application = web.Application()
+        application.router.add_get("/", self._talk)
+        self._runner = web.AppRunner(application, shutdown_timeout=0.1)
+        await self._runner.setup()
+        site = web.TCPSite(self._runner, "127.0.0.1", self.port)
+        await site.start()
+        self.port = self._runner.addresses[0][1]
+
+    async def _talk(self, request: web.Request) -> web.WebSocketResponse:
+        client = web.WebSocketResponse()
+        await client.prepare(request)
+        authenticated_by = ""
+        async for message in client:
+            if message.type is not WSMsgType.TEXT:
+                continue
+            asked = json.loads(message.data)
+            kind, data = asked["messageType"], asked.get("data", {})
+            if kind == "AuthenticationRequest":
+                authenticated_by = data["authenticationToken"]
+            is_authenticated = bool(self.token) and authenticated_by == self.token
+            answered, answer = self._answer(kind, data, is_authenticated)
+            await client.send_json(
+                {
+                    "apiName": "VTubeStudioPublicAPI",
+                    "apiVersion": "1.0",
+                    "timestamp": 1625405710728,
+                    "requestID": asked["requestID"],
+                    "messageType": answered,
+                    "data": answer,
+                }
+            )
+        return client
+
+    def _answer(self, kind: str, data: dict[str, object], is_authenticated: bool) -> Answer:
+        if kind != "InjectParameterDataRequest":
+            self.requests.append(kind)
+        if kind == "AuthenticationTokenRequest":
+            return self._give_token()
+        if kind == "AuthenticationRequest":
+            return "AuthenticationResponse", {"authenticated": is_authenticated, "reason": ""}
+        if not is_authenticated:
+            return _error(8, "This request requires authentication")
+        if kind == "InputParameterListRequest":
+            listed = [{"name": name, "value": 0.0, "min": 0, "max": 1} for name in PARAMETERS]
+            return "InputParameterListResponse", {
+                "defaultParameters": listed,
+                "customParameters": [],
+            }
+        return self._inject(data)
+
+    def _give_token(self) -> Answer:
+        if self.is_asking:
+            return _error(51, "A permission popup is already shown.")
+        if not self._user_allows:
+            return _error(50, "User has denied API access for your plugin.")
+        self.token = "a-token"  # noqa: S105 - the stub's own
+        return "AuthenticationTokenResponse", {"authenticationToken": self.token}
+
+    def _inject(self, data: dict[str, object]) -> Answer:
+        values = data["parameterValues"]
+        if not isinstance(values, list) or any(each["id"] not in PARAMETERS for each in values):
+            return _error(453, "Parameter not found")
+        self.arrived_s.append(time.perf_counter())
+        self.frames.append({each["id"]: each["value"] for each in values})
+        return "InjectParameterDataResponse", {}
+
+
+def _error(number: int, text: str) -> Answer:
+    return "APIError", {"errorID": number, "message": text}

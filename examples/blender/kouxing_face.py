@@ -1,0 +1,213 @@
+"""Blender add-on: a face of shape keys speaks, live or from a recording. Blender 4.2 to 5.0.
+
+Every shape key of the scene that has one of ARKit's 52 names follows. Live, the weights come by
+UDP as the app Live Link Face sends them (`kouxing send livelink://127.0.0.1:11111`); a recording is
+a table of `kouxing render my.wav my.csv --as arkit`, or its .jsonl. "Edit > Preferences > Add-ons >
+Install from Disk" takes this file; its panel is in the sidebar (N) of the 3-D view.
+"""
+
+import csv
+import json
+import socket
+import struct
+from collections import defaultdict
+from pathlib import Path
+
+import bpy
+from bpy_extras.io_utils import ImportHelper
+
+bl_info = {
+    "name": "kouxing face",
+    "author": "the kouxing authors",
+    "version": (1, 0, 0),
+    "blender": (4, 2, 0),
+    "location": "3D View > Sidebar > kouxing",
+    "description": "Speech moves a face of ARKit shape keys",
+    "category": "Animation",
+}
+
+PORT = 11111
+POLL_S = 1 / 60
+NUM_VALUES = 61  # of which the first 52 are shapes
+# fmt: off
+LIVE_LINK_ORDER = (
+    "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft",
+    "eyeSquintLeft", "eyeWideLeft", "eyeBlinkRight", "eyeLookDownRight", "eyeLookInRight",
+    "eyeLookOutRight", "eyeLookUpRight", "eyeSquintRight", "eyeWideRight", "jawForward", "jawLeft",
+    "jawRight", "jawOpen", "mouthClose", "mouthFunnel", "mouthPucker", "mouthLeft", "mouthRight",
+    "mouthSmileLeft", "mouthSmileRight", "mouthFrownLeft", "mouthFrownRight", "mouthDimpleLeft",
+    "mouthDimpleRight", "mouthStretchLeft", "mouthStretchRight", "mouthRollLower",
+    "mouthRollUpper", "mouthShrugLower", "mouthShrugUpper", "mouthPressLeft", "mouthPressRight",
+    "mouthLowerDownLeft", "mouthLowerDownRight", "mouthUpperUpLeft", "mouthUpperUpRight",
+    "browDownLeft", "browDownRight", "browInnerUp", "browOuterUpLeft", "browOuterUpRight",
+    "cheekPuff", "cheekSquintLeft", "cheekSquintRight", "noseSneerLeft", "noseSneerRight",
+    "tongueOut",
+)
+# fmt: on
+
+
+def shape_keys():
+    """Find the scene's shape keys: a list of those of each name."""
+    found = defaultdict(list)
+    for shapes in bpy.data.shape_keys:
+        for key in shapes.key_blocks[1:]:  # the first is the face at rest
+            found[key.name].append(key)
+    return found
+
+
+def read_live_link(packet):
+    """Return the weights of a packet by name, or nothing if it is none."""
+    size = 4 * NUM_VALUES
+    if len(packet) <= size or packet[0] != 6 or packet[-size - 1] != NUM_VALUES:
+        return {}
+    values = struct.unpack(f">{NUM_VALUES}f", packet[-size:])
+    return dict(zip(LIVE_LINK_ORDER, values, strict=False))
+
+
+def read_recording(path):
+    """Return the times in seconds, and the weights at these by name, of a .csv or .jsonl file."""
+    with Path(path).open(encoding="utf-8") as file:
+        if path.endswith(".csv"):
+            rows = [
+                {name: float(value) for name, value in row.items()} for row in csv.DictReader(file)
+            ]
+            times_s = [row.pop("time_s") for row in rows]
+        else:
+            frames = [json.loads(line) for line in file]
+            times_s = [frame["time_s"] for frame in frames]
+            rows = [frame["arkit"] for frame in frames]
+    return times_s, {name: [row[name] for row in rows] for name in rows[0]}
+
+
+class Receiver:
+    """Takes packets from a port and shows the newest."""
+
+    def __init__(self):
+        self.socket = None
+        self.num_packets = 0
+
+    def open(self, port):
+        """Listen on this machine."""
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", port))
+        self.socket.setblocking(False)
+        self.num_packets = 0
+
+    def close(self):
+        """Stop; the face stays as it is."""
+        if self.socket is not None:
+            self.socket.close()
+        self.socket = None
+
+    def poll(self):
+        """Show what has come, and say when to look again; Blender's timer calls this."""
+        if self.socket is None:
+            return None
+        packet = b""
+        while True:
+            try:
+                packet = self.socket.recv(2048)
+            except BlockingIOError:
+                break
+            self.num_packets += 1
+        keys = shape_keys() if packet else {}
+        for name, weight in read_live_link(packet).items():
+            for key in keys.get(name, ()):
+                key.value = weight
+        return POLL_S
+
+
+RECEIVER = Receiver()
+
+
+class KOUXING_OT_follow(bpy.types.Operator):
+    """Let the face follow the stream, or stop it."""
+
+    bl_idname = "kouxing.follow"
+    bl_label = "Follow the stream"
+
+    def execute(self, context):
+        """Open or close the port."""
+        if RECEIVER.socket is not None:
+            RECEIVER.close()
+            return {"FINISHED"}
+        try:
+            RECEIVER.open(context.scene.kouxing_port)
+        except OSError as error:
+            RECEIVER.close()
+            self.report({"ERROR"}, f"port {context.scene.kouxing_port}: {error.strerror}")
+            return {"CANCELLED"}
+        bpy.app.timers.register(RECEIVER.poll)
+        return {"FINISHED"}
+
+
+class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
+    """Insert a recording as key frames, from the current frame on."""
+
+    bl_idname = "kouxing.insert"
+    bl_label = "Insert a recording"
+    bl_options = {"REGISTER", "UNDO"}
+    filter_glob: bpy.props.StringProperty(default="*.csv;*.jsonl", options={"HIDDEN"})
+
+    def execute(self, context):
+        """Set a key frame for every frame of the file."""
+        try:
+            times_s, weights = read_recording(self.filepath)
+        except (OSError, KeyError, ValueError, IndexError) as error:
+            self.report({"ERROR"}, f"{self.filepath} is no table of ARKit weights: {error}")
+            return {"CANCELLED"}
+        keys = shape_keys()
+        known = [name for name in weights if name in keys]
+        if not known:
+            self.report({"ERROR"}, "no shape key in the scene has a name of the table's (jawOpen)")
+            return {"CANCELLED"}
+        scene = context.scene
+        rate_hz = scene.render.fps / scene.render.fps_base
+        frames = [scene.frame_current + time_s * rate_hz for time_s in times_s]
+        for name in known:
+            for key in keys[name]:
+                for frame, key.value in zip(frames, weights[name], strict=True):
+                    key.keyframe_insert("value", frame=frame)
+        scene.frame_end = max(scene.frame_end, int(frames[-1]) + 1)
+        self.report({"INFO"}, f"{len(frames)} frames of {len(known)} shapes")
+        return {"FINISHED"}
+
+
+class KOUXING_PT_panel(bpy.types.Panel):
+    """What the sidebar shows."""
+
+    bl_label = "kouxing"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "kouxing"
+
+    def draw(self, context):
+        """Draw the port, the two commands and the number of packets."""
+        follows = RECEIVER.socket is not None
+        self.layout.prop(context.scene, "kouxing_port")
+        self.layout.operator(
+            KOUXING_OT_follow.bl_idname, text="Stop" if follows else "", depress=follows
+        )
+        if follows:
+            self.layout.label(text=f"{RECEIVER.num_packets} packets")
+        self.layout.operator(KOUXING_OT_insert.bl_idname)
+
+
+CLASSES = (KOUXING_OT_follow, KOUXING_OT_insert, KOUXING_PT_panel)
+
+
+def register():
+    """Add commands and panel to Blender."""
+    for each in CLASSES:
+        bpy.utils.register_class(each)
+    bpy.types.Scene.kouxing_port = bpy.props.IntProperty(
+        name="Port", default=PORT, min=1, max=65535, description="Of Live Link Face packets"
+    )
+
+
+def unregister():
+    """Take them away."""
+    RECEIVER.close()
+    del bpy.types.Scene.kouxing_port
+    for each in reversed(CLASSES):
+        bpy.utils.unregister_class(each)

@@ -1,0 +1,266 @@
+/* Follows the face of a session from C: needs libzmq 4.3 alone (Debian: libzmq3-dev).
+
+   cc -std=c11 -Wall -o follow follow.c -lzmq
+   ./follow [SESSION [CONTROL-ADDRESS]]      (default: the newest session, tcp://127.0.0.1:5550)
+
+   Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
+   52 weights. It waits until there is a session and ends with it. proto/PROTOCOL.md says what else
+   there is, and has the names of the others. */
+
+#define _POSIX_C_SOURCE 200809L
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <time.h>
+#include <zmq.h>
+
+enum { KEY_LENGTH = 40, MAX_NAME = 64, MAX_ENDPOINT = 256 };
+enum { NUM_WEIGHTS = 52, JAW_OPEN = 24 }; /* its place among ARKit's names */
+
+static void fail(const char *what) {
+  fprintf(stderr, "follow: %s\n", what);
+  exit(1);
+}
+
+/* --- msgpack: as much of it as a reader of maps needs ------------------------------------------ */
+
+typedef struct {
+  const uint8_t *at, *end;
+} Bytes;
+
+typedef struct {
+  enum { NUMBER, STRING, ARRAY, MAP } kind; /* STRING: text or binary */
+  double number;
+  uint32_t size;       /* bytes of a string, items of an array, pairs of a map */
+  const uint8_t *text; /* of a string */
+} Value;
+
+static uint64_t big_endian(Bytes *in, int num_bytes) {
+  uint64_t number = 0;
+  if (in->end - in->at < num_bytes) fail("a message breaks off");
+  while (num_bytes-- > 0) number = number << 8 | *in->at++;
+  return number;
+}
+
+/* Read a value, of an array or a map only its size. */
+static Value read_value(Bytes *in) {
+  Value value = {NUMBER, 0, 0, NULL};
+  uint8_t tag = (uint8_t)big_endian(in, 1);
+  if (tag <= 0x7f) value.number = tag;
+  else if (tag <= 0x8f) value.kind = MAP, value.size = tag & 0x0f;
+  else if (tag <= 0x9f) value.kind = ARRAY, value.size = tag & 0x0f;
+  else if (tag <= 0xbf) value.kind = STRING, value.size = tag & 0x1f;
+  else if (tag >= 0xe0) value.number = (int8_t)tag;
+  else switch (tag) {
+    case 0xc0: case 0xc2: break;          /* nil, false */
+    case 0xc3: value.number = 1; break;   /* true */
+    case 0xc4: case 0xd9: value.kind = STRING, value.size = (uint32_t)big_endian(in, 1); break;
+    case 0xc5: case 0xda: value.kind = STRING, value.size = (uint32_t)big_endian(in, 2); break;
+    case 0xc6: case 0xdb: value.kind = STRING, value.size = (uint32_t)big_endian(in, 4); break;
+    case 0xdc: value.kind = ARRAY, value.size = (uint32_t)big_endian(in, 2); break;
+    case 0xdd: value.kind = ARRAY, value.size = (uint32_t)big_endian(in, 4); break;
+    case 0xde: value.kind = MAP, value.size = (uint32_t)big_endian(in, 2); break;
+    case 0xdf: value.kind = MAP, value.size = (uint32_t)big_endian(in, 4); break;
+    case 0xcb: { uint64_t bits = big_endian(in, 8); memcpy(&value.number, &bits, 8); break; }
+    case 0xcc: case 0xcd: case 0xce: case 0xcf:
+      value.number = (double)big_endian(in, 1 << (tag - 0xcc));
+      break;
+    case 0xd0: value.number = (int8_t)big_endian(in, 1); break;
+    case 0xd1: value.number = (int16_t)big_endian(in, 2); break;
+    case 0xd2: value.number = (int32_t)big_endian(in, 4); break;
+    case 0xd3: value.number = (double)(int64_t)big_endian(in, 8); break;
+    default: fail("a message has a type that the protocol does not use");
+  }
+  if (value.kind == STRING) {
+    if (in->end - in->at < (ptrdiff_t)value.size) fail("a message breaks off");
+    value.text = in->at;
+    in->at += value.size;
+  }
+  return value;
+}
+
+static void skip(Bytes *in) {
+  Value value = read_value(in);
+  if (value.kind == STRING || value.kind == NUMBER) return;
+  for (uint64_t left = value.kind == MAP ? 2 * (uint64_t)value.size : value.size; left > 0; left--)
+    skip(in);
+}
+
+/* Move to the value of a key of a map; false if there is none. */
+static bool find(Bytes map, const char *key, Bytes *found) {
+  Value pairs = read_value(&map);
+  if (pairs.kind != MAP) return false;
+  while (pairs.size-- > 0) {
+    Value name = read_value(&map);
+    *found = map;
+    if (name.kind == STRING && name.size == strlen(key) && !memcmp(name.text, key, name.size))
+      return true;
+    skip(&map);
+  }
+  return false;
+}
+
+/* Copy the text at a key of a map; false if there is none, or it is longer than the place for it. */
+static bool find_text(Bytes map, const char *key, char *text, size_t capacity) {
+  Bytes at;
+  if (!find(map, key, &at)) return false;
+  Value value = read_value(&at);
+  if (value.kind != STRING || value.size >= capacity) return false;
+  memcpy(text, value.text, value.size);
+  text[value.size] = '\0';
+  return true;
+}
+
+static double find_number(Bytes map, const char *key) {
+  Bytes at;
+  return find(map, key, &at) ? read_value(&at).number : 0;
+}
+
+/* --- sockets ------------------------------------------------------------------------------------ */
+
+typedef struct {
+  char public[KEY_LENGTH + 1], secret[KEY_LENGTH + 1], control[KEY_LENGTH + 1];
+} Key;
+
+/* Take a key out of a JSON object of three strings. */
+static void read_key(const char *json, const char *name, char *key) {
+  char quoted[16];
+  snprintf(quoted, sizeof quoted, "\"%s\"", name);
+  const char *at = strstr(json, quoted);
+  at = at ? strchr(at + strlen(quoted), '"') : NULL;
+  if (!at || strlen(at) <= KEY_LENGTH) fail("client.key is no key file");
+  memcpy(key, at + 1, KEY_LENGTH);
+  key[KEY_LENGTH] = '\0';
+}
+
+static Key own_key(void) {
+  char path[4096], json[1024] = "";
+  const char *state = getenv("XDG_STATE_HOME"), *home = getenv("HOME");
+  if (state && *state) snprintf(path, sizeof path, "%s/kouxing/client.key", state);
+  else snprintf(path, sizeof path, "%s/.local/state/kouxing/client.key", home ? home : "");
+  FILE *file = fopen(path, "r");
+  if (!file || fread(json, 1, sizeof json - 1, file) == 0)
+    fail("no client.key: start kouxing, or copy one from its machine");
+  fclose(file);
+  Key key;
+  read_key(json, "public", key.public);
+  read_key(json, "secret", key.secret);
+  read_key(json, "control", key.control);
+  return key;
+}
+
+/* Connect to an address and the public key of who is there: "tcp://HOST:PORT KEY". */
+static void *open_socket(void *context, int kind, const char *endpoint, const Key *key) {
+  char address[MAX_ENDPOINT + 1], server[MAX_ENDPOINT + 1];
+  if (sscanf(endpoint, "%256s %256s", address, server) != 2) fail("an endpoint has no key");
+  void *socket = zmq_socket(context, kind);
+  if (zmq_setsockopt(socket, ZMQ_CURVE_SERVERKEY, server, KEY_LENGTH + 1) ||
+      zmq_setsockopt(socket, ZMQ_CURVE_PUBLICKEY, key->public, KEY_LENGTH + 1) ||
+      zmq_setsockopt(socket, ZMQ_CURVE_SECRETKEY, key->secret, KEY_LENGTH + 1) ||
+      zmq_connect(socket, address))
+    fail(zmq_strerror(zmq_errno()));
+  return socket;
+}
+
+/* Receive the two parts of a message; the body lies in `body` until the next. */
+static Bytes receive(void *socket, char *topic, size_t capacity, zmq_msg_t *body) {
+  int size = zmq_recv(socket, topic, capacity - 1, 0);
+  if (size < 0 || zmq_msg_recv(body, socket, 0) < 0) fail(zmq_strerror(zmq_errno()));
+  topic[(size_t)size < capacity ? (size_t)size : capacity - 1] = '\0';
+  const uint8_t *data = zmq_msg_data(body);
+  return (Bytes){data, data + zmq_msg_size(body)};
+}
+
+/* --- the program -------------------------------------------------------------------------------- */
+
+/* Send control a request about a session, and receive the answer; `rest` is a further field. */
+static Bytes ask(void *control, const char *kind, const char *session, const char *rest,
+                 zmq_msg_t *answer) {
+  static int number = 0;
+  char topic[MAX_NAME + 32], request[16], body[192];
+  snprintf(topic, sizeof topic, "%s/%s/", kind, session);
+  snprintf(request, sizeof request, "%d", ++number);
+  /* a map: an integer, two strings with their lengths before them, and the rest */
+  int size = snprintf(body, sizeof body, "%c\xa7version\x02\xa7session\xd9%c%s\xa7request%c%s%s",
+                      *rest ? 0x84 : 0x83, (int)strlen(session), session,
+                      0xa0 + (int)strlen(request), request, rest);
+  zmq_send(control, topic, strlen(topic), ZMQ_SNDMORE);
+  zmq_send(control, body, (size_t)size, 0);
+  return receive(control, topic, sizeof topic, answer);
+}
+
+/* Ask control once for the wanted session, or the newest; false if there is none yet. */
+static bool find_session(void *control, const char *wanted, char *name, char *faps) {
+  zmq_msg_t answer;
+  zmq_msg_init(&answer);
+  Bytes report = ask(control, "status-request", wanted, "", &answer), sessions, endpoints;
+  double least_age_s = 1e300;
+  if (find(report, "sessions", &sessions)) { /* an error has none */
+    for (uint32_t left = read_value(&sessions).size; left > 0; left--, skip(&sessions)) {
+      double age_s = find_number(sessions, "age_s");
+      if (age_s < least_age_s && find(sessions, "endpoints", &endpoints) &&
+          find_text(endpoints, "faps", faps, MAX_ENDPOINT + 1) &&
+          find_text(sessions, "session", name, MAX_NAME + 1))
+        least_age_s = age_s;
+    }
+  }
+  zmq_msg_close(&answer);
+  return least_age_s < 1e300;
+}
+
+/* Subscribe to a kind of message of a session, or no longer. */
+static void choose(void *socket, int option, const char *kind, const char *session) {
+  char topic[MAX_NAME + 32];
+  int size = snprintf(topic, sizeof topic, "%s/%s/", kind, session);
+  zmq_setsockopt(socket, option, topic, (size_t)size);
+}
+
+int main(int num_arguments, char **arguments) {
+  const char *wanted = num_arguments > 1 ? arguments[1] : "";
+  const char *address = num_arguments > 2 ? arguments[2] : "tcp://127.0.0.1:5550";
+  if (strlen(wanted) > MAX_NAME) fail("no session has such a long name");
+  Key key = own_key();
+  void *context = zmq_ctx_new();
+
+  char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1];
+  snprintf(endpoint, sizeof endpoint, "%s %s", address, key.control);
+  void *control = open_socket(context, ZMQ_DEALER, endpoint, &key);
+  while (!find_session(control, wanted, name, endpoint))
+    nanosleep(&(struct timespec){.tv_nsec = 500000000}, NULL);
+
+  void *face = open_socket(context, ZMQ_SUB, endpoint, &key);
+  choose(face, ZMQ_SUBSCRIBE, "shapes", name);
+  choose(face, ZMQ_SUBSCRIBE, "end-of-faps", name);
+  choose(face, ZMQ_SUBSCRIBE, "joined", name); /* last: no frame is missed from then on */
+
+  zmq_msg_t body;
+  zmq_msg_init(&body);
+  for (;;) {
+    char topic[MAX_NAME + 32], set[16];
+    Bytes message = receive(face, topic, sizeof topic, &body), at;
+    if (!strncmp(topic, "end-of-faps/", 12)) break;
+    if (!strncmp(topic, "joined/", 7)) {
+      zmq_msg_t answer;
+      zmq_msg_init(&answer);
+      ask(control, "add-shapes", name, "\xa6shapes\x91\xa5" "arkit", &answer); /* a list of one */
+      zmq_msg_close(&answer);
+      printf("following %s\n", name);
+      choose(face, ZMQ_UNSUBSCRIBE, "joined", name); /* it comes whenever anybody joins */
+    } else if (find_text(message, "set", set, sizeof set) && !strcmp(set, "arkit") &&
+               find(message, "weights", &at)) { /* others may have asked for other sets */
+      Value values = read_value(&at);
+      float weights[NUM_WEIGHTS]; /* little-endian on the wire, as on every usual machine */
+      if (values.kind != STRING || values.size != sizeof weights) fail("a face has other weights");
+      memcpy(weights, values.text, sizeof weights);
+      printf("%.3f %.2f\n", find_number(message, "media_time") / 16000, weights[JAW_OPEN]);
+    }
+    fflush(stdout);
+  }
+  zmq_msg_close(&body);
+  zmq_close(face);
+  zmq_close(control);
+  zmq_ctx_destroy(context);
+  return 0;
+}

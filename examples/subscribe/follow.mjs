@@ -1,0 +1,72 @@
+// Follows the face of a session from Node 18 or newer: npm install zeromq @msgpack/msgpack
+//
+// usage: node follow.mjs [SESSION [CONTROL-ADDRESS]]
+// (default: the newest session, tcp://127.0.0.1:5550)
+//
+// Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
+// 52 weights. It waits until there is a session and ends with it. proto/PROTOCOL.md says what else
+// there is, and has the names of the others.
+
+import { readFile } from "node:fs/promises";
+import { homedir } from "node:os";
+import { join } from "node:path";
+import { setTimeout as sleep } from "node:timers/promises";
+import { decode, encode } from "@msgpack/msgpack";
+import { Dealer, Subscriber } from "zeromq";
+
+const JAW_OPEN = 24; // its place among ARKit's names
+const [wanted = "", controlAddress = "tcp://127.0.0.1:5550"] = process.argv.slice(2);
+const state = process.env.XDG_STATE_HOME || join(homedir(), ".local", "state");
+const key = JSON.parse(await readFile(join(state, "kouxing", "client.key"), "utf8"));
+
+let numRequests = 0;
+
+/** Connect to an address and the public key of who is there. */
+function connect(Kind, endpoint) {
+  const [address, curveServerKey] = endpoint.split(" ");
+  const socket = new Kind({ curveServerKey, curvePublicKey: key.public, curveSecretKey: key.secret });
+  socket.connect(address);
+  return socket;
+}
+
+/** Return the kind of a message and its fields. */
+function read([topic, body]) {
+  return [topic.toString().split("/")[0], decode(body)];
+}
+
+/** Send a request, and return the answer. */
+async function ask(control, kind, session, fields = {}) {
+  const body = { version: 2, session, request: String(++numRequests), ...fields };
+  await control.send([`${kind}/${session}/`, encode(body)]);
+  return read(await control.receive())[1];
+}
+
+/** Return the wanted session, or the newest, once control knows one. */
+async function find(control) {
+  for (;;) {
+    const { sessions = [] } = await ask(control, "status-request", wanted); // an error has none
+    const open = sessions.filter(({ endpoints }) => "faps" in endpoints);
+    if (open.length > 0) return open.reduce((a, b) => (a.age_s < b.age_s ? a : b));
+    await sleep(500);
+  }
+}
+
+const control = connect(Dealer, `${controlAddress} ${key.control}`);
+const { session, endpoints } = await find(control);
+const face = connect(Subscriber, endpoints.faps);
+for (const kind of ["shapes", "end-of-faps", "joined"]) { // joined, last: none is missed from then on
+  face.subscribe(`${kind}/${session}/`);
+}
+
+for await (const message of face) {
+  const [kind, body] = read(message);
+  if (kind === "end-of-faps") break;
+  if (kind === "joined") {
+    await ask(control, "add-shapes", session, { shapes: ["arkit"] });
+    console.log("following", session);
+    face.unsubscribe(`joined/${session}/`); // it comes whenever anybody joins
+  } else if (body.set === "arkit") { // others may have asked for other sets
+    const weights = new Float32Array(new Uint8Array(body.weights).buffer); // 52
+    console.log((body.media_time / 16000).toFixed(3), weights[JAW_OPEN].toFixed(2));
+  }
+}

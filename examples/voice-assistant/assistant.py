@@ -1,0 +1,94 @@
+"""A voice assistant with a face that can be interrupted: pip install aiohttp.
+
+usage: assistant.py [GATEWAY]    (default: ws://127.0.0.1:8080; with a token: wss://HOST:8080?token=...)
+
+Each line typed is something that the user said. The assistant answers it, and the face of its
+session speaks the answer, on the page and wherever else it is sent. A line typed while it speaks
+interrupts it: the face falls silent at once and goes on with the new answer. Put your language
+model in place of `answer` and your text-to-speech in place of `synthesize`.
+"""
+
+import array
+import asyncio
+import itertools
+import math
+import sys
+from urllib.parse import urlsplit, urlunsplit
+
+import aiohttp
+
+RATE_HZ = 16000
+PITCH_HZ = 140
+VOWELS_HZ = ((850, 1300), (300, 2300), (320, 800), (480, 850), (420, 1400))  # formants: a i u o e
+SYLLABLE_S = 0.2
+
+
+def answer(text):
+    """Say something about what the user said."""
+    return f"you said {text}"
+
+
+async def synthesize(text):
+    """Yield 16-bit PCM as it is made, in pieces of any length: here a hum with a vowel a letter."""
+    for letter in text:
+        states = [[0.0, 0.0], [0.0, 0.0]]
+        samples = array.array("h")
+        for number in range(int(SYLLABLE_S * RATE_HZ)):
+            value = float(number % (RATE_HZ // PITCH_HZ) == 0 and letter != " ")
+            for state, formant_hz in zip(states, VOWELS_HZ[ord(letter) % 5], strict=True):
+                value += (
+                    1.94 * math.cos(math.tau * formant_hz / RATE_HZ) * state[0] - 0.94 * state[1]
+                )
+                state[:] = value, state[0]
+            samples.append(max(-32767, min(32767, int(1500 * value))))
+        yield samples.tobytes()
+        await asyncio.sleep(0)  # others may have work
+
+
+async def speak(face, text):
+    """Send an answer to the face, and wait until it is spoken."""
+    begun_s = asyncio.get_running_loop().time()
+    sent_s = 0.0
+    async for pcm in synthesize(text):
+        await face.send_bytes(pcm)
+        sent_s += len(pcm) / 2 / RATE_HZ
+    await asyncio.sleep(begun_s + sent_s - asyncio.get_running_loop().time())
+
+
+async def converse(face):
+    """Answer the user until there is no more."""
+    speaking = None
+    for number in itertools.count(1):
+        line = (await asyncio.to_thread(sys.stdin.readline)).strip()
+        if speaking is not None and not speaking.done() and line:
+            speaking.cancel()
+            await face.send_json({"flush": True})
+            print("interrupted", flush=True)
+        if not line:
+            break
+        print(f"answer {number}", flush=True)
+        speaking = asyncio.create_task(speak(face, answer(line)))
+    if speaking is not None:
+        await speaking
+    await face.send_json({"eof": 1})
+
+
+async def main(gateway):
+    """Open one session for the whole conversation."""
+    scheme, host, _, query, _ = urlsplit(gateway)
+    url = urlunsplit((scheme, host, "/microphone", query, ""))
+    async with aiohttp.ClientSession() as http, http.ws_connect(url) as face:
+        await face.send_json({"sample_rate_hz": RATE_HZ, "encoding": "s16le", "ahead": True})
+        opened = await face.receive_json()
+        if opened["type"] != "opened":
+            raise SystemExit(opened["text"])
+        print("the face is session", opened["session"], flush=True)
+        conversation = asyncio.create_task(converse(face))
+        async for message in face:  # until the gateway closes, as it does when all is spoken
+            if message.type is aiohttp.WSMsgType.TEXT:
+                raise SystemExit(message.json()["text"])
+        await conversation
+
+
+if __name__ == "__main__":
+    asyncio.run(main(sys.argv[1] if len(sys.argv) > 1 else "ws://127.0.0.1:8080"))

@@ -1,0 +1,48 @@
+"""``kouxing cluster``: recognizers and synthesizers on the hosts of a Ray cluster."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from services.cli.services import ConfigFile
+from services.kinds import KINDS, read_settings
+from shared.config import parse_assignments
+from shared.errors import UserError
+
+Number = Annotated[int | None, typer.Option(min=0, max=1000, help="How many are to run.")]
+
+
+def cluster(
+    recognizers: Number = None,
+    synthesizers: Number = None,
+    address: Annotated[
+        str, typer.Option(help="Address of the Ray cluster; auto: the one that this host is in.")
+    ] = "auto",
+    config: ConfigFile = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="SERVICE.KEY=VALUE", help="Set one key of new workers; repeatable."
+        ),
+    ] = None,
+) -> None:
+    """Run so many recognizers and synthesizers on a Ray cluster; without numbers, list them."""
+    settings = read_settings(config, parse_assignments(assignments or []))
+    try:
+        from services.cli.ray_workers import RayWorkers
+    except ModuleNotFoundError:
+        raise UserError("Ray is missing; on every host: pip install 'kouxing[cluster]'") from None
+    with RayWorkers(address) as workers:
+        for name, number in (("recognizer", recognizers), ("synthesizer", synthesizers)):
+            if number is not None:
+                workers.scale(KINDS[name], number, settings)
+        table = Table("worker", "host", box=box.SIMPLE)
+        for name, host in workers.hosts().items():
+            table.add_row(name, escape(host or "waits for a free core"))
+    Console().print(table if table.rows else "no worker runs on this cluster")

@@ -1,0 +1,51 @@
+"""The morph targets of an exported head: FAPs, shapes of ARKit, expressions of VRM."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from shared.face.shapes import ARKIT, VRM
+
+Float32 = NDArray[np.float32]
+
+_ANGLE_UNITS_PER_WEIGHT = 1 / RADIANS_PER_ANGLE_UNIT  # a weight of 1 is 1 rad
+_MIN_FAP_SHIFT_M = 2e-5
+_MIN_SHIFT_M = 1e-4
+EMOTIONS = {"happy": "joy", "angry": "anger", "sad": "sadness", "surprised": "surprise"}
+
+
+class Morph(NamedTuple):
+    """A morph target to be made."""
+
+    name: str
+    faps: Float32  # (68,) at weight 1
+    min_shift_m: float = _MIN_SHIFT_M  # smaller displacements are left out
+    turns_eyes: bool = True  # it moves the eyeballs; else nodes turn them
+
+
+def units_per_weight(fapu: str) -> float:
+    """Return the FAP units of a weight of 1, by the unit of the FAP."""
+    return _ANGLE_UNITS_PER_WEIGHT if fapu == "AU" else FAP_UNITS_PER_FAPU
+
+
+def _of_faps() -> tuple[Morph, ...]:
+    units = np.array([units_per_weight(fap.fapu) for fap in FAPS], np.float32)
+    rows = np.eye(NUM_FAPS, dtype=np.float32) * units
+    return tuple(
+        Morph(fap.name, row, _MIN_FAP_SHIFT_M, turns_eyes=False)
+        for fap, row in zip(FAPS, rows, strict=True)
+    )
+
+
+FAP_MORPHS = _of_faps()
+ARKIT_MORPHS = tuple(Morph(name, faps) for name, faps in zip(ARKIT.names, ARKIT.basis, strict=True))
+AVATAR_MORPHS = (
+    *(Morph(name, faps) for name, faps in zip(VRM.names, VRM.basis, strict=True)),
+    *(Morph(new, EXPRESSIONS[EXPRESSION_NAMES.index(old)]) for new, old in EMOTIONS.items()),
+    *ARKIT_MORPHS,
+)

@@ -1,0 +1,106 @@
+"""What makes a GLB a VRM 1.0 avatar: a skeleton, and the extension ``VRMC_vrm``.
+
+VRM Consortium, "VRMC_vrm-1.0". Each expression is a morph target: those of the shapes "vrm", four
+emotions, and ARKit's 52 for programs with "perfect sync". The format demands a whole body: the head
+gets the bones of one that stands in a T, without a mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from services.driver.head.morphs import EMOTIONS
+from shared.face.shapes import ARKIT, VRM
+
+Place = tuple[float, float, float]
+Bindings = Mapping[str, Sequence[tuple[int, int]]]  # morph: nodes, and its number in each
+
+_LOOK_DEGREES = {  # that ARKit's shapes turn the eyes by
+    "rangeMapHorizontalInner": 24.6,
+    "rangeMapHorizontalOuter": 24.6,
+    "rangeMapVerticalDown": 17.8,
+    "rangeMapVerticalUp": 12.0,
+}
+
+_LIMBS: tuple[tuple[str, str, Place], ...] = (
+    ("UpperLeg", "hips", (0.09, -0.05, 0)),
+    ("LowerLeg", "UpperLeg", (0, -0.4, 0)),
+    ("Foot", "LowerLeg", (0, -0.4, 0)),
+    ("UpperArm", "spine", (0.16, 0.33, 0)),
+    ("LowerArm", "UpperArm", (0.26, 0, 0)),
+    ("Hand", "LowerArm", (0.24, 0, 0)),
+)
+# Each bone with its parent, which comes first, and its place in m from there; the floor is at 0.
+BONES: tuple[tuple[str, str, Place], ...] = (
+    ("hips", "", (0, 0.93, 0)),
+    ("spine", "hips", (0, 0.12, 0)),
+    ("body", "spine", (0, 0.45, 0)),  # the head's pivot; no bone of the format
+    *(
+        (side + name, side + parent if parent[0].isupper() else parent, (sign * x, y, z))
+        for side, sign in (("left", 1), ("right", -1))
+        for name, parent, (x, y, z) in _LIMBS
+    ),
+)
+
+
+def extension(
+    name: str, nodes: Mapping[str, int], bindings: Bindings, eyes: Place, *, is_free: bool
+) -> dict[str, Any]:
+    """Describe an avatar.
+
+    Parameters
+    ----------
+    name
+        Its own.
+    nodes
+        Node of each bone.
+    bindings
+        Where the morph targets are.
+    eyes
+        From the head's pivot to between the eyes, m.
+    is_free
+        It is under CC0; else nothing is allowed but to its author.
+    """
+    bones = ["head", *(bone for bone, _, _ in BONES if bone != "body")]
+    return {
+        "specVersion": "1.0",
+        "meta": _meta(name, is_free=is_free),
+        "humanoid": {"humanBones": {bone: {"node": nodes[bone]} for bone in bones}},
+        "expressions": {
+            "preset": {each: _expression(bindings[each]) for each in (*VRM.names, *EMOTIONS)},
+            "custom": {each: _expression(bindings[each]) for each in ARKIT.names},
+        },
+        "lookAt": {
+            "type": "expression",
+            "offsetFromHeadBone": eyes,
+            **{
+                name: {"inputMaxValue": degrees, "outputScale": 1.0}
+                for name, degrees in _LOOK_DEGREES.items()
+            },
+        },
+    }
+
+
+def _expression(targets: Sequence[tuple[int, int]]) -> dict[str, Any]:
+    binds = [{"node": node, "index": index, "weight": 1.0} for node, index in targets]
+    return {"morphTargetBinds": binds}
+
+
+def _meta(name: str, *, is_free: bool) -> dict[str, Any]:
+    meta = {"name": name, "licenseUrl": "https://vrm.dev/licenses/1.0/", "authors": ["unknown"]}
+    if not is_free:
+        return meta
+    return meta | {
+        "authors": ["the kouxing authors"],
+        "otherLicenseUrl": "https://creativecommons.org/publicdomain/zero/1.0/",
+        "avatarPermission": "everyone",
+        "allowExcessivelyViolentUsage": True,
+        "allowExcessivelySexualUsage": True,
+        "commercialUsage": "corporation",
+        "allowPoliticalOrReligiousUsage": True,
+        "allowAntisocialOrHateUsage": True,
+        "creditNotation": "unnecessary",
+        "allowRedistribution": True,
+        "modification": "allowModificationRedistribution",
+    }

@@ -1,0 +1,127 @@
+"""The sound that a client says it sends, and whether what comes is that."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+from shared.errors import UserError
+
+SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
+RATES_HZ = (8000, 48000)
+MAX_FLOAT = 8.0  # of a sample; what is a little above 1 is clipped
+_FILES = {  # by how they begin
+    b"RIFF": "a WAV file",
+    b"OggS": "an Ogg file",
+    b"fLaC": "a FLAC file",
+    b"ID3": "an MP3 file",
+    b"FORM": "an AIFF file",
+    b"\x1aE\xdf\xa3": "WebM, as MediaRecorder makes it",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SoundFormat:
+    """The format of the PCM that a client sends."""
+
+    sample_rate_hz: int
+    num_channels: int = 1
+    encoding: str = "s16le"  # or f32le
+
+    def __post_init__(self) -> None:
+        rate_hz = self.sample_rate_hz
+        if type(rate_hz) is not int or not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
+            raise UserError(
+                f"sample_rate_hz must be a whole number of {RATES_HZ[0]} to {RATES_HZ[1]}, "
+                f"not {rate_hz!r}"
+            )
+        if type(self.num_channels) is not int or self.num_channels not in (1, 2):
+            raise UserError("num_channels must be 1 or 2")
+        if not isinstance(self.encoding, str) or self.encoding not in SAMPLE_BYTES:
+            raise UserError(f"encoding must be one of {', '.join(SAMPLE_BYTES)}")
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of one sample of all channels."""
+        return SAMPLE_BYTES[self.encoding] * self.num_channels
+
+    def __str__(self) -> str:
+        channels = "mono" if self.num_channels == 1 else "stereo"
+        return f"{self.encoding} samples, {self.sample_rate_hz} Hz {channels}, without a header"
+
+    def num_frames(self, pcm: bytes, *, is_first: bool) -> int:
+        """Return how many samples of each channel a binary message holds.
+
+        Parameters
+        ----------
+        is_first
+            Whether the sound begins with it, where files have their headers.
+
+        Raises
+        ------
+        UserError
+            If it cannot be of this format; says what was expected.
+        """
+        if is_first and (kind := _file_kind(pcm)):
+            raise UserError(f"expected {self}; this begins as {kind}")
+        if pcm[:1] == b"{" and _is_json(pcm):
+            raise UserError(f"expected {self}; this is JSON: send it as a text message")
+        num_frames, rest = divmod(len(pcm), self.frame_bytes)
+        if rest:
+            raise UserError(
+                f"expected {self}: a multiple of {self.frame_bytes} bytes; {len(pcm)} came"
+            )
+        if self.encoding == "f32le":
+            self._check_level(np.frombuffer(pcm, "<f4"))
+        return num_frames
+
+    def _check_level(self, samples: np.ndarray) -> None:
+        peak = float(np.abs(samples).max(initial=0.0))
+        if not peak <= MAX_FLOAT:  # or no number
+            raise UserError(
+                f"expected {self}, between -1 and 1; one is {peak:g}: divide integers by 32768, "
+                "or say encoding s16le"
+            )
+
+
+def check_text(text: str, expected: str) -> None:
+    """Refuse a text message that holds sound.
+
+    Parameters
+    ----------
+    expected
+        What may come.
+
+    Raises
+    ------
+    UserError
+        If it looks like base64.
+    """
+    if len(text) >= 16 and not text.lstrip().startswith("{") and _is_base64(text):
+        raise UserError(
+            f"expected {expected}; this text looks like base64: send the bytes as a binary message"
+        )
+
+
+def _file_kind(pcm: bytes) -> str:
+    kinds = (kind for begin, kind in _FILES.items() if pcm.startswith(begin))
+    return next(kinds, "an MP4 file" if pcm[4:8] == b"ftyp" else "")
+
+
+def _is_json(pcm: bytes) -> bool:
+    try:
+        json.loads(pcm)
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def _is_base64(text: str) -> bool:
+    try:
+        base64.b64decode(text.partition(",")[2] or text, validate=True)  # of a data URL, too
+    except ValueError:
+        return False
+    return True

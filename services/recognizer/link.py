@@ -1,0 +1,80 @@
+"""A session's messages to its synthesizer, and what a new synthesizer needs to go on.
+
+A face shows what it was told lately. A synthesizer that takes the place of a lost one is told the
+newest frame that was shown, then the last seconds of messages once more.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from shared.bus import Socket
+from shared.clock import to_samples
+from shared.reliable import ReliableSender
+from shared.wire.message import Message
+from shared.wire.speech import Acknowledge, ResumeFace, Speech
+
+KEPT = to_samples(3.0)  # samples of media time whose messages a new synthesizer is told
+
+
+class SynthesizerLink:
+    """Sends to one synthesizer after the other, and keeps what the next one needs."""
+
+    def __init__(self) -> None:
+        self._sender: ReliableSender | None = None
+        self._kept: deque[Message] = deque()  # acknowledged ones of the last KEPT samples
+        self._speech: Speech | None = None  # the newest one before them
+        self._shown: Acknowledge | None = None  # tells the newest frame
+
+    @property
+    def backlog(self) -> int:
+        """Number of messages not acknowledged yet."""
+        return self._sender.backlog if self._sender is not None else 0
+
+    def connect(self, socket: Socket, session: str, epoch: int, now_s: float) -> None:
+        """Send to a synthesizer from now on; first what a new one needs."""
+        messages = [*self._kept, *(self._sender.waiting if self._sender is not None else ())]
+        self._kept.clear()
+        self._sender = ReliableSender(socket, session, epoch)
+        if self._shown is not None:
+            shown = self._shown
+            resume = ResumeFace(media_time=shown.media_time, frame=shown.frame, faps=shown.faps)
+            self._sender.send(resume, now_s)
+        if self._speech is not None:
+            self._sender.send(self._speech, now_s)
+        for message in messages:
+            if not isinstance(message, ResumeFace):
+                self._sender.send(message, now_s)
+
+    def disconnect(self) -> None:
+        """Send nothing any more."""
+        self._sender = None
+        self.forget()
+
+    def send(self, message: Message, now_s: float) -> None:
+        """Send a message, if there is a synthesizer."""
+        if self._sender is not None:
+            self._sender.send(message, now_s)
+
+    def acknowledge(self, ack: Acknowledge, now_s: float) -> list[Message]:
+        """Return the messages that the synthesizer has now."""
+        if self._sender is None or ack.epoch != self._sender.epoch:
+            return []
+        if ack.frame:
+            self._shown = ack
+        known = self._sender.acknowledge(ack.sequence, now_s)
+        self._kept.extend(each for each in known if not isinstance(each, ResumeFace))
+        while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
+            oldest = self._kept.popleft()
+            if isinstance(oldest, Speech):
+                self._speech = oldest
+        return known
+
+    def forget(self) -> None:
+        """Keep nothing of what came before an interruption."""
+        self._kept.clear()
+        self._speech = None
+
+    def tick(self, now_s: float) -> int:
+        """Repeat what is not acknowledged after too long; return the number of messages."""
+        return self._sender.tick(now_s) if self._sender is not None else 0

@@ -1,0 +1,48 @@
+"""Services fail in the midst of a live session, and its face shows nothing of it but a pause."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from evaluation.commands import app
+from evaluation.system.faults import Timing
+from tests.system import DEMO
+
+pytestmark = pytest.mark.bench
+
+
+@pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
+def test_a_crash_loses_nothing_and_the_command_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, service: str
+) -> None:
+    monkeypatch.setattr("evaluation.system.faults.TIMING", Timing(length_s=6.0, fault_at_s=2.0))
+    monkeypatch.setattr("evaluation.system.live.END_LIMIT_S", 60.0)  # a busy machine starts slowly
+    fault, figures, logs = f"{service} killed", tmp_path / "faults.json", tmp_path / "logs"
+    arguments = [str(DEMO / "hello-female.wav"), "--fault", fault]
+    result = CliRunner().invoke(
+        app,
+        ["faults", *arguments, "--logs", str(logs), "--json", str(figures)],
+        env={"COLUMNS": "200"},
+    )
+    assert result.exit_code == 0, result.output
+    assert fault in result.stdout
+    ready = (logs / f"{service}-killed" / f"{service}.log").read_text("utf-8").count('"ready ')
+    assert ready == 2, "it was not killed"
+    (outcome,) = json.loads(figures.read_text(encoding="utf-8"))
+    assert (outcome["fault"], outcome["failure"], outcome["old_frames"]) == (fault, "", 0)
+    face = outcome["face"]
+    assert face["phones"] > 25
+    assert face["stood_s"] > 0
+    assert (face["phones_lost"], face["phones_doubled"]) == (0, 0)
+    assert (face["frames_lost"], face["frames_doubled"]) == (0, 0)
+    assert face["largest_step"] < 2.0, face["largest_step_fap"]
+
+
+def test_an_unknown_fault_is_named() -> None:
+    result = CliRunner().invoke(app, ["faults", "--fault", "flood"])
+    assert result.exit_code != 0
+    assert "'flood' is no fault" in str(result.exception)

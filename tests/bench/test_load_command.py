@@ -1,0 +1,35 @@
+"""The load command speaks into many sessions and says what they cost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from evaluation.commands import bench_app
+from tests.system import VOWELS_FILE
+
+pytestmark = pytest.mark.bench
+
+
+def test_it_prints_a_table_writes_the_same_figures_and_draws_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("evaluation.system.load.SETTLE_S", 1.0)
+    figures, picture = tmp_path / "load.json", tmp_path / "load.png"
+    arguments = ["load", str(VOWELS_FILE), "--sessions", "3", "--seconds", "1"]
+    result = CliRunner().invoke(
+        bench_app, [*arguments, "--json", str(figures), "--picture", str(picture)]
+    )
+    assert result.exit_code == 0, result.output
+    load = json.loads(figures.read_text(encoding="utf-8"))
+    assert [step["num_asked"] for step in load["steps"]] == [1, 2, 3]
+    for step in load["steps"]:
+        assert step["num_sessions"] + sum(step["refusals"].values()) == step["num_asked"]
+        assert 0 < step["delay_ms"]["p50"] <= step["delay_ms"]["p95"]
+        assert set(step["cpu_cores"]) == {"control", "recognizer", "synthesizer"}
+        assert step["memory_mb"]["recognizer"] > 50
+    assert f"{load['steps'][0]['delay_ms']['p50']:.1f}" in result.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,124 @@
+"""Containers without an engine: a process with what a container would have, and no more.
+
+It has a network and a file system of its own that can only be read, but for ``/tmp``; the
+environment, secrets and hosts that its description names; and a user without rights, but to read
+this machine's Python wherever that lies. In a changed root (``chroot``), whose file system nobody
+can set apart, it has that of the machine.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from evaluation.system.network import Network
+from tests.system import ROOT
+
+USER = 10001
+READ = "+dac_read_search"
+BECOME_USER = f"""
+exec setpriv --reuid={USER} --regid={USER} --clear-groups --no-new-privs \
+    --bounding-set=-all,{READ} --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "$@"
+"""
+# Arguments: folder of secrets, file of hosts, then the command.
+ENTER = f"""
+mount --make-rprivate /
+mount -t tmpfs tmpfs /run
+mkdir /run/secrets
+cp "$1"/* /run/secrets
+cp "$2" /run/hosts
+shift 2
+chown {USER} /run/secrets/*
+chmod 400 /run/secrets/*
+mount --bind /run/hosts /etc/hosts
+mount -t tmpfs -o noexec,nosuid,nodev tmpfs /tmp
+findmnt --raw --noheadings --output TARGET | grep -vE '^/(tmp|run|proc|sys|dev)(/|$)' |
+    while read -r target; do mount -o remount,bind,ro "$target"; done
+mount -o remount,bind,ro /run
+{BECOME_USER}"""
+ENTER_WITHOUT_ROOT = f"""
+chown {USER} "$1"/*
+chmod 400 "$1"/*
+export CREDENTIALS_DIRECTORY="$1"
+shift 2
+{BECOME_USER}"""
+
+
+def image_environment() -> dict[str, str]:
+    """Return the variables that the image sets, without its paths of programs."""
+    text = (ROOT / "deploy" / "Dockerfile").read_text("utf-8").replace("\\\n", " ")
+    (line,) = re.findall(r"^ENV (.*)$", text, re.MULTILINE)
+    variables = dict(each.split("=", 1) for each in line.split())
+    return {name: value for name, value in variables.items() if name != "PATH"}
+
+
+class Containers:
+    """Containers by name, on one network.
+
+    Parameters
+    ----------
+    network
+        Has a host for each of them.
+    names
+        Names by which they find others, and the hosts that bear them.
+    """
+
+    def __init__(self, folder: Path, network: Network, names: Mapping[str, str]) -> None:
+        self._folder = folder
+        self._network = network
+        self._names = names
+        self._has_root = not subprocess.run(["unshare", "--mount", "true"], check=False).returncode
+        self._hosts = folder / "hosts"
+        self._hosts.write_text(
+            "127.0.0.1 localhost\n"
+            + "".join(f"{network.bound(host)} {name}\n" for name, host in names.items())
+        )
+
+    def start(
+        self,
+        host: str,
+        arguments: Sequence[str],
+        environment: Mapping[str, str],
+        secrets: Mapping[str, Path],
+    ) -> subprocess.Popen[bytes]:
+        """Start ``kouxing`` with arguments in a container on a host; its output is in a log."""
+        folder = self._folder / f"{host}-secrets"
+        folder.mkdir()
+        for name, path in secrets.items():
+            (folder / name).write_bytes(path.read_bytes())
+        program = [sys.executable, "-m", "services", *arguments]
+        enter = ["unshare", "--mount", "sh", "-ec", ENTER]
+        if not self._has_root:
+            folder.parent.chmod(0o755)
+            enter = ["sh", "-ec", ENTER_WITHOUT_ROOT]
+            environment = {name: self._by_number(each) for name, each in environment.items()}
+        enter += ["sh", str(folder), str(self._hosts)]
+        own = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT)}
+        with self.log(host).open("ab") as log:
+            return subprocess.Popen(
+                self._network.command(host, *enter, *program),
+                env={**own, **image_environment(), **environment},
+                cwd=ROOT,
+                stdout=log,
+                stderr=log,
+            )
+
+    def _by_number(self, value: str) -> str:
+        """Return an address with the host's number for its name."""
+        for name, host in self._names.items():
+            value = value.replace(f"//{name}:", f"//{self._network.bound(host)}:")
+        return value
+
+    def log(self, host: str) -> Path:
+        """Return where the output of a container is."""
+        return self._folder / f"{host}.log"
+
+    def is_healthy(self, host: str, check: Sequence[str]) -> bool:
+        """Return whether a health check that starts Python succeeds in a container."""
+        assert check[0] == "python"
+        command = self._network.command(host, sys.executable, *check[1:])
+        done = subprocess.run(command, check=False, stderr=subprocess.DEVNULL, timeout=30)
+        return done.returncode == 0

@@ -1,0 +1,83 @@
+"""Control between services that only say that they start what it asks for."""
+
+from __future__ import annotations
+
+import time
+
+import zmq
+
+from evaluation.system.attackers import connect
+from services.control.config import ControlConfig
+from services.control.service import ControlService
+from shared.bus import Bus, Socket
+from shared.keys import Key, own_key
+from shared.wire.codec import decode, encode
+from shared.wire.control import Heartbeat, StartSession
+from shared.wire.message import Message
+from shared.wire.session import Done, OpenSession
+
+LOCAL = "tcp://127.0.0.1:*"
+PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
+
+
+class Stage:
+    """Control, and two services that start whatever it says."""
+
+    def __init__(self, *, insecure: bool) -> None:
+        self.control = ControlService(
+            ControlConfig(
+                commands=LOCAL, events=LOCAL, insecure=insecure, lost_after_s=60.0, max_load=1000.0
+            )
+        )
+        self.buses = []
+        self.services = []
+        for kind, provided in PROVIDED.items():
+            bus = Bus(None if insecure else own_key(kind, (f"service:{kind}",)))
+            service = bus.connect_dealer(self.control.endpoints["commands"])
+            endpoints = dict.fromkeys(provided, "tcp://127.0.0.1:1")
+            service.send(
+                Heartbeat(
+                    service=kind, instance=kind, role="worker", state="ready", sent_ns=0,
+                    endpoints=endpoints,
+                )
+            )  # fmt: skip
+            self.buses.append(bus)
+            self.services.append(service)
+        self.strangers: list[zmq.Socket[bytes]] = []
+        self.sockets = zmq.Context()
+        while not all(service.wait(0.0) for service in self.services):  # they are registered
+            self.control.step(0.01)
+
+    def close(self) -> None:
+        for raw in self.strangers:
+            raw.close(linger=0)
+        self.sockets.term()
+        for bus in (*self.buses, self.control.bus):
+            bus.close()
+
+    def stranger(self, key: Key | None) -> zmq.Socket[bytes]:
+        """Return a socket that calls itself as all others do."""
+        raw = self.sockets.socket(zmq.DEALER)
+        self.strangers.append(raw)
+        raw.setsockopt(zmq.ROUTING_ID, b"the same")
+        endpoint = self.control.endpoints["commands"]
+        raw.connect(endpoint) if key is None else connect(raw, endpoint, key)
+        return raw
+
+    def open(self, raw: zmq.Socket[bytes], session: str, request: str = "1") -> Message:
+        """Ask for a session; return the answer."""
+        raw.send_multipart(encode(OpenSession(request=request, session=session)))
+        end_s = time.monotonic() + 20
+        while not raw.poll(0):
+            assert time.monotonic() < end_s
+            self.control.step(0.01)
+            for service in self.services:
+                self._start(service)
+        answer = decode(raw.recv_multipart())
+        assert isinstance(answer, Message)
+        return answer
+
+    def _start(self, service: Socket) -> None:
+        for received in service.receive():
+            if isinstance(start := received.message, StartSession):
+                service.send(Done(session=start.session, request=start.request))

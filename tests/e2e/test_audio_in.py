@@ -1,0 +1,232 @@
+"""Sound from other programs' protocols, through the gateway into real services."""
+
+from __future__ import annotations
+
+import asyncio
+import difflib
+import json
+import socket
+import wave
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import aiohttp
+import aioice
+import numpy as np
+import pytest
+from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
+from aiortc.contrib.media import MediaPlayer
+
+from evaluation.system.chromium import wait_until
+from services.gateway.wire import FAP_TYPE, SHAPES_TYPE
+from shared.face.shapes import ARKIT
+from shared.phones.inventory import load_inventory
+from tests.e2e.following import samples_of_file, stream
+from tests.scripted_system import Gateway
+from tests.system import DEMO, System, free_port
+
+pytestmark = pytest.mark.e2e
+
+SDP = "application/sdp"
+OPEN_JAW = 2  # index of FAP 3
+SPOKEN = DEMO / "lake-male.wav"
+Socket = aiohttp.ClientWebSocketResponse
+
+
+@pytest.fixture(scope="module")
+def vosk_port() -> int:
+    return free_port()
+
+
+@pytest.fixture(scope="module")
+def gateway(system: System, vosk_port: int) -> Iterator[Gateway]:
+    gateway = Gateway(system.control, free_port(), vosk_port=str(vosk_port))
+    wait_until(lambda: is_answered(gateway.page), 60)
+    yield gateway
+    assert gateway.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def expected(system: System) -> list[str]:
+    """The phones of the recording, without its pauses."""
+    silence = load_inventory().silence
+    symbols = stream(system.control, samples_of_file(SPOKEN)).symbols
+    return [symbol for symbol in symbols if symbol != silence]
+
+
+def is_answered(page: str) -> bool:
+    address = urlsplit(page)
+    with socket.socket() as probe:
+        return probe.connect_ex((str(address.hostname), address.port or 0)) == 0
+
+
+async def ask(client: Socket, message: str | bytes) -> dict[str, Any]:
+    """Send a message and return its reply, as the clients of vosk-server do."""
+    if isinstance(message, str):
+        await client.send_str(message)
+    else:
+        await client.send_bytes(message)
+    return dict(await client.receive_json(timeout=60))
+
+
+def connect(url: str, converse: Callable[[Socket], Coroutine[None, None, None]]) -> None:
+    async def run() -> None:
+        async with aiohttp.ClientSession() as http, http.ws_connect(url) as client:
+            await converse(client)
+
+    asyncio.run(run())
+
+
+def words_of(replies: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [word for reply in replies for word in reply.get("result", ())]
+
+
+def test_a_client_of_vosk_server_gets_the_phones_in_its_shape(
+    gateway: Gateway, vosk_port: int, expected: list[str]
+) -> None:
+    replies: list[dict[str, Any]] = []
+
+    async def recognize(client: Socket) -> None:
+        with wave.open(str(SPOKEN)) as file:
+            rate_hz = file.getframerate()
+            await client.send_str('{ "config" : { "sample_rate" : %d } }' % rate_hz)  # noqa: UP031
+            while data := file.readframes(int(rate_hz * 0.2)):
+                replies.append(await ask(client, data))
+        replies.append(await ask(client, '{"eof" : 1}'))
+        assert (await client.receive(60)).type is aiohttp.WSMsgType.CLOSE
+
+    connect(f"ws://localhost:{vosk_port}", recognize)
+    assert len(replies) == 19
+    assert all(reply.keys() in ({"partial"}, {"result", "text"}) for reply in replies[:-1])
+    words = words_of(replies)
+    assert [word["word"] for word in words] == expected
+    assert " ".join(reply["text"] for reply in replies if "text" in reply).split() == expected
+    assert all(word.keys() == {"word", "start", "end", "conf"} for word in words)
+    times = [time for word in words for time in (word["start"], word["end"])]
+    assert times == sorted(times)
+    assert 0 < times[0] < times[-1] < 3.6
+
+
+def test_a_whole_wav_file_needs_no_config(gateway: Gateway, expected: list[str]) -> None:
+    replies: list[dict[str, Any]] = []
+
+    async def recognize(client: Socket) -> None:
+        with SPOKEN.open("rb") as file:  # its header, too
+            while data := file.read(8000):
+                replies.append(await ask(client, data))
+        replies.append(await ask(client, '{"eof" : 1}'))
+
+    connect(f"{gateway.page}vosk", recognize)
+    assert [word["word"] for word in words_of(replies)] == expected
+
+
+def test_speech_that_is_synthesized_ahead_can_be_interrupted(
+    gateway: Gateway, expected: list[str]
+) -> None:
+    replies: list[dict[str, Any]] = []
+    pcm = (samples_of_file(SPOKEN) * 32767).astype("<i2").tobytes()
+
+    async def speak(client: Socket) -> None:
+        await client.send_str('{"config": {"sample_rate": 16000, "ahead": true}}')
+        for _ in range(7):  # 25 s
+            replies.append(await ask(client, pcm))
+        replies.append(await ask(client, '{"flush": 1}'))
+        replies.append(await ask(client, pcm))
+        replies.append(await ask(client, '{"eof" : 1}'))
+
+    connect(f"{gateway.page}vosk", speak)
+    symbols = [word["word"] for word in words_of(replies)]
+    assert len(symbols) < 5 * len(expected)
+    spoken_last = symbols[-len(expected) :]  # recognised a little otherwise after the cut
+    assert difflib.SequenceMatcher(None, spoken_last, expected).ratio() > 0.8
+
+
+def test_sound_in_a_wrong_format_is_an_error_and_the_end(gateway: Gateway) -> None:
+    async def send(client: Socket) -> None:
+        await client.send_str('{"config": {"sample_rate": 0}}')
+        reply = await ask(client, bytes(640))
+        assert "sample_rate_hz must be a whole number of 8000 to 48000, not 0" in reply["error"]
+        assert (await client.receive(60)).type is aiohttp.WSMsgType.CLOSE
+        assert client.close_code == aiohttp.WSCloseCode.UNSUPPORTED_DATA
+
+    connect(f"{gateway.page}vosk", send)
+
+
+async def offer(peer: RTCPeerConnection) -> str:
+    await peer.setLocalDescription(await peer.createOffer())
+    return peer.localDescription.sdp
+
+
+def test_webrtc_brings_sound_and_takes_frames_back(
+    gateway: Gateway, expected: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
+    faces: list[np.ndarray] = []
+    weights: list[np.ndarray] = []
+    phones: dict[int, str] = {}
+
+    def receive(message: str | bytes) -> None:
+        if isinstance(message, bytes):
+            values = np.frombuffer(message, "<f4", offset=16)
+            if message[0] == FAP_TYPE:
+                faces.append(values)
+            elif message[0] == SHAPES_TYPE:
+                weights.append(values)
+        elif (told := json.loads(message))["type"] == "phone":
+            phones[told["index"]] = told["symbol"]
+
+    async def call() -> None:
+        peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        track = MediaPlayer(str(SPOKEN)).audio
+        assert track is not None
+        peer.addTrack(track)
+        peer.createDataChannel("face").on("message", receive)
+        url, headers = f"{gateway.page}whip?shapes=arkit", {"Content-Type": SDP}
+        async with (
+            aiohttp.ClientSession() as http,
+            http.post(url, data=await offer(peer), headers=headers) as answer,
+        ):
+            assert answer.status == 201
+            sdp = await answer.text()
+            hosts = {line.split()[4] for line in sdp.splitlines() if "a=candidate" in line}
+            assert hosts == {"127.0.0.1"}
+            await peer.setRemoteDescription(RTCSessionDescription(sdp, "answer"))
+            async with asyncio.timeout(60):
+                while len(phones) < len(expected) / 2:
+                    await asyncio.sleep(0.05)
+            resource = gateway.page.rstrip("/") + answer.headers["Location"]
+            async with http.delete(resource) as ended:
+                assert ended.status == 200
+        await peer.close()
+
+    asyncio.run(call())
+    silence = load_inventory().silence
+    heard = [phones[index] for index in sorted(phones) if phones[index] != silence]
+    assert difflib.SequenceMatcher(None, heard, expected[: len(heard)]).ratio() > 0.5
+    assert max(face[OPEN_JAW] for face in faces) > 100
+    assert max(each[ARKIT.names.index("jawOpen")] for each in weights) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "status", "told"),
+    [
+        ("{}", "application/json", 415, "expected an SDP offer (application/sdp)"),
+        ("hello", SDP, 422, "expected"),
+        ("v=0\r\n", SDP, 422, "an audio track in Opus"),
+        ("v=0\r\nm=audio x", SDP, 422, "expected an SDP offer"),
+        (b"\xff\xfe", SDP, 422, "expected"),
+    ],
+)
+def test_what_is_no_offer_of_opus_is_refused(
+    gateway: Gateway, body: str | bytes, kind: str, status: int, told: str
+) -> None:
+    async def post() -> None:
+        headers = {"Content-Type": kind}
+        async with (
+            aiohttp.ClientSession() as http,
+            http.post(f"{gateway.page}whip", data=body, headers=headers) as answer,
+        ):
+            assert (answer.status, told in await answer.text()) == (status, True)
+
+    asyncio.run(post())

@@ -1,0 +1,81 @@
+"""Workers on a Ray cluster of three nodes: placed, started again elsewhere, taken away."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ray.cluster_utils import Cluster
+
+from shared.client import Client
+from shared.wire.control import StatusReport
+from tests.e2e.following import samples_of_file, stream
+from tests.system import VOWELS_FILE, System, kouxing
+
+pytestmark = pytest.mark.e2e
+NODE = {"object_store_memory": 80 << 20, "include_dashboard": False}
+
+
+@pytest.fixture
+def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **NODE})
+    try:
+        for _ in range(2):
+            cluster.add_node(num_cpus=2, **NODE)
+        yield cluster
+    finally:
+        cluster.shutdown()
+
+
+@pytest.fixture
+def control(tmp_path: Path) -> Iterator[System]:
+    with System(["control"], tmp_path, settings={"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as running:
+        yield running
+
+
+def workers(report: StatusReport) -> dict[str, str]:
+    """Return the kinds of the workers by instance."""
+    return {each.instance: each.service for each in report.services if each.role == "worker"}
+
+
+@pytest.mark.timeout(400)  # of a busy machine
+def test_workers_are_placed_started_again_elsewhere_and_taken_away(
+    nodes: Cluster, control: System
+) -> None:
+    def scale(**numbers: int) -> str:
+        options = [text for name, number in numbers.items() for text in (f"--{name}", number)]
+        done = kouxing(
+            "cluster", "--address", nodes.address, *options, environment=control.environment
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    listed = scale(recognizers=1, synthesizers=1)
+    assert "recognizer-0" in listed
+    assert "synthesizer-0" in listed
+    control.wait_until(lambda report: len(workers(report)) == 2)
+    with Client(control.control) as client:
+        first = workers(client.status())
+    samples = samples_of_file(VOWELS_FILE)
+    assert stream(control.control, samples).ended
+
+    nodes.remove_node(nodes.worker_nodes.copy().pop())  # one of them was there: Ray spreads them
+    control.wait_until(
+        lambda report: (
+            sorted(workers(report).values()) == ["recognizer", "synthesizer"]
+            and workers(report) != first
+        )
+    )
+    assert stream(control.control, samples).ended
+
+    assert "waits for a free core" in scale(recognizers=2)
+    assert "no worker runs" in scale(recognizers=0, synthesizers=0)
+    control.wait_until(lambda report: not workers(report))
+
+
+def test_without_a_cluster_on_this_host_the_way_to_one_is_told() -> None:
+    refused = kouxing("cluster")
+    assert refused.returncode == 2
+    assert "'ray start --head' begins one" in refused.stderr

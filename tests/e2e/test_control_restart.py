@@ -1,0 +1,69 @@
+"""Nobody notices that control was killed and started again while a session runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.client import Client
+from shared.face.shapes import ARKIT, VRM
+from shared.wire.face import Shapes
+from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send
+from tests.system import DEMO, System
+
+pytestmark = pytest.mark.e2e
+SERVICES = ("control", "recognizer", "synthesizer", "driver")
+
+
+def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: Path) -> None:
+    samples = samples_of_file(DEMO / "hello-female.wav")[:64000]
+    with System(SERVICES, tmp_path) as system, Client(system.control) as client:
+        session = client.open_session(encoding="f32le", shapes=["vrm"])
+        opened = session.opened
+        output = session.subscribe(*KINDS, Shapes)
+        collected = Collected()
+        send(session, samples[:16000], output, collected, paced=True)
+        client.choose_expressiveness(session.name, 1.8)
+        client.add_shapes(session.name, ["arkit"])
+        killed = system.processes.pop("control")
+        killed.kill()
+        killed.wait()
+        send(session, samples[16000:32000], output, collected, paced=True)
+        system.start("control")
+        session.express({"joy": 0.5})  # asked before control knows the session
+        send(session, samples[32000:40000], output, collected, paced=True)
+        assert session.opened == opened, "it has not moved"
+        (state,) = client.status().sessions
+        assert (state.session, state.state) == (session.name, "open")
+        assert {*state.workers} == {"audio", "phones", "phone_input", "faps"}
+
+        system.start_beside("synthesizer", "other")
+        lost = system.processes.pop("synthesizer")
+        lost.kill()
+        lost.wait()
+        send(session, samples[40000:], output, collected, paced=True)
+        finish(session, output, collected)
+        assert session.opened.epoch == 2, "the new control tells the client that it has moved"
+        session.flush()
+        session.close()
+        assert not client.status().sessions
+        system.assert_all_alive()
+
+    for name, shapes in (("vrm", VRM), ("arkit", ARKIT)):
+        published = [each for each in collected.shapes if each.set == name]
+        assert {each.epoch for each in published} == {1, 2}
+        first = published[0].media_time
+        frames = [frame for frame in collected.frames if frame.media_time >= first]
+        for frame, each in zip(frames, published, strict=True):
+            assert (each.sequence, each.media_time) == (frame.sequence, frame.media_time)
+            found = shapes.weights(np.frombuffer(frame.values, "<f4"))
+            np.testing.assert_array_equal(np.frombuffer(each.weights, "<f4"), found)
+    before = [frame for frame in collected.frames if frame.epoch == 1]
+    assert [frame.sequence for frame in before] == [*range(1, len(before) + 1)]
+    sounds = [sound for sound in collected.sounds if sound.epoch == 1]
+    ends = [sound.media_time + len(sound.pcm) // 2 for sound in sounds]
+    assert [sound.media_time for sound in sounds] == [0, *ends[:-1]]
+    assert ends[-1] >= 40000
+    assert "taken over" in system.log("control")

@@ -1,0 +1,61 @@
+"""The subscribers of examples/subscribe follow a session, each in its language."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from shared.client import Client
+from tests.e2e.following import samples_of_file, stream_into
+from tests.system import ROOT, VOWELS_FILE, System
+
+FOLDER = ROOT / "examples" / "subscribe"
+NODE = str(Path(sys.executable).with_name("node"))
+
+pytestmark = pytest.mark.e2e
+
+
+@pytest.fixture
+def programs(tmp_path: Path) -> list[list[str]]:
+    """The commands that start them."""
+    shutil.copy(FOLDER / "follow.mjs", tmp_path)
+    (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
+    program = tmp_path / "follow"
+    options = ["-std=c11", "-Wall", "-Werror", "-lzmq"]
+    subprocess.run(["cc", FOLDER / "follow.c", "-o", program, *options], check=True)
+    return [
+        [sys.executable, str(FOLDER / "follow.py")],
+        [NODE, str(tmp_path / "follow.mjs")],
+        [str(program)],
+    ]
+
+
+def test_they_follow_a_face_to_its_end(system: System, programs: list[list[str]]) -> None:
+    name = "followed-by-examples"
+    address = system.control.partition(" ")[0]
+    with ExitStack() as stack, Client(system.control) as client:
+        running = [
+            stack.enter_context(
+                subprocess.Popen([*program, name, address], stdout=subprocess.PIPE, text=True)
+            )
+            for program in programs
+        ]
+        session = client.open_session(session=name, encoding="f32le", paced=False)
+        for each in running:
+            assert each.stdout is not None
+            assert each.stdout.readline() == f"following {name}\n"
+        stream_into(session, samples_of_file(VOWELS_FILE), chunk=1600)
+        outputs = [each.communicate(timeout=60)[0].splitlines() for each in running]
+        session.close()
+    assert [each.returncode for each in running] == [0, 0, 0]
+    assert outputs[0] == outputs[1] == outputs[2]
+    times_s, jaw = zip(*(map(float, line.split()) for line in outputs[0]), strict=True)
+    assert len(jaw) > 100
+    assert sorted(times_s) == list(times_s)
+    assert 0.2 < max(jaw) <= 1, "/a/ opens the jaw"
+    assert min(jaw) == 0

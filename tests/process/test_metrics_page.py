@@ -1,0 +1,144 @@
+"""What real services serve for Prometheus is what the documents and the dashboard name."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from prometheus_client import Metric
+from prometheus_client.parser import text_string_to_metric_families
+
+from shared.audio_file import read_audio
+from shared.client import Client
+from shared.config import variable
+from shared.wire.face import EndOfFaps, FapFrame
+from tests.system import ROOT, VOWELS_FILE, System, free_port
+
+pytestmark = pytest.mark.process
+
+SERVICES = ("control", "recognizer", "synthesizer")
+ELSEWHERE = {"frames_missed", "videos", "video_seconds"}  # of services that do not run here
+NUM_CHUNKS = 4
+SUFFIXES = ("_total", "_bucket", "_count", "_sum")
+
+
+@pytest.fixture(scope="module")
+def families(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, list[Metric]]]:
+    """What each service serves while a session of its own is open."""
+    ports = {service: free_port() for service in SERVICES}
+    settings = {variable(name, "metrics_port"): str(port) for name, port in ports.items()}
+    folder = tmp_path_factory.mktemp("metrics")
+    with System(SERVICES, folder, settings=settings) as system, Client(system.control) as client:
+        samples, rate_hz = read_audio(VOWELS_FILE)
+        session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz, paced=False)
+        output = session.subscribe(FapFrame, EndOfFaps)
+        for part in np.array_split(samples, NUM_CHUNKS):
+            assert session.send(part)
+        session.finish()
+        while not any(isinstance(each.message, EndOfFaps) for each in output.receive()):
+            assert output.wait(60.0)
+        before = _heartbeats(client)
+        system.wait_until(lambda _: _heartbeats(client) > before + 2)  # they set the gauges
+        yield {
+            name: list(text_string_to_metric_families(_page(port))) for name, port in ports.items()
+        }
+
+
+def _heartbeats(client: Client) -> float:
+    return client.status().services[0].metrics["in_heartbeat"]
+
+
+def _page(port: int) -> str:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
+        text: str = page.read().decode()
+        return text
+
+
+def _value(families: list[Metric], name: str, **labels: str) -> float:
+    (value,) = (
+        sample.value
+        for family in families
+        for sample in family.samples
+        if sample.name == name and labels.items() <= sample.labels.items()
+    )
+    return value
+
+
+def _names(families: dict[str, list[Metric]]) -> set[str]:
+    return {family.name for each in families.values() for family in each}
+
+
+def test_a_session_is_seen_in_the_figures_of_all(families: dict[str, list[Metric]]) -> None:
+    for service in SERVICES:
+        assert _value(families[service], "kouxing_sessions", service=service) == 1
+        assert 0 <= _value(families[service], "kouxing_load") <= 1
+    recognizer, synthesizer = families["recognizer"], families["synthesizer"]
+    chunks = _value(recognizer, "kouxing_messages_received_total", kind="audio-chunk")
+    assert chunks == NUM_CHUNKS
+    assert _value(recognizer, "kouxing_chunk_seconds_count") > 0
+    assert _value(recognizer, "kouxing_unacknowledged_messages") == 0
+    frames = _value(synthesizer, "kouxing_messages_published_total", kind="fap-frame")
+    assert frames > 100
+    assert _value(families["control"], "kouxing_events_total", event="session-opened") == 1
+    assert _value(families["control"], "kouxing_services") == len(SERVICES)
+
+
+def test_the_page_names_every_metric(families: dict[str, list[Metric]]) -> None:
+    page = (ROOT / "docs" / "metrics.md").read_text("utf-8")
+    documented = {
+        re.sub("_total$", "", name) for name in re.findall(r"`((?:kouxing|process)_\w+)`", page)
+    }
+    elsewhere = {f"kouxing_{name}" for name in ELSEWHERE}
+    assert documented == {re.sub("_total$", "", name) for name in _names(families)} | elsewhere
+
+
+def test_every_metric_of_the_dashboard_is_served(families: dict[str, list[Metric]]) -> None:
+    dashboard = json.loads((ROOT / "deploy" / "grafana.json").read_text("utf-8"))
+    served = {name for each in families.values() for family in each for name in _forms(family)}
+    for panel in dashboard["panels"]:
+        for target in panel["targets"]:
+            names = re.findall(r"\b(?:kouxing|process)_\w+", target["expr"])
+            assert names, panel["title"]
+            assert set(names) <= served, panel["title"]
+
+
+def _forms(family: Metric) -> set[str]:
+    suffixes = {"counter": SUFFIXES[:1], "histogram": SUFFIXES[1:], "gauge": ("",)}
+    return {f"{family.name}{suffix}" for suffix in suffixes[family.type]}
+
+
+def test_the_dashboard_is_one_that_grafana_imports() -> None:
+    dashboard: dict[str, Any] = json.loads((ROOT / "deploy" / "grafana.json").read_text("utf-8"))
+    panels = dashboard["panels"]
+    assert dashboard["uid"]
+    assert dashboard["schemaVersion"] >= 39
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    places = {(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in panels}
+    assert len(places) == len(panels)
+    variables = {each["name"] for each in dashboard["templating"]["list"]}
+    used = set(re.findall(r"\$\{?(\w+)", json.dumps(panels))) - {"__rate_interval"}
+    assert used == variables
+
+
+def test_nothing_is_served_unasked(tmp_path: Path) -> None:
+    with System(["control"], tmp_path) as system:
+        number = system.processes["control"].pid
+        sockets = set()
+        for link in Path(f"/proc/{number}/fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # it opens and closes files meanwhile
+                sockets.add(link.readlink().name)
+        table = Path(f"/proc/{number}/net/tcp").read_text("ascii").splitlines()[1:]
+        rows = [line.split() for line in table]
+        listening = {
+            int(row[1].rpartition(":")[2], 16)
+            for row in rows
+            if row[3] == "0A" and f"socket:[{row[9]}]" in sockets
+        }
+    assert listening == system.ports

@@ -1,0 +1,85 @@
+"""How other programs read a face that is sent to them, byte by byte as they are specified."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pythonosc.osc_bundle import OscBundle
+
+from services.senders import live_link, osc, vmc
+from services.senders.face import Face
+from services.senders.target import Target, parse_target
+from services.senders.vtube_studio import Dialogue, parameters
+
+# what can be sent, each to a program that reads it otherwise
+SENT = (
+    "vmc://", "vmc://?shapes=arkit", "livelink://", "osc://", "osc://?shapes=oculus", "vts://",
+)  # fmt: skip
+Messages = list[tuple[str, list[Any]]]
+
+
+def received(url: str, faps: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what moves the avatar of a program that is sent a face of FAPs (68,)."""
+    target, face = parse_target(url), Face(faps, 0.0)
+    return np.array(_READERS[target.protocol](face, target), np.float32)
+
+
+def _read_vmc(face: Face, target: Target) -> list[float]:
+    messages = read_osc(list(vmc.encode(face, target)))
+    return [params[1] for address, params in messages if address == "/VMC/Ext/Blend/Val"]
+
+
+def _read_plain_osc(face: Face, target: Target) -> list[float]:
+    messages = dict(read_osc(list(osc.encode(face, target))))
+    for other in ("time", "head"):
+        del messages[target.prefix + other]
+    return [value for (value,) in messages.values()]
+
+
+def _read_vtube_studio(face: Face, _target: Target) -> list[float]:
+    dialogue = Dialogue("token", lambda _: None)
+    known = [{"name": name} for name in parameters(face, is_mouth_only=True)]
+    listed = {"defaultParameters": known, "customParameters": []}
+    dialogue.answer(json.dumps({"messageType": "InputParameterListResponse", "data": listed}))
+    frame = json.loads(dialogue.frame(face, is_mouth_only=True))
+    return [each["value"] for each in frame["data"]["parameterValues"]]
+
+
+_READERS = {
+    "vmc": _read_vmc,
+    "osc": _read_plain_osc,
+    "livelink": lambda face, target: read_live_link(live_link.encode(face, target, 0.0))["values"],
+    "vts": _read_vtube_studio,
+}
+
+
+def read_osc(datagrams: list[bytes]) -> Messages:
+    """Return addresses and arguments of bundles, each small enough for one packet."""
+    assert all(len(datagram) <= 1500 - 28 for datagram in datagrams)
+    return [(each.address, each.params) for datagram in datagrams for each in OscBundle(datagram)]
+
+
+def read_live_link(datagram: bytes) -> dict[str, Any]:
+    """Return the fields of a datagram of version 6, read as Unreal does."""
+    version, id_length = struct.unpack_from(">Bi", datagram)
+    offset = 5 + id_length
+    device = datagram[5:offset].decode()
+    (name_length,) = struct.unpack_from(">i", datagram, offset)
+    offset += 4 + name_length
+    name = datagram[offset - name_length : offset].decode()
+    frame, part, rate_hz, denominator, num_values = struct.unpack_from(">ifiiB", datagram, offset)
+    offset += 17
+    values = struct.unpack_from(f">{num_values}f", datagram, offset)
+    assert offset + 4 * num_values == len(datagram), "bytes that nobody reads"
+    return {
+        "version": version,
+        "device": device,
+        "name": name,
+        "frame": (frame, part),
+        "rate_hz": rate_hz / denominator,
+        "values": values,
+    }

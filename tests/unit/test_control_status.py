@@ -1,0 +1,107 @@
+"""The state of a system of any size, in pages."""
+
+from __future__ import annotations
+
+import secrets
+import time
+
+import pytest
+
+from services.control import service as control_service
+from shared.bus import Socket
+from shared.wire.control import Heartbeat, StatusReport, StatusRequest
+from shared.wire.session import Error
+from tests.control_stage import Stage
+
+pytestmark = pytest.mark.unit
+
+
+def ask(stage: Stage, client: Socket, **fields: object) -> StatusReport | Error:
+    """Return the answer to a status request."""
+    request = secrets.token_hex(4)  # an answer of before is not given again
+    client.send(StatusRequest(request=request, **fields))  # type: ignore[arg-type]
+    end_s = time.monotonic() + 20
+    while True:
+        assert time.monotonic() < end_s
+        stage.control.step(0.01)
+        for received in client.receive():
+            if isinstance(answer := received.message, StatusReport | Error):
+                return answer
+
+
+def open_sessions(stage: Stage, number: int) -> list[str]:
+    names = [f"s{each}" for each in range(number)]
+    raw = stage.stranger(None)
+    for name in names:
+        stage.open(raw, name, request=name)
+    return names
+
+
+def test_all_pages_together_have_everything_once(
+    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = open_sessions(stage, 5)
+    whole = ask(stage, client)
+    assert isinstance(whole, StatusReport)
+    assert whole.next == 0
+    monkeypatch.setattr(control_service, "PAGE_BYTES", 700)
+    services, sessions, after, num_pages = [], [], 0, 0
+    while True:
+        page = ask(stage, client, after=after)
+        assert isinstance(page, StatusReport)
+        services += [state.instance for state in page.services]
+        sessions += [state.session for state in page.sessions]
+        num_pages += 1
+        if page.next == 0:
+            break
+        assert page.next > after
+        after = page.next
+    assert num_pages >= 3
+    assert services == [state.instance for state in whole.services]
+    assert sessions == names == [state.session for state in whole.sessions]
+
+
+def test_a_session_that_ended_between_two_pages_does_not_hide_another(
+    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = open_sessions(stage, 4)
+    monkeypatch.setattr(control_service, "PAGE_BYTES", 0)
+    after, seen = control_service.FIRST_SESSION, []
+    while True:
+        page = ask(stage, client, after=after)
+        assert isinstance(page, StatusReport)
+        if not page.sessions:
+            break
+        seen += [state.session for state in page.sessions]
+        if seen == names[:2]:
+            stage.control._end(stage.control._sessions.find(names[0]), "over")
+        after = page.next
+    assert seen == names
+
+
+def test_of_one_session_it_has_that_and_its_services(stage: Stage, client: Socket) -> None:
+    open_sessions(stage, 3)
+    report = ask(stage, client, session="s1")
+    assert isinstance(report, StatusReport)
+    assert [state.session for state in report.sessions] == ["s1"]
+    assert {state.instance for state in report.services} == {"recognizer", "synthesizer"}
+    stage.control._takes_over = False
+    assert getattr(ask(stage, client, session="none"), "code", "") == "unknown-session"
+
+
+def test_the_first_page_has_a_service_of_every_kind(
+    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(20):
+        beat = Heartbeat(
+            service="a-lamp", instance=f"a{number}", role="observer", state="ready", sent_ns=0
+        )
+        client.send(beat)
+    while len(stage.control._registry.sorted()) < 22:
+        stage.control.step(0.01)
+        list(client.receive())
+    monkeypatch.setattr(control_service, "PAGE_BYTES", 1000)
+    page = ask(stage, client)
+    assert isinstance(page, StatusReport)
+    assert page.next
+    assert {state.service for state in page.services} >= {"a-lamp", "recognizer", "synthesizer"}

@@ -1,0 +1,156 @@
+"""A control that starts again learns the sessions from the services, and only what they may say."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from services.control import service as control_service
+from shared.bus import Bus, Socket
+from shared.wire.control import Heartbeat, SessionInput, StartSession, StopSession
+from shared.wire.message import Message
+from shared.wire.session import CloseSession, Done, Error, OpenSession, SessionMoved, SessionOpened
+from tests.control_stage import Stage
+
+pytestmark = pytest.mark.unit
+PLACED = {
+    "audio": "tcp://127.0.0.1:1",
+    "phones": "tcp://127.0.0.1:1",
+    "phone_input": "tcp://127.0.0.1:1",
+    "faps": "tcp://127.0.0.1:1",
+}
+
+
+def served(endpoints: dict[str, str] = PLACED, **fields: object) -> StartSession:
+    """Return a session that an earlier control has placed at the services of the stage."""
+    return StartSession(
+        session="mine", epoch=4, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
+        num_channels=1, record=False, paced=True, language="mandarin", endpoints=endpoints,
+        **fields,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
+    """Return the next messages that control sends to a socket."""
+    received: list[Message] = []
+    end_s = time.monotonic() + 20
+    while len(received) < num:
+        assert time.monotonic() < end_s
+        stage.control.step(0.01)
+        received += [each.message for each in socket.receive()]  # type: ignore[misc]
+    return received
+
+
+def test_a_session_is_taken_over_as_it_was(stage: Stage, client: Socket) -> None:
+    recognizer, synthesizer = stage.services
+    answers(stage, synthesizer)  # its heartbeat is answered
+    answers(stage, recognizer)
+    recognizer.send(served(lips="learnt", expressiveness=1.5))
+    for service in stage.services:
+        (start,) = answers(stage, service)
+        assert isinstance(start, StartSession)
+        assert (start.session, start.epoch, start.token) == ("mine", 4, "t")
+        assert (start.lips, start.expressiveness) == ("learnt", 1.5)
+    client.send(CloseSession(session="mine", token="t", request="1"))
+    assert answers(stage, client) == [Done(session="mine", request="1")]
+
+
+def test_a_request_waits_until_its_session_is_known(stage: Stage, client: Socket) -> None:
+    client.send(CloseSession(session="mine", token="t", request="1"))
+    while not stage.control._deferred:
+        stage.control.step(0.01)
+    stage.services[0].send(served())
+    assert answers(stage, client) == [Done(session="mine", request="1")]
+
+
+def test_a_client_that_asks_again_for_its_session_gets_it(stage: Stage) -> None:
+    with Bus() as bus:
+        client = bus.connect_dealer(stage.control.endpoints["commands"])
+        client.send(OpenSession(session="other", request="1"))
+        _, start = answers(stage, stage.services[0], 2)
+        assert isinstance(start, StartSession)
+        stage.services[0].send(served(client=start.client, client_request="2"))
+        client.send(OpenSession(session="mine", request="2"))
+        (opened,) = answers(stage, client)
+        if opened.session == "other":  # a slow machine gave up on it, for nobody serves it
+            (opened,) = answers(stage, client)
+    assert isinstance(opened, SessionOpened)
+    assert (opened.session, opened.token, opened.epoch) == ("mine", "t", 4)
+
+
+@pytest.mark.parametrize("sender", ["synthesizer", "recognizer elsewhere"])
+def test_only_the_recognizer_of_a_session_brings_it(
+    stage: Stage, client: Socket, sender: str
+) -> None:
+    recognizer, synthesizer = stage.services
+    if sender == "synthesizer":
+        synthesizer.send(served())
+    else:
+        recognizer.send(served({**PLACED, "audio": "tcp://127.0.0.1:2"}))
+    stage.control._takeover_end_s = time.monotonic() + 0.5
+    client.send(CloseSession(session="mine", token="t", request="1"))
+    (answer,) = answers(stage, client)
+    assert isinstance(answer, Error)
+    assert answer.code == "unknown-session"
+
+
+def test_a_session_whose_synthesizer_is_gone_gets_another_at_the_end(
+    stage: Stage,
+) -> None:
+    recognizer, synthesizer = stage.services
+    recognizer.send(served({**PLACED, "faps": "tcp://127.0.0.1:3"}))
+    stage.control._takeover_end_s = time.monotonic() + 0.5
+    starts: list[StartSession] = []
+    while not starts or starts[-1].epoch == 4:
+        told = answers(stage, synthesizer)
+        starts += [message for message in told if isinstance(message, StartSession)]
+    assert starts[-1].epoch == 5
+    assert starts[-1].endpoints["faps"] == PLACED["faps"]
+
+
+def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
+    recognizer, _ = stage.services
+    answers(stage, recognizer)
+    beat = Heartbeat(
+        service="recognizer", instance="recognizer", role="worker", state="ready", sent_ns=0,
+        endpoints={name: PLACED[name] for name in ("audio", "phones")},
+        sessions={"mine": SessionInput()},
+    )  # fmt: skip
+    recognizer.send(beat)
+    (seen,) = answers(stage, recognizer)
+    assert not isinstance(seen, StopSession)
+    stage.control._takeover_end_s = 0.0
+    stage.control.step(0.02)
+    recognizer.send(beat)
+    assert StopSession(session="mine") in answers(stage, recognizer, 2)
+
+
+def test_a_client_is_told_again_that_its_session_moved(
+    stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control_service, "MOVED_AGAIN_S", (0.1, 0.2))
+    _, synthesizer = stage.services
+    client.send(OpenSession(session="mine", request="1"))
+    for service in stage.services:
+        _, start = answers(stage, service, 2)
+        assert isinstance(start, StartSession)
+        service.send(Done(session="mine", request=start.request))
+    answers(stage, client)
+    again = {"phone_input": "tcp://127.0.0.1:9", "faps": "tcp://127.0.0.1:9"}
+    synthesizer.send(
+        Heartbeat(
+            service="synthesizer", instance="synthesizer", role="worker", state="ready", sent_ns=0,
+            endpoints=again,
+        )
+    )  # fmt: skip
+    for service in stage.services:
+        starts: list[StartSession] = []
+        while not starts:
+            told = answers(stage, service)
+            starts = [message for message in told if isinstance(message, StartSession)]
+        service.send(Done(session="mine", request=starts[0].request))
+    first, *others = answers(stage, client, 3)
+    assert isinstance(first, SessionMoved)
+    assert (first.epoch, first.faps) == (2, again["faps"])
+    assert others == [first, first]

@@ -1,0 +1,209 @@
+"""The experiment of the paper: which sentences, what is measured, and one small run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+from typer.testing import CliRunner
+
+from corpora.speech_corpus import Utterance
+from evaluation.commands import app
+from evaluation.lips.four_schemes import Condition, Hearing, events_told, listeners_of
+from evaluation.lips.measures import rms_jerk
+from evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted
+from evaluation.lips.scheme_report import sentence
+from evaluation.lips.scheme_scores import Order, falls, first_told
+from evaluation.lips.schemes import once_the_next_begins
+from evaluation.lips.sentences import choose
+from services.recording_chain import HeardRecording
+from services.synthesizer.config import DELAYS_MS
+from shared.face.lip_models import LipModelName
+from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from tests.lips import phone
+
+pytestmark = pytest.mark.unit
+
+DEMO = Path(__file__).parents[2] / "shared" / "demo"
+
+
+def test_jerk_is_the_third_derivative() -> None:
+    time_s = np.arange(50) / 50.0
+    assert rms_jerk([time_s**3, -(time_s**3)], 50.0) == pytest.approx(6.0)
+    assert rms_jerk([time_s**2], 50.0) == pytest.approx(0.0, abs=1e-6)
+    assert rms_jerk([np.zeros(3)], 50.0) is None
+
+
+def test_an_order_holds_only_if_every_scheme_is_worse_than_the_one_before() -> None:
+    assert falls(np.array([1.0, 0.8, 0.7, 0.6]))
+    assert not falls(np.array([1.0, 0.8, 0.8, 0.6]))
+    assert not falls(np.array([1.0, 0.7, 0.8, 0.6]))
+    order = Order(
+        lips="learnt",
+        recognizer="blocks",
+        reference="scheme 1",
+        num_sentences=20,
+        correlations=[1.0, 0.9, 0.75, 0.8],
+        holds=False,
+        num_holding=7,
+    )
+    assert sentence(order) == (
+        "learnt, blocks, opening against scheme 1 (1.00 0.90 0.75 0.80): 1 > 2 > 3 > 4 does not "
+        "hold, in 7 of 20 sentences; live costs +0.25, waiting for the next phone -0.05"
+    )
+
+
+def test_a_phone_is_told_when_it_comes_first() -> None:
+    told = first_told(
+        [
+            Progress(time_s=0.02, level_db=-20.0),
+            phone(0, "b", 0.0, final=False),
+            Progress(time_s=0.04, level_db=-20.0),
+            Progress(time_s=0.06, level_db=-20.0),
+            phone(0, "p", 0.0),
+            phone(1, "a", 0.03, final=False),
+            phone(2, "d", 0.04, final=False),
+            Progress(time_s=0.08, level_db=-20.0),
+        ]
+    )
+    assert [(each.symbol, time_s) for each, time_s in told] == [
+        ("b", 0.04),
+        ("a", 0.08),
+        ("d", 0.08),
+    ]
+
+
+# The rule emits b, then a, then t instead of a, then i; the search makes d of t, and puts an h
+# between. At the end of speech i is withdrawn.
+LIVE: list[SoundEvent] = [
+    phone(0, "b", 0.0, 0.1, final=False),
+    Progress(time_s=0.04, level_db=-20.0),
+    phone(0, "b", 0.0, 0.06, final=False),
+    phone(1, "a", 0.06, 0.13, final=False),
+    Progress(time_s=0.1, level_db=-20.0),
+    phone(0, "p", 0.0, 0.08, final=True),
+    phone(1, "t", 0.08, 0.1, final=False),
+    Progress(time_s=0.12, level_db=-20.0),
+    phone(1, "h", 0.08, 0.05, final=False),
+    phone(2, "d", 0.13, 0.07, final=False),
+    phone(3, "i", 0.2, 0.11, final=False),
+    Progress(time_s=0.24, level_db=-20.0),
+    phone(1, "sil", 0.08, 0.0, final=True),
+    phone(2, "h", 0.08, 0.05, final=True),
+    phone(3, "d", 0.13, 0.12, final=True),
+    SpeechChange(active=False, time_s=0.25),
+]
+
+
+def told_phones(events: list[SoundEvent]) -> list[tuple[str, float, float]]:
+    found = [event for event in events if isinstance(event, Phone)]
+    indices = [event.index for event in found]
+    assert indices == sorted(set(indices)), "no phone is corrected"
+    assert [event for event in events if not isinstance(event, Phone)] == [
+        event for event in LIVE if not isinstance(event, Phone)
+    ]
+    return [(event.symbol, event.onset_s, event.duration_s) for event in found]
+
+
+def test_by_the_papers_rule_nothing_is_corrected() -> None:
+    told = as_emitted(LIVE)
+    assert told_phones(told) == [
+        ("b", 0.0, 0.1),
+        ("a", 0.06, 0.13),
+        ("t", 0.08, 0.1),
+        ("i", 0.2, 0.11),
+    ]
+    assert told.index(Progress(time_s=0.12, level_db=-20.0)) == 5, "i comes after it"
+
+
+def test_by_the_papers_rule_a_phone_waits_for_the_next_and_has_its_duration() -> None:
+    told = once_the_next_is_emitted(LIVE)
+    assert told_phones(told) == [("b", 0.0, 0.06), ("d", 0.13, 0.07)]
+    assert told[1:3] == [
+        phone(0, "b", 0.0, 0.06, final=False),
+        Progress(time_s=0.1, level_db=-20.0),
+    ]
+    assert isinstance(told[-1], SpeechChange)
+
+
+def test_the_papers_rule_is_three_frames_of_any_confidence() -> None:
+    (listener,) = listeners_of(["gmm"], has_paper_rule=True)
+    assert listener.name == "gmm-paper"
+    config = listener.config
+    assert (config.acoustic, config.num_stable_frames, config.min_confidence) == ("gmm", 3, 0.0)
+
+
+def test_live_schemes_are_told_by_the_listeners_rule() -> None:
+    lips = LipModelName.DYNAMIC_VISEMES
+    nothing = HeardRecording(duration_s=0.0, events=[], is_text_known=False)
+    for has_paper_rule, live, next_phone in (
+        (True, as_emitted(LIVE), once_the_next_is_emitted(LIVE)),
+        (False, LIVE, once_the_next_begins(LIVE)),
+    ):
+        hearing = Hearing(nothing, {DELAYS_MS[lips] / 1e3: LIVE}, has_paper_rule)
+        assert events_told(Condition(3, lips, "gmm"), hearing) == live
+        assert events_told(Condition(4, lips, "gmm"), hearing) == next_phone
+
+
+def utterance(name: str, speaker: str, seconds: float) -> Utterance:
+    return Utterance(
+        utterance_id=name,
+        path=Path(name),
+        speaker=speaker,
+        source="",
+        licence="",
+        split="test",
+        seconds=seconds,
+        phones=(0,),
+        syllables=(1,),
+    )
+
+
+def test_sentences_are_of_all_speakers_and_near_4_s() -> None:
+    found = [
+        utterance("a-long", "A", 9.0),
+        utterance("a-usual", "A", 4.1),
+        utterance("a-short", "A", 3.0),
+        utterance("b-long", "B", 8.0),
+    ]
+    assert [each.utterance_id for each in choose(found, 2)] == ["a-usual", "b-long"]
+    assert [each.utterance_id for each in choose(found, 3)] == ["a-short", "a-usual", "b-long"]
+    assert len(choose(found)) == 4
+
+
+def test_a_small_run_of_the_command(tmp_path: Path) -> None:
+    samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=11_200)
+    soundfile.write(tmp_path / "hello.wav", samples, rate_hz)
+    (tmp_path / "manifest.tsv").write_text(
+        "utt_id\tpath\tspeaker\tsplit\ttext\nhello\thello.wav\tA\ttest\t你好\n", encoding="utf-8"
+    )
+    videos = tmp_path / "videos"
+    conditions = ["scheme1-learnt", *(f"scheme{number}-learnt-neural" for number in (2, 3, 4))]
+    for name in conditions[1:]:
+        (videos / name).mkdir(parents=True)
+        (videos / name / "hello.mp4").write_bytes(b"made before")
+    arguments = ["schemes", "--manifest", str(tmp_path), "--acoustic", "neural", "--lips", "learnt"]
+    outputs = ["--videos", str(videos), "--json", str(tmp_path / "figures.json")]
+    result = CliRunner().invoke(app, [*arguments, *outputs], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+
+    assert sorted(path.parent.name for path in videos.glob("*/hello.mp4")) == conditions
+    assert (videos / conditions[0] / "hello.mp4").stat().st_size > 1000
+    for name in conditions[1:]:
+        assert (videos / name / "hello.mp4").read_bytes() == b"made before", "it is kept"
+    figures = json.loads((tmp_path / "figures.json").read_text(encoding="utf-8"))
+    bound, recognised, live, next_phone = figures["scores"]
+    assert bound["like_scheme_1"]["curves"]["opening"]["correlation"] == pytest.approx(1.0)
+    assert bound["like_scheme_1"]["curves"]["opening"]["best_lag_ms"] == 0
+    assert bound["face_delay_ms"] is bound["phone_delay_p50_ms"] is None
+    assert recognised["phone_delay_p50_ms"] is None
+    assert 0.0 < live["phone_delay_p50_ms"] < next_phone["phone_delay_p50_ms"]
+    assert live["face_delay_ms"] == 60.0
+    assert 0.5 < live["like_scheme_1"]["curves"]["opening"]["correlation"] < 1.0
+    assert all(
+        score["jerk"] > 0.0 and score["like_real_lips"] is None for score in figures["scores"]
+    )
+    assert [order["reference"] for order in figures["orders"]] == ["scheme 1"]

@@ -1,0 +1,133 @@
+"""The Kubernetes manifests: valid, consistent, locked in, and understood by the services."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+
+from services.kinds import KINDS
+from shared.config import Bound, Settings, bound_keys
+from tests.system import ROOT
+
+pytestmark = pytest.mark.unit
+FOLDER = ROOT / "deploy" / "kubernetes"
+KUSTOMIZATION = yaml.safe_load((FOLDER / "kustomization.yaml").read_text("utf-8"))
+OBJECTS: dict[tuple[str, str], Any] = {
+    (each["kind"], each["metadata"]["name"]): each
+    for name in KUSTOMIZATION["resources"]
+    for each in yaml.safe_load_all((FOLDER / name).read_text("utf-8"))
+}
+WORKLOADS = {
+    name: each for (kind, name), each in OBJECTS.items() if kind in ("Deployment", "StatefulSet")
+}
+SECRETS = {
+    each["name"]: {file.rpartition("/")[2] for file in each["files"]}
+    for each in KUSTOMIZATION["secretGenerator"]
+}
+per_service = pytest.mark.parametrize("name", WORKLOADS)
+
+
+def container(name: str) -> Any:
+    (only,) = WORKLOADS[name]["spec"]["template"]["spec"]["containers"]
+    return only
+
+
+def settings(name: str) -> Settings:
+    """Return what a container's environment says."""
+    variables = dict(OBJECTS["ConfigMap", "kouxing"]["data"])
+    variables |= {each["name"]: each.get("value", "") for each in container(name)["env"]}
+    types = {kind.name: kind.config_type for kind in KINDS.values()}
+    return Settings(types, environment=variables)
+
+
+def ports(name: str) -> dict[str, int]:
+    return {each["name"]: each["containerPort"] for each in container(name)["ports"]}
+
+
+@pytest.mark.parametrize("key", OBJECTS, ids="-".join)
+def test_an_object_is_valid(key: tuple[str, str]) -> None:
+    newest = kubernetes_validate.latest_version()
+    kubernetes_validate.validate(OBJECTS[key], newest, strict=True)
+
+
+def test_all_services_but_the_driver_run() -> None:
+    assert WORKLOADS.keys() == KINDS.keys() - {"driver"}
+    files = {path.name for path in FOLDER.glob("*.yaml")}
+    assert files == {*KUSTOMIZATION["resources"], "kustomization.yaml", "prometheus-adapter.yaml"}
+
+
+@per_service
+def test_a_service_understands_its_environment(name: str) -> None:
+    config = settings(name).load(KINDS[name].config_type)
+    assert container(name)["args"] == [name]
+    assert not config.insecure
+    assert config.metrics_port == ports(name)["metrics"]
+    for key, bound in bound_keys(type(config)).items():
+        value = getattr(config, key)
+        if bound is Bound.ENDPOINT:
+            assert value == f"tcp://0.0.0.0:{ports(name)[key.replace('_', '-')]}"
+        elif bound is Bound.PORT:
+            assert value == ports(name)["page"]
+
+
+@per_service
+def test_a_service_is_locked_in(name: str) -> None:
+    pod = WORKLOADS[name]["spec"]["template"]["spec"]
+    assert pod["securityContext"]["runAsNonRoot"]
+    assert pod["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert not pod["automountServiceAccountToken"]
+    assert not pod["enableServiceLinks"], "its variables could look like settings"
+    assert container(name)["securityContext"] == {
+        "allowPrivilegeEscalation": False,
+        "readOnlyRootFilesystem": True,
+        "capabilities": {"drop": ["ALL"]},
+    }
+    user = f"USER {pod['securityContext']['runAsUser']}:{pod['securityContext']['runAsGroup']}\n"
+    assert user in (ROOT / "deploy" / "Dockerfile").read_text("utf-8")
+
+
+@per_service
+def test_a_service_gets_its_own_key_alone(name: str) -> None:
+    pod = WORKLOADS[name]["spec"]["template"]["spec"]
+    volumes = {each["name"]: each for each in pod["volumes"]}
+    mounts = {each["name"]: each["mountPath"] for each in container(name)["volumeMounts"]}
+    assert mounts.keys() == volumes.keys()
+    assert mounts["keys"] == OBJECTS["ConfigMap", "kouxing"]["data"]["CREDENTIALS_DIRECTORY"]
+    assert volumes["keys"]["secret"]["defaultMode"] == 0o440
+    given = SECRETS[volumes["keys"]["secret"]["secretName"]]
+    assert {each for each in given if each.endswith(".key")} == {f"{name}.key"}
+    assert ("allowed" in given) == (name == "control")
+
+
+@per_service
+def test_objects_find_each_other(name: str) -> None:
+    labels = WORKLOADS[name]["spec"]["template"]["metadata"]["labels"]
+    assert WORKLOADS[name]["spec"]["selector"]["matchLabels"].items() <= labels.items()
+    service = OBJECTS["Service", name]["spec"]
+    assert service["selector"].items() <= labels.items()
+    names = ports(name)
+    assert {each["name"] for each in service["ports"]} == names.keys() - {"metrics"}
+    policy = OBJECTS["NetworkPolicy", name]["spec"]
+    assert policy["podSelector"]["matchLabels"].items() <= labels.items()
+    opened = {each["port"] for rule in policy["ingress"] for each in rule["ports"]}
+    assert opened == names.keys()
+
+
+@pytest.mark.parametrize("name", ["recognizer", "synthesizer"])
+def test_workers_are_scaled_by_a_metric_that_they_have(name: str) -> None:
+    assert OBJECTS["Service", name]["spec"]["clusterIP"] == "None"
+    assert WORKLOADS[name]["spec"]["serviceName"] == name
+    scaler = OBJECTS["HorizontalPodAutoscaler", name]["spec"]
+    target = WORKLOADS[scaler["scaleTargetRef"]["name"]]
+    assert target["kind"] == scaler["scaleTargetRef"]["kind"]
+    assert "replicas" not in target["spec"], "the autoscaler's"
+    (metric,) = (each["pods"]["metric"]["name"] for each in scaler["metrics"])
+    assert f"| `{metric}` |" in (ROOT / "docs" / "metrics.md").read_text("utf-8")
+    adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text("utf-8"))
+    (rule,) = adapter["rules"]["custom"]
+    assert rule["name"]["as"] == metric
+    assert re.match(r"\w+", rule["seriesQuery"])[0] == metric  # type: ignore[index]

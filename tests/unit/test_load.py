@@ -1,0 +1,108 @@
+"""What the load's figures are made of, without sockets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from evaluation.commands import bench_app
+from evaluation.system import latency
+from evaluation.system.load import Load, Step, step_sizes
+from evaluation.system.speakers import Spoken, voiced
+from shared.client import Session
+from shared.wire.face import FapFrame
+from shared.wire.session import SessionOpened
+
+pytestmark = pytest.mark.unit
+
+
+class _Session:
+    opened = SessionOpened(
+        request="1", token="t", audio="a", phones="p", faps="f", events="e", frame_rate_hz=50.0
+    )
+
+
+def _spoken(arrived_s: dict[int, float]) -> Spoken:
+    return Spoken(cast(Session, _Session()), b"", begin_s=100.0, arrived_s=arrived_s)
+
+
+def test_a_frame_is_due_with_the_last_chunk_that_it_needs() -> None:
+    # with a delay of 60 ms the frame at 20 ms needs 80 ms of sound: due at 100.08 s
+    spoken = _spoken({0: 100.065, 320: 100.090})
+    assert list(spoken.delays_s(0.06, 100.0, 100.085)) == pytest.approx([0.005, 0.005])
+
+
+def test_frames_that_do_not_come_count_as_late() -> None:
+    assert list(_spoken({0: 100.065}).delays_s(0.06, 100.07, 100.2)) == pytest.approx(
+        [0.12, 0.10, 0.08, 0.06, 0.04, 0.02], abs=1e-6
+    )
+
+
+def test_a_frame_of_rest_is_no_arrival() -> None:
+    spoken = _spoken({})
+    frame = FapFrame(media_time=320, values=bytes(272), mask=bytes(9))
+    spoken.take(frame)
+    arrived_s = dict(spoken.arrived_s)
+    spoken.take(frame)
+    assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
+
+
+def test_every_speaker_has_a_voice_and_a_place_of_its_own() -> None:
+    text = np.sin(np.cumsum(np.linspace(0.01, 1.0, 16_000))).astype(np.float32)
+    sounds = [voiced(text, number) for number in range(12)]
+    assert np.array_equal(sounds[0], text)
+    assert len({sound.tobytes() for sound in sounds}) == len(sounds)
+
+
+def test_steps_rise_to_the_last_number() -> None:
+    assert step_sizes(24) == [1, 3, 6, 9, 12, 15, 18, 21, 24]
+    assert step_sizes(3) == [1, 2, 3]
+
+
+def _step(number: int, worst_p95_ms: float) -> Step:
+    return Step(
+        num_asked=number,
+        num_sessions=number,
+        refusals={},
+        delay_ms={"p50": 5.0, "p95": worst_p95_ms},
+        worst_p95_ms=worst_p95_ms,
+        num_rest_frames=0,
+        cpu_cores={"recognizer": 0.1 * number, "synthesizer": 0.0},
+        memory_mb={"recognizer": 100.0 + 3 * number, "synthesizer": 50.0},
+        client_late_ms=0.0,
+        client_cpu_cores=0.1,
+    )
+
+
+def test_the_summary_is_of_the_most_sessions_in_time() -> None:
+    refused = replace(_step(12, 20.0), num_asked=16, refusals={"busy": 4})
+    load = Load([_step(1, 5.0), _step(8, 10.0), refused, _step(20, 900.0)], 2, 0.0, 60.0)
+    assert load.summary == pytest.approx(
+        {
+            "sessions": 12,
+            "sessions_per_core": 6,
+            "sessions_per_busy_core": 10,
+            "recognizer_mb_per_session": 3,
+            "synthesizer_mb_per_session": 0,
+        }
+    )
+    assert Load([_step(1, 61.0)], 2, 0.0, 60.0).summary == {"sessions": 0}
+
+
+def test_bench_of_a_file_measures_the_chain(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[tuple[Path, int]] = []
+
+    def measure(path: Path, repeats: int, _console: object) -> None:
+        measured.append((path, repeats))
+        raise SystemExit(3)
+
+    monkeypatch.setattr(latency, "measure", measure)
+    for arguments in (["my.wav", "--repeats", "2"], ["--repeats", "2", "my.wav"]):
+        assert CliRunner().invoke(bench_app, arguments).exit_code == 3
+    assert measured == [(Path("my.wav"), 2)] * 2
+    assert "load" in CliRunner().invoke(bench_app, ["--help"]).output

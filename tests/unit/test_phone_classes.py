@@ -1,0 +1,86 @@
+"""Every class of phones is seen in every output, and shapes lead back to the face they are of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from services.synthesizer.lips.load import load_lip_model
+from services.synthesizer.offline import synthesize
+from shared.face.lip_models import LipModelName
+from shared.face.shapes import SHAPE_SETS
+from shared.phones.events import Phone
+from shared.phones.inventory import load_inventory
+from tests import heads
+from tests.receivers import SENT, received
+
+pytestmark = pytest.mark.unit
+Values = NDArray[np.float32]
+PHONE_S, FRAME_RATE_HZ = 0.2, 50
+VISIBLE = 0.1  # of a whole shape
+LIPS = ("2.2", "2.3", "2.4", "2.5", "2.6", "2.7", "2.8", "2.9", *(f"8.{k}" for k in range(1, 9)))
+
+# The columns of the table: what a receiver gets of a face's FAPs (68,), 0 to 1 each.
+OUTPUTS: dict[str, Callable[[Values], Values]] = {
+    **{str(name): shapes.weights for name, shapes in SHAPE_SETS.items()},
+    **{url: partial(received, url) for url in SENT},
+}
+
+
+def phone_classes() -> dict[str, str]:
+    """Return the rows of the table: the first phone of each viseme, and its kind."""
+    inventory = load_inventory()
+    classes: dict[str, tuple[str, str]] = {}
+    for phone, kind in zip(inventory.phones, inventory.kinds, strict=True):
+        if kind != "silence":
+            classes.setdefault(inventory.visemes[phone][0][0], (phone, kind))
+    return dict(classes.values())
+
+
+@cache
+def frames_of(*symbols: str) -> Values:
+    """Return the FAPs of phones of one length, from one to the other."""
+    lips = load_lip_model(name=LipModelName.DYNAMIC_VISEMES)
+    assert isinstance(lips, DynamicVisemes)
+    phones = [
+        Phone(
+            index=index,
+            symbol=symbol,
+            onset_s=index * PHONE_S,
+            duration_s=PHONE_S,
+            confidence=1.0,
+            final=True,
+        )
+        for index, symbol in enumerate(symbols)
+    ]
+    return synthesize(lips, phones, round(len(phones) * PHONE_S * FRAME_RATE_HZ), FRAME_RATE_HZ)
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+@pytest.mark.parametrize(("phone", "kind"), phone_classes().items())
+def test_every_class_of_phones_moves_every_output(phone: str, kind: str, output: str) -> None:
+    beside, instead = ("a", "a") if kind == "initial" else ("sil", "sil")
+    spoken, without = (frames_of(beside, each, beside) for each in (phone, instead))
+    own = slice(round(PHONE_S * FRAME_RATE_HZ), round(2 * PHONE_S * FRAME_RATE_HZ), 3)
+    values, others = (
+        np.array([OUTPUTS[output](faps) for faps in frames[own]]) for frames in (spoken, without)
+    )
+    assert np.abs(values - others).max() > VISIBLE
+
+
+@pytest.mark.parametrize(("name", "most_mm"), [("arkit", 0.5), ("oculus", 2.0), ("vrm", 1.9)])
+def test_shapes_lead_back_to_the_lips(name: str, most_mm: float) -> None:
+    head, shapes = heads.load("woman", "coarse"), SHAPE_SETS[name]
+    points = [head.feature_points[point] for point in LIPS]
+    errors_mm = []
+    for phone in phone_classes():
+        for faps in frames_of("a", phone, "a")[::3]:
+            back = shapes.faps(shapes.weights(faps))
+            error_m = (head.deform(back) - head.deform(faps))[points]
+            errors_mm.append(1000 * np.linalg.norm(error_m, axis=1))
+    assert np.mean(errors_mm) < most_mm  # as docs/shapes.md states

@@ -1,0 +1,89 @@
+"""What a talking session takes in the recognizer is little, and does not grow."""
+
+from __future__ import annotations
+
+import gc
+import tracemalloc
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from services.recognizer.acoustic.load import load_live_model
+from services.recognizer.front_end.resample import to_16_khz
+from services.recognizer.lips import lips_for
+from services.recognizer.stream import SpeechStream
+from shared.audio_file import read_audio
+from tests.system import DEMO
+
+pytestmark = [pytest.mark.unit, pytest.mark.slow]
+
+NUM_SESSIONS = 4
+CHUNK = 320  # samples: 20 ms
+MAX_MB = 4.0  # of a session
+MAX_GROWTH_MB = 0.05  # of a session, from one round to the next
+
+
+class Sessions:
+    """Streams that speak at once; any of them are processed together, as chunks happen to come."""
+
+    def __init__(self, model: AcousticModel) -> None:
+        self._model = model
+        self._sound = to_16_khz(*read_audio(DEMO / "bilabials-female.wav"))
+        self._rng = np.random.default_rng(0)
+        self._streams: list[SpeechStream] = []
+        self._num_sent: list[int] = []  # samples
+
+    def add(self, number: int) -> None:
+        lips = lips_for(self._model)
+        self._streams += [SpeechStream(self._model, lips=lips) for _ in range(number)]
+        self._num_sent += [0] * number
+
+    def remove_all(self) -> None:
+        self._streams.clear()
+        self._num_sent.clear()
+        gc.collect()
+
+    def speak_a_round(self) -> None:
+        for _ in range(len(self._sound) // CHUNK):
+            order = self._rng.permutation(len(self._streams))
+            cut = int(self._rng.integers(len(order) + 1))
+            for group in (order[:cut], order[cut:]):
+                tasks = [self._streams[number].process([self._next(number)]) for number in group]
+                run_scoring_tasks(self._model, tasks)
+
+    def _next(self, number: int) -> tuple[int, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
+        at = self._num_sent[number]
+        self._num_sent[number] += CHUNK
+        begin = (at + number * len(self._sound) // NUM_SESSIONS) % (len(self._sound) - CHUNK)
+        return at, self._sound[begin : begin + CHUNK]
+
+
+@pytest.fixture
+def traced() -> Iterator[None]:
+    tracemalloc.start()
+    yield
+    tracemalloc.stop()
+
+
+def used_mb() -> float:
+    return tracemalloc.get_traced_memory()[0] / 2**20
+
+
+@pytest.mark.usefixtures("traced")
+def test_a_talking_session_takes_less_than_4_mb_and_stays_so() -> None:
+    model = load_live_model("blocks")
+    sessions = Sessions(model)
+    sessions.add(NUM_SESSIONS)
+    sessions.speak_a_round()  # what sessions that are computed together share is there now
+    sessions.remove_all()
+    before_mb = used_mb()
+    sessions.add(NUM_SESSIONS)
+    used = []
+    for _ in range(2):
+        sessions.speak_a_round()
+        used.append(used_mb())
+    each_mb = [(mb - before_mb) / NUM_SESSIONS for mb in used]
+    assert max(each_mb) < MAX_MB, each_mb
+    assert each_mb[-1] - each_mb[0] < MAX_GROWTH_MB, each_mb

@@ -1,0 +1,167 @@
+"""FAPs as weights of ARKit's shapes, Oculus' visemes and VRM's expressions, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from services.driver.head.head import Head, neutral_faps
+from shared.face.faps import FAP_NUMBER, NUM_FAPS
+from shared.face.high_level import EXPRESSIONS, VISEMES
+from shared.face.idle_motion import LOWER_LID, UPPER_LID
+from shared.face.shapes import ARKIT, OCULUS, SHAPE_SETS, VRM, ShapeSet
+from tests import heads
+
+pytestmark = pytest.mark.unit
+
+
+def weights_by_name(faps: np.ndarray, shapes: ShapeSet = ARKIT) -> dict[str, float]:
+    return dict(zip(shapes.names, shapes.weights(faps).tolist(), strict=True))
+
+
+def test_names_are_those_of_others() -> None:
+    assert len(set(ARKIT.names)) == 52
+    assert {"jawOpen", "mouthClose", "eyeBlinkLeft", "browInnerUp", "tongueOut"} <= set(ARKIT.names)
+    assert len(set(OCULUS.names)) == 15
+    assert {"aa", "ih", "ou", "ee", "oh", "blink", "blinkLeft", "lookUp"} <= set(VRM.names)
+
+
+def test_nothing_from_nothing() -> None:
+    rest = np.zeros(NUM_FAPS, np.float32)
+    assert not ARKIT.weights(rest).any()
+    np.testing.assert_array_equal(OCULUS.weights(rest), np.eye(15, dtype=np.float32)[0])
+    assert not VRM.weights(rest).any()
+
+
+@pytest.mark.parametrize("name", ARKIT.names)
+def test_a_shape_is_found_again(name: str) -> None:
+    row = ARKIT.names.index(name)
+    found = ARKIT.weights(ARKIT.basis[row])
+    assert found.argmax() == row
+    assert found[row] > 0.55  # some agree with the sum of others
+
+
+def test_shapes_add_up() -> None:
+    weights = np.zeros(52, np.float32)
+    weights[[ARKIT.names.index("jawOpen"), ARKIT.names.index("tongueOut")]] = 0.5, 1.0
+    wanted = (
+        0.5 * ARKIT.basis[ARKIT.names.index("jawOpen")]
+        + ARKIT.basis[ARKIT.names.index("tongueOut")]
+    )
+    np.testing.assert_allclose(ARKIT.faps(weights), wanted)
+
+
+def test_left_and_right_mirror_each_other() -> None:
+    for name, row in zip(ARKIT.names, ARKIT.basis, strict=True):
+        if name.endswith("Left"):
+            other = ARKIT.basis[ARKIT.names.index(name.replace("Left", "Right"))]
+            assert row[FAP_NUMBER["open_jaw"] - 1] == other[FAP_NUMBER["open_jaw"] - 1]
+            left, right = FAP_NUMBER["raise_l_cornerlip"] - 1, FAP_NUMBER["raise_r_cornerlip"] - 1
+            assert row[left] == other[right]
+
+
+def test_single_faps_go_where_they_belong() -> None:
+    blink = weights_by_name(neutral_faps(close_t_l_eyelid=1000))
+    assert blink["eyeBlinkLeft"] > 0.6
+    assert blink["eyeBlinkRight"] < 1e-6
+    look = weights_by_name(neutral_faps(yaw_l_eyeball=20_000, yaw_r_eyeball=20_000))
+    assert look["eyeLookOutLeft"] == pytest.approx(look["eyeLookInRight"], abs=0.02)
+    assert look["eyeLookOutLeft"] > 0.4
+    spoken = weights_by_name(VISEMES[10])
+    assert spoken["jawOpen"] > 0.4
+    assert max(spoken["jawLeft"], spoken["jawRight"]) < 0.01
+
+
+@pytest.mark.parametrize("name", SHAPE_SETS)
+def test_the_solution_is_the_least_squares_one(name: str) -> None:
+    shapes = SHAPE_SETS[name]
+    root = np.linalg.cholesky(shapes._gram)
+    random = np.random.default_rng(1)
+    faces = [random.uniform(0, 1, len(shapes.names)) ** 4 @ shapes.basis for _ in range(20)]
+    for faps in [*VISEMES, *(3 * EXPRESSIONS), *faces, random.normal(0, 300, NUM_FAPS)]:
+        right = np.linalg.solve(root, shapes._right @ faps.astype(float))
+        best = lsq_linear(root.T, right, (0, 1), method="bvls").x
+        np.testing.assert_allclose(shapes._solve(faps.astype(float)), best, atol=1e-3)
+
+
+def test_visemes_are_oculus() -> None:
+    for row in range(1, 15):
+        found = OCULUS.weights(VISEMES[row])
+        assert found.argmax() == row
+        assert found[row] > 0.5
+
+
+def test_vowels_are_vrms() -> None:
+    for name, viseme in (("aa", 10), ("ee", 11), ("ih", 12), ("oh", 13), ("ou", 14)):
+        found = weights_by_name(VISEMES[viseme], VRM)
+        assert max(found, key=found.__getitem__) == name
+        assert found[name] > 0.7
+
+
+@pytest.mark.parametrize("shapes", SHAPE_SETS.values(), ids=SHAPE_SETS)
+def test_closed_lips_and_lids_stay_closed(shapes: ShapeSet) -> None:
+    inner = [FAP_NUMBER[name] - 1 for name in ("lower_t_midlip_o", "raise_b_midlip_o")]
+    shut = VISEMES[1].copy()  # p b m
+    shut[inner] = 0.0
+    assert shapes.faps(shapes.weights(shut))[inner].sum() > -60  # 1 mm
+    if shapes is not OCULUS:
+        lids = neutral_faps(close_t_l_eyelid=UPPER_LID, close_b_l_eyelid=LOWER_LID)
+        found = weights_by_name(lids, shapes)
+        assert max(found.values()) == found.get("eyeBlinkLeft", found.get("blinkLeft"))
+        assert max(found.values()) > 0.95
+
+
+def test_blinks_of_vrm_add_up() -> None:
+    both = weights_by_name(neutral_faps(close_t_l_eyelid=800, close_t_r_eyelid=800), VRM)
+    assert both["blink"] > 0.5
+    assert both["blinkLeft"] == both["blinkRight"] == 0
+    wink = weights_by_name(neutral_faps(close_t_l_eyelid=800, close_t_r_eyelid=200), VRM)
+    assert wink["blink"] + wink["blinkLeft"] == pytest.approx(both["blink"], abs=0.01)
+    assert wink["blink"] == pytest.approx(both["blink"] / 4, abs=0.01)
+    assert wink["blinkRight"] == 0
+
+
+def test_gaze_of_vrm() -> None:
+    for name, faps in (
+        ("lookLeft", {"yaw_l_eyeball": 40_000, "yaw_r_eyeball": 40_000}),
+        ("lookRight", {"yaw_l_eyeball": -40_000, "yaw_r_eyeball": -40_000}),
+        ("lookUp", {"pitch_l_eyeball": -20_000, "pitch_r_eyeball": -20_000}),
+        ("lookDown", {"pitch_l_eyeball": 30_000, "pitch_r_eyeball": 30_000}),
+    ):
+        found = weights_by_name(neutral_faps(**faps), VRM)
+        assert max(found, key=found.__getitem__) == name
+        assert found[name] > 0.5
+
+
+def test_shapes_do_on_the_mesh_what_they_say() -> None:
+    head = heads.load("woman")
+
+    def shift(name: str, point: str, *more: str) -> np.ndarray:
+        faps = ARKIT.basis[[ARKIT.names.index(shape) for shape in (name, *more)]].sum(axis=0)
+        vertex = head.feature_points[point]
+        moved: np.ndarray = 1000 * (head.deform(faps) - head.vertices)[vertex]
+        return moved
+
+    assert shift("jawOpen", "2.3")[1] < -15
+    assert shift("jawOpen", "9.11")[1] < -10  # teeth go with the jaw
+    gap = shift("jawOpen", "2.2", "mouthClose") - shift("jawOpen", "2.3", "mouthClose")
+    assert abs(gap[1]) < 1  # the lips meet although the jaw is open
+    assert shift("mouthSmileLeft", "2.4")[1] > 5
+    assert abs(shift("mouthSmileLeft", "2.5")[1]) < 1
+    assert shift("mouthPucker", "2.2")[2] > 5
+    assert shift("eyeBlinkLeft", "3.1")[1] < -5
+    assert shift("browInnerUp", "4.1")[1] > 0.5
+    assert shift("tongueOut", "6.1")[2] > 20
+    assert shift("eyeLookUpLeft", "3.5")[1] > 1
+
+
+def test_wrong_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"\(68,\)"):
+        ARKIT.weights(np.zeros(52, np.float32))
+
+
+def test_all_shapes_keep_the_head_whole() -> None:
+    head: Head = heads.load("woman", "coarse")
+    for row in ARKIT.basis:
+        assert np.isfinite(head.deform(row)).all()

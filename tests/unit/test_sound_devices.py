@@ -1,0 +1,75 @@
+"""What the machine plays, from a sound server that is scripted."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shared.errors import UserError
+from shared.sound_devices import monitor, sound_devices
+
+pytestmark = pytest.mark.unit
+
+SOURCES = [
+    {"name": "mic0", "description": "A microphone", "properties": {"device.class": "sound"}},
+    {"name": "hdmi.monitor", "description": "HDMI", "properties": {"device.class": "monitor"}},
+]
+PLAYING = [{"index": 7, "properties": {"application.name": "Firefox"}}]
+PCM = np.full(1000, 1 << 14, "<i2").tobytes()
+
+
+@pytest.fixture
+def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of programs that answer for a sound server, and write down what they were asked."""
+    (tmp_path / "sources").write_text(json.dumps(SOURCES))
+    (tmp_path / "sink-inputs").write_text(json.dumps(PLAYING))
+    (tmp_path / "pcm").write_bytes(PCM)
+    for name, line in (
+        ("pactl", f'cat "{tmp_path}/$3"'),
+        ("parec", f'echo "$@" > {tmp_path}/asked; cat {tmp_path}/pcm'),
+    ):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{line}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "target"),
+    [
+        ("", "--device=@DEFAULT_MONITOR@"),
+        ("hdmi", "--device=hdmi.monitor"),
+        ("firefox", "--monitor-stream=7"),
+    ],
+)
+def test_a_monitor_is_recorded_by_its_name(server: Path, name: str, target: str) -> None:
+    blocks = [*monitor(name).blocks]
+    np.testing.assert_array_equal(np.concatenate(blocks), np.full((1000, 1), 0.5))
+    assert target in (server / "asked").read_text().split()
+
+
+def test_devices_are_listed(server: Path) -> None:
+    listed = [(each.kind, each.name) for each in sound_devices() if each.kind != "mic"]
+    assert listed == [("monitor", "HDMI"), ("program", "Firefox")]
+
+
+def test_a_name_that_no_device_has_is_told_which_there_are(server: Path) -> None:
+    with pytest.raises(UserError, match="no device is called 'vlc'; there are 'HDMI', 'Firefox'"):
+        monitor("vlc")
+
+
+def test_without_a_sound_server_it_is_said_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    for name in ("", "firefox"):
+        with pytest.raises(UserError, match=r"PulseAudio or PipeWire.*BlackHole"):
+            monitor(name)
+
+
+def test_what_cannot_be_recorded_says_why(server: Path) -> None:
+    (server / "parec").write_text("#!/bin/sh\necho Connection refused >&2; exit 1\n")
+    with pytest.raises(UserError, match="nothing can be recorded: Connection refused"):
+        next(monitor().blocks)
