@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import socket
 import tempfile
 import threading
 import time
@@ -40,12 +41,12 @@ from services.kinds import KINDS
 from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
-from shared.connections import BAN_S
-from shared.errors import UserError
+from shared.connections import BAN_S, KIB
 
 PHASE_S = 3.0
 SLACK_S = 0.5  # in which a session opens
 RETURN_S = 3.0  # for memory to come back
+LET_IN_S = 0.5  # that a connection lasts unless it is cut
 ATTACKED = {  # sockets, by whether others have keys; then nobody else gets far
     False: ("commands", "audio", "faps"),
     True: ("audio",),
@@ -156,11 +157,18 @@ def _damage(
 
 
 def wait_until_let_in(control: str) -> None:
-    """Wait while faults count against this address."""
+    """Wait while faults count against this address: a connection of it is cut then."""
+    host, port = control.partition(" ")[0].removeprefix("tcp://").rsplit(":", 1)
     for _ in range(2 * BAN_S):
-        with contextlib.suppress(UserError), Client(control) as client:
-            client.status()
-            return
+        with (
+            contextlib.suppress(ConnectionError),
+            socket.create_connection((host, int(port)), LET_IN_S) as connection,
+        ):
+            try:
+                while connection.recv(KIB):  # the greeting, then nothing
+                    pass
+            except TimeoutError:
+                return
         time.sleep(1.0)
 
 
