@@ -49,7 +49,7 @@ check: .venv/installed-dev $(PAGE)/node_modules/.bin/eslint
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(NPM) $(PAGE) run lint
-	cd $(MOS) && $(CURDIR)/$(PAGE)/node_modules/.bin/eslint --max-warnings 0 -c $(CURDIR)/$(PAGE)/eslint.config.mjs .
+	cd $(MOS) && PATH="$(CURDIR)/$(BIN):$$PATH" $(CURDIR)/$(PAGE)/node_modules/.bin/eslint --max-warnings 0 -c $(CURDIR)/$(PAGE)/eslint.config.mjs .
 	$(NPM) $(RIVALS) run lint
 	$(NPM) $(JAVASCRIPT) run lint
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
