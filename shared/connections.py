@@ -36,7 +36,7 @@ LOOK_S = 0.02  # between looks while bytes arrive
 NEAR_LOOK_S = 0.005  # while much waits, and at first: a flood takes some 5 MB in that time
 NEAR_S = 0.2  # after a connection has come
 MUCH = 128 * KIB  # more than honest peers' messages take as a rule
-SWEEP_S = 1.0  # between looks for connections that have ended
+SWEEP_S = 1.0  # between looks at all connections: some have ended, or ZeroMQ was too quick to see
 STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscriber stands still
 STUCK_SMALL = 4 * KIB  # of each connection, that a busy ZeroMQ may not have passed on yet
 STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
@@ -151,20 +151,24 @@ class Connection:
         """Find what waits, and what of that is stuck; cut the connection if it is too much.
 
         A whole turn and a while after bytes came, their message was delivered if it is complete.
+        Messages are delivered while this looks, which may take long on a busy machine. So what
+        waits is rather taken for too little than for too much: what was delivered is read again.
         """
         if self.guarded is None:
             return
-        delivered, turns, bounds = self.delivered, self.guarded.turns, self.guarded.bounds
-        received = _bytes_read(self.descriptor)
-        self._surplus = max(self._surplus, delivered - max(received, HANDSHAKE))
-        self.waiting = max(0, received - delivered + self._surplus)
-        before, waiting, turn, time_s = self._mark
-        if delivered != before:
+        bounds, turns, before = self.guarded.bounds, self.guarded.turns, self.delivered
+        least, most = _bytes_read(self.descriptor)
+        delivered = self.delivered
+        self._surplus = max(self._surplus, before - max(most, HANDSHAKE))
+        self.waiting = max(0, least - delivered + self._surplus)
+        marked, waiting, turn, time_s = self._mark
+        is_due = turns > turn + 1 and now_s >= time_s + STUCK_S
+        if delivered != marked:
             self.stuck = 0
-            self._mark = (delivered, self.waiting, turns, now_s)
-        elif turns > turn + 1 and now_s >= time_s + STUCK_S:
+        elif is_due:
             self.stuck = waiting
-            self._mark = (delivered, self.waiting, turns, now_s)
+        if delivered != marked or is_due:
+            self._mark = (delivered, self.waiting, self.guarded.turns, time.monotonic())
         if self.waiting > bounds.full_queue:
             self.cut("more waits than a queue holds", FLOOD_FAULTS)
         elif self.stuck > bounds.one_message:
@@ -303,7 +307,7 @@ class Guard:
         self._is_stopping = False
         self._thread = threading.Thread(target=self._run, name="guard", daemon=True)
         self._events = select.epoll() if _SEES_BYTES else None
-        self._stop = os.eventfd(0) if _SEES_BYTES else -1
+        self._wake = os.eventfd(0) if _SEES_BYTES else -1
 
     @property
     def num_connections(self) -> int:
@@ -322,11 +326,13 @@ class Guard:
             self._events.register(guarded.descriptor, select.EPOLLIN | select.EPOLLET)
         if not self._thread.is_alive():
             if self._events is not None:
-                self._events.register(self._stop, select.EPOLLIN)
+                self._events.register(self._wake, select.EPOLLIN | select.EPOLLET)
             max_files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
             wanted = MAX_CONNECTIONS + self._extra_connections
             self._max_connections = max(1, min(wanted, max_files - RESERVED_FILES))
             self._thread.start()
+        if self._events is not None:
+            os.eventfd_write(self._wake, 1)  # a monitor tells of nothing until it was once read
         return guarded
 
     def connection(self, descriptor: int) -> Connection | None:
@@ -372,13 +378,13 @@ class Guard:
         self._is_stopping = True
         if self._thread.is_alive():
             if self._events is not None:
-                os.eventfd_write(self._stop, 1)
+                os.eventfd_write(self._wake, 1)
             self._thread.join()
         for guarded in self._guarded:
             guarded.close()
         if self._events is not None:
             self._events.close()
-            os.close(self._stop)
+            os.close(self._wake)
 
     def _run(self) -> None:
         while not self._is_stopping:
@@ -456,8 +462,12 @@ class Guard:
             shares[connection.address] -= connection.is_cut
 
     def _sweep(self) -> None:
-        """Forget the connections that have ended; return the memory of those that were cut."""
+        """Forget the connections that have ended; return the memory of those that were cut.
+
+        The others are looked at: bytes that ZeroMQ took while the thread slept woke nobody.
+        """
         self._forget_ended(list(self._connections.values()))
+        self._pending.update(self._descriptors.values())
         if self._num_trims:
             self._num_trims -= 1
             give_back_memory()
@@ -541,12 +551,13 @@ def _address(descriptor: int) -> str:
     return ""
 
 
-def _bytes_read(descriptor: int) -> int:
-    """Return how many bytes libzmq has read from a connection; the kernel has others still."""
+def _bytes_read(descriptor: int) -> tuple[int, int]:
+    """Return how many bytes libzmq has read at least, and at most; the kernel has others still."""
     with contextlib.suppress(OSError):
-        received = _tcp_figure(descriptor, _BYTES_RECEIVED)
-        return received - _kernel_figure(descriptor, termios.FIONREAD)
-    return 0
+        before = _tcp_figure(descriptor, _BYTES_RECEIVED)
+        waiting = _kernel_figure(descriptor, termios.FIONREAD)
+        return before - waiting, _tcp_figure(descriptor, _BYTES_RECEIVED) - waiting
+    return 0, 0
 
 
 def _bytes_taken(descriptor: int) -> tuple[int, int]:

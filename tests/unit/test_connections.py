@@ -72,6 +72,32 @@ def test_many_fast_senders_wait_while_nothing_is_received(bus: Bus) -> None:
     assert numbers == {str(name): [*range(num_chunks)] for name in range(len(senders))}
 
 
+@pytest.mark.parametrize("is_late", [(True, False), (False, True)], ids=["before", "after"])
+def test_a_fast_sender_stays_while_the_guard_is_not_given_the_processor(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, is_late: tuple[bool, bool]
+) -> None:
+    figure = connections._tcp_figure
+
+    def late_figure(descriptor: int, offset: int) -> int:
+        time.sleep(0.1 * is_late[0])
+        found = figure(descriptor, offset)
+        time.sleep(0.1 * is_late[1])
+        return found
+
+    monkeypatch.setattr(connections, "_tcp_figure", late_figure)
+    audio = bus.bind_router(LOCAL, "audio")
+    sender = bus.connect_dealer(audio.endpoint)
+    chunks = [chunk(number, 20_000) for number in range(500)]
+    received: list[Received] = []
+    for each in chunks:
+        assert sender.send(each)
+        time.sleep(0.001)
+        received += audio.receive()
+    received += collect(bus, audio, lambda all_: len(received) + len(all_) == len(chunks))
+    assert [each.message for each in received] == chunks
+    assert len({each.sender.connection for each in received}) == 1
+
+
 def test_a_message_that_comes_in_pieces_arrives(bus: Bus) -> None:
     audio = bus.bind_router(LOCAL, "audio")
     data = wire_bytes(chunk(1))
@@ -96,6 +122,8 @@ def test_a_subscriber_may_follow_one_session_after_another_for_hours(bus: Bus) -
         for number in range(num_topics):
             topic = str(number).rjust(MAX_SUBSCRIPTION, "x").encode()
             subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
+            time.sleep(0.001)
+            list(faps.receive())
         subscriber.sendall(frame(b"\x01fap-frame/") + frame(b"\x01joined/s/"))
         subscriber.settimeout(0.002)
         answer, end_s = b"", time.monotonic() + 20
@@ -124,10 +152,10 @@ def test_one_that_subscribes_to_too_much_is_cut(bus: Bus) -> None:
     assert honest.wait(20.0)
 
 
-def is_cut(connection: socket.socket, bound: Socket) -> bool:
+def is_cut(connection: socket.socket, bound: Socket, num_looks: int = 500) -> bool:
     """Whether a connection ends soon, while its other end's messages are received."""
     connection.settimeout(0.02)
-    for _ in range(500):
+    for _ in range(num_looks):
         list(bound.receive())
         try:
             if not connection.recv(65_536):
@@ -137,6 +165,34 @@ def is_cut(connection: socket.socket, bound: Socket) -> bool:
         except OSError:
             return True
     return False
+
+
+def test_the_first_connection_is_watched_at_once(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "SWEEP_S", 1000.0)
+    phones = bus.bind_router(LOCAL, "phones")
+    with connected(port_of(phones)) as hostile:
+        for _ in range(2000):
+            try:
+                hostile.sendall(frame(b"", more=True) * 1000)
+            except ConnectionError:
+                return
+            list(phones.receive())
+            time.sleep(0.002)
+    raise AssertionError("it was not cut")
+
+
+def test_what_comes_while_the_guard_sleeps_is_seen_later(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "LOOK_S", 0.3)
+    monkeypatch.setattr(connections, "NEAR_S", 0.0)
+    phones = bus.bind_router(LOCAL, "phones")
+    with connected(port_of(phones)) as hostile:
+        assert not is_cut(hostile, phones, num_looks=30)
+        hostile.sendall(frame(b"", more=True))  # wakes it
+        time.sleep(0.1)
+        hostile.sendall(frame(b"", more=True) * 50_000)
+        assert is_cut(hostile, phones)
 
 
 def test_one_whose_message_does_not_end_is_cut_though_little_waits(bus: Bus) -> None:
