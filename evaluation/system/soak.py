@@ -2,8 +2,9 @@
 
 Control, a recognizer and a synthesizer serve one session that is not paced, so a day passes as fast
 as they can work. Recordings are spoken round after round, in other voices, places, levels and
-noise, so that no two rounds are alike. But every tenth is the first one again: it must give the
-same phones. The sound comes at 44.1 kHz, a rate that does not divide media time's 16 kHz.
+noise, so that no two rounds are alike. But every tenth and the one after it are the first again:
+the second of these has the same before it every time, and must give the same phones. The sound
+comes at 44.1 kHz, a rate that does not divide media time's 16 kHz.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Round:
     num_irregular: int  # frames of the round not 1 / frame rate after the one before
     num_phones: int  # of the round, final
     num_unfinished: int  # of the round's phones, those left out or never final
-    num_lost: int | None  # of the first round's phones, in one that is the same
+    num_lost: int | None  # of the second round's phones, in one that is the same after the same
     memory_mb: dict[str, float]  # by service
 
 
@@ -126,14 +127,16 @@ def measure(
         session = client.open_session(sample_rate_hz=RATE_HZ, paced=False)
         listener = Listener(session)
         begin_s, lag = time.monotonic(), None
-        first: list[str] = []
+        second: list[str] = []
         while not rounds or rounds[-1].media_s < hours * 3600:
             number = len(rounds)
             _speak(session, listener, sound_of(text, number))
             _wait_for_frames(session, listener, lag)
             lag = session.media_time - listener.newest if lag is None else lag
             symbols, num_unfinished, num_irregular = listener.take_round()
-            first = first or symbols
+            is_compared = number % SAME_EVERY == 1
+            if is_compared:
+                second = second or symbols
             rounds.append(
                 Round(
                     number=number,
@@ -143,7 +146,7 @@ def measure(
                     num_irregular=num_irregular,
                     num_phones=len(symbols),
                     num_unfinished=num_unfinished,
-                    num_lost=None if number % SAME_EVERY else lost_phones(first, symbols),
+                    num_lost=lost_phones(second, symbols) if is_compared else None,
                     memory_mb={
                         state.service: state.metrics["memory_mb"]
                         for state in client.status().services
@@ -156,10 +159,10 @@ def measure(
 
 
 def sound_of(text: NDArray[np.float32], number: int) -> NDArray[np.int16]:
-    """Return what is spoken in a round, at 44.1 kHz, shape (n,); every tenth is the same."""
+    """Return what is spoken in a round, at 44.1 kHz, shape (n,)."""
     rng = np.random.default_rng(number)
     sound = text
-    if number % SAME_EVERY:
+    if number % SAME_EVERY > 1:
         level = 10 ** rng.uniform(-0.6, 0.1)  # -12 to 2 dB
         noise = rng.normal(scale=10 ** rng.uniform(-4.0, -2.5), size=len(text))
         sound = np.clip(level * np.resize(voiced(text, number), len(text)) + noise, -1.0, 1.0)
@@ -205,10 +208,10 @@ def _wait_until(condition: Callable[[], bool], listener: Listener) -> None:
     listener.wait(0.0)
 
 
-def lost_phones(first: Sequence[str], symbols: Sequence[str]) -> int:
-    """Return how many phones of the first round did not come again in their order."""
-    blocks = difflib.SequenceMatcher(None, first, symbols, autojunk=False).get_matching_blocks()
-    return len(first) - sum(block.size for block in blocks)
+def lost_phones(before: Sequence[str], symbols: Sequence[str]) -> int:
+    """Return how many phones of a round before did not come again in their order."""
+    blocks = difflib.SequenceMatcher(None, before, symbols, autojunk=False).get_matching_blocks()
+    return len(before) - sum(block.size for block in blocks)
 
 
 def summary(rounds: Sequence[Round]) -> dict[str, float]:

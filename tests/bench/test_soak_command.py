@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.bench, pytest.mark.slow, pytest.mark.timeout(400)]
 def test_half_a_minute_neither_drift_nor_lose_anything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(soak, "SAME_EVERY", 2)
+    monkeypatch.setattr(soak, "SAME_EVERY", 3)
     figures, picture = tmp_path / "soak.json", tmp_path / "soak.png"
     arguments = ["soak", str(DEMO / "bilabials-female.wav"), "--hours", "0.01"]
     result = CliRunner().invoke(
@@ -33,7 +33,7 @@ def test_half_a_minute_neither_drift_nor_lose_anything(
     assert summary["unfinished_phones"] == 0
     assert summary["lost_phones"] == 0
     same = [each["num_phones"] for each in rounds if each["num_lost"] is not None]
-    assert len(same) >= 3
+    assert len(same) >= 2
     assert min(same) > 10
     assert len({each["num_phones"] for each in rounds}) > 1, "rounds are alike"
     assert "largest drift: 0" in result.stdout
