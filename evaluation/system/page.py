@@ -22,7 +22,7 @@ from rich.table import Table
 
 from evaluation.system import sync
 from evaluation.system.chromium import Chromium
-from evaluation.system.live import speak
+from evaluation.system.live import NUM_TRIES, speak
 from evaluation.system.systems import LocalSystem
 from services.recognizer.front_end.resample import to_16_khz
 from shared.audio_file import read_audio
@@ -122,22 +122,22 @@ def _hear(browser: Chromium, client: Client, voice: NDArray[np.float32]) -> sync
     Raises
     ------
     UserError
-        If none is heard near its picture.
+        If none is heard near its picture each time.
     """
     sound = np.resize(0.1 * voice / np.abs(voice).max(), round((SETTLE_S + MEASURE_S) * 16000))
     sound[CLICK_EVERY::CLICK_EVERY] = 0.6
-    session = client.open_session(encoding="f32le")
-    browser.wait_for(f"window.kouxing.state.session === '{session.name}'")
-    sync.begin(browser)
-    speak([session], sound)
-    session.close()
-    clicks_ms, pictures = sync.read(browser)
-    seen_ms = sync.passages_ms(pictures, CLICK_EVERY)
-    settled_ms = clicks_ms[clicks_ms - clicks_ms[:1] >= 1e3 * SETTLE_S]
-    offsets = sync.offsets_ms(settled_ms, seen_ms)
-    if not offsets:
-        raise UserError("no click is heard near its picture; this machine is too busy")
-    return sync.summary(offsets)
+    for _ in range(NUM_TRIES):
+        session = client.open_session(encoding="f32le")
+        browser.wait_for(f"window.kouxing.state.session === '{session.name}'")
+        sync.begin(browser)
+        speak([session], sound)
+        session.close()
+        clicks_ms, pictures = sync.read(browser)
+        seen_ms = sync.passages_ms(pictures, CLICK_EVERY)
+        settled_ms = clicks_ms[clicks_ms - clicks_ms[:1] >= 1e3 * SETTLE_S]
+        if offsets := sync.offsets_ms(settled_ms, seen_ms):
+            return sync.summary(offsets)
+    raise UserError("no click is heard near its picture; this machine is too busy")
 
 
 def _drawing(browser: Chromium) -> Drawing:
