@@ -420,6 +420,7 @@ class Bus:
                 f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
                 "is another system running, or the address not this host's?"
             ) from None
+        guarded.port = int(raw.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         socket = Socket(
             raw,
             self._key,

@@ -158,6 +158,9 @@ class Connection:
             return
         bounds, turns, before = self.guarded.bounds, self.guarded.turns, self.delivered
         least, most = _bytes_read(self.descriptor)
+        if not self.exists():  # the figures are those of whoever has its descriptor now
+            self.waiting = self.stuck = 0
+            return
         delivered = self.delivered
         self._surplus = max(self._surplus, before - max(most, HANDSHAKE))
         self.waiting = max(0, least - delivered + self._surplus)
@@ -204,6 +207,7 @@ class Guarded:
 
     def __init__(self, guard: Guard, bounds: Bounds, monitor: zmq.Socket[bytes]) -> None:
         self.bounds = bounds
+        self.port = 0  # where it is bound; 0: nowhere yet
         self.turns = 0  # times that every connection's next complete message was delivered
         self._guard = guard
         self._monitor = monitor
@@ -212,7 +216,7 @@ class Guarded:
 
     def delivered(self, descriptor: int, num_bytes: int) -> Connection | None:
         """Note a message that came through a descriptor; return its connection if it lasts."""
-        connection = self._guard.connection(descriptor)
+        connection = self._guard.connection(descriptor, self.port)
         if connection is None:
             return None
         if connection.guarded is None:  # the guard has not come to it yet
@@ -335,13 +339,16 @@ class Guard:
             os.eventfd_write(self._wake, 1)  # a monitor tells of nothing until it was once read
         return guarded
 
-    def connection(self, descriptor: int) -> Connection | None:
-        """Return the connection of a descriptor, None if it is closed."""
+    def connection(self, descriptor: int, port: int) -> Connection | None:
+        """Return the connection of a descriptor to a port, None if it is closed.
+
+        Then another socket of the process may have the descriptor, which is not watched.
+        """
         inode = _inode(descriptor)
-        if inode is None:
-            return None
-        known = self._connections.get(inode)
-        return known or self._connections.setdefault(inode, Connection(descriptor, inode))
+        known = None if inode is None else self._connections.get(inode)
+        if known is not None or inode is None or port != _port(descriptor):
+            return known
+        return self._connections.setdefault(inode, Connection(descriptor, inode))
 
     def connections_to(self, guarded: Guarded) -> list[Connection]:
         """Return the connections to a socket."""
@@ -425,7 +432,7 @@ class Guard:
         """Begin to watch connections; cut the newest where there are too many."""
         admitted = []
         for descriptor, guarded in accepted:
-            connection = self.connection(descriptor)
+            connection = self.connection(descriptor, guarded.port)
             if connection is None:
                 continue
             connection.address = _address(descriptor)
@@ -479,6 +486,8 @@ class Guard:
                 self._num_trims = NUM_TRIMS
             self._ending.discard(connection)
             self._pending.discard(connection)
+            if self._descriptors.get(connection.descriptor) is connection:
+                del self._descriptors[connection.descriptor]
             if self._connections.pop(connection.inode, None) and connection.guarded is not None:
                 connection.guarded.note_end(connection)
 
@@ -549,6 +558,14 @@ def _address(descriptor: int) -> str:
     with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
         return str(connection.getpeername()[0])
     return ""
+
+
+def _port(descriptor: int) -> int:
+    """Return the port of this end, 0 if it has none."""
+    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
+        name = connection.getsockname()
+        return int(name[1]) if isinstance(name, tuple) else 0
+    return 0
 
 
 def _bytes_read(descriptor: int) -> tuple[int, int]:

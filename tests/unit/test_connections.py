@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 import time
 from collections.abc import Callable, Iterator
 
@@ -262,6 +263,45 @@ def test_a_descriptor_that_is_used_again_is_not_cut() -> None:
         assert left.recv(20) == b"still there"
         assert not gone.exists()
         os.close(descriptor)
+
+
+def test_what_a_reused_descriptor_brings_counts_against_nobody(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(connections, "SWEEP_S", 0.02)
+    audio = bus.bind_router(LOCAL, "audio")
+    for _ in range(3):
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            left = socket.create_connection(server.getsockname())
+            right, _ = server.accept()
+        descriptors = {each for each in range(100) if is_socket(each)}
+        with connected(port_of(audio)) as client:
+            client.sendall(wire_bytes(chunk(1, 10)))
+            collect(bus, audio, lambda all_: len(all_) == 1)
+            (descriptor,) = {each for each in range(100) if is_socket(each)} - {
+                *descriptors,
+                client.fileno(),
+            }
+        end_s = time.monotonic() + 20
+        while is_socket(descriptor):
+            assert time.monotonic() < end_s
+            time.sleep(0.001)
+        with left, right:
+            os.dup2(left.fileno(), descriptor)
+            for _ in range(20):
+                right.sendall(bytes(20_000))
+                left.recv(20_000, socket.MSG_WAITALL)
+                list(audio.receive())
+                time.sleep(0.01)
+            os.close(descriptor)
+    assert "cut a connection" not in caplog.text
+
+
+def is_socket(descriptor: int) -> bool:
+    try:
+        return stat.S_ISSOCK(os.fstat(descriptor).st_mode)
+    except OSError:
+        return False
 
 
 def test_silent_connections_make_room_for_new_ones(
