@@ -19,10 +19,10 @@ from typing import Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from shared.connections import KIB, Bounds, Connection, Guard, Guarded
+from shared.connections import BAN_FAULTS, KIB, Bounds, Connection, Guard, Guarded
 from shared.endpoints import split_endpoint
 from shared.errors import UserError
-from shared.keys import NOBODY, Key, Peer, may_follow
+from shared.keys import NOBODY, Guest, Key, Peer, may_follow
 from shared.wire.codec import BadMessage, decode, encode, topic
 from shared.wire.message import (
     MAX_AUDIO_BYTES,
@@ -45,6 +45,7 @@ PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
 SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, num_slow=128, cost=1.0)
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 MAX_PARTS = 4
+MAX_DROPPED = 2000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
 CONNECT_MS = 300  # for one; whoever is further away cannot be reached
@@ -83,6 +84,7 @@ class Socket:
         self._on_joined = on_joined
         self._connection: Connection | None = None  # that the last message came through
         self._sender = NOBODY  # of it
+        self._has_rest = False  # parts of it that nobody wants
         self._refusal_cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
@@ -137,14 +139,19 @@ class Socket:
                 if self._raw.closed:  # by the handler of the last message
                     return
                 try:
+                    self._drop_rest()
                     parts, key = self._take()
                 except zmq.Again:
-                    self.drained()
+                    if not self._has_rest:
+                        self.drained()
                     return
-                if self._zap is not None and key not in self._zap.guests:  # gone or revoked
+                if self._connection is not None and self._connection.is_cut:
+                    continue
+                guest = None if self._zap is None else self._zap.guests.get(key)
+                if self._zap is not None and guest is None:  # gone or revoked
                     continue
                 if self._publishes:
-                    self._on_subscription(parts, key)
+                    self._on_subscription(parts, guest)
                     continue
                 number = self._connection.inode if self._connection is not None else 0
                 self._sender = Peer(parts.pop(0), key, number) if self._routes else NOBODY
@@ -212,7 +219,7 @@ class Socket:
         return self._raw
 
     def _take(self) -> tuple[list[bytes], str]:
-        """Return the parts of a message, of too many the first few, and its sender's key.
+        """Return the parts of a message, of too many the first ones, and its sender's key.
 
         Raises
         ------
@@ -220,25 +227,37 @@ class Socket:
             If no message has arrived.
         """
         frame = self._raw.recv(zmq.DONTWAIT, copy=False)
-        parts, num_bytes, num_parts = [frame.bytes], len(frame), 1
+        parts = [frame.bytes]
         descriptor = _descriptor(frame)
-        while frame.more:
+        while frame.more and len(parts) < MAX_PARTS:
             frame = self._raw.recv(zmq.DONTWAIT, copy=False)
-            num_bytes += len(frame)
-            num_parts += 1
-            if num_parts <= MAX_PARTS:
-                parts.append(frame.bytes)
-        if self._guarded is not None:
-            self._connection = self._guarded.delivered(descriptor, num_bytes)
-            self._refusal_cost = REFUSAL_COST + num_bytes / KIB
-            if num_parts > MAX_PARTS and self._connection is not None:
-                self._connection.cut("its message has too many parts", 1 + num_parts // 1000)
+            parts.append(frame.bytes)
+        self._has_rest = frame.more
         key = "" if self._zap is None else _key(frame)
-        if self._connection is not None and self._guarded is not None:
-            self._guarded.identify(self._connection, key)
+        if self._guarded is not None:
+            num_bytes = sum(map(len, parts))
+            self._connection = self._guarded.delivered(descriptor, num_bytes, key)
+            self._refusal_cost = REFUSAL_COST + num_bytes / KIB
+            if self._has_rest and self._connection is not None:
+                self._connection.cut("its message has too many parts", BAN_FAULTS)
         return parts, key
 
-    def _on_subscription(self, parts: list[bytes], key: str) -> None:
+    def _drop_rest(self) -> None:
+        """Drop what is left of a message of too many parts, so much that nobody waits for long.
+
+        Raises
+        ------
+        zmq.Again
+            If more is left for the next time.
+        """
+        for _ in range(MAX_DROPPED):
+            if not self._has_rest:
+                return
+            self._has_rest = self._raw.recv(zmq.DONTWAIT, copy=False).more
+        if self._has_rest:
+            raise zmq.Again
+
+    def _on_subscription(self, parts: list[bytes], guest: Guest | None) -> None:
         if len(parts) != 1:  # nobody publishes here
             return
         if self._connection is not None and self._guarded is not None:
@@ -246,7 +265,7 @@ class Socket:
             if self._connection.is_cut:
                 return
         verb, wanted = parts[0][:1], parts[0][1:]
-        may = self._zap is None or may_follow(self._zap.guests[key], wanted)
+        may = guest is None or may_follow(guest, wanted)  # without keys everybody may
         if verb == b"\x00":
             self._raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
         elif verb == b"\x01" and may:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import ipaddress
 import os
 import resource
 import select
@@ -53,8 +54,8 @@ CREDIT = 5000.0  # that a connection may spend at once
 CREDIT_S = 500.0  # that it gets back in a second
 MAX_FAULTS = 100  # of an address, whose new connections are cut then
 FAULTS_S = 2  # that an address is forgiven in a second
-FLOOD_FAULTS = 50  # of a connection that has sent what no honest one can
 BAN_S = 3  # until an address with too many faults is let in again, at the longest
+BAN_FAULTS = MAX_FAULTS + FAULTS_S * BAN_S  # of one that has sent what no honest one can
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
@@ -88,6 +89,23 @@ class Bounds:
         return self.queue_length * (self.message_bytes + OVERHEAD) + self.one_message
 
 
+class Credit:
+    """What a peer may make this process do; it comes back with time."""
+
+    def __init__(self, left: float = CREDIT) -> None:
+        self._left = left
+        self._since_s = time.monotonic()
+
+    @property
+    def left(self) -> float:
+        """What may be spent at once."""
+        return min(CREDIT, self._left + (time.monotonic() - self._since_s) * CREDIT_S)
+
+    def spend(self, cost: float) -> None:
+        """Take some away; less than nothing may be left."""
+        self._left, self._since_s = self.left - cost, time.monotonic()
+
+
 class Connection:
     """One connection to a bound socket."""
 
@@ -97,24 +115,23 @@ class Connection:
         self.guarded: Guarded | None = None  # once the guard has seen it
         self.address = ""
         self.key = ""  # of the peer, once something was delivered
+        self.owner = ""  # then also: the key, or without keys the address
+        self.credit = Credit()
         self.delivered = HANDSHAKE  # bytes; only the socket's thread writes it
         self.waiting = 0  # bytes that libzmq holds; the guard's, as all that follows
         self.stuck = 0  # of them, those that waited while all complete messages were delivered
         self.subscribed_bytes = 0
         self._subscriptions: set[bytes] = set()
         self.is_cut = False
+        self._num_faults = 0  # that its address was blamed for
         self._surplus = 0  # by which delivered is too high, as overhead is estimated
-        self._credit = CREDIT
-        self._credit_s = time.monotonic()
         self._mark = (0, 0, 0, 0.0)  # delivered, waiting, turns and time at an earlier look
         self._taken = (-1, 0.0)  # bytes that the peer has acknowledged, and since when no more
 
     def charge(self, cost: float) -> None:
         """Take credit for what the connection makes this process do; without any it is cut."""
-        now_s = time.monotonic()
-        self._credit = min(CREDIT, self._credit + (now_s - self._credit_s) * CREDIT_S) - cost
-        self._credit_s = now_s
-        if self._credit < 0:
+        self.credit.spend(cost)
+        if self.credit.left < 0:
             self.cut("it sends too much that is of no use")
 
     def subscribe(self, topic: bytes) -> None:
@@ -170,20 +187,21 @@ class Connection:
         if delivered != marked or is_due:
             self._mark = (delivered, self.waiting, self.guarded.turns, time.monotonic())
         if self.waiting > bounds.full_queue:
-            self.cut("more waits than a queue holds", FLOOD_FAULTS)
+            self.cut("more waits than a queue holds", BAN_FAULTS)
         elif self.stuck > bounds.one_message:
-            self.cut("its message does not end", FLOOD_FAULTS)
+            self.cut("its message does not end", BAN_FAULTS)
 
     def cut(self, reason: str, num_faults: int = 1) -> None:
         """End the connection; libzmq then frees what it holds. Any thread may call this.
 
-        Faults count against its address.
+        Faults count against its address, for each connection those of the worst reason.
         """
+        if self.guarded is not None and num_faults > self._num_faults:
+            self.guarded.blame(self.address, num_faults - self._num_faults)
+            self._num_faults = num_faults
         if self.is_cut:
             return
         self.is_cut = True
-        if self.guarded is not None:
-            self.guarded.blame(self.address, num_faults)
         with contextlib.suppress(OSError):  # it may have ended by itself
             own = os.dup(self.descriptor)  # which nobody else closes
             try:
@@ -210,13 +228,20 @@ class Guarded:
         self._num_delivered = 0  # in this turn
         self._ended: deque[int] = deque(maxlen=MAX_CONNECTIONS)  # numbers; the thread adds
 
-    def delivered(self, descriptor: int, num_bytes: int) -> Connection | None:
-        """Note a message that came through a descriptor; return its connection if it lasts."""
+    def delivered(self, descriptor: int, num_bytes: int, key: str) -> Connection | None:
+        """Note a message that came through a descriptor; return its connection if it lasts.
+
+        ``key`` is that of its sender, empty without keys.
+        """
         connection = self._guard.connection(descriptor)
         if connection is None:
             return None
         if connection.guarded is None:  # the guard has not come to it yet
             connection.guarded, connection.address = self, _address(descriptor)
+            self._guard.shut_out(connection)
+        if not connection.owner:
+            connection.key, connection.owner = key, key or connection.address
+            self._guard.bound_owner(connection)
         connection.delivered += num_bytes + OVERHEAD
         self._num_delivered += 1
         if self._num_delivered > self._guard.num_connections:  # ZeroMQ takes them one by one
@@ -224,16 +249,10 @@ class Guarded:
         connection.charge(self.bounds.cost)
         return connection
 
-    def identify(self, connection: Connection, key: str) -> None:
-        """Note whose connection it is."""
-        if connection.key != key:
-            connection.key = key
-            self._guard.bound_key(connection)
-
     def blame(self, address: str, num_faults: int) -> None:
         """Count faults against an address."""
         faults = self._guard.faults
-        faults[address] = min(faults[address] + num_faults, MAX_FAULTS + FAULTS_S * BAN_S)
+        faults[address] = min(faults[address] + num_faults, BAN_FAULTS)
 
     def drained(self) -> None:
         """Note that every complete message was delivered."""
@@ -296,6 +315,7 @@ class Guard:
         self._extra_connections = extra_connections
         self.faults: Counter[str] = Counter()  # by address; both threads add
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
+        self._credits: dict[str, Credit] = {}  # of owners whose connections ended; the thread's
         self._descriptors: dict[int, Connection] = {}  # the thread's, as all that follows
         self._pending: set[Connection] = set()  # something of theirs waits
         self._ending: set[Connection] = set()  # ZeroMQ is about to close them
@@ -354,10 +374,21 @@ class Guard:
             if connection.key in keys:
                 connection.cut("its key is allowed no longer, or not for the same", 0)
 
-    def bound_key(self, connection: Connection) -> None:
-        """Cut a connection whose key has too many."""
+    def shut_out(self, connection: Connection) -> None:
+        """Cut a new connection if its address has too many faults."""
+        if self.faults[connection.address] > MAX_FAULTS:
+            connection.cut("its address sent too much that is of no use", 0)
+
+    def bound_owner(self, connection: Connection) -> None:
+        """Let a connection begin with the credit that its owner has left from those before.
+
+        One whose key has too many is cut.
+        """
+        if (kept := self._credits.get(connection.owner)) is not None:
+            connection.credit = Credit(kept.left)
         shared = [each for each in list(self._connections.values()) if each.key == connection.key]
-        if sum(not each.is_cut for each in shared) > MAX_SHARE * self._max_connections:
+        num_shared = sum(not each.is_cut for each in shared)
+        if connection.key and num_shared > MAX_SHARE * self._max_connections:
             connection.cut("its key has too many connections", 0)
 
     def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
@@ -431,9 +462,8 @@ class Guard:
             connection.address = _address(descriptor)
             connection.guarded = guarded
             self._descriptors[descriptor] = connection
-            is_silent = connection.delivered == HANDSHAKE  # else it was quicker, and is heard
-            if is_silent and self.faults[connection.address] > MAX_FAULTS:
-                connection.cut("its address sent too much that is of no use", 0)
+            if connection.delivered == HANDSHAKE:  # else it was quicker, and was judged then
+                self.shut_out(connection)
             self._pending.add(connection)  # bytes may have come before
             admitted.append(connection)
             self._admitted_s = time.monotonic()
@@ -481,9 +511,18 @@ class Guard:
             self._pending.discard(connection)
             if self._connections.pop(connection.inode, None) and connection.guarded is not None:
                 connection.guarded.note_end(connection)
+                self._keep_credit(connection)
+
+    def _keep_credit(self, connection: Connection) -> None:
+        """Keep what is left of a connection's credit for the next ones of its owner."""
+        kept = self._credits.get(connection.owner)
+        if connection.credit.left < (CREDIT if kept is None else kept.left):
+            self._credits[connection.owner] = connection.credit
 
     def _forgive(self) -> None:
-        """Take a second's faults off every address."""
+        """Take a second's faults off every address, and forget whose credit is whole again."""
+        for owner in [each for each, credit in self._credits.items() if credit.left == CREDIT]:
+            del self._credits[owner]
         for address in list(self.faults):
             self.faults[address] -= FAULTS_S
             if self.faults[address] <= 0:
@@ -545,10 +584,23 @@ def _inode(descriptor: int) -> int | None:
 
 
 def _address(descriptor: int) -> str:
-    """Return the other end's address, empty if it is gone."""
+    """Return the other end's address, empty if it is gone.
+
+    All that one host has at its hand counts as one: loopback, and an IPv6 network.
+    """
     with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
-        return str(connection.getpeername()[0])
+        return _network(str(connection.getpeername()[0]))
     return ""
+
+
+def _network(host: str) -> str:
+    address = ipaddress.ip_address(host.partition("%")[0])
+    if address.version == 6:
+        address = address.ipv4_mapped or address
+    if address.is_loopback:
+        return "loopback"
+    prefix = 64 if address.version == 6 else 32
+    return str(ipaddress.ip_network((address, prefix), strict=False).network_address)
 
 
 def _bytes_read(descriptor: int) -> tuple[int, int]:

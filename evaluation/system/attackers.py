@@ -34,15 +34,17 @@ def ready(kind: str) -> bytes:
     return bytes([COMMAND, len(command)]) + command
 
 
-def connected(port: int, kind: str = "DEALER") -> socket.socket:
+def connected(port: int, kind: str = "DEALER", host: str = "127.0.0.1") -> socket.socket:
     """Return a connection that shook hands as a socket of some kind, without any key.
+
+    ``host`` is the address that it comes from.
 
     Raises
     ------
     OSError
         If the other end refuses.
     """
-    connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+    connection = socket.create_connection(("127.0.0.1", port), 5.0, (host, 0))
     try:
         connection.sendall(GREETING + ready(kind))
         answer = b""
