@@ -68,6 +68,15 @@ class Zap:
             except UserError as error:
                 LOG.error("the allowed keys stay as they were: %s", error)
             self.version = version
+        self._cut_changed(before)
+
+    def allow(self, guests: Guests) -> None:
+        """Let these connect and no others, until the file changes."""
+        with self._lock:
+            before, self.guests = self.guests, guests
+        self._cut_changed(before)
+
+    def _cut_changed(self, before: Guests) -> None:
         self._cut({key for key, guest in before.items() if self.guests.get(key) != guest})
 
     def _newest_version(self) -> tuple[int, int]:
