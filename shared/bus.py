@@ -31,7 +31,7 @@ from shared.wire.message import (
     Message,
 )
 from shared.wire.session import Error, Joined
-from shared.zap import Zap
+from shared.zap import Zap, answer_handshakes
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames of a recording for a subscriber that pauses
 LIVE_BUFFER = 65_536  # bytes of the kernel: some seconds of FAP frames, over any distance
@@ -41,11 +41,12 @@ AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recogn
 AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_slow=16, num_answers=100)
 COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, num_slow=1, cost=1.0)
 PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
-# ZeroMQ stores a subscription before it is received; a handshake takes most of the size.
-SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, num_slow=128, cost=1.0)
+# ZeroMQ stores a subscription before it is received; a handshake takes most of the size. All that a
+# connection may hold has room while the service is busy.
+SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=32, num_slow=128, cost=1.0)
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 MAX_PARTS = 4
-MAX_DROPPED = 2000  # parts of a message of too many, before other sockets get their turn
+MAX_DROPPED = 5000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
 CONNECT_MS = 300  # for one; whoever is further away cannot be reached
@@ -326,7 +327,8 @@ class Bus:
         self._context = zmq.Context()
         self._guard = Guard(extra_connections)
         self._key = key
-        self.zap = None if key is None else Zap(self._context, self._guard.cut_keys)
+        self.zap = None if key is None else Zap(self._guard.cut_keys)
+        self._answers_handshakes = False
         self._sockets: list[Socket] = []
 
     def __enter__(self) -> Self:
@@ -430,6 +432,9 @@ class Bus:
             raw.setsockopt(zmq.XPUB_MANUAL, 1)
         if kind == zmq.ROUTER:
             raw.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        if not self._answers_handshakes:
+            answer_handshakes(self._context, self.zap, self._guard.is_shut_out)
+            self._answers_handshakes = True
         guarded = self._guard.watch(raw, bounds)
         try:
             raw.bind(endpoint)

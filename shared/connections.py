@@ -46,8 +46,9 @@ MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
 MAX_SHARE = 0.75  # of them that may come from one address, or have one key
 RESERVED_FILES = 256  # for the process itself: models, pages, its own connections
 MAX_SUBSCRIPTION = 128  # bytes of a topic's beginning
-MAX_SUBSCRIBED = 128 * KIB  # of a connection; in memory up to 60 times that, or twice as much
+MAX_SUBSCRIBED = 32 * KIB  # of a connection: 64 sessions; in memory up to 60 times that, or 120
 MAX_ALL_SUBSCRIBED = 192 * KIB  # of all connections
+SUBSCRIBED_FAULTS = 10  # of a connection that has subscribed to too much
 HANDSHAKE = 1 * KIB  # more than a handshake takes on the wire
 OVERHEAD = 128  # more than a message's frames, keys and heartbeats take on the wire
 CREDIT = 5000.0  # that a connection may spend at once
@@ -238,7 +239,6 @@ class Guarded:
             return None
         if connection.guarded is None:  # the guard has not come to it yet
             connection.guarded, connection.address = self, _address(descriptor)
-            self._guard.shut_out(connection)
         if not connection.owner:
             connection.key, connection.owner = key, key or connection.address
             self._guard.bound_owner(connection)
@@ -374,10 +374,9 @@ class Guard:
             if connection.key in keys:
                 connection.cut("its key is allowed no longer, or not for the same", 0)
 
-    def shut_out(self, connection: Connection) -> None:
-        """Cut a new connection if its address has too many faults."""
-        if self.faults[connection.address] > MAX_FAULTS:
-            connection.cut("its address sent too much that is of no use", 0)
+    def is_shut_out(self, address: str) -> bool:
+        """Return whether nobody may connect from an address for now."""
+        return self.faults[_network(address)] > MAX_FAULTS
 
     def bound_owner(self, connection: Connection) -> None:
         """Let a connection begin with the credit that its owner has left from those before.
@@ -394,7 +393,7 @@ class Guard:
     def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
         """Keep the subscriptions of one connection, and of all, within their bounds."""
         if connection.subscribed_bytes > MAX_SUBSCRIBED:
-            connection.cut("it has too many subscriptions")
+            connection.cut("it has too many subscriptions", SUBSCRIBED_FAULTS)
         self._subscribed += num_bytes
         if self._subscribed > MAX_ALL_SUBSCRIBED:
             self._subscribed = _shed(
@@ -462,8 +461,9 @@ class Guard:
             connection.address = _address(descriptor)
             connection.guarded = guarded
             self._descriptors[descriptor] = connection
-            if connection.delivered == HANDSHAKE:  # else it was quicker, and was judged then
-                self.shut_out(connection)
+            is_silent = connection.delivered == HANDSHAKE  # else it came before
+            if is_silent and self.faults[connection.address] > MAX_FAULTS:
+                connection.cut("its address sent too much that is of no use", 0)
             self._pending.add(connection)  # bytes may have come before
             admitted.append(connection)
             self._admitted_s = time.monotonic()
