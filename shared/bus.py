@@ -105,6 +105,7 @@ class Socket:
         What answers the message that is being handled is charged to its sender, by its size.
         """
         parts = encode(message)
+        num_bytes = sum(map(len, parts))
         if self._routes:
             parts.insert(0, to.address)
         if self._connection is not None and to == self._sender:
@@ -114,6 +115,10 @@ class Socket:
             self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
         except zmq.Again:
             return False
+        if self._guarded is not None and self._routes:
+            self._guarded.answered(to.connection, num_bytes)
+        elif self._guarded is not None:
+            self._guarded.published(parts[0], num_bytes)
         return True
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:

@@ -23,7 +23,7 @@ import termios
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import zmq
@@ -42,6 +42,7 @@ STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscribe
 STUCK_SMALL = 4 * KIB  # of each connection, that a busy ZeroMQ may not have passed on yet
 STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
 MAX_WAITING = 24 * MIB  # of all connections
+MAX_UNREAD = 16 * MIB  # of all connections; in memory twice that where messages are small
 MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
 MAX_SHARE = 0.75  # of them that may come from one address, or have one key
 RESERVED_FILES = 256  # for the process itself: models, pages, its own connections
@@ -119,6 +120,8 @@ class Connection:
         self.owner = ""  # then also: the key, or without keys the address
         self.credit = Credit()
         self.delivered = HANDSHAKE  # bytes; only the socket's thread writes it
+        self.answered = 0  # bytes sent to it alone; the same
+        self.unread = 0  # bytes that libzmq holds for the peer; the guard's
         self.waiting = 0  # bytes that libzmq holds; the guard's, as all that follows
         self.stuck = 0  # of them, those that waited while all complete messages were delivered
         self.subscribed_bytes = 0
@@ -127,6 +130,7 @@ class Connection:
         self._num_faults = 0  # that its address was blamed for
         self._surplus = 0  # by which delivered is too high, as overhead is estimated
         self._mark = (0, 0, 0, 0.0)  # delivered, waiting, turns and time at an earlier look
+        self._out_mark = (0, 0)  # answered, and given to the kernel, at an earlier look
         self._taken = (-1, 0.0)  # bytes that the peer has acknowledged, and since when no more
 
     def charge(self, cost: float) -> None:
@@ -160,6 +164,23 @@ class Connection:
             return now_s - since_s > STOPPED_S
         self._taken = (taken, now_s)
         return False
+
+    def look_out(self, published: Mapping[bytes, int]) -> None:
+        """Find what waits for the peer, from what was sent and what the kernel has taken of it.
+
+        ``published`` has the bytes of each topic since the last look.
+        """
+        if not self.exists():
+            return
+        taken, waiting = _bytes_taken(self.descriptor)
+        answered, given = self.answered, taken + waiting
+        answered_before, given_before = self._out_mark
+        self._out_mark = (answered, given)
+        begins = tuple(self._subscriptions)
+        sent = sum(size for topic, size in published.items() if topic.startswith(begins))
+        sent += answered - answered_before
+        # a kernel that has passed all on has room: nothing waits for that
+        self.unread = max(0, self.unread + sent - (given - given_before)) if waiting else 0
 
     def exists(self) -> bool:
         """Return whether it is not closed yet."""
@@ -226,6 +247,8 @@ class Guarded:
         self.turns = 0  # times that every connection's next complete message was delivered
         self._guard = guard
         self._monitor = monitor
+        self.num_sent = 0  # bytes, each message once, since the guard looked
+        self._published: Counter[bytes] = Counter()  # of them by topic
         self._num_delivered = 0  # in this turn
         self._ended: deque[int] = deque(maxlen=MAX_CONNECTIONS)  # numbers; the thread adds
 
@@ -269,6 +292,22 @@ class Guarded:
             self._guard.bound_subscriptions(connection, len(topic))
         else:
             connection.unsubscribe(topic)
+
+    def published(self, topic: bytes, num_bytes: int) -> None:
+        """Note a message to all that have subscribed to its topic."""
+        self.num_sent += num_bytes
+        self._published[topic] += num_bytes
+
+    def answered(self, number: int, num_bytes: int) -> None:
+        """Note a message to one connection."""
+        self.num_sent += num_bytes
+        self._guard.note_answer(number, num_bytes)
+
+    def look_out(self) -> None:
+        """Find what waits for each peer."""
+        published, self._published, self.num_sent = self._published, Counter(), 0
+        for connection in self._guard.connections_to(self):
+            connection.look_out(dict(published))
 
     def note_end(self, connection: Connection) -> None:
         """Note that a connection has ended."""
@@ -368,6 +407,11 @@ class Guard:
         connections = list(self._connections.values())
         return [each for each in connections if each.guarded is guarded and not each.is_cut]
 
+    def note_answer(self, number: int, num_bytes: int) -> None:
+        """Note a message to one connection, if it lasts."""
+        if (connection := self._connections.get(number)) is not None:
+            connection.answered += num_bytes
+
     def cut_keys(self, keys: Collection[str]) -> None:
         """Cut the connections of some keys; those that delivered nothing get nothing, either."""
         for connection in list(self._connections.values()):
@@ -421,11 +465,15 @@ class Guard:
             ready = self._wait()
             now_s = time.monotonic()
             self._take_events()
-            if now_s > self._swept_s + SWEEP_S:
+            is_due = now_s > self._swept_s + SWEEP_S
+            if is_due:
                 self._swept_s = now_s
                 self._sweep()
                 self._forgive()
             self._look(ready, now_s)
+            num_sent = sum(guarded.num_sent for guarded in self._guarded)
+            if is_due or num_sent * self.num_connections > MAX_UNREAD / 4:
+                self._look_out()
             much = any(connection.waiting > MUCH for connection in self._pending)
             is_near = much or self.faults or now_s < self._admitted_s + NEAR_S
             time.sleep(NEAR_LOOK_S if is_near else LOOK_S)
@@ -505,13 +553,19 @@ class Guard:
     def _forget_ended(self, connections: Iterable[Connection]) -> None:
         """Forget those of some connections that have ended, and say so."""
         for connection in [each for each in connections if not each.exists()]:
-            if connection.is_cut:
+            if connection.is_cut or connection.unread:
                 self._num_trims = NUM_TRIMS
             self._ending.discard(connection)
             self._pending.discard(connection)
             if self._connections.pop(connection.inode, None) and connection.guarded is not None:
                 connection.guarded.note_end(connection)
                 self._keep_credit(connection)
+
+    def _look_out(self) -> None:
+        """Keep the bound of what waits for peers that do not take it."""
+        for guarded in self._guarded:
+            guarded.look_out()
+        _shed(list(self._connections.values()), "unread", MAX_UNREAD, "it takes too little")
 
     def _keep_credit(self, connection: Connection) -> None:
         """Keep what is left of a connection's credit for the next ones of its owner."""
@@ -550,21 +604,25 @@ class Guard:
 
 
 def _shed(connections: Iterable[Connection], measure: str, limit: int, reason: str) -> int:
-    """Cut those with the most of something until all together keep the limit.
+    """Cut connections until all together keep the limit of something; return what is left.
 
-    Returns what is left.
+    The largest of whoever has the most in sum go first.
     """
     shares: dict[Connection, int] = {
         connection: share
         for connection in connections
         if not connection.is_cut and (share := getattr(connection, measure)) > 0
     }
-    total = sum(shares.values())
-    while total > limit:
-        largest = max(shares, key=lambda connection: shares[connection])
+    if sum(shares.values()) <= limit:
+        return sum(shares.values())
+    sums: Counter[str] = Counter()
+    for connection, share in shares.items():
+        sums[connection.owner] += share
+    while sums.total() > limit:
+        largest = max(shares, key=lambda each: (sums[each.owner], shares[each]))
         largest.cut(reason)
-        total -= shares.pop(largest)
-    return total
+        sums[largest.owner] -= shares.pop(largest)
+    return sums.total()
 
 
 def raise_file_limit() -> None:

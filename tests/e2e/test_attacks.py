@@ -90,6 +90,14 @@ def test_subscriptions_are_bounded_in_length_and_number(
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
 
 
+@pytest.mark.parametrize("attack", attackers.SESSIONS)
+def test_what_nobody_takes_is_bounded(system: System, witness: Session, attack: str) -> None:
+    memory = Memory(system.processes["synthesizer"].pid)
+    attackers.SESSIONS[attack](system.control, SECONDS)
+    assert memory.growth_mb < MAX_GROWTH_MB
+    assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
+
+
 @pytest.fixture
 def few_files(tmp_path: Path) -> Iterator[System]:
     """A system started where a process may open no more files than it needs, and raise that."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -12,8 +13,9 @@ import pytest
 
 from evaluation.system.attackers import connected, frame
 from shared import connections
-from shared.bus import MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
+from shared.bus import COMMANDS, MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
 from shared.connections import CREDIT, MAX_SUBSCRIBED, MAX_SUBSCRIPTION, Connection
+from shared.keys import NOBODY, Peer
 from shared.wire.audio import AudioChunk
 from shared.wire.codec import encode
 from shared.wire.face import FapFrame
@@ -225,6 +227,48 @@ def test_one_that_sends_only_what_is_refused_is_cut(bus: Bus) -> None:
             for received in audio.receive():
                 audio.send(Error(code="bad-message", text="no"), to=received.sender)
     raise AssertionError("it was not cut")
+
+
+def test_one_that_takes_nothing_is_cut_once_too_much_waits(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_UNREAD", connections.MIB)
+    faps = bus.bind_publisher(LOCAL, "faps")
+    honest = bus.connect_subscriber(faps.endpoint)
+    honest.subscribe(FapFrame, "s")
+    with connected(port_of(faps), "SUB") as silent:
+        silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        silent.sendall(frame(b"\x01fap-frame/"))
+        send_until_cut(silent, faps, NOBODY, honest)
+
+
+def test_one_that_takes_no_answers_is_cut_once_too_much_waits(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_UNREAD", connections.MIB)
+    commands = bus.bind_router(LOCAL, "commands", COMMANDS)
+    with connected(port_of(commands)) as silent:
+        silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        silent.sendall(wire_bytes(Progress(level_db=0.0)))
+        (received,) = collect(bus, commands, lambda all_: len(all_) == 1)
+        send_until_cut(silent, commands, received.sender)
+
+
+def send_until_cut(silent: socket.socket, bound: Socket, peer: Peer, *honest: Socket) -> None:
+    """Send to one that takes nothing; others get all."""
+    ends = select.poll()
+    ends.register(silent, 0)
+    num_sent, num_taken, end_s = 0, 0, time.monotonic() + 30
+    while not ends.poll(5):
+        assert time.monotonic() < end_s
+        list(bound.receive())
+        for _ in range(100 if num_sent < 15_000 else 0):  # ZeroMQ itself drops more than 20 000
+            bound.send(FapFrame(session="s", values=bytes(272), mask=bytes(9)), to=peer)
+            num_sent += 1
+        num_taken += sum(len(list(each.receive())) for each in honest)
+    while honest and num_taken < num_sent - 300:  # before it had subscribed
+        assert honest[0].wait(5.0)
+        num_taken += len(list(honest[0].receive()))
 
 
 def test_a_message_of_another_connection_has_another_number(bus: Bus) -> None:
