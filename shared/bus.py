@@ -86,6 +86,7 @@ class Socket:
         self._connection: Connection | None = None  # that the last message came through
         self._sender = NOBODY  # of it
         self._has_rest = False  # parts of it that nobody wants
+        self._rest_from: Connection | None = None  # whose they are
         self._refusal_cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
@@ -245,7 +246,8 @@ class Socket:
             self._connection = self._guarded.delivered(descriptor, num_bytes, key)
             self._refusal_cost = REFUSAL_COST + num_bytes / KIB
             if self._has_rest and self._connection is not None:
-                self._connection.cut("its message has too many parts", BAN_FAULTS)
+                self._rest_from = self._connection
+                self._connection.cut("its message has too many parts")
         return parts, key
 
     def _drop_rest(self) -> None:
@@ -261,6 +263,8 @@ class Socket:
                 return
             self._has_rest = self._raw.recv(zmq.DONTWAIT, copy=False).more
         if self._has_rest:
+            if self._rest_from is not None:
+                self._rest_from.cut("its message has very many parts", BAN_FAULTS)
             raise zmq.Again
 
     def _on_subscription(self, parts: list[bytes], guest: Guest | None) -> None:

@@ -248,7 +248,7 @@ class Service:
             turn_ends_s = time.monotonic() + TURN_S
             for received in socket.receive():
                 self._dispatch(socket, handlers, received)
-                if time.monotonic() > turn_ends_s:
+                if socket in self._paused or time.monotonic() > turn_ends_s:
                     break
         self._ask_what_changed()  # it may have stood still meanwhile, too
         now_s = time.monotonic()

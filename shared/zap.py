@@ -13,7 +13,11 @@ from shared.keys import Guests, guests_file, read_guests
 from shared.logs import LOG
 
 # Who may connect to a socket, by its setting; to the others every key that is allowed at all.
-ROLES_AT = {"recognizer.audio": "client", "synthesizer.phone_input": "service"}
+ROLES_AT = {
+    "recognizer.audio": "client",
+    "recognizer.unpaced_audio": "client",
+    "synthesizer.phone_input": "service",
+}
 
 
 class Zap:

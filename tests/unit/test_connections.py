@@ -344,7 +344,7 @@ def test_an_address_that_floods_once_is_shut_out_for_a_while(
     talker.send(chunk(1, 10))
     collect(bus, audio, lambda all_: len(all_) == 1)
     with connected(port_of(audio)) as hostile:
-        hostile.sendall(frame(b"", more=True) * 100 + frame(b""))
+        hostile.sendall(frame(b"", more=True) * 2 * MAX_DROPPED + frame(b""))
         assert is_cut(hostile, audio)
     for host in ("127.0.0.1", "127.0.0.9"):  # all of them are one
         with contextlib.suppress(ConnectionError), connected(port_of(audio), host=host) as other:
