@@ -45,6 +45,7 @@ PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
 # connection may hold has room while the service is busy.
 SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=32, num_slow=128, cost=1.0)
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
+ANSWER_COST = 0.25  # that each KiB of an answer takes: the longest status has 15 MB
 MAX_PARTS = 4
 MAX_DROPPED = 5000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
@@ -111,7 +112,7 @@ class Socket:
             parts.insert(0, to.address)
         if self._connection is not None and to == self._sender:
             refusal_cost = self._refusal_cost if isinstance(message, Error) else 0.0
-            self._connection.charge(len(parts[-1]) / KIB + refusal_cost)
+            self._connection.charge(ANSWER_COST * len(parts[-1]) / KIB + refusal_cost)
         try:
             self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
         except zmq.Again:
