@@ -172,15 +172,17 @@ class Connection:
         """
         if not self.exists():
             return
-        taken, waiting = _bytes_taken(self.descriptor)
+        taken, waiting = _bytes_taken(self.descriptor) if _SEES_BYTES else (0, 0)
         answered, given = self.answered, taken + waiting
         answered_before, given_before = self._out_mark
         self._out_mark = (answered, given)
+        if not waiting:  # the kernel has room: nothing waits before it
+            self.unread = 0
+            return
         begins = tuple(self._subscriptions)
         sent = sum(size for topic, size in published.items() if topic.startswith(begins))
         sent += answered - answered_before
-        # a kernel that has passed all on has room: nothing waits for that
-        self.unread = max(0, self.unread + sent - (given - given_before)) if waiting else 0
+        self.unread = max(0, self.unread + sent - (given - given_before))
 
     def exists(self) -> bool:
         """Return whether it is not closed yet."""
@@ -305,9 +307,10 @@ class Guarded:
 
     def look_out(self) -> None:
         """Find what waits for each peer."""
-        published, self._published, self.num_sent = self._published, Counter(), 0
+        counted, self._published, self.num_sent = self._published, Counter(), 0
+        published = dict(counted)  # the socket's thread may add to the other yet
         for connection in self._guard.connections_to(self):
-            connection.look_out(dict(published))
+            connection.look_out(published)
 
     def note_end(self, connection: Connection) -> None:
         """Note that a connection has ended."""
