@@ -19,10 +19,10 @@ from typing import Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from shared.connections import KIB, Bounds, Connection, Guard, Guarded
+from shared.connections import BAN_FAULTS, KIB, Bounds, Connection, Guard, Guarded
 from shared.endpoints import split_endpoint
 from shared.errors import UserError
-from shared.keys import NOBODY, Key, Peer, may_follow
+from shared.keys import NOBODY, Guest, Key, Peer, may_follow
 from shared.wire.codec import BadMessage, decode, encode, topic
 from shared.wire.message import (
     MAX_AUDIO_BYTES,
@@ -31,7 +31,7 @@ from shared.wire.message import (
     Message,
 )
 from shared.wire.session import Error, Joined
-from shared.zap import Zap
+from shared.zap import Zap, answer_handshakes
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames of a recording for a subscriber that pauses
 LIVE_BUFFER = 65_536  # bytes of the kernel: some seconds of FAP frames, over any distance
@@ -41,10 +41,13 @@ AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recogn
 AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_slow=16, num_answers=100)
 COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, num_slow=1, cost=1.0)
 PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
-# ZeroMQ stores a subscription before it is received; a handshake takes most of the size.
-SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, num_slow=128, cost=1.0)
+# ZeroMQ stores a subscription before it is received; a handshake takes most of the size. All that a
+# connection may hold has room while the service is busy.
+SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=32, num_slow=128, cost=1.0)
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
+ANSWER_COST = 0.25  # that each KiB of an answer takes: the longest status has 15 MB
 MAX_PARTS = 4
+MAX_DROPPED = 5000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
 CONNECT_MS = 300  # for one; whoever is further away cannot be reached
@@ -83,6 +86,8 @@ class Socket:
         self._on_joined = on_joined
         self._connection: Connection | None = None  # that the last message came through
         self._sender = NOBODY  # of it
+        self._has_rest = False  # parts of it that nobody wants
+        self._rest_from: Connection | None = None  # whose they are
         self._refusal_cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
@@ -102,15 +107,20 @@ class Socket:
         What answers the message that is being handled is charged to its sender, by its size.
         """
         parts = encode(message)
+        num_bytes = sum(map(len, parts))
         if self._routes:
             parts.insert(0, to.address)
         if self._connection is not None and to == self._sender:
             refusal_cost = self._refusal_cost if isinstance(message, Error) else 0.0
-            self._connection.charge(len(parts[-1]) / KIB + refusal_cost)
+            self._connection.charge(ANSWER_COST * len(parts[-1]) / KIB + refusal_cost)
         try:
             self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
         except zmq.Again:
             return False
+        if self._guarded is not None and self._routes:
+            self._guarded.answered(to.connection, num_bytes)
+        elif self._guarded is not None:
+            self._guarded.published(parts[0], num_bytes)
         return True
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
@@ -137,14 +147,19 @@ class Socket:
                 if self._raw.closed:  # by the handler of the last message
                     return
                 try:
+                    self._drop_rest()
                     parts, key = self._take()
                 except zmq.Again:
-                    self.drained()
+                    if not self._has_rest:
+                        self.drained()
                     return
-                if self._zap is not None and key not in self._zap.guests:  # gone or revoked
+                if self._connection is not None and self._connection.is_cut:
+                    continue
+                guest = None if self._zap is None else self._zap.guests.get(key)
+                if self._zap is not None and guest is None:  # gone or revoked
                     continue
                 if self._publishes:
-                    self._on_subscription(parts, key)
+                    self._on_subscription(parts, guest)
                     continue
                 number = self._connection.inode if self._connection is not None else 0
                 self._sender = Peer(parts.pop(0), key, number) if self._routes else NOBODY
@@ -212,7 +227,7 @@ class Socket:
         return self._raw
 
     def _take(self) -> tuple[list[bytes], str]:
-        """Return the parts of a message, of too many the first few, and its sender's key.
+        """Return the parts of a message, of too many the first ones, and its sender's key.
 
         Raises
         ------
@@ -220,25 +235,40 @@ class Socket:
             If no message has arrived.
         """
         frame = self._raw.recv(zmq.DONTWAIT, copy=False)
-        parts, num_bytes, num_parts = [frame.bytes], len(frame), 1
+        parts = [frame.bytes]
         descriptor = _descriptor(frame)
-        while frame.more:
+        while frame.more and len(parts) < MAX_PARTS:
             frame = self._raw.recv(zmq.DONTWAIT, copy=False)
-            num_bytes += len(frame)
-            num_parts += 1
-            if num_parts <= MAX_PARTS:
-                parts.append(frame.bytes)
-        if self._guarded is not None:
-            self._connection = self._guarded.delivered(descriptor, num_bytes)
-            self._refusal_cost = REFUSAL_COST + num_bytes / KIB
-            if num_parts > MAX_PARTS and self._connection is not None:
-                self._connection.cut("its message has too many parts", 1 + num_parts // 1000)
+            parts.append(frame.bytes)
+        self._has_rest = frame.more
         key = "" if self._zap is None else _key(frame)
-        if self._connection is not None and self._guarded is not None:
-            self._guarded.identify(self._connection, key)
+        if self._guarded is not None:
+            num_bytes = sum(map(len, parts))
+            self._connection = self._guarded.delivered(descriptor, num_bytes, key)
+            self._refusal_cost = REFUSAL_COST + num_bytes / KIB
+            if self._has_rest and self._connection is not None:
+                self._rest_from = self._connection
+                self._connection.cut("its message has too many parts")
         return parts, key
 
-    def _on_subscription(self, parts: list[bytes], key: str) -> None:
+    def _drop_rest(self) -> None:
+        """Drop what is left of a message of too many parts, so much that nobody waits for long.
+
+        Raises
+        ------
+        zmq.Again
+            If more is left for the next time.
+        """
+        for _ in range(MAX_DROPPED):
+            if not self._has_rest:
+                return
+            self._has_rest = self._raw.recv(zmq.DONTWAIT, False).more  # quicker than by keyword
+        if self._has_rest:
+            if self._rest_from is not None:
+                self._rest_from.cut("its message has very many parts", BAN_FAULTS)
+            raise zmq.Again
+
+    def _on_subscription(self, parts: list[bytes], guest: Guest | None) -> None:
         if len(parts) != 1:  # nobody publishes here
             return
         if self._connection is not None and self._guarded is not None:
@@ -246,7 +276,7 @@ class Socket:
             if self._connection.is_cut:
                 return
         verb, wanted = parts[0][:1], parts[0][1:]
-        may = self._zap is None or may_follow(self._zap.guests[key], wanted)
+        may = guest is None or may_follow(guest, wanted)  # without keys everybody may
         if verb == b"\x00":
             self._raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
         elif verb == b"\x01" and may:
@@ -307,7 +337,8 @@ class Bus:
         self._context = zmq.Context()
         self._guard = Guard(extra_connections)
         self._key = key
-        self.zap = None if key is None else Zap(self._context, self._guard.cut_keys)
+        self.zap = None if key is None else Zap(self._guard.cut_keys)
+        self._answers_handshakes = False
         self._sockets: list[Socket] = []
 
     def __enter__(self) -> Self:
@@ -411,6 +442,9 @@ class Bus:
             raw.setsockopt(zmq.XPUB_MANUAL, 1)
         if kind == zmq.ROUTER:
             raw.setsockopt(zmq.ROUTER_HANDOVER, 1)
+        if not self._answers_handshakes:
+            answer_handshakes(self._context, self.zap, self._guard.is_shut_out)
+            self._answers_handshakes = True
         guarded = self._guard.watch(raw, bounds)
         try:
             raw.bind(endpoint)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import ipaddress
 import os
 import resource
 import select
@@ -22,7 +23,7 @@ import termios
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import zmq
@@ -41,20 +42,22 @@ STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscribe
 STUCK_SMALL = 4 * KIB  # of each connection, that a busy ZeroMQ may not have passed on yet
 STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
 MAX_WAITING = 24 * MIB  # of all connections
+MAX_UNREAD = 16 * MIB  # of all connections; in memory twice that where messages are small
 MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
 MAX_SHARE = 0.75  # of them that may come from one address, or have one key
 RESERVED_FILES = 256  # for the process itself: models, pages, its own connections
 MAX_SUBSCRIPTION = 128  # bytes of a topic's beginning
-MAX_SUBSCRIBED = 128 * KIB  # of a connection; in memory up to 60 times that, or twice as much
+MAX_SUBSCRIBED = 32 * KIB  # of a connection: 64 sessions; in memory up to 60 times that, or 120
 MAX_ALL_SUBSCRIBED = 192 * KIB  # of all connections
+SUBSCRIBED_FAULTS = 10  # of a connection that has subscribed to too much
 HANDSHAKE = 1 * KIB  # more than a handshake takes on the wire
 OVERHEAD = 128  # more than a message's frames, keys and heartbeats take on the wire
 CREDIT = 5000.0  # that a connection may spend at once
 CREDIT_S = 500.0  # that it gets back in a second
 MAX_FAULTS = 100  # of an address, whose new connections are cut then
 FAULTS_S = 2  # that an address is forgiven in a second
-FLOOD_FAULTS = 50  # of a connection that has sent what no honest one can
 BAN_S = 3  # until an address with too many faults is let in again, at the longest
+BAN_FAULTS = MAX_FAULTS + FAULTS_S * BAN_S  # of one that has sent what no honest one can
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
 _RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
@@ -88,6 +91,23 @@ class Bounds:
         return self.queue_length * (self.message_bytes + OVERHEAD) + self.one_message
 
 
+class Credit:
+    """What a peer may make this process do; it comes back with time."""
+
+    def __init__(self, left: float = CREDIT) -> None:
+        self._left = left
+        self._since_s = time.monotonic()
+
+    @property
+    def left(self) -> float:
+        """What may be spent at once."""
+        return min(CREDIT, self._left + (time.monotonic() - self._since_s) * CREDIT_S)
+
+    def spend(self, cost: float) -> None:
+        """Take some away; less than nothing may be left."""
+        self._left, self._since_s = self.left - cost, time.monotonic()
+
+
 class Connection:
     """One connection to a bound socket."""
 
@@ -97,24 +117,26 @@ class Connection:
         self.guarded: Guarded | None = None  # once the guard has seen it
         self.address = ""
         self.key = ""  # of the peer, once something was delivered
+        self.owner = ""  # then also: the key, or without keys the address
+        self.credit = Credit()
         self.delivered = HANDSHAKE  # bytes; only the socket's thread writes it
+        self.answered = 0  # bytes sent to it alone; the same
+        self.unread = 0  # bytes that libzmq holds for the peer; the guard's
         self.waiting = 0  # bytes that libzmq holds; the guard's, as all that follows
         self.stuck = 0  # of them, those that waited while all complete messages were delivered
         self.subscribed_bytes = 0
         self._subscriptions: set[bytes] = set()
         self.is_cut = False
+        self._num_faults = 0  # that its address was blamed for
         self._surplus = 0  # by which delivered is too high, as overhead is estimated
-        self._credit = CREDIT
-        self._credit_s = time.monotonic()
         self._mark = (0, 0, 0, 0.0)  # delivered, waiting, turns and time at an earlier look
+        self._out_mark = (0, 0)  # answered, and given to the kernel, at an earlier look
         self._taken = (-1, 0.0)  # bytes that the peer has acknowledged, and since when no more
 
     def charge(self, cost: float) -> None:
         """Take credit for what the connection makes this process do; without any it is cut."""
-        now_s = time.monotonic()
-        self._credit = min(CREDIT, self._credit + (now_s - self._credit_s) * CREDIT_S) - cost
-        self._credit_s = now_s
-        if self._credit < 0:
+        self.credit.spend(cost)
+        if self.credit.left < 0:
             self.cut("it sends too much that is of no use")
 
     def subscribe(self, topic: bytes) -> None:
@@ -142,6 +164,25 @@ class Connection:
             return now_s - since_s > STOPPED_S
         self._taken = (taken, now_s)
         return False
+
+    def look_out(self, published: Mapping[bytes, int]) -> None:
+        """Find what waits for the peer, from what was sent and what the kernel has taken of it.
+
+        ``published`` has the bytes of each topic since the last look.
+        """
+        if not self.exists():
+            return
+        taken, waiting = _bytes_taken(self.descriptor) if _SEES_BYTES else (0, 0)
+        answered, given = self.answered, taken + waiting
+        answered_before, given_before = self._out_mark
+        self._out_mark = (answered, given)
+        if not waiting:  # the kernel has room: nothing waits before it
+            self.unread = 0
+            return
+        begins = tuple(self._subscriptions)
+        sent = sum(size for topic, size in published.items() if topic.startswith(begins))
+        sent += answered - answered_before
+        self.unread = max(0, self.unread + sent - (given - given_before))
 
     def exists(self) -> bool:
         """Return whether it is not closed yet."""
@@ -173,20 +214,21 @@ class Connection:
         if delivered != marked or is_due:
             self._mark = (delivered, self.waiting, self.guarded.turns, time.monotonic())
         if self.waiting > bounds.full_queue:
-            self.cut("more waits than a queue holds", FLOOD_FAULTS)
+            self.cut("more waits than a queue holds", BAN_FAULTS)
         elif self.stuck > bounds.one_message:
-            self.cut("its message does not end", FLOOD_FAULTS)
+            self.cut("its message does not end", BAN_FAULTS)
 
     def cut(self, reason: str, num_faults: int = 1) -> None:
         """End the connection; libzmq then frees what it holds. Any thread may call this.
 
-        Faults count against its address.
+        Faults count against its address, for each connection those of the worst reason.
         """
+        if self.guarded is not None and num_faults > self._num_faults:
+            self.guarded.blame(self.address, num_faults - self._num_faults)
+            self._num_faults = num_faults
         if self.is_cut:
             return
         self.is_cut = True
-        if self.guarded is not None:
-            self.guarded.blame(self.address, num_faults)
         with contextlib.suppress(OSError):  # it may have ended by itself
             own = os.dup(self.descriptor)  # which nobody else closes
             try:
@@ -211,16 +253,24 @@ class Guarded:
         self.turns = 0  # times that every connection's next complete message was delivered
         self._guard = guard
         self._monitor = monitor
+        self.num_sent = 0  # bytes, each message once, since the guard looked
+        self._published: Counter[bytes] = Counter()  # of them by topic
         self._num_delivered = 0  # in this turn
         self._ended: deque[int] = deque(maxlen=MAX_CONNECTIONS)  # numbers; the thread adds
 
-    def delivered(self, descriptor: int, num_bytes: int) -> Connection | None:
-        """Note a message that came through a descriptor; return its connection if it lasts."""
+    def delivered(self, descriptor: int, num_bytes: int, key: str) -> Connection | None:
+        """Note a message that came through a descriptor; return its connection if it lasts.
+
+        ``key`` is that of its sender, empty without keys.
+        """
         connection = self._guard.connection(descriptor, self.port)
         if connection is None:
             return None
         if connection.guarded is None:  # the guard has not come to it yet
             connection.guarded, connection.address = self, _address(descriptor)
+        if not connection.owner:
+            connection.key, connection.owner = key, key or connection.address
+            self._guard.bound_owner(connection)
         connection.delivered += num_bytes + OVERHEAD
         self._num_delivered += 1
         if self._num_delivered > self._guard.num_connections:  # ZeroMQ takes them one by one
@@ -228,16 +278,10 @@ class Guarded:
         connection.charge(self.bounds.cost)
         return connection
 
-    def identify(self, connection: Connection, key: str) -> None:
-        """Note whose connection it is."""
-        if connection.key != key:
-            connection.key = key
-            self._guard.bound_key(connection)
-
     def blame(self, address: str, num_faults: int) -> None:
         """Count faults against an address."""
         faults = self._guard.faults
-        faults[address] = min(faults[address] + num_faults, MAX_FAULTS + FAULTS_S * BAN_S)
+        faults[address] = min(faults[address] + num_faults, BAN_FAULTS)
 
     def drained(self) -> None:
         """Note that every complete message was delivered."""
@@ -254,6 +298,23 @@ class Guarded:
             self._guard.bound_subscriptions(connection, len(topic))
         else:
             connection.unsubscribe(topic)
+
+    def published(self, topic: bytes, num_bytes: int) -> None:
+        """Note a message to all that have subscribed to its topic."""
+        self.num_sent += num_bytes
+        self._published[topic] += num_bytes
+
+    def answered(self, number: int, num_bytes: int) -> None:
+        """Note a message to one connection."""
+        self.num_sent += num_bytes
+        self._guard.note_answer(number, num_bytes)
+
+    def look_out(self) -> None:
+        """Find what waits for each peer."""
+        counted, self._published, self.num_sent = self._published, Counter(), 0
+        published = dict(counted)  # the socket's thread may add to the other yet
+        for connection in self._guard.connections_to(self):
+            connection.look_out(published)
 
     def note_end(self, connection: Connection) -> None:
         """Note that a connection has ended."""
@@ -300,6 +361,7 @@ class Guard:
         self._extra_connections = extra_connections
         self.faults: Counter[str] = Counter()  # by address; both threads add
         self._connections: dict[int, Connection] = {}  # by inode; both threads add
+        self._credits: dict[str, Credit] = {}  # of owners whose connections ended; the thread's
         self._descriptors: dict[int, Connection] = {}  # the thread's, as all that follows
         self._pending: set[Connection] = set()  # something of theirs waits
         self._ending: set[Connection] = set()  # ZeroMQ is about to close them
@@ -355,22 +417,37 @@ class Guard:
         connections = list(self._connections.values())
         return [each for each in connections if each.guarded is guarded and not each.is_cut]
 
+    def note_answer(self, number: int, num_bytes: int) -> None:
+        """Note a message to one connection, if it lasts."""
+        if (connection := self._connections.get(number)) is not None:
+            connection.answered += num_bytes
+
     def cut_keys(self, keys: Collection[str]) -> None:
         """Cut the connections of some keys; those that delivered nothing get nothing, either."""
         for connection in list(self._connections.values()):
             if connection.key in keys:
                 connection.cut("its key is allowed no longer, or not for the same", 0)
 
-    def bound_key(self, connection: Connection) -> None:
-        """Cut a connection whose key has too many."""
+    def is_shut_out(self, address: str) -> bool:
+        """Return whether nobody may connect from an address for now."""
+        return self.faults[_network(address)] > MAX_FAULTS
+
+    def bound_owner(self, connection: Connection) -> None:
+        """Let a connection begin with the credit that its owner has left from those before.
+
+        One whose key has too many is cut.
+        """
+        if (kept := self._credits.get(connection.owner)) is not None:
+            connection.credit = Credit(kept.left)
         shared = [each for each in list(self._connections.values()) if each.key == connection.key]
-        if sum(not each.is_cut for each in shared) > MAX_SHARE * self._max_connections:
+        num_shared = sum(not each.is_cut for each in shared)
+        if connection.key and num_shared > MAX_SHARE * self._max_connections:
             connection.cut("its key has too many connections", 0)
 
     def bound_subscriptions(self, connection: Connection, num_bytes: int) -> None:
         """Keep the subscriptions of one connection, and of all, within their bounds."""
         if connection.subscribed_bytes > MAX_SUBSCRIBED:
-            connection.cut("it has too many subscriptions")
+            connection.cut("it has too many subscriptions", SUBSCRIBED_FAULTS)
         self._subscribed += num_bytes
         if self._subscribed > MAX_ALL_SUBSCRIBED:
             self._subscribed = _shed(
@@ -398,11 +475,15 @@ class Guard:
             ready = self._wait()
             now_s = time.monotonic()
             self._take_events()
-            if now_s > self._swept_s + SWEEP_S:
+            is_due = now_s > self._swept_s + SWEEP_S
+            if is_due:
                 self._swept_s = now_s
                 self._sweep()
                 self._forgive()
             self._look(ready, now_s)
+            num_sent = sum(guarded.num_sent for guarded in self._guarded)
+            if is_due or num_sent * self.num_connections > MAX_UNREAD / 4:
+                self._look_out()
             much = any(connection.waiting > MUCH for connection in self._pending)
             is_near = much or self.faults or now_s < self._admitted_s + NEAR_S
             time.sleep(NEAR_LOOK_S if is_near else LOOK_S)
@@ -438,7 +519,7 @@ class Guard:
             connection.address = _address(descriptor)
             connection.guarded = guarded
             self._descriptors[descriptor] = connection
-            is_silent = connection.delivered == HANDSHAKE  # else it was quicker, and is heard
+            is_silent = connection.delivered == HANDSHAKE  # else it came before
             if is_silent and self.faults[connection.address] > MAX_FAULTS:
                 connection.cut("its address sent too much that is of no use", 0)
             self._pending.add(connection)  # bytes may have come before
@@ -482,7 +563,7 @@ class Guard:
     def _forget_ended(self, connections: Iterable[Connection]) -> None:
         """Forget those of some connections that have ended, and say so."""
         for connection in [each for each in connections if not each.exists()]:
-            if connection.is_cut:
+            if connection.is_cut or connection.unread:
                 self._num_trims = NUM_TRIMS
             self._ending.discard(connection)
             self._pending.discard(connection)
@@ -490,9 +571,24 @@ class Guard:
                 del self._descriptors[connection.descriptor]
             if self._connections.pop(connection.inode, None) and connection.guarded is not None:
                 connection.guarded.note_end(connection)
+                self._keep_credit(connection)
+
+    def _look_out(self) -> None:
+        """Keep the bound of what waits for peers that do not take it."""
+        for guarded in self._guarded:
+            guarded.look_out()
+        _shed(list(self._connections.values()), "unread", MAX_UNREAD, "it takes too little")
+
+    def _keep_credit(self, connection: Connection) -> None:
+        """Keep what is left of a connection's credit for the next ones of its owner."""
+        kept = self._credits.get(connection.owner)
+        if connection.credit.left < (CREDIT if kept is None else kept.left):
+            self._credits[connection.owner] = connection.credit
 
     def _forgive(self) -> None:
-        """Take a second's faults off every address."""
+        """Take a second's faults off every address, and forget whose credit is whole again."""
+        for owner in [each for each, credit in self._credits.items() if credit.left == CREDIT]:
+            del self._credits[owner]
         for address in list(self.faults):
             self.faults[address] -= FAULTS_S
             if self.faults[address] <= 0:
@@ -520,21 +616,25 @@ class Guard:
 
 
 def _shed(connections: Iterable[Connection], measure: str, limit: int, reason: str) -> int:
-    """Cut those with the most of something until all together keep the limit.
+    """Cut connections until all together keep the limit of something; return what is left.
 
-    Returns what is left.
+    The largest of whoever has the most in sum go first.
     """
     shares: dict[Connection, int] = {
         connection: share
         for connection in connections
         if not connection.is_cut and (share := getattr(connection, measure)) > 0
     }
-    total = sum(shares.values())
-    while total > limit:
-        largest = max(shares, key=lambda connection: shares[connection])
+    if sum(shares.values()) <= limit:
+        return sum(shares.values())
+    sums: Counter[str] = Counter()
+    for connection, share in shares.items():
+        sums[connection.owner] += share
+    while sums.total() > limit:
+        largest = max(shares, key=lambda each: (sums[each.owner], shares[each]))
         largest.cut(reason)
-        total -= shares.pop(largest)
-    return total
+        sums[largest.owner] -= shares.pop(largest)
+    return sums.total()
 
 
 def raise_file_limit() -> None:
@@ -554,9 +654,12 @@ def _inode(descriptor: int) -> int | None:
 
 
 def _address(descriptor: int) -> str:
-    """Return the other end's address, empty if it is gone."""
+    """Return the other end's address, empty if it is gone.
+
+    All that one host has at its hand counts as one: loopback, and an IPv6 network.
+    """
     with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
-        return str(connection.getpeername()[0])
+        return _network(str(connection.getpeername()[0]))
     return ""
 
 
@@ -566,6 +669,16 @@ def _port(descriptor: int) -> int:
         name = connection.getsockname()
         return int(name[1]) if isinstance(name, tuple) else 0
     return 0
+
+
+def _network(host: str) -> str:
+    address = ipaddress.ip_address(host.partition("%")[0])
+    if address.version == 6:
+        address = address.ipv4_mapped or address
+    if address.is_loopback:
+        return "loopback"
+    prefix = 64 if address.version == 6 else 32
+    return str(ipaddress.ip_network((address, prefix), strict=False).network_address)
 
 
 def _bytes_read(descriptor: int) -> tuple[int, int]:

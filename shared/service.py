@@ -248,7 +248,7 @@ class Service:
             turn_ends_s = time.monotonic() + TURN_S
             for received in socket.receive():
                 self._dispatch(socket, handlers, received)
-                if time.monotonic() > turn_ends_s:
+                if socket in self._paused or time.monotonic() > turn_ends_s:
                     break
         self._ask_what_changed()  # it may have stood still meanwhile, too
         now_s = time.monotonic()
@@ -444,9 +444,14 @@ class Service:
 
     def _on_allowed_keys(self, allowed: AllowedKeys, _sender: Peer) -> None:
         guests = {key: Guest(each.name, tuple(each.roles)) for key, each in allowed.keys.items()}
-        save_guests(guests)
-        if self.bus.zap is not None:
+        if self.bus.zap is None:
+            return
+        try:
+            save_guests(guests)
             self.bus.zap.refresh()
+        except UserError as error:  # it counts as long as this process runs
+            LOG.error("the allowed keys are not kept: %s", error)
+            self.bus.zap.allow(guests)
 
     def _on_start(self, start: StartSession, _sender: Peer) -> None:
         if self._stop_requested:

@@ -13,19 +13,18 @@ from shared.keys import Guests, guests_file, read_guests
 from shared.logs import LOG
 
 # Who may connect to a socket, by its setting; to the others every key that is allowed at all.
-ROLES_AT = {"recognizer.audio": "client", "synthesizer.phone_input": "service"}
+ROLES_AT = {
+    "recognizer.audio": "client",
+    "recognizer.unpaced_audio": "client",
+    "synthesizer.phone_input": "service",
+}
 
 
 class Zap:
-    """Answers libzmq on a thread of its own, until its context ends.
-
-    A refusal is a temporary one (status 300): who is refused tries again, for the key may be
-    allowed any moment.
+    """The keys that may connect.
 
     Parameters
     ----------
-    context
-        Of the sockets.
     cut
         Ends the connections of keys that are allowed no longer, or not for the same.
 
@@ -42,19 +41,12 @@ class Zap:
         As ``read_guests``.
     """
 
-    def __init__(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        cut: Callable[[Collection[str]], None],
-    ) -> None:
+    def __init__(self, cut: Callable[[Collection[str]], None]) -> None:
         self._file = guests_file()
         self.version = self._newest_version()
         self.guests: Guests = read_guests()
         self._cut = cut
         self._lock = threading.Lock()
-        self._socket = context.socket(zmq.REP)
-        self._socket.bind("inproc://zeromq.zap.01")
-        threading.Thread(target=self._answer, name="zap", daemon=True).start()
 
     def refresh(self) -> None:
         """Let changes of the list take effect."""
@@ -68,6 +60,15 @@ class Zap:
             except UserError as error:
                 LOG.error("the allowed keys stay as they were: %s", error)
             self.version = version
+        self._cut_changed(before)
+
+    def allow(self, guests: Guests) -> None:
+        """Let these connect and no others, until the file changes."""
+        with self._lock:
+            before, self.guests = self.guests, guests
+        self._cut_changed(before)
+
+    def _cut_changed(self, before: Guests) -> None:
         self._cut({key for key, guest in before.items() if self.guests.get(key) != guest})
 
     def _newest_version(self) -> tuple[int, int]:
@@ -77,23 +78,52 @@ class Zap:
             return 0, 0
         return about.st_ino, about.st_mtime_ns
 
-    def _answer(self) -> None:
-        with self._socket as socket:
-            while True:
-                try:
-                    parts = socket.recv_multipart()
-                except zmq.ContextTerminated:
-                    return
-                _version, request, domain, _address, _identity, _mechanism, key = parts
-                public = z85.encode(key)
-                self.refresh()
-                is_guest = self._may_connect(public.decode(), domain.decode())
-                answer = (b"200", b"", public) if is_guest else (b"300", b"not allowed", b"")
-                socket.send_multipart([b"1.0", request, *answer, b""])
-
-    def _may_connect(self, public: str, domain: str) -> bool:
+    def may_connect(self, public: str, domain: str) -> bool:
+        """Return whether a key may connect to the socket of some setting."""
+        self.refresh()
         guest = self.guests.get(public)
         if guest is None:
             return False
         wanted = ROLES_AT.get(domain)
         return wanted is None or any(role.partition(":")[0] == wanted for role in guest.roles)
+
+
+def answer_handshakes(
+    context: zmq.Context[zmq.Socket[bytes]],
+    zap: Zap | None,
+    is_shut_out: Callable[[str], bool],
+) -> None:
+    """Answer libzmq on a thread of its own, until the context ends.
+
+    A refusal is a temporary one (status 300): who is refused tries again, for the key, or the
+    address, may be allowed any moment.
+
+    Parameters
+    ----------
+    context
+        Of the sockets.
+    zap
+        Says which keys may connect; None: all is plain.
+    is_shut_out
+        Says whether nobody may connect from an address.
+    """
+    socket = context.socket(zmq.REP)
+    socket.bind("inproc://zeromq.zap.01")
+
+    def may_connect(address: str, domain: str, key: str) -> bool:
+        return not is_shut_out(address) and (zap is None or zap.may_connect(key, domain))
+
+    def answer() -> None:
+        with socket:
+            while True:
+                try:
+                    parts = socket.recv_multipart()
+                except zmq.ContextTerminated:
+                    return
+                _version, request, domain, address, _identity, _mechanism, *keys = parts
+                public = z85.encode(keys[0]) if keys else b""  # none where all is plain
+                is_guest = may_connect(address.decode(), domain.decode(), public.decode())
+                reply = (b"200", b"", public) if is_guest else (b"300", b"not allowed", b"")
+                socket.send_multipart([b"1.0", request, *reply, b""])
+
+    threading.Thread(target=answer, name="zap", daemon=True).start()

@@ -12,13 +12,17 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import zmq
 
+from shared.client import Client
+from shared.clock import MEDIA_RATE_HZ
 from shared.keys import Key, user_key
 
 MORE, LONG, COMMAND = 1, 2, 4  # flags of a frame
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 BLOCK_BYTES = 64 * 1024
+NUM_SILENT = 100  # subscribers
 TARGETS = {  # sockets of all kinds: their service, their setting, and the kind of their peers
     "commands": ("control", "COMMANDS", "DEALER"),
     "events": ("control", "EVENTS", "SUB"),
@@ -34,15 +38,17 @@ def ready(kind: str) -> bytes:
     return bytes([COMMAND, len(command)]) + command
 
 
-def connected(port: int, kind: str = "DEALER") -> socket.socket:
+def connected(port: int, kind: str = "DEALER", host: str = "127.0.0.1") -> socket.socket:
     """Return a connection that shook hands as a socket of some kind, without any key.
+
+    ``host`` is the address that it comes from.
 
     Raises
     ------
     OSError
         If the other end refuses.
     """
-    connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+    connection = socket.create_connection(("127.0.0.1", port), 5.0, (host, 0))
     try:
         connection.sendall(GREETING + ready(kind))
         answer = b""
@@ -207,10 +213,33 @@ AllowedAttack = Callable[[str, float], None]  # of an endpoint, for some seconds
 
 
 def connect(raw: zmq.Socket[bytes], endpoint: str, key: Key) -> None:
-    """Connect a socket as any program does that has a key."""
-    address, raw.curve_serverkey = endpoint.encode().split()
-    raw.curve_publickey, raw.curve_secretkey = key.public.encode(), key.secret.encode()
-    raw.connect(address.decode())
+    """Connect a socket as any program does that has a key, where one is needed."""
+    address, _, server_key = endpoint.partition(" ")
+    if server_key:
+        raw.curve_serverkey = server_key.encode()
+        raw.curve_publickey, raw.curve_secretkey = key.public.encode(), key.secret.encode()
+    raw.connect(address)
+
+
+def never_read(control: str, seconds: float) -> None:
+    """Let the frames of a session wait for subscribers that take none; gaps make very many."""
+    with Client(control) as client, zmq.Context() as context, contextlib.ExitStack() as held:
+        session = client.open_session(paced=False)
+        for _ in range(NUM_SILENT):
+            raw = held.enter_context(context.socket(zmq.SUB))
+            raw.rcvhwm, raw.rcvbuf, raw.linger = 1, 4096, 0
+            connect(raw, session.opened.faps, user_key())
+            raw.subscribe(f"fap-frame/{session.name}/")
+        time.sleep(seconds / 4)
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            if session.send(np.zeros(320, np.int16)):
+                session.skip(round(9.9 * MEDIA_RATE_HZ))
+            time.sleep(seconds / 60)
+        session.close()
+
+
+SESSIONS: dict[str, AllowedAttack] = {"subscribers that never read": never_read}  # at control
 
 
 def _sends(kind: int, part: bytes, num_parts: int = 1) -> AllowedAttack:

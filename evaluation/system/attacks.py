@@ -29,6 +29,7 @@ from evaluation.system.attackers import (
     ALLOWED,
     FLOODS,
     PAGE,
+    SESSIONS,
     SUBSCRIPTIONS,
     TARGETS,
     Attack,
@@ -127,6 +128,8 @@ def _attacks(keys: bool) -> Iterator[tuple[str, str]]:
             yield attack, target
     for attack in SUBSCRIPTIONS:
         yield attack, "faps"
+    for attack in SESSIONS:
+        yield attack, "commands"
     yield "very many connections", "audio"
     if keys:
         for attack in ALLOWED:
@@ -216,8 +219,8 @@ def _attack(attack: str, target: str, endpoint: str, begins: Event) -> None:
         if not endpoint:
             continue
         with contextlib.suppress(OSError):  # refused
-            if attack in ALLOWED:
-                ALLOWED[attack](endpoint, 1.0)
+            if attack in (at_endpoint := {**ALLOWED, **SESSIONS}):
+                at_endpoint[attack](endpoint, 1.0)
             else:
                 address = endpoint.partition(" ")[0].rstrip("/")
                 kind = TARGETS[target][2] if target in TARGETS else ""

@@ -26,7 +26,7 @@ READY_S = 60.0
 ON_HOSTS = ("control", "recognizer", "synthesizer")
 PORTS = {  # where services are bound that have hosts of their own
     "control": {"commands": 5550, "events": 5551},
-    "recognizer": {"audio": 5560, "phones": 5561},
+    "recognizer": {"audio": 5560, "phones": 5561, "unpaced_audio": 5562},
     "synthesizer": {"phone_input": 5570, "faps": 5571},
 }
 

@@ -18,9 +18,11 @@ from shared.wire.control import Heartbeat
 from shared.wire.session import ErrorCode
 
 CLIENT_NEEDS = ("audio", "phones", "faps")  # the endpoints that a client is told
+UNPACED_AUDIO = "unpaced_audio"  # instead of "audio", where a recognizer has it
 # Who alone may provide an endpoint, as another one's key is for another kind of service.
 PROVIDERS = {
     "audio": "recognizer",
+    UNPACED_AUDIO: "recognizer",
     "phones": "recognizer",
     "phone_input": "synthesizer",
     "faps": "synthesizer",
@@ -277,6 +279,8 @@ class Registry:
             workers[endpoint] = instance
             needs = self._services[instance].heartbeat.needs
             wanted += [need for need in needs if need not in wanted]
+        if UNPACED_AUDIO in self._services[workers["audio"]].heartbeat.endpoints:
+            workers[UNPACED_AUDIO] = workers["audio"]
         return workers
 
     def endpoints(self, workers: Mapping[str, str]) -> dict[str, str]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from operator import attrgetter
 
-from services.control.registry import Refusal, Registry
+from services.control.registry import UNPACED_AUDIO, Refusal, Registry
 from shared.face.shapes import SHAPE_SETS
 from shared.keys import Peer
 from shared.wire.control import Heartbeat, SessionState, StartSession
@@ -56,6 +56,12 @@ class SessionRecord:
     def start_request(self) -> str:
         """The request that its services confirm when they have started it."""
         return f"start-{self.name}-{self.epoch}"
+
+    @property
+    def audio(self) -> str:
+        """Where its client sends audio."""
+        live = self.endpoints["audio"]
+        return live if self.opening.paced else self.endpoints.get(UNPACED_AUDIO, live)
 
     @property
     def is_settled(self) -> bool:
@@ -349,7 +355,7 @@ class Sessions:
             language=record.language,
             frame_rate_hz=self._registry.frame_rate_hz(record.workers.values()),
             shapes={name: list(SHAPE_SETS[name].names) for name in record.shapes},
-            audio=record.endpoints["audio"],
+            audio=record.audio,
             phones=record.endpoints["phones"],
             faps=record.endpoints["faps"],
         )
@@ -360,7 +366,7 @@ class Sessions:
             session=record.name,
             epoch=record.epoch,
             next_sequence=record.resume_sequence,
-            audio=record.endpoints["audio"],
+            audio=record.audio,
             phones=record.endpoints["phones"],
             faps=record.endpoints["faps"],
         )

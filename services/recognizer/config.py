@@ -19,9 +19,11 @@ class RecognizerConfig(ServiceConfig):
     """The recognizer's own keys."""
 
     audio: BoundEndpoint = "tcp://127.0.0.1:5560"
-    """Where clients send audio."""
+    """Where clients send audio of live sessions."""
     phones: BoundEndpoint = "tcp://127.0.0.1:5561"
     """Where phones and sound are published."""
+    unpaced_audio: BoundEndpoint = "tcp://127.0.0.1:5562"
+    """Where clients send audio of sessions that are not paced, which waits for live audio."""
     acoustic: str = "blocks"
     """Acoustic model: blocks (fewest errors), neural (half the processor time), gmm, or a file."""
     look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0

@@ -15,6 +15,7 @@ import secrets
 import time
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 
 from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from services.recognizer.acoustic.load import load_live_model
@@ -47,7 +48,10 @@ MAX_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 MAX_BACKLOG = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
 MAX_BACKLOG_S = 5.0  # for so long; then the session's link is given up for the others' sake
 MAX_QUEUED_S = 0.3  # of audio, of all sessions, that is processed together
-MAX_UNPACED_S = 0.06  # of a session that is not paced, while another is: live audio waits for it
+MAX_UNPACED_S = 0.06  # of those that are not paced, while another is: live audio waits for it
+MIN_CHUNK_S = 0.001  # that a chunk counts for at least
+MAX_LEAD_S = 15.0  # of a paced client before the clock; one that was behind may catch up as much
+CLOCK_RATE = 1.01  # its clock may be faster than this one
 ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
 GIVE_BACK_S = 10.0  # after the end of a session: sessions of different lengths leave holes
 STALL_S = 0.2  # a live client silent for so long has stalled
@@ -58,8 +62,9 @@ MAX_NEEDED = 5000  # messages of audio that a client keeps
 class _Session:
     """One session: its stream, and its place among messages."""
 
-    def __init__(self, start: StartSession, stream: SpeechStream) -> None:
+    def __init__(self, start: StartSession, stream: SpeechStream, socket: Socket) -> None:
         self.start = start
+        self.socket = socket  # where its audio comes in
         self.first_epoch = start.epoch  # when this recognizer took the session
         self.stream = stream
         self.resumption: Resumption | None = None  # of a session that another has lost
@@ -77,9 +82,27 @@ class _Session:
         self.last_audio_s = time.monotonic()
         self.silent_s = 0.0  # for how long this process listened and no audio came
         self.voice_refusal = ""  # why the client's voice is not used, if it was not told yet
-        self.finished = False
+        self.end: EndOfAudio | None = None  # has come
+        self.finished = False  # all audio up to the end is processed
         self.num_gaps = 0  # of the stream's, counted
         self.late_since_s: float | None = None  # since when the synthesizer owes too much
+        self._lead_s, self._lead_at_s = 0.0, time.monotonic()  # before the clock, and when
+
+    @property
+    def num_taken(self) -> int:
+        """Number of the newest audio message that its client need not send again."""
+        if self.end is None or self.finished:
+            return self.order.last
+        return min(self.order.last, self.end.sequence - 1)
+
+    def is_ahead(self, duration_s: float, now_s: float) -> bool:
+        """Return whether sound of a live client comes too long before its time."""
+        passed_s = (now_s - self._lead_at_s) * CLOCK_RATE
+        lead_s = max(self._lead_s - passed_s, -MAX_LEAD_S) + duration_s
+        if lead_s > MAX_LEAD_S:
+            return True
+        self._lead_s, self._lead_at_s = lead_s, now_s
+        return False
 
 
 class RecognizerService(Service):
@@ -96,13 +119,20 @@ class RecognizerService(Service):
         self._queued: dict[str, list[Chunk]] = {}  # by session, not yet processed
         self._give_back_s = math.inf  # when the memory of sessions that have ended is given back
         self._queued_share = 0.0  # of what is processed together
+        # Of sessions that are not paced: chunks that came, and (None) the end of the audio.
+        self._unpaced: deque[tuple[_Session, Chunk | None]] = deque()
+        self._unpaced_s = 0.0  # of sound therein
+        self._listened_s = time.monotonic()  # when such sessions were last listened to
+        self._late = {True: False, False: False}  # by paced: a synthesizer owes too much
         self._ticked_s = time.monotonic()
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
         self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
+        self._unpaced_audio = self.bus.bind_router(config.unpaced_audio, "recognizer.unpaced_audio")
         self.endpoints = {
             "audio": config.reachable(self._audio.endpoint),
             "phones": config.reachable(self._phones.endpoint),
+            "unpaced_audio": config.reachable(self._unpaced_audio.endpoint),
         }
         self._model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
         self.language = self._model.inventory.language
@@ -113,13 +143,22 @@ class RecognizerService(Service):
                 "mouth; with synthesizer.lips=dynamic-visemes they have the delay that suits them"
             )
         warm_up(self._model)
-        self.register(self._audio, {AudioChunk: self._on_audio, EndOfAudio: self._on_audio})
+        for socket in (self._audio, self._unpaced_audio):
+            on_audio = partial(self._on_audio, socket)
+            self.register(socket, {AudioChunk: on_audio, EndOfAudio: on_audio})
         self.register(self._phones, {})
 
     def step(self, timeout_s: float) -> None:
-        """Take in what has arrived, then process the audio of all sessions together."""
-        super().step(timeout_s)
+        """Take in what has arrived, then process the audio of all live sessions together.
+
+        Once no live audio waits, some of the others' is processed. What they send meanwhile waits
+        in their own socket, and where that is full at the sender.
+        """
+        super().step(0.0 if self._unpaced and not self._late[False] else timeout_s)
         self._process_queued()
+        is_live_waiting = not self._late[True] and self._audio.wait(0.0)
+        if not self._late[False] and not is_live_waiting:
+            self._process_unpaced()
 
     def start_session(self, start: StartSession) -> bool:
         """Make a stream, or after a crash of the synthesizer give the old one a new link."""
@@ -128,7 +167,8 @@ class RecognizerService(Service):
         is_new = False
         if session is None or session.start.token != start.token:
             lips, voice_refusal = self._lips_of(start)
-            session = _Session(start, self._new_stream(start, lips))
+            socket = self._audio if start.paced else self._unpaced_audio
+            session = _Session(start, self._new_stream(start, lips), socket)
             session.voice_refusal = voice_refusal
             if start.media_time:
                 silence = self._model.inventory.silence
@@ -175,6 +215,9 @@ class RecognizerService(Service):
         self._process_queued()
         found = self._sessions.get(session)
         if found is not None:
+            self._unpaced = deque(
+                (each, chunk) for each, chunk in self._unpaced if each is not found or chunk is None
+            )
             found.link.forget()
             self._emit(found, found.stream.flush())
 
@@ -187,7 +230,7 @@ class RecognizerService(Service):
             self._give_back_s = math.inf
             give_back_memory()
         self._find_stalled(now_s)
-        any_late = False
+        late = {True: False, False: False}
         for name, session in self._sessions.items():
             self._take_in_order(session, session.order.tick(now_s), session.client)
             if session.acknowledge_s is not None and now_s >= session.acknowledge_s:
@@ -196,12 +239,14 @@ class RecognizerService(Service):
             if session.link.backlog <= MAX_BACKLOG:
                 session.late_since_s = None
                 continue
-            any_late = True
+            late[session.start.paced] = True
             session.late_since_s = session.late_since_s or now_s
             if now_s - session.late_since_s > MAX_BACKLOG_S:
                 self.warn("no-link", "the synthesizer takes no phones; they are dropped", name)
                 session.link.disconnect()
-        self.pause(self._audio, paused=any_late)
+        self._late = late
+        self.pause(self._audio, paused=late[True])
+        self._hold_back()
 
     def _find_stalled(self, now_s: float) -> None:
         """Tell the synthesizer whose live client sends nothing.
@@ -225,16 +270,18 @@ class RecognizerService(Service):
         sessions = self._sessions.values()
         if self.hands_over and not all(session.finished for session in sessions):
             return False
+        while self._unpaced:
+            self._process_unpaced()
         for session in sessions:
             self._finish(session)
         return all(session.link.backlog == 0 for session in sessions)
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return how far the audio of each session has come."""
-        now_s = time.monotonic()
+        listened_s = {True: time.monotonic(), False: self._listened_s}  # by paced
         return {
             name: SessionInput(
-                idle_s=now_s - session.last_audio_s,
+                idle_s=max(0.0, listened_s[session.start.paced] - session.last_audio_s),
                 sequence=session.num_needless,
                 media_time=to_samples(session.final.time_s),
             )
@@ -250,14 +297,14 @@ class RecognizerService(Service):
             for _, part in chunks
         )
         return {
-            "queued_audio_seconds": queued_s,
+            "queued_audio_seconds": queued_s + self._unpaced_s,
             "unacknowledged_messages": max(backlogs, default=0),
         }
 
     # --- from clients ----------------------------------------------------------------------------
 
-    def _on_audio(self, message: AudioMessage, sender: Peer) -> None:
-        session = self._admit(message, sender)
+    def _on_audio(self, socket: Socket, message: AudioMessage, sender: Peer) -> None:
+        session = self._admit(socket, message, sender)
         if session is None:
             return
         now_s = time.monotonic()
@@ -281,39 +328,47 @@ class RecognizerService(Service):
         for message in messages:
             if message.media_time > MAX_MEDIA_TIME:
                 text = f"media_time {message.media_time} is no sample index at 16 kHz; count from 0"
-                self._refuse(message, sender, ErrorCode.BAD_AUDIO, text)
-            elif session.finished:
+                self._refuse(session.socket, message, sender, ErrorCode.BAD_AUDIO, text)
+            elif session.end is not None:
                 text = f"session {message.session!r} has ended; open another"
-                self._refuse(message, sender, ErrorCode.FINISHED, text)
+                self._refuse(session.socket, message, sender, ErrorCode.FINISHED, text)
             elif isinstance(message, AudioChunk):
                 self._take_chunk(session, message, sender)
             else:
-                self._process_queued()
-                self._finish(session)
+                session.end = message
+                if session.start.paced:
+                    self._process_queued()
+                    self._finish(session)
+                else:
+                    self._unpaced.append((session, None))
 
     def _acknowledge(self, session: _Session, now_s: float) -> None:
         """Tell the client which audio it need not send again."""
         session.acknowledge_s, session.acknowledged_s = None, now_s
-        self._audio.send(
+        session.socket.send(
             Acknowledge(
                 session=session.start.session,
                 epoch=session.start.epoch,
-                sequence=session.order.last,
+                sequence=session.num_taken,
             ),
             to=session.client,
         )
 
     def _take_chunk(self, session: _Session, chunk: AudioChunk, sender: Peer) -> None:
         if session.voice_refusal:
-            self._refuse(chunk, sender, ErrorCode.BAD_VOICE, session.voice_refusal)
+            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_VOICE, session.voice_refusal)
             session.voice_refusal = ""
         start = session.start
         try:
             samples = samples_of(chunk.pcm, start.encoding, start.num_channels)
         except BadAudio as error:
-            self._refuse(chunk, sender, ErrorCode.BAD_AUDIO, str(error))
+            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_AUDIO, str(error))
             return
         rate_hz = start.sample_rate_hz
+        if start.paced and session.is_ahead(len(samples) / rate_hz, time.monotonic()):
+            text = f"it is more than {MAX_LEAD_S:g} s ahead of the clock; open with paced false"
+            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_AUDIO, text)
+            return
         media_time = chunk.media_time
         end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
         session.needed.append((chunk.sequence, end))
@@ -322,8 +377,12 @@ class RecognizerService(Service):
             session.has_begun = len(samples) > 0
             if not session.has_begun:
                 return
-        hurries = not start.paced and any(each.start.paced for each in self._sessions.values())
-        piece = round((MAX_UNPACED_S if hurries else MAX_QUEUED_S) * rate_hz)
+        if not start.paced:
+            self._unpaced.append((session, (media_time, samples)))
+            self._unpaced_s += max(MIN_CHUNK_S, len(samples) / rate_hz)
+            self._hold_back()
+            return
+        piece = round(MAX_QUEUED_S * rate_hz)
         for begin in range(0, max(1, len(samples)), piece):  # a long chunk must not hold others up
             part = samples[begin : begin + piece]
             part_time = media_time + begin * MEDIA_RATE_HZ // rate_hz
@@ -332,6 +391,49 @@ class RecognizerService(Service):
             if self._queued_share >= 1.0:
                 self._process_queued()
                 self.beat_if_due()
+
+    @property
+    def _max_unpaced_s(self) -> float:
+        """How much of sessions that are not paced is processed, and read, at a time."""
+        has_live = any(session.start.paced for session in self._sessions.values())
+        return MAX_UNPACED_S if has_live else MAX_QUEUED_S
+
+    def _hold_back(self) -> None:
+        """Let clients that are not paced wait while there is enough of theirs."""
+        is_enough = self._unpaced_s >= self._max_unpaced_s
+        self.pause(self._unpaced_audio, paused=is_enough or self._late[False])
+        if not is_enough and not self._late[False]:
+            self._listened_s = time.monotonic()
+
+    def _process_unpaced(self) -> None:
+        """Process some audio of sessions that are not paced, and end those that are through."""
+        left_s = self._max_unpaced_s
+        while self._unpaced and left_s > 0.0:
+            session, chunk = self._unpaced.popleft()
+            start = session.start
+            if self._sessions.get(start.session) is not session:
+                continue
+            if chunk is None:
+                self._process_queued()
+                self._finish(session)
+                if session.end is not None and session.end.acknowledge:
+                    session.acknowledge_s = time.monotonic()
+                continue
+            media_time, samples = chunk
+            rate_hz = start.sample_rate_hz
+            part = samples[: max(1, round(left_s * rate_hz))]
+            self._queued.setdefault(start.session, []).append((media_time, part))
+            left_s -= len(part) / rate_hz
+            if len(part) < len(samples):
+                rest_time = media_time + len(part) * MEDIA_RATE_HZ // rate_hz
+                self._unpaced.appendleft((session, (rest_time, samples[len(part) :])))
+        self._unpaced_s = sum(
+            max(MIN_CHUNK_S, len(chunk[1]) / session.start.sample_rate_hz)
+            for session, chunk in self._unpaced
+            if chunk is not None
+        )
+        self._process_queued()
+        self._hold_back()
 
     def _process_queued(self) -> None:
         """Process the queued chunks; the network scores all sessions' frames in one go."""
@@ -350,27 +452,32 @@ class RecognizerService(Service):
             session.num_gaps = session.stream.num_gaps
         self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
 
-    def _admit(self, message: AudioMessage, sender: Peer) -> _Session | None:
+    def _admit(self, socket: Socket, message: AudioMessage, sender: Peer) -> _Session | None:
         """Return the session if the sender may write to it."""
         session = self._sessions.get(message.session)
         if session is None:
             text = f"there is no session {message.session!r} here; open it at control"
-            self._refuse(message, sender, ErrorCode.UNKNOWN_SESSION, text)
+            self._refuse(socket, message, sender, ErrorCode.UNKNOWN_SESSION, text)
         elif not secrets.compare_digest(session.start.token.encode(), message.token.encode()):
             text = f"the token is not that of session {message.session!r}"
-            self._refuse(message, sender, ErrorCode.BAD_TOKEN, text)
+            self._refuse(socket, message, sender, ErrorCode.BAD_TOKEN, text)
+        elif socket is not session.socket:
+            text = f"send the audio of session {message.session!r} where session-opened says"
+            self._refuse(socket, message, sender, ErrorCode.BAD_AUDIO, text)
         elif message.sequence == 0:
             text = "the message has no sequence; number audio messages from 1"
-            self._refuse(message, sender, ErrorCode.BAD_AUDIO, text)
+            self._refuse(socket, message, sender, ErrorCode.BAD_AUDIO, text)
         elif 0 < message.epoch < session.first_epoch:  # meant for the recognizer before this one
             self.metrics.count("other_epoch")
         else:
             return session
         return None
 
-    def _refuse(self, message: Message, sender: Peer, code: ErrorCode, text: str) -> None:
+    def _refuse(
+        self, socket: Socket, message: Message, sender: Peer, code: ErrorCode, text: str
+    ) -> None:
         self.warn(code, text, message.session)
-        self._audio.send(
+        socket.send(
             Error(session=message.session, media_time=message.media_time, code=code, text=text),
             to=sender,
         )

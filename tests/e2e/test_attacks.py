@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import resource
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from random import Random
+from typing import Self
 
 import numpy as np
 import pytest
 
 from evaluation.system import attackers
 from evaluation.system.memory import Memory
+from services.synthesizer.config import SynthesizerConfig
 from shared.client import Client, Session
 from shared.connections import MAX_CONNECTIONS
+from shared.wire.face import FapFrame
 from tests.e2e.following import stream
 from tests.system import System
 
@@ -66,6 +71,44 @@ def client(system: System) -> Iterator[Client]:
         yield made
 
 
+class LiveFace(threading.Thread):
+    """A live session of which at most a second may be missing when something has gone on."""
+
+    def __init__(self, control: str) -> None:
+        super().__init__()
+        self._control = control
+        self._begins, self._ends = threading.Event(), threading.Event()
+        self._num_missing = -1  # frames
+
+    def __enter__(self) -> Self:
+        self.start()
+        assert self._begins.wait(30.0)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._ends.set()
+        self.join(30.0)
+        assert 0 <= self._num_missing < 50 + SynthesizerConfig().delay_ms / 20
+
+    def run(self) -> None:
+        with Client(self._control) as client:
+            session = client.open_session()
+            output = session.subscribe(FapFrame)
+            num_sent = num_frames = 0
+            begin_s, last_s = time.monotonic(), math.inf
+            while time.monotonic() < last_s:
+                if self._ends.is_set() and last_s == math.inf:
+                    last_s = time.monotonic() + 0.5
+                if last_s == math.inf and time.monotonic() > begin_s + 0.02 * num_sent:
+                    num_sent += session.send(np.zeros(320, np.int16))
+                output.wait(0.01)
+                num_frames += sum(isinstance(r.message, FapFrame) for r in output.receive())
+                if num_frames:
+                    self._begins.set()
+            session.close()
+        self._num_missing = max(0, num_sent - num_frames)
+
+
 @pytest.mark.parametrize("attack", attackers.FLOODS)
 @pytest.mark.parametrize("target", ["commands", "audio", "faps"])
 def test_a_flood_takes_little_memory_and_leaves_none(
@@ -74,7 +117,8 @@ def test_a_flood_takes_little_memory_and_leaves_none(
     service, _, kind = attackers.TARGETS[target]
     port = port_of(system, target)
     memory = Memory(system.processes[service].pid)
-    attackers.FLOODS[attack](port, kind, SECONDS)
+    with LiveFace(system.control):
+        attackers.FLOODS[attack](port, kind, SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
 
@@ -85,7 +129,17 @@ def test_subscriptions_are_bounded_in_length_and_number(
 ) -> None:
     port = int(system.environment["KOUXING_SYNTHESIZER_FAPS"].rpartition(":")[2])
     memory = Memory(system.processes["synthesizer"].pid)
-    attackers.SUBSCRIPTIONS[attack](port, "SUB", SECONDS)
+    with LiveFace(system.control):
+        attackers.SUBSCRIPTIONS[attack](port, "SUB", SECONDS)
+    assert memory.growth_mb < MAX_GROWTH_MB
+    assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
+
+
+@pytest.mark.parametrize("attack", attackers.SESSIONS)
+def test_what_nobody_takes_is_bounded(system: System, witness: Session, attack: str) -> None:
+    memory = Memory(system.processes["synthesizer"].pid)
+    with LiveFace(system.control):
+        attackers.SESSIONS[attack](system.control, 4 * SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
 

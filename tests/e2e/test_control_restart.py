@@ -37,7 +37,8 @@ def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: P
         assert session.opened == opened, "it has not moved"
         (state,) = client.status().sessions
         assert (state.session, state.state) == (session.name, "open")
-        assert {*state.workers} == {"audio", "phones", "phone_input", "faps"}
+        provided = {"audio", "unpaced_audio", "phones", "phone_input", "faps"}
+        assert {*state.workers} == provided
 
         system.start_beside("synthesizer", "other")
         lost = system.processes.pop("synthesizer")

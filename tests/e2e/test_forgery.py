@@ -73,7 +73,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
         stranger.send(replace(HEARTBEAT, **forged))  # type: ignore[arg-type]
         assert answer(stranger, Error).code == "not-allowed"
     assert {each.instance for each in client.status().services} == before
-    session = client.open_session()
+    session = client.open_session(paced=False)
     assert session.opened.audio == witness.opened.audio
     session.close()
 

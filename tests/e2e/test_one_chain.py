@@ -117,7 +117,7 @@ def recognizer_with_lips(control: str) -> Iterator[None]:
     """Run a recognizer in this process, since no shipped file holds the made-up lips."""
     local = "tcp://127.0.0.1:*"
     address = control.partition(" ")[0]
-    config = RecognizerConfig(control=address, audio=local, phones=local)
+    config = RecognizerConfig(control=address, audio=local, phones=local, unpaced_audio=local)
     service = RecognizerService(config, LoudLips())
     stop = threading.Event()
 

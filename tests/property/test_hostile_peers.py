@@ -187,7 +187,9 @@ class PeersOfControl(Peers):
 @cache
 def recognizer() -> RecognizerService:
     control = f"tcp://127.0.0.1:{free_port()}"
-    config = RecognizerConfig(audio=LOCAL, phones=LOCAL, control=control, insecure=True)
+    config = RecognizerConfig(
+        audio=LOCAL, phones=LOCAL, unpaced_audio=LOCAL, control=control, insecure=True
+    )
     return RecognizerService(config)
 
 

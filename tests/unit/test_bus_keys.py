@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +13,13 @@ import zmq
 from evaluation.system.attackers import connect
 from shared import connections
 from shared.bus import Bus, Socket
+from shared.config import ServiceConfig
 from shared.endpoints import split_endpoint, with_key
 from shared.errors import UserError
-from shared.keys import Key, add_guest, key_folder, own_key, revoke_guest
+from shared.keys import NOBODY, Guest, Key, add_guest, key_folder, own_key, revoke_guest
+from shared.service import Service
 from shared.wire.codec import encode
-from shared.wire.control import StatusRequest
+from shared.wire.control import AllowedKey, AllowedKeys, StatusRequest
 from shared.wire.face import FapFrame
 from shared.wire.message import Message
 from shared.wire.session import Joined
@@ -198,6 +201,58 @@ def test_a_key_is_allowed_and_revoked_while_the_socket_is_bound(
         server.bus.zap.refresh()
         dealer.send(StatusRequest(request="2"))
         assert messages_of(router) == []
+        assert bus.is_refused(endpoint)
+
+
+class Fleeting(dict[str, Guest]):
+    """Guests who are revoked as soon as somebody has asked for one."""
+
+    def __contains__(self, key: object) -> bool:
+        return self.pop(str(key), None) is not None
+
+
+def test_a_key_that_is_revoked_while_its_subscription_is_handled_harms_nobody(
+    server: Server,
+) -> None:
+    publisher, endpoint = server.publisher()
+    with Bus(key_of("screen", "subscriber:*")) as bus:
+        bus.connect_subscriber(endpoint).subscribe(FapFrame, None)
+        assert publisher.wait(5.0)
+        assert server.bus.zap is not None
+        server.bus.zap.guests = Fleeting(server.bus.zap.guests)
+        assert list(publisher.receive()) == []
+
+
+class Recognizer(Service):
+    """A service of which nothing is wanted but who may connect."""
+
+    name = "recognizer"
+    role = "worker"
+
+
+def test_a_list_that_cannot_be_written_counts_as_long_as_the_service_runs(
+    server: Server,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    key = key_of("laptop", "client")
+    key_of("recognizer", "service:recognizer")
+    shutil.copytree(key_folder(), tmp_path / "other" / "kouxing")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
+    for name in ("control.key", "allowed"):  # as on another machine, whose list is empty yet
+        (key_folder() / name).unlink()
+    service = Recognizer(ServiceConfig())
+    with service.bus, Bus(key) as bus:
+        router = service.bus.bind_router(LOCAL, "recognizer.audio")
+        endpoint = with_key(router.endpoint, service.key.public if service.key else "")
+        assert bus.is_refused(endpoint)
+        key_folder().chmod(0o755)  # nothing is written there
+        allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
+        service._on_allowed_keys(AllowedKeys(keys=allowed), NOBODY)
+        assert "are not kept: others can read" in caplog.text
+        assert not bus.is_refused(endpoint)
+        service._on_allowed_keys(AllowedKeys(keys={}), NOBODY)
         assert bus.is_refused(endpoint)
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
 import socket
 import stat
 import time
@@ -12,8 +14,9 @@ import pytest
 
 from evaluation.system.attackers import connected, frame
 from shared import connections
-from shared.bus import Bus, Received, Socket
-from shared.connections import MAX_SUBSCRIBED, MAX_SUBSCRIPTION, Connection
+from shared.bus import COMMANDS, MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
+from shared.connections import CREDIT, MAX_SUBSCRIBED, MAX_SUBSCRIPTION, Connection
+from shared.keys import NOBODY, Peer
 from shared.wire.audio import AudioChunk
 from shared.wire.codec import encode
 from shared.wire.face import FapFrame
@@ -142,8 +145,10 @@ def test_one_that_subscribes_to_too_much_is_cut(bus: Bus) -> None:
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
     with connected(port_of(faps), "SUB") as hostile:
-        for number in range(MAX_SUBSCRIBED // MAX_SUBSCRIPTION + 1):
+        for number in range(MAX_SUBSCRIBED // MAX_SUBSCRIPTION):
             hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_SUBSCRIPTION, "x").encode()))
+        assert not is_cut(hostile, faps, num_looks=20)
+        hostile.sendall(frame(b"\x01x"))
         assert is_cut(hostile, faps)
     with connected(port_of(faps), "SUB") as hostile:
         hostile.sendall(frame(b"\x01" + bytes(MAX_SUBSCRIPTION + 1)))
@@ -155,17 +160,22 @@ def test_one_that_subscribes_to_too_much_is_cut(bus: Bus) -> None:
 
 def is_cut(connection: socket.socket, bound: Socket, num_looks: int = 500) -> bool:
     """Whether a connection ends soon, while its other end's messages are received."""
-    connection.settimeout(0.02)
     for _ in range(num_looks):
         list(bound.receive())
-        try:
-            if not connection.recv(65_536):
-                return True
-        except TimeoutError:
-            continue
-        except OSError:
+        if has_ended(connection):
             return True
     return False
+
+
+def has_ended(connection: socket.socket) -> bool:
+    """Whether a connection ends now."""
+    connection.settimeout(0.02)
+    try:
+        return not connection.recv(65_536)
+    except TimeoutError:
+        return False
+    except OSError:
+        return True
 
 
 def test_the_first_connection_is_watched_at_once(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,6 +228,48 @@ def test_one_that_sends_only_what_is_refused_is_cut(bus: Bus) -> None:
             for received in audio.receive():
                 audio.send(Error(code="bad-message", text="no"), to=received.sender)
     raise AssertionError("it was not cut")
+
+
+def test_one_that_takes_nothing_is_cut_once_too_much_waits(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_UNREAD", connections.MIB)
+    faps = bus.bind_publisher(LOCAL, "faps")
+    honest = bus.connect_subscriber(faps.endpoint)
+    honest.subscribe(FapFrame, "s")
+    with connected(port_of(faps), "SUB") as silent:
+        silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        silent.sendall(frame(b"\x01fap-frame/"))
+        send_until_cut(silent, faps, NOBODY, honest)
+
+
+def test_one_that_takes_no_answers_is_cut_once_too_much_waits(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_UNREAD", connections.MIB)
+    commands = bus.bind_router(LOCAL, "commands", COMMANDS)
+    with connected(port_of(commands)) as silent:
+        silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        silent.sendall(wire_bytes(Progress(level_db=0.0)))
+        (received,) = collect(bus, commands, lambda all_: len(all_) == 1)
+        send_until_cut(silent, commands, received.sender)
+
+
+def send_until_cut(silent: socket.socket, bound: Socket, peer: Peer, *honest: Socket) -> None:
+    """Send to one that takes nothing; others get all."""
+    ends = select.poll()
+    ends.register(silent, 0)
+    num_sent, num_taken, end_s = 0, 0, time.monotonic() + 30
+    while not ends.poll(5):
+        assert time.monotonic() < end_s
+        list(bound.receive())
+        for _ in range(100 if num_sent < 15_000 else 0):  # ZeroMQ itself drops more than 20 000
+            bound.send(FapFrame(session="s", values=bytes(272), mask=bytes(9)), to=peer)
+            num_sent += 1
+        num_taken += sum(len(list(each.receive())) for each in honest)
+    while honest and num_taken < num_sent - 300:  # before it had subscribed
+        assert honest[0].wait(5.0)
+        num_taken += len(list(honest[0].receive()))
 
 
 def test_a_message_of_another_connection_has_another_number(bus: Bus) -> None:
@@ -323,24 +375,85 @@ def test_silent_connections_make_room_for_new_ones(
         each.close()
 
 
-def test_an_address_with_many_faults_is_let_in_again_later(
+def test_an_address_that_floods_once_is_shut_out_for_a_while(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "MAX_FAULTS", 3)
     monkeypatch.setattr(connections, "FAULTS_S", 0)
     audio = bus.bind_router(LOCAL, "audio")
     talker = bus.connect_dealer(audio.endpoint)
     talker.send(chunk(1, 10))
     collect(bus, audio, lambda all_: len(all_) == 1)
-    for _ in range(4):
-        with connected(port_of(audio)) as hostile:
-            hostile.sendall(frame(b"", more=True) * 100 + frame(b""))
-            assert is_cut(hostile, audio)
+    with connected(port_of(audio)) as hostile:
+        hostile.sendall(frame(b"", more=True) * 2 * MAX_DROPPED + frame(b""))
+        assert is_cut(hostile, audio)
+    for host in ("127.0.0.1", "127.0.0.9"):  # all of them are one
+        with contextlib.suppress(ConnectionError), connected(port_of(audio), host=host) as other:
+            assert is_cut(other, audio, num_looks=50)
     late = bus.connect_dealer(audio.endpoint)
     for sequence in range(10, 20):  # its connection stays
         time.sleep(0.02)
         talker.send(chunk(sequence, 10))
-        (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
-        assert received.message == chunk(sequence, 10)
-    monkeypatch.setattr(connections, "FAULTS_S", 2)
+        received = collect(bus, audio, lambda all_: len(all_) >= 1)
+        assert received[-1].message == chunk(sequence, 10)
+    monkeypatch.setattr(connections, "FAULTS_S", 50)
     collect(bus, audio, lambda all_: late.send(chunk(3, 10)) and bool(all_))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "is_one"),
+    [
+        ("127.0.0.1", "127.200.1.1", True),
+        ("127.0.0.1", "::1", True),
+        ("127.0.0.1", "::ffff:127.0.0.2", True),
+        ("10.0.0.1", "10.0.0.2", False),
+        ("10.0.0.1", "::ffff:10.0.0.1", True),
+        ("2001:db8:0:1::1", "2001:db8:0:1:ffff::2", True),
+        ("2001:db8:0:1::1", "2001:db8:0:2::1", False),
+        ("fe80::1%eth0", "fe80::2%eth0", True),
+    ],
+)
+def test_the_addresses_of_one_host_count_as_one(first: str, second: str, is_one: bool) -> None:
+    assert (connections._network(first) == connections._network(second)) == is_one
+
+
+@pytest.mark.parametrize("kind", ["DEALER", "SUB"])
+def test_a_message_of_very_many_parts_is_given_up_little_by_little(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    for name in ("NEAR_LOOK_S", "LOOK_S"):  # the guard comes too late
+        monkeypatch.setattr(connections, name, 2.0)
+    bound = (bus.bind_router if kind == "DEALER" else bus.bind_publisher)(LOCAL, "bound")
+    with connected(port_of(bound), kind) as hostile:
+        num_parts = 20 * MAX_DROPPED
+        hostile.sendall(frame(b"", more=True) * num_parts + frame(b""))
+        assert bound.wait(20.0)
+        guarded = bound._guarded
+        assert guarded is not None
+        turns, before = 0, guarded.turns
+        while bound.wait(0.0):
+            assert guarded.turns == before  # whose message was not delivered yet is not judged
+            list(bound.receive())
+            turns += 1
+    assert turns >= num_parts // MAX_DROPPED
+
+
+def test_who_comes_again_has_no_more_credit_than_before(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "CREDIT_S", 0.0)
+    audio = bus.bind_router(LOCAL, "audio")
+    bad = frame(b"nothing/s/", more=True) + frame(b"\x80")
+    num_refused = 0
+    for _ in range(4):
+        with connected(port_of(audio)) as hostile:
+            hostile.sendall(bad * 500)
+            num_left = 500
+            while num_left and not has_ended(hostile):
+                for received in audio.receive():
+                    audio.send(Error(code="bad-message", text="no"), to=received.sender)
+                    num_left -= 1
+                    num_refused += 1
+        end_s = time.monotonic() + 20
+        while not list(audio.ended()) and time.monotonic() < end_s:
+            list(audio.receive())
+    assert num_refused < CREDIT / REFUSAL_COST + 10

@@ -81,5 +81,6 @@ def test_more_workers_bind_other_ports_of_the_same_address() -> None:
         "KOUXING_RECOGNIZER_INSTANCE": "",
         "KOUXING_RECOGNIZER_AUDIO": "tcp://127.0.0.5:*",
         "KOUXING_RECOGNIZER_PHONES": "tcp://127.0.0.1:*",
+        "KOUXING_RECOGNIZER_UNPACED_AUDIO": "tcp://127.0.0.1:*",
     }
     assert {kind_of(name) for name in more} < KINDS.keys()

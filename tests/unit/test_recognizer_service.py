@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from services.recognizer.acoustic.load import load_model, model_path
+from services.recognizer.audio_order import AudioMessage
 from services.recognizer.config import RecognizerConfig
 from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
-from services.recognizer.service import MAX_QUEUED_S, MAX_UNPACED_S, RecognizerService
+from services.recognizer.service import (
+    MAX_LEAD_S,
+    MAX_QUEUED_S,
+    MAX_UNPACED_S,
+    RecognizerService,
+)
 from services.recognizer.stream import SpeechStream
 from services.recognizer.voice import Voice
+from shared.bus import Bus
 from shared.keys import Peer
 from shared.phones.events import LipFrame
-from shared.wire.audio import AudioChunk
+from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.control import StartSession
 from shared.wire.message import MAX_AUDIO_BYTES
 from tests.e2e.following import samples_of_file
@@ -33,12 +42,27 @@ class Watched(RecognizerService):
     def __init__(self) -> None:
         local = "tcp://127.0.0.1:*"
         nobody = f"tcp://127.0.0.1:{free_port()}"
-        super().__init__(RecognizerConfig(control=nobody, audio=local, phones=local, insecure=True))
+        config = RecognizerConfig(
+            control=nobody, audio=local, phones=local, unpaced_audio=local, insecure=True
+        )
+        super().__init__(config)
         self.media_times: list[int] = [0]
         self.warnings_given: list[tuple[str, str]] = []
 
     def warn(self, reason: str, text: str, session: str = "") -> None:
         self.warnings_given.append((reason, text))
+
+    def take(self, message: AudioMessage) -> None:
+        """Take a message of a client."""
+        socket = self._sessions[message.session].socket
+        self._on_audio(socket, message, Peer())
+
+    def work_off(self) -> None:
+        """Process what has come."""
+        self._process_queued()
+        while self._unpaced:
+            self._process_unpaced()
+            self.beat_if_due()
 
     def beat_if_due(self) -> None:
         self.media_times += [session.stream.media_time for session in self._sessions.values()]
@@ -68,37 +92,132 @@ def start_of(voice: bytes = b"") -> StartSession:
     )
 
 
+def steps_of(times: list[int]) -> list[int]:
+    return [after - before for before, after in pairwise(times)]
+
+
 def test_the_longest_chunk_is_processed_in_pieces_with_heartbeats_between(service: Watched) -> None:
     service.start_session(start_of())
-    pcm = bytes(MAX_AUDIO_BYTES)
-    service._on_audio(AudioChunk(session="s", token="t", sequence=1, pcm=pcm), Peer())
-    service._process_queued()
-    service.beat_if_due()
-    steps = [
-        after - before
-        for before, after in zip(service.media_times, service.media_times[1:], strict=False)
-    ]
-    assert max(steps) <= MAX_QUEUED_S * 16000 + 320
+    service.take(AudioChunk(session="s", token="t", sequence=1, pcm=bytes(MAX_AUDIO_BYTES)))
+    service.work_off()
+    assert max(steps_of(service.media_times)) <= MAX_QUEUED_S * 16000 + 320
     assert service.media_times[-1] == pytest.approx(
         MAX_AUDIO_BYTES, abs=320
     )  # 2 bytes at half the rate
 
 
-def test_live_audio_waits_for_little_of_what_is_not_paced(service: Watched) -> None:
+def test_live_audio_is_processed_before_what_is_not_paced(service: Watched) -> None:
     service.start_session(start_of())
     service.start_session(replace(start_of(), session="live", paced=True))
-    for number in range(1, 11):  # 0.2 s each
-        pcm = bytes(2 * RATE_HZ // 5)
-        chunk = AudioChunk(
-            session="s", token="t", sequence=number, media_time=3200 * (number - 1), pcm=pcm
-        )
-        service._on_audio(chunk, Peer())
-    service._process_queued()
-    service.beat_if_due()
-    times = [media_time for media_time in service.media_times if media_time]  # not the live one's
-    steps = [after - before for before, after in zip([0, *times], times, strict=False)]
-    assert max(steps) <= MAX_UNPACED_S * 16000 + 320
-    assert times[-1] > 30_000
+    live, other = (service._sessions[name].stream for name in ("live", "s"))
+    num_long, num_short = 12, 100
+    with Bus() as bus:
+        pouring = bus.connect_dealer(service.endpoints["unpaced_audio"])
+        for number in range(num_long):  # of 0.5 s
+            pcm, media_time = bytes(RATE_HZ), 8000 * number
+            pouring.send(
+                AudioChunk(
+                    session="s", token="t", sequence=number + 1, media_time=media_time, pcm=pcm
+                )
+            )
+        speaking = bus.connect_dealer(service.endpoints["audio"])
+        for number in range(num_short):  # of 20 ms
+            media_time = 320 * number
+            speaking.send(
+                AudioChunk(
+                    session="live",
+                    token="t",
+                    sequence=number + 1,
+                    media_time=media_time,
+                    pcm=bytes(320),
+                )
+            )
+            assert service._audio.wait(5.0)
+            before = other.media_time
+            service.step(0.0)
+            assert live.next_media_time == media_time + 320  # at once
+            assert other.media_time - before <= MAX_UNPACED_S * 16000 + 320
+        assert other.media_time > 0.5 * MAX_UNPACED_S * 16000 * num_short  # as time is left
+        end_s = time.monotonic() + 60
+        while other.next_media_time < 8000 * num_long and time.monotonic() < end_s:
+            service.step(0.01)
+        assert other.next_media_time == 8000 * num_long
+        assert other.num_gaps == 0  # nothing was dropped
+    assert not service.warnings_given
+
+
+def test_what_is_not_paced_waits_at_its_sender_while_live_audio_does_not_end(
+    service: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service.start_session(start_of())
+    other = service._sessions["s"]
+    monkeypatch.setattr(service._audio, "wait", lambda _timeout_s: True)
+    pcm, num_taken = bytes(MAX_AUDIO_BYTES), 0
+    with Bus() as bus:
+        pouring = bus.connect_dealer(service.endpoints["unpaced_audio"], queue_length=10)
+        for _ in range(500):
+            sequence = num_taken + 1
+            num_taken += pouring.send(
+                AudioChunk(session="s", token="t", sequence=sequence, pcm=pcm)
+            )
+            service.step(0.001)
+    assert num_taken < 250, "its socket takes no more"
+    assert (other.order.last, other.stream.media_time) == (1, 0)
+
+
+def test_the_end_is_acknowledged_when_all_before_it_is_processed(service: Watched) -> None:
+    service.start_session(start_of())
+    session = service._sessions["s"]
+    service.take(AudioChunk(session="s", token="t", sequence=1, pcm=bytes(2 * RATE_HZ)))
+    service.take(EndOfAudio(session="s", token="t", sequence=2, acknowledge=True))
+    assert (session.num_taken, session.finished) == (1, False)
+    service.work_off()
+    assert (session.num_taken, session.finished) == (2, True)
+
+
+def test_audio_at_the_other_socket_is_refused(service: Watched) -> None:
+    service.start_session(start_of())
+    chunk = AudioChunk(session="s", token="t", sequence=1, pcm=bytes(320))
+    service._on_audio(service._audio, chunk, Peer())
+    assert service.warnings_given == [
+        ("bad-audio", "send the audio of session 's' where session-opened says")
+    ]
+
+
+def test_live_audio_far_ahead_of_the_clock_is_refused(
+    service: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now_s)
+    service.start_session(replace(start_of(), paced=True))
+    session = service._sessions["s"]
+    sound_s = 0.0
+
+    def take(duration_s: float) -> bool:
+        """Whether so much sound is taken."""
+        nonlocal sound_s
+        refused = session.is_ahead(duration_s, now_s)
+        sound_s += 0.0 if refused else duration_s
+        return not refused
+
+    assert all(take(1.0) for _ in range(int(MAX_LEAD_S)))
+    assert not take(1.0)
+    now_s += 2.0
+    assert take(1.0)
+    assert take(1.0)
+    assert not take(1.0)
+    now_s += 600.0  # stopped, or cut off, for long
+    assert all(take(1.0) for _ in range(int(2 * MAX_LEAD_S)))
+    assert not take(1.0)
+    for _ in range(24 * 3600):  # its clock is faster by 1 in 1000
+        now_s += 1.0
+        assert take(1.001)
+    sequence = session.order.last
+    for number in range(1, 11):  # of 4 s
+        pcm = bytes(8 * RATE_HZ)
+        service.take(AudioChunk(session="s", token="t", sequence=sequence + number, pcm=pcm))
+    assert {reason for reason, _ in service.warnings_given} == {"bad-audio"}
+    assert "paced false" in service.warnings_given[0][1]
 
 
 def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:
@@ -111,8 +230,8 @@ def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:
             media_time=9280 + 320 * number,
             pcm=bytes(320),
         )
-        service._on_audio(chunk, Peer())
-    service._process_queued()
+        service.take(chunk)
+    service.work_off()
     assert service._sessions["s"].stream.next_media_time == 9280 + 100 * 320
 
 
@@ -132,11 +251,8 @@ def test_a_voice_that_does_not_fit_is_refused_once_and_the_session_goes_on(
 ) -> None:
     service.start_session(start_of(voice))
     for sequence in (1, 2):
-        service._on_audio(
-            AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)), Peer()
-        )
-    service._process_queued()
-    service.beat_if_due()
+        service.take(AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)))
+    service.work_off()
     assert [reason for reason, _ in service.warnings_given] == ["bad-voice"]
     assert "the voice is not used" in service.warnings_given[0][1]
     assert service.media_times[-1] == pytest.approx(6400, abs=640)

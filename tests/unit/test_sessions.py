@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from services.control.registry import Refusal, Registry
+from services.control.registry import UNPACED_AUDIO, Refusal, Registry
 from services.control.sessions import SessionRecord, Sessions
 from shared.face.shapes import ARKIT, VRM
 from shared.keys import Peer
@@ -251,6 +251,24 @@ def take_input(made: Made, record: SessionRecord, sequence: int, idle_s: float =
         sessions={record.name: SessionInput(idle_s=idle_s, sequence=sequence)},
     )
     return made.sessions.take_input(record, beat)
+
+
+def test_audio_of_a_session_that_is_not_paced_has_a_socket_of_its_own(made: Made) -> None:
+    for instance in ("recognizer-1", "recognizer-2"):
+        made.lose("recognizer-1")
+        own = {UNPACED_AUDIO: f"tcp://{instance}:unpaced"}
+        heartbeat = worker("recognizer", instance)
+        made.add(dataclasses.replace(heartbeat, endpoints={**heartbeat.endpoints, **own}))
+        if instance == "recognizer-1":
+            live = made.open("live")
+            opening = OpenSession(session="file", request="r", paced=False)
+            file = made.sessions.open(opening, PEER, 0.0)
+            assert made.sessions.opened_message(live, "").audio == "tcp://recognizer-1:audio"
+            assert made.sessions.opened_message(file, "").audio == "tcp://recognizer-1:unpaced"
+    assert made.sessions.replace(file, 1.0)
+    assert made.sessions.moved_message(file).audio == "tcp://recognizer-2:unpaced"
+    start = made.sessions.start_message(file, 0.0)
+    assert made.sessions.restore(start, 2.0).audio == "tcp://recognizer-2:unpaced"
 
 
 def test_a_session_moves_to_another_recognizer_and_goes_on_where_the_lost_one_was(
