@@ -672,7 +672,10 @@ def _port(descriptor: int) -> int:
 
 
 def _network(host: str) -> str:
-    address = ipaddress.ip_address(host.partition("%")[0])
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:  # the other end is gone
+        return ""
     if address.version == 6:
         address = address.ipv4_mapped or address
     if address.is_loopback:

@@ -410,6 +410,7 @@ def test_an_address_that_floods_once_is_shut_out_for_a_while(
         ("2001:db8:0:1::1", "2001:db8:0:1:ffff::2", True),
         ("2001:db8:0:1::1", "2001:db8:0:2::1", False),
         ("fe80::1%eth0", "fe80::2%eth0", True),
+        ("", "127.0.0.1", False),  # gone already
     ],
 )
 def test_the_addresses_of_one_host_count_as_one(first: str, second: str, is_one: bool) -> None:
