@@ -46,7 +46,7 @@ SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=16, num_slow=128, cost=1.
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 MAX_PARTS = 4
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
-RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
+RECONNECT_MS = (20, 50)  # between attempts to connect, at first and later
 CONNECT_MS = 300  # for one; whoever is further away cannot be reached
 HANDSHAKE_MS = 2000
 _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
@@ -296,6 +296,8 @@ class Bus:
     ----------
     zap
         Who may connect; None on a plain bus.
+    connect_ms
+        How long sockets that are opened from now on try to connect at a time.
 
     Raises
     ------
@@ -304,6 +306,7 @@ class Bus:
     """
 
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
+        self.connect_ms = CONNECT_MS
         self._context = zmq.Context()
         self._guard = Guard(extra_connections)
         self._key = key
@@ -386,7 +389,7 @@ class Bus:
         raw.setsockopt(zmq.RCVHWM, queue_length)
         raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
         raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
-        raw.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_MS)
+        raw.setsockopt(zmq.CONNECT_TIMEOUT, self.connect_ms)
         raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         raw.setsockopt(zmq.LINGER, 0)
         return raw

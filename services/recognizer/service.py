@@ -139,6 +139,7 @@ class RecognizerService(Service):
             session.start = start
             socket = self._connect(start.endpoints["phone_input"])
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
+            session.silent_s = 0.0  # another face does not know yet that its client is
             self._leave_synthesizers()
         return True
 
@@ -176,6 +177,7 @@ class RecognizerService(Service):
         found = self._sessions.get(session)
         if found is not None:
             found.link.forget()
+            found.silent_s = 0.0  # the face shall learn anew that its client is
             self._emit(found, found.stream.flush())
 
     def on_tick(self, now_s: float) -> None:
