@@ -346,7 +346,11 @@ class RecognizerService(Service):
             for session, chunks in zip(sessions, self._queued.values(), strict=True)
         ]
         self._queued, self._queued_share = {}, 0.0
-        for session, outputs in zip(sessions, run_scoring_tasks(self._model, tasks), strict=True):
+        results = run_scoring_tasks(self._model, tasks)
+        self._ask_what_changed()  # if this stood still meanwhile, others may serve the sessions
+        for session, outputs in zip(sessions, results, strict=True):
+            if self._sessions.get(session.start.session) is not session:
+                continue
             self._emit(session, outputs)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps)
             session.num_gaps = session.stream.num_gaps

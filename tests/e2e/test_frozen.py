@@ -23,6 +23,7 @@ from tests.system import ANY_LOAD, DEMO, System
 
 pytestmark = pytest.mark.e2e
 SERVICES = ("control", "recognizer", "synthesizer")
+MAX_TOLD_AT_ONCE = 6  # phones: one that is new revises those before it
 SETTINGS = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
 
 
@@ -61,7 +62,7 @@ def test_one_that_thaws_does_not_publish_beside_the_one_in_its_place(
         late = list(witness.receive())
         session.close()
 
-    assert len(late) <= 2, "what it was in the midst of, and nothing else"
+    assert len(late) <= MAX_TOLD_AT_ONCE, "what it was in the midst of, and nothing else"
     epochs = [frame.epoch for frame in collected.frames]
     assert epochs == sorted(epochs)
     assert epochs[-1] == 2
