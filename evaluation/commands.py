@@ -384,12 +384,19 @@ def attacks(
 def faults(
     audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
     fault: Annotated[
-        list[str] | None, typer.Option(help="Only this one, as the table names it; repeatable.")
+        list[str] | None, typer.Option(help="Only this one, by its name; repeatable.")
     ] = None,
     logs: Annotated[Path | None, typer.Option(help="Keep the services' logs there.")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure what faults do to a live face: how long it stands, what is lost, how it jumps."""
+    """Measure what faults do to a live face: how long it stands, what is lost, how it jumps.
+
+    Faults: "none", "recognizer killed", "synthesizer killed", the same with "stopped" and "hangs"
+    in place of "killed", each of the six also with ", one more" of its kind behind it, "control
+    killed", "busy machine", "16 sessions", "a subscriber stopped", and between hosts of their own
+    "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut off for 2 s", "hosts,
+    recognizer gone for good, one more", "hosts, synthesizer gone for good, one more".
+    """
     from evaluation.system.faults import TIMING, measure, show
 
     check_output(json_file)

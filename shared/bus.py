@@ -49,7 +49,7 @@ ANSWER_COST = 0.25  # that each KiB of an answer takes: the longest status has 1
 MAX_PARTS = 4
 MAX_DROPPED = 5000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
-RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
+RECONNECT_MS = (20, 50)  # between attempts to connect, at first and later
 CONNECT_MS = 300  # for one; whoever is further away cannot be reached
 HANDSHAKE_MS = 2000
 _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
@@ -326,6 +326,8 @@ class Bus:
     ----------
     zap
         Who may connect; None on a plain bus.
+    connect_ms
+        How long sockets that are opened from now on try to connect at a time.
 
     Raises
     ------
@@ -334,6 +336,7 @@ class Bus:
     """
 
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
+        self.connect_ms = CONNECT_MS
         self._context = zmq.Context()
         self._guard = Guard(extra_connections)
         self._key = key
@@ -417,7 +420,7 @@ class Bus:
         raw.setsockopt(zmq.RCVHWM, queue_length)
         raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
         raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
-        raw.setsockopt(zmq.CONNECT_TIMEOUT, CONNECT_MS)
+        raw.setsockopt(zmq.CONNECT_TIMEOUT, self.connect_ms)
         raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
         raw.setsockopt(zmq.LINGER, 0)
         return raw

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.bus import AUDIO_QUEUE_LENGTH, Bus, Received
+from shared.bus import AUDIO_QUEUE_LENGTH, CONNECT_MS, Bus, Received
 from shared.clock import MEDIA_RATE_HZ
 from shared.errors import UserError
 from shared.face.expressions import DEFAULT_HOLD_S
@@ -42,6 +42,8 @@ RESEND_S = 10.0  # audio kept for a recognizer that takes the place of a lost on
 MAX_KEPT = 5000  # messages of that
 MAX_UNSENT = 500  # messages; then whoever sends must wait
 ANSWER_S = (0.6, 10.0)  # without an acknowledgement, at first and at most, to connect again
+SHORT_CUT_S = 2.5  # until the next attempt, in which who was near before is taken to be so still
+NEAREST_MS = 100  # for one connection, at least
 HURRIED_ANSWER_S = 5.0  # at first, where audio comes as fast as it is taken and may wait for long
 LAST_ANSWER_S = 2.0  # for the end of the audio to be acknowledged before a session is closed
 ANSWER_WAIT_S = 0.02  # between looks for it
@@ -268,6 +270,7 @@ class Session:
         self._progress_s = 0.0  # when something was acknowledged, or the first message waited
         self._least_answer_s = ANSWER_S[0] if opening.paced else HURRIED_ANSWER_S
         self._answer_s = self._least_answer_s  # how long to wait for more
+        self._near_ms = CONNECT_MS  # in which the recognizer can be reached, by its first answer
         self._rejoin_end_s = 0.0  # until then audio waits for subscriptions
         self._errors: deque[Error] = deque()
         self._unknown: tuple[float, Error] | None = (
@@ -463,15 +466,25 @@ class Session:
             if isinstance(message, Error):
                 self._errors.append(message)
             elif isinstance(message, Acknowledge) and message.sequence > self._acknowledged:
+                now_s = time.monotonic()
+                if not self._acknowledged:
+                    answer_ms = round(1e3 * (now_s - self._progress_s))
+                    self._near_ms = min(max(2 * answer_ms, NEAREST_MS), CONNECT_MS)
                 self._acknowledged = min(message.sequence, self._sequence)
-                self._progress_s = time.monotonic()
+                self._progress_s = now_s
                 self._answer_s = max(self._least_answer_s, self._answer_s / 2)
 
     def _reconnect(self) -> None:
-        """Give up the sockets: nothing comes through, but TCP may not say so for long."""
+        """Give up the sockets: nothing comes through, but TCP may not say so for long.
+
+        A packet that is lost while a connection is made costs the whole time for it.
+        """
         self._answer_s = min(2 * self._answer_s, ANSWER_S[1])
+        bus = self._client.bus
+        bus.connect_ms = self._near_ms if self._answer_s <= SHORT_CUT_S else CONNECT_MS
         self._subscribe_again()
         self._connect_audio()
+        bus.connect_ms = CONNECT_MS
 
     def _subscribe_again(self) -> None:
         self._rejoin_end_s = time.monotonic() + REJOIN_S

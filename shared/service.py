@@ -56,7 +56,9 @@ UNANSWERED_S = 10.0  # without an answer to heartbeats it is worth asking why
 DRAIN_LIMIT_S = 5.0
 HAND_OVER_S = 1.5  # of it, for other workers to take the sessions of one that stops
 ALIVE_S = 5.0  # without a tick the loop hangs
+ENDS_S = 15.0  # without one the process ends when somebody asks for its health
 PARENT_VARIABLE = "_KOUXING_SUPERVISOR"  # its process number; the underscore: no setting
+PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that tells it of each heartbeat
 
 Handler = Callable[[Any, Peer], None]
 
@@ -378,12 +380,21 @@ class Service:
             self.config.metrics_port,
             self.metrics,
             self.name,
-            is_alive=lambda: time.monotonic() < self._tick_due_s + ALIVE_S,
+            is_alive=self.check_health,
         )
+
+    def check_health(self) -> bool:
+        """Return whether the loop runs; after long, end: whoever asks may not start it again."""
+        stood_s = time.monotonic() - self._tick_due_s
+        if stood_s > ENDS_S:
+            LOG.critical("the loop hangs")
+            os._exit(1)
+        return stood_s < ALIVE_S
 
     def _beat(self, *, whole: bool = False) -> None:
         """Send a heartbeat, with the whole of the sessions or with some in turn."""
         self._beat_sent_s, self._sent_ns = time.monotonic(), now_ns()
+        _tell_parent()
         sessions, load = self.session_inputs(), self._busy.share(time.monotonic())
         for name, value in {"sessions": len(sessions), "load": load, **self.gauges()}.items():
             self.metrics.set(name, value)
@@ -494,6 +505,13 @@ class Service:
 
     def _on_error(self, error: Error, _sender: Peer) -> None:
         self.warn(error.code, f"control: {error.text}", error.session)
+
+
+def _tell_parent() -> None:
+    """Tell whoever started this process that its loop runs, if he wants to know."""
+    if pulse := os.environ.get(PULSE_VARIABLE):
+        with contextlib.suppress(OSError):  # he has not read for hours, or is gone
+            os.write(int(pulse), b".")
 
 
 def run_service(make: Callable[[], Service], section: str, log_level: str) -> int:

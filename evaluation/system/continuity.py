@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from shared.clock import MEDIA_RATE_HZ
 from shared.face.faps import FAPS
 
 UNSEEN = 1.0  # FAP units; a smaller step is none
+LATE_S = 0.06  # after the sound that a frame needs; one that comes later is not in time
+CALM_S = 1.0  # in which no frame is late: then all are in time again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +23,7 @@ class Continuity:
     """Figures of one session against the same sound undisturbed."""
 
     stood_s: float  # longest time without a frame of a new media time, while sound came
+    late_s: float  # after the fault, until frames were in time again
     phones: int  # without the fault
     phones_lost: int
     phones_doubled: int
@@ -34,7 +37,9 @@ class Continuity:
     late_p95_ms: float
 
 
-def compare(seen: Seen, undisturbed: Seen, silence: str, delay_s: float) -> Continuity:
+def compare(
+    seen: Seen, undisturbed: Seen, silence: str, delay_s: float, *, fault_s: float
+) -> Continuity:
     """Compare what came with what comes of the same sound without a fault.
 
     Parameters
@@ -43,6 +48,8 @@ def compare(seen: Seen, undisturbed: Seen, silence: str, delay_s: float) -> Cont
         The phone that is no speech.
     delay_s
         How much later than its sound a frame is made.
+    fault_s
+        When it happened.
     """
     arrived_s = np.array([arrival_s for arrival_s, _ in seen.frames])
     times = np.array([frame.media_time for _, frame in seen.frames], np.int64)
@@ -59,6 +66,7 @@ def compare(seen: Seen, undisturbed: Seen, silence: str, delay_s: float) -> Cont
     ratios = steps / np.maximum(largest_steps(undisturbed.faps), UNSEEN)
     return Continuity(
         stood_s=float(np.diff([seen.begin_s, *arrived_s[is_live], seen.live_until_s]).max()),
+        late_s=_late_until_s(due_s[is_live], late_s, fault_s) - fault_s,
         phones=errors.reference,
         phones_lost=errors.deletions,
         phones_doubled=errors.insertions,
@@ -71,6 +79,26 @@ def compare(seen: Seen, undisturbed: Seen, silence: str, delay_s: float) -> Cont
         late_p50_ms=float(np.percentile(late_s, 50)) * 1e3,
         late_p95_ms=float(np.percentile(late_s, 95)) * 1e3,
     )
+
+
+def worst(faces: Sequence[Continuity]) -> Continuity:
+    """Return the worst of each figure of several sessions with the same sound."""
+    largest = max(faces, key=lambda face: face.largest_step)
+    numbers = {each.name for each in fields(Continuity)} - {"largest_step_fap"}
+    return replace(
+        largest, **{name: max(getattr(face, name) for face in faces) for name in numbers}
+    )
+
+
+def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault_s: float) -> float:
+    """Return when the last of the frames came that a fault has made late."""
+    until_s = fault_s
+    for due, late in sorted(zip(due_s, late_s, strict=True)):
+        if due > until_s + CALM_S:
+            break
+        if late > LATE_S:
+            until_s = max(until_s, float(due + late))
+    return until_s
 
 
 def largest_steps(faps: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -3,7 +3,8 @@
 For each fault the services run as under ``kouxing run``, on ports of their own, or each on a host
 of its own (``evaluation.system.network``). A sentence is streamed again and again at real pace, in
 the midst of it something breaks, and what a subscriber saw is compared with the same sound
-undisturbed (``evaluation.system.continuity``).
+undisturbed (``evaluation.system.continuity``). What is sudden happens at several instants, in a
+session each; the worst of each figure counts.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.continuity import Continuity, compare, staleness
+from evaluation.system.continuity import Continuity, compare, staleness, worst
 from evaluation.system.live import Seen, Wire, speak, speak_undisturbed
 from evaluation.system.network import Link, Network
 from evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
@@ -58,6 +59,7 @@ class Timing:
 
     length_s: float = 24.0  # of the sound
     fault_at_s: float = 8.0
+    also_at_s: tuple[float, ...] = (3.2, 4.6)  # in sessions of their own
     frozen_s: float = 10.0  # a service, or others busy
     stopped_s: float = 60.0  # a subscriber, for which the sound is longer
     cut_s: float = 2.0  # a link
@@ -77,6 +79,7 @@ class Fault:
     num_sessions: int = 1
     stops_subscriber: bool = False  # a second one
     link: Link | None = None  # between hosts of their own; None: all is on this one
+    is_sudden: bool = True  # what it does depends on the instant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +126,11 @@ def _hang(service: str) -> Callable[[System, str, Timing], list[Action]]:
 
 
 def _signal(number: int, which: int, at_s: float) -> Action:
-    return at_s, functools.partial(os.kill, number, which)
+    def send() -> None:
+        with contextlib.suppress(ProcessLookupError):  # it was ended meanwhile
+            os.kill(number, which)
+
+    return at_s, send
 
 
 def _stopped(number: int, at_s: float, for_s: float) -> list[Action]:
@@ -172,18 +179,21 @@ def _cut(which: str, *, mended: bool) -> Callable[[HostsSystem, str, Timing], li
 
 _WORKERS = ("recognizer", "synthesizer")
 FAULTS = {
-    "none": Fault(_nothing),
+    "none": Fault(_nothing, is_sudden=False),
     **{f"{each} killed": Fault(_kill(each)) for each in _WORKERS},
     **{f"{each} killed, one more": Fault(_kill(each), each) for each in _WORKERS},
     **{f"{each} stopped, one more": Fault(_stop(each), each) for each in _WORKERS},
     **{f"{each} hangs, one more": Fault(_hang(each), each) for each in _WORKERS},
     **{f"{each} stopped": Fault(_stop(each)) for each in _WORKERS},
+    **{f"{each} hangs": Fault(_hang(each)) for each in _WORKERS},
     "control killed": Fault(_kill("control")),
-    "busy machine": Fault(_busy),
-    f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS),
-    "a subscriber stopped": Fault(_nothing, stops_subscriber=True),
+    "busy machine": Fault(_busy, is_sudden=False),
+    f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS, is_sudden=False),
+    "a subscriber stopped": Fault(_nothing, stops_subscriber=True, is_sudden=False),
     **{
-        f"hosts, {delay_ms} ms, {loss:.0%} lost": Fault(_nothing, link=Link(delay_ms, loss))
+        f"hosts, {delay_ms} ms, {loss:.0%} lost": Fault(
+            _nothing, link=Link(delay_ms, loss), is_sudden=False
+        )
         for delay_ms in (0, 20, 50)
         for loss in (0.0, 0.01, 0.03)
     },
@@ -209,7 +219,7 @@ def measure(
     names
         Of ``FAULTS``; empty: all.
     logs
-        Folder for the services' logs, one in it for each fault; None: none are kept.
+        Folder for the services' logs, one in it for each fault and instant; None: none are kept.
 
     Raises
     ------
@@ -222,14 +232,37 @@ def measure(
     sentence = to_16_khz(*read_audio(path))
     undisturbed: dict[int, Seen] = {}  # by the length of the sound
     for name in names or FAULTS:
-        console.print(f"fault: {name}")
-        with tempfile.TemporaryDirectory() as temporary:
-            folder = Path(temporary) if logs is None else logs / name.replace(" ", "-")
-            folder.mkdir(parents=True, exist_ok=True)
-            try:
-                yield _outcome(name, folder, sentence, undisturbed, timing, console)
-            except UserError as error:
-                yield Outcome(fault=name, failure=str(error), load=os.getloadavg()[0])
+        also_at_s = timing.also_at_s if FAULTS[name].is_sudden else ()
+        outcomes = []
+        for at_s in (*also_at_s, timing.fault_at_s):
+            console.print(f"fault: {name}, at {at_s:g} s")
+            with tempfile.TemporaryDirectory() as temporary:
+                folder = Path(temporary) if logs is None else logs / f"{name}-{at_s:g}-s"
+                folder.mkdir(parents=True, exist_ok=True)
+                own = replace(timing, fault_at_s=at_s)
+                try:
+                    outcome = _outcome(name, folder, sentence, undisturbed, own, console)
+                except UserError as error:
+                    outcome = Outcome(fault=name, failure=str(error), load=os.getloadavg()[0])
+            outcomes.append(outcome)
+        yield _worst(outcomes)
+
+
+def _worst(outcomes: Sequence[Outcome]) -> Outcome:
+    """Return the worst of each figure of one fault's outcomes."""
+    faces = [each.face for each in outcomes if each.face is not None]
+    late_ms = [each.late_p95_ms for each in outcomes if each.late_p95_ms is not None]
+    return Outcome(
+        fault=outcomes[0].fault,
+        failure="; ".join(sorted({each.failure for each in outcomes} - {""})),
+        face=worst(faces) if faces else None,
+        old_frames=max(each.old_frames for each in outcomes),
+        num_refused=max(each.num_refused for each in outcomes),
+        late_p95_ms=max(late_ms, default=None),
+        stale_frames=max(each.stale_frames for each in outcomes),
+        stalest_s=max(each.stalest_s for each in outcomes),
+        load=max(each.load for each in outcomes),
+    )
 
 
 def show(outcomes: Collection[Outcome], console: Console) -> None:
@@ -237,6 +270,7 @@ def show(outcomes: Collection[Outcome], console: Console) -> None:
     table = Table(
         "fault",
         "stood s",
+        "late s",
         "phones lost, doubled, changed",
         "frames lost, doubled, old, at rest",
         "largest step",
@@ -256,6 +290,7 @@ def show(outcomes: Collection[Outcome], console: Console) -> None:
             frames = face.frames_lost, face.frames_doubled, each.old_frames, face.rest_frames
             figures = [
                 f"{face.stood_s:.2f}",
+                f"{face.late_s:.2f}",
                 f"{', '.join(map(str, phones))} of {face.phones}",
                 ", ".join(map(str, frames)),
                 f"{face.largest_step:.1f} x {face.largest_step_fap}",
@@ -330,7 +365,15 @@ def _outcome(
                 session.close()
     failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
     faces = [
-        compare(seen, undisturbed[len(sound)], silence, delay_s) for seen in all_seen if seen.frames
+        compare(
+            seen,
+            undisturbed[len(sound)],
+            silence,
+            delay_s,
+            fault_s=begin_s + timing.fault_at_s,
+        )
+        for seen in all_seen
+        if seen.frames
     ]
     return Outcome(
         fault=name,

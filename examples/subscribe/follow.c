@@ -4,8 +4,8 @@
    ./follow [SESSION [CONTROL-ADDRESS]]      (default: the newest session, tcp://127.0.0.1:5550)
 
    Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
-   52 weights. It waits until there is a session and ends with it. proto/PROTOCOL.md says what else
-   there is, and has the names of the others. */
+   52 weights. It waits until there is a session, follows it to whatever host, and ends with it.
+   proto/PROTOCOL.md says what else there is, and has the names of the others. */
 
 #define _POSIX_C_SOURCE 200809L
 #include <stdbool.h>
@@ -152,16 +152,14 @@ static Key own_key(void) {
 }
 
 /* Connect to an address and the public key of who is there: "tcp://HOST:PORT KEY". */
-static void *open_socket(void *context, int kind, const char *endpoint, const Key *key) {
+static void connect_to(void *socket, const char *endpoint, const Key *key) {
   char address[MAX_ENDPOINT + 1], server[MAX_ENDPOINT + 1];
   if (sscanf(endpoint, "%256s %256s", address, server) != 2) fail("an endpoint has no key");
-  void *socket = zmq_socket(context, kind);
   if (zmq_setsockopt(socket, ZMQ_CURVE_SERVERKEY, server, KEY_LENGTH + 1) ||
       zmq_setsockopt(socket, ZMQ_CURVE_PUBLICKEY, key->public, KEY_LENGTH + 1) ||
       zmq_setsockopt(socket, ZMQ_CURVE_SECRETKEY, key->secret, KEY_LENGTH + 1) ||
       zmq_connect(socket, address))
     fail(zmq_strerror(zmq_errno()));
-  return socket;
 }
 
 /* Receive the two parts of a message; the body lies in `body` until the next. */
@@ -210,6 +208,20 @@ static bool find_session(void *control, const char *wanted, char *name, char *fa
   return least_age_s < 1e300;
 }
 
+/* Ask control where it tells of sessions that move. */
+static void find_events(void *control, char *events) {
+  zmq_msg_t answer;
+  zmq_msg_init(&answer);
+  Bytes services, endpoints;
+  bool found = false;
+  if (find(ask(control, "status-request", "", "", &answer), "services", &services))
+    for (uint32_t left = read_value(&services).size; left > 0 && !found; left--, skip(&services))
+      found = find(services, "endpoints", &endpoints) &&
+              find_text(endpoints, "events", events, MAX_ENDPOINT + 1); /* control's alone */
+  zmq_msg_close(&answer);
+  if (!found) fail("control tells nobody when sessions move");
+}
+
 /* Subscribe to a kind of message of a session, or no longer. */
 static void choose(void *socket, int option, const char *kind, const char *session) {
   char topic[MAX_NAME + 32];
@@ -224,37 +236,53 @@ int main(int num_arguments, char **arguments) {
   Key key = own_key();
   void *context = zmq_ctx_new();
 
-  char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1];
+  char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1], events[MAX_ENDPOINT + 1];
   snprintf(endpoint, sizeof endpoint, "%s %s", address, key.control);
-  void *control = open_socket(context, ZMQ_DEALER, endpoint, &key);
+  void *control = zmq_socket(context, ZMQ_DEALER);
+  connect_to(control, endpoint, &key);
   while (!find_session(control, wanted, name, endpoint))
     nanosleep(&(struct timespec){.tv_nsec = 500000000}, NULL);
+  find_events(control, events);
 
-  void *face = open_socket(context, ZMQ_SUB, endpoint, &key);
+  void *face = zmq_socket(context, ZMQ_SUB);
+  connect_to(face, endpoint, &key);
+  choose(face, ZMQ_SUBSCRIBE, "session-moved", name);
   choose(face, ZMQ_SUBSCRIBE, "shapes", name);
   choose(face, ZMQ_SUBSCRIBE, "end-of-faps", name);
   choose(face, ZMQ_SUBSCRIBE, "joined", name); /* last: no frame is missed from then on */
 
+  double epoch = 0, newest = -1, newest_number = 0; /* of the frames shown */
+  bool following = false;
   zmq_msg_t body;
   zmq_msg_init(&body);
   for (;;) {
     char topic[MAX_NAME + 32], set[16];
     Bytes message = receive(face, topic, sizeof topic, &body), at;
-    if (!strncmp(topic, "end-of-faps/", 12)) break;
-    if (!strncmp(topic, "joined/", 7)) {
+    double time = find_number(message, "media_time"), number = find_number(message, "sequence");
+    if (!strncmp(topic, "end-of-faps/", 12) && find_number(message, "epoch") >= epoch) break;
+    if (!strncmp(topic, "joined/", 7) && !following) { /* it comes again whenever anybody joins */
+      following = true;
       zmq_msg_t answer;
       zmq_msg_init(&answer);
       ask(control, "add-shapes", name, "\xa6shapes\x91\xa5" "arkit", &answer); /* a list of one */
       zmq_msg_close(&answer);
+      connect_to(face, events, &key); /* control tells there when the face is made elsewhere */
       printf("following %s\n", name);
-      choose(face, ZMQ_UNSUBSCRIBE, "joined", name); /* it comes whenever anybody joins */
+    } else if (!strncmp(topic, "session-moved/", 14) &&
+               find_text(message, "faps", endpoint, sizeof endpoint)) {
+      epoch = find_number(message, "epoch");
+      connect_to(face, endpoint, &key);
+      choose(face, ZMQ_UNSUBSCRIBE, "joined", name);
+      choose(face, ZMQ_SUBSCRIBE, "joined", name); /* a moved face's newest frames come again */
     } else if (find_text(message, "set", set, sizeof set) && !strcmp(set, "arkit") &&
-               find(message, "weights", &at)) { /* others may have asked for other sets */
+               find(message, "weights", &at) && /* others may have asked for other sets */
+               (time > newest || (time == newest && number > newest_number))) {
+      newest = time, newest_number = number;
       Value values = read_value(&at);
       float weights[NUM_WEIGHTS]; /* little-endian on the wire, as on every usual machine */
       if (values.kind != STRING || values.size != sizeof weights) fail("a face has other weights");
       memcpy(weights, values.text, sizeof weights);
-      printf("%.3f %.2f\n", find_number(message, "media_time") / 16000, weights[JAW_OPEN]);
+      printf("%.3f %.2f\n", time / 16000, weights[JAW_OPEN]);
     }
     fflush(stdout);
   }

@@ -4,8 +4,8 @@
 // (default: the newest session, tcp://127.0.0.1:5550)
 //
 // Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
-// 52 weights. It waits until there is a session and ends with it. proto/PROTOCOL.md says what else
-// there is, and has the names of the others.
+// 52 weights. It waits until there is a session, follows it to whatever host, and ends with it.
+// proto/PROTOCOL.md says what else there is, and has the names of the others.
 
 import { readFile } from "node:fs/promises";
 import { homedir } from "node:os";
@@ -41,6 +41,12 @@ async function ask(control, kind, session, fields = {}) {
   return read(await control.receive())[1];
 }
 
+/** Return whether a frame is newer than another; after a move some come twice. */
+function isAfter(one, other) {
+  return one.media_time > other.media_time
+    || (one.media_time === other.media_time && one.sequence > other.sequence);
+}
+
 /** Return the wanted session, or the newest, once control knows one. */
 async function find(control) {
   for (;;) {
@@ -51,22 +57,40 @@ async function find(control) {
   }
 }
 
-const control = connect(Dealer, `${controlAddress} ${key.control}`);
-const { session, endpoints } = await find(control);
-const face = connect(Subscriber, endpoints.faps);
-for (const kind of ["shapes", "end-of-faps", "joined"]) { // joined, last: none is missed from then on
-  face.subscribe(`${kind}/${session}/`);
+/** Print a session's frames from one publisher, to the end. */
+async function follow(endpoint) {
+  const face = connect(Subscriber, endpoint);
+  for (const kind of ["shapes", "end-of-faps", "joined"]) { // joined, last: none is missed from then on
+    face.subscribe(`${kind}/${session}/`);
+  }
+  for await (const message of face) {
+    const [kind, body] = read(message);
+    if (kind === "end-of-faps" && body.epoch >= epoch) process.exit();
+    if (kind === "joined" && newest.media_time < 0) {
+      await ask(control, "add-shapes", session, { shapes: ["arkit"] });
+      console.log("following", session);
+      face.unsubscribe(`joined/${session}/`); // it comes whenever anybody joins
+    } else if (body.set === "arkit" && isAfter(body, newest)) { // others may have asked for other sets
+      newest = body;
+      const weights = new Float32Array(new Uint8Array(body.weights).buffer); // 52
+      console.log((body.media_time / 16000).toFixed(3), weights[JAW_OPEN].toFixed(2));
+    }
+  }
 }
 
-for await (const message of face) {
-  const [kind, body] = read(message);
-  if (kind === "end-of-faps") break;
-  if (kind === "joined") {
-    await ask(control, "add-shapes", session, { shapes: ["arkit"] });
-    console.log("following", session);
-    face.unsubscribe(`joined/${session}/`); // it comes whenever anybody joins
-  } else if (body.set === "arkit") { // others may have asked for other sets
-    const weights = new Float32Array(new Uint8Array(body.weights).buffer); // 52
-    console.log((body.media_time / 16000).toFixed(3), weights[JAW_OPEN].toFixed(2));
-  }
+const control = connect(Dealer, `${controlAddress} ${key.control}`);
+const { session, endpoints } = await find(control);
+const { services } = await ask(control, "status-request", "");
+const { events } = services.find(({ service }) => service === "control").endpoints;
+const moves = connect(Subscriber, events); // control tells there when the face is made elsewhere
+moves.subscribe(`session-moved/${session}/`);
+
+let epoch = 0;
+let newest = { media_time: -1, sequence: 0 };
+let publisher = endpoints.faps;
+follow(publisher);
+for await (const message of moves) {
+  const [, moved] = read(message);
+  ({ epoch } = moved);
+  if (moved.faps !== publisher) follow(publisher = moved.faps);
 }

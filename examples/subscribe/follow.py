@@ -3,8 +3,8 @@
 usage: follow.py [SESSION [CONTROL-ADDRESS]]    (default: the newest session, tcp://127.0.0.1:5550)
 
 Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
-52 weights. It waits until there is a session and ends with it. proto/PROTOCOL.md says what else
-there is, and has the names of the others.
+52 weights. It waits until there is a session, follows it to whatever host, and ends with it.
+proto/PROTOCOL.md says what else there is, and has the names of the others.
 """
 
 import itertools
@@ -26,13 +26,11 @@ numbers = itertools.count(1)  # of requests
 JAW_OPEN = 24  # its place among ARKit's names
 
 
-def connect(kind, endpoint):
+def connect(socket, endpoint):
     """Connect to an address and the public key of who is there."""
-    socket = context.socket(kind)
     address, socket.curve_serverkey = endpoint.encode().split()
     socket.curve_publickey, socket.curve_secretkey = key["public"].encode(), key["secret"].encode()
     socket.connect(address.decode())
-    return socket
 
 
 def receive(socket):
@@ -56,23 +54,41 @@ def sessions(control):
         time.sleep(0.5)
 
 
-control = connect(zmq.DEALER, f"{control_address} {key['control']}")
+control = context.socket(zmq.DEALER)
+connect(control, f"{control_address} {key['control']}")
 found = (
     [session for session in known if "faps" in session["endpoints"]] for known in sessions(control)
 )
 session = min(next(filter(None, found)), key=lambda each: each["age_s"])
 name = session["session"]
+_, report = ask(control, "status-request", "")
+events = next(
+    each["endpoints"]["events"] for each in report["services"] if each["service"] == "control"
+)
 
-face = connect(zmq.SUB, session["endpoints"]["faps"])
-for kind in ("shapes", "end-of-faps", "joined"):  # joined, last: none is missed from then on
+face = context.socket(zmq.SUB)
+connect(face, session["endpoints"]["faps"])
+for kind in ("session-moved", "shapes", "end-of-faps", "joined"):  # joined, last: none is missed
     face.subscribe(f"{kind}/{name}/")
 
-while (message := receive(face))[0] != "end-of-faps":
-    kind, body = message
-    if kind == "joined":
+epoch, newest, following = 0, (-1, 0), False
+while True:
+    kind, body = receive(face)
+    if kind == "joined" and not following:  # it comes again whenever anybody joins
+        following = True
         ask(control, "add-shapes", name, shapes=["arkit"])
+        connect(face, events)  # control tells there when the face is made elsewhere
         print("following", name, flush=True)
-        face.unsubscribe(f"joined/{name}/")  # it comes whenever anybody joins
-    elif body["set"] == "arkit":  # others may have asked for other sets
-        weights = struct.unpack("<52f", body["weights"])
-        print(f"{body['media_time'] / 16000:.3f} {weights[JAW_OPEN]:.2f}", flush=True)
+    elif kind == "session-moved":
+        epoch = body["epoch"]
+        connect(face, body["faps"])
+        face.unsubscribe(f"joined/{name}/")
+        face.subscribe(f"joined/{name}/")  # who joins a moved face gets its newest frames again
+    elif kind == "end-of-faps" and body["epoch"] >= epoch:
+        break
+    elif kind == "shapes" and body["set"] == "arkit":  # others may have asked for other sets
+        place = body["media_time"], body["sequence"]
+        if place > newest:
+            newest = place
+            weights = struct.unpack("<52f", body["weights"])
+            print(f"{body['media_time'] / 16000:.3f} {weights[JAW_OPEN]:.2f}", flush=True)

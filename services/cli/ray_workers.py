@@ -7,10 +7,10 @@ and speaks ZeroMQ as any other does: no sound and no frame passes through Ray.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Mapping
@@ -19,12 +19,13 @@ from typing import Self
 
 import ray
 
+from services.cli.service_process import LOOK_S, WORKED_S, ServiceProcess
 from services.cli.supervisor import ONE_THREAD
 from services.kinds import KINDS, ServiceKind
 from shared.config import Bound, Settings, bound_keys, variable
 from shared.errors import UserError
 from shared.keys import key_text, own_key
-from shared.service import DRAIN_LIMIT_S, PARENT_VARIABLE
+from shared.service import DRAIN_LIMIT_S
 
 NAMESPACE = "kouxing"  # of the actors' names
 PLACED_WITHIN_S = 5.0  # otherwise there is no room
@@ -32,6 +33,8 @@ PLACED_WITHIN_S = 5.0  # otherwise there is no room
 
 class Worker:
     """Holds one worker process; ends with it, so that Ray starts both again.
+
+    One that hangs it ends.
 
     Parameters
     ----------
@@ -52,12 +55,11 @@ class Worker:
         own = {
             "CREDENTIALS_DIRECTORY": str(self._folder),
             "XDG_STATE_HOME": str(self._folder),
-            PARENT_VARIABLE: str(os.getpid()),
         }
         self._draining = False
-        self._process = subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", f"services.{kind}"],
-            env={**os.environ, **ONE_THREAD, **environment, **own},
+        self._process = ServiceProcess(
+            kind,
+            environment={**os.environ, **ONE_THREAD, **environment, **own},
             stdin=subprocess.DEVNULL,
         )
         threading.Thread(target=self._end_with_process, daemon=True).start()
@@ -78,7 +80,11 @@ class Worker:
         ray.actor.exit_actor()
 
     def _end_with_process(self) -> None:
-        status = self._process.wait()
+        while (status := self._process.poll()) is None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(LOOK_S)
+            if not self._draining and self._process.hangs(WORKED_S):
+                self._process.kill()
         shutil.rmtree(self._folder)
         if not self._draining:
             os._exit(status or 1)

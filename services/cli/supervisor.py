@@ -1,4 +1,4 @@
-"""All services on one machine: started, watched, and started again when one crashes."""
+"""All services on one machine: started, watched, started again when one crashes or hangs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -17,13 +16,13 @@ from typing import IO
 
 from rich.console import Console
 
-from services.kinds import KINDS, kind_of
+from services.cli.service_process import BLOCKED_S, LOOK_S, WORKED_S, ServiceProcess
+from services.kinds import KINDS, WORKERS, kind_of
 from shared.client import Client
 from shared.errors import UserError
-from shared.service import DRAIN_LIMIT_S, PARENT_VARIABLE
+from shared.service import DRAIN_LIMIT_S
 
 BACKOFF_S = (0.2, 5.0)  # least and longest wait before a service that crashed twice starts again
-CHECK_EVERY_S = 0.2
 STEADY_S = 30.0  # after which a crash counts as the first one again
 STANDBY_S = 3.0  # after the newest start, so that it has the processor for itself
 USER_ERROR = 2  # exit status of a service that was configured wrongly
@@ -64,9 +63,8 @@ class Supervisor:
         self._log_folder = log_folder
         self._console = console
         self._environment = {**os.environ, **ONE_THREAD, **(environment or {})}
-        self._environment[PARENT_VARIABLE] = str(os.getpid())
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        self._standby: subprocess.Popen[bytes] | None = None  # becomes what crashes next
+        self._processes: dict[str, ServiceProcess] = {}
+        self._standby: ServiceProcess | None = None  # becomes what crashes next
         self._started_s: dict[str, float] = {}
         self._wait_s = dict.fromkeys(self._services, 0.0)
         self._due_s: dict[str, float] = {}
@@ -120,13 +118,13 @@ class Supervisor:
         UserError
             If a watched service says that it is configured wrongly.
         """
-        while not self._stopping.wait(CHECK_EVERY_S):
+        while not self._stopping.wait(LOOK_S):
             if self._failure is not None:
                 raise self._failure
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
-            self._ended.wait(CHECK_EVERY_S)
+            self._ended.wait(LOOK_S)
             self._ended.clear()
             try:
                 self.check()
@@ -135,7 +133,7 @@ class Supervisor:
                 return
 
     def check(self) -> None:
-        """Start crashed services again.
+        """Start crashed services again, and end those that hang.
 
         Raises
         ------
@@ -146,6 +144,9 @@ class Supervisor:
         for service, process in list(self._processes.items()):
             status = process.poll()
             if status is None:
+                if process.hangs(WORKED_S if kind_of(service) in WORKERS else BLOCKED_S):
+                    self._console.print(f"[yellow]{service} hangs; ending it")
+                    process.kill()
                 continue
             if status == USER_ERROR:
                 raise UserError(f"{service} cannot start; see above")
@@ -200,9 +201,7 @@ class Supervisor:
         follow = threading.Thread(target=self._follow, args=(service, process), daemon=True)
         follow.start()
 
-    def _told_to_become(
-        self, kind: str, environment: Mapping[str, str]
-    ) -> subprocess.Popen[bytes] | None:
+    def _told_to_become(self, kind: str, environment: Mapping[str, str]) -> ServiceProcess | None:
         """Let the process that stands by be a service; return it, or None where it cannot."""
         process, self._standby = self._standby, None
         if process is None or process.stdin is None:
@@ -222,10 +221,11 @@ class Supervisor:
         arguments: Collection[str] = (),
         environment: Mapping[str, str] | None = None,
         stdin: int = subprocess.DEVNULL,
-    ) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", f"services.{module}", *arguments],
-            env={**self._environment, **(environment or {})},
+    ) -> ServiceProcess:
+        return ServiceProcess(
+            module,
+            arguments,
+            environment={**self._environment, **(environment or {})},
             stdin=stdin,
             stderr=subprocess.PIPE,
             start_new_session=True,  # Ctrl-C reaches the supervisor alone, which asks in order

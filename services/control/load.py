@@ -58,7 +58,7 @@ class WorkerLoad:
         self._measured, self._measured_s = load, now_s
         num_measured = self.num_sessions + _num_recent(self._left_s, now_s)
         if not num_measured:
-            self._idle = min(load, self._idle or load)
+            self._idle = load if self._idle is None else min(load, self._idle)
         else:
             cost = max(0.0, load - (self._idle or 0.0)) / num_measured
             self._cost = max(cost, (self._cost or 0.0) * faded)

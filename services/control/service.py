@@ -533,6 +533,8 @@ class ControlService(Service):
             self._commands.send(moved, to=record.client)
             self._events.send(moved)
             self._publish(EventName.SESSION_MOVED, record.name)
+            workers = ", ".join(sorted({*record.workers.values()}))
+            LOG.info("session moved to %s", workers, extra={"session": record.name})
             now_s = time.monotonic()
             for delay_s in MOVED_AGAIN_S:
                 heapq.heappush(self._to_tell_again, (now_s + delay_s, record.name, moved))

@@ -128,5 +128,10 @@ class OwnSessions:
 def error_text(error: UserError) -> str:
     """Return the message for a browser about what went wrong."""
     if isinstance(error, Refused):
-        return wire.error_text(error.text, error.code)
+        return wire.error_text(error.text, error.code, retry_after_s(error))
     return wire.error_text(str(error))
+
+
+def retry_after_s(error: UserError) -> float:
+    """Return when it is worth trying again, in seconds; 0: nobody knows."""
+    return error.retry_after_s if isinstance(error, Refused) else 0.0

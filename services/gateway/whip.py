@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib
+import math
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from aiohttp import web
 
 from services.gateway import wire
 from services.gateway.outbox import Kind
-from services.gateway.own_sessions import OwnSession, OwnSessions, error_text
+from services.gateway.own_sessions import OwnSession, OwnSessions, error_text, retry_after_s
 from services.gateway.pace import COMMAND_S, Pace
 from services.gateway.shape_view import ShapeView, parse_shape_view
 from services.gateway.viewers import Viewers
@@ -107,7 +108,9 @@ class WhipClients:
         try:
             await opened
         except UserError as error:
-            raise web.HTTPServiceUnavailable(text=f"{error}\n") from None
+            wait_s = retry_after_s(error)
+            headers = {"Retry-After": str(math.ceil(wait_s))} if wait_s else {}
+            raise web.HTTPServiceUnavailable(text=f"{error}\n", headers=headers) from None
         headers = {"Location": f"{request.path}/{name}"}
         return web.Response(status=201, text=answer, content_type=SDP, headers=headers)
 

@@ -36,9 +36,10 @@ def text(kind: str, **fields: object) -> str:
     return json.dumps({"type": kind, **fields}, ensure_ascii=False)
 
 
-def error_text(reason: str, code: str = "refused") -> str:
-    """Return the message that something was refused, and why."""
-    return text("error", code=code, text=reason)
+def error_text(reason: str, code: str = "refused", retry_after_s: float = 0.0) -> str:
+    """Return the message that something was refused, why, and when to try again; 0: unknown."""
+    when = {"retry_after_s": retry_after_s} if retry_after_s else {}
+    return text("error", code=code, text=reason, **when)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

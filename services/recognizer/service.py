@@ -179,6 +179,7 @@ class RecognizerService(Service):
             session.start = start
             socket = self._connect(start.endpoints["phone_input"])
             session.link.connect(socket, start.session, start.epoch, time.monotonic())
+            session.silent_s = 0.0  # another face does not know yet that its client is
             self._leave_synthesizers()
         return True
 
@@ -219,6 +220,7 @@ class RecognizerService(Service):
                 (each, chunk) for each, chunk in self._unpaced if each is not found or chunk is None
             )
             found.link.forget()
+            found.silent_s = 0.0  # the face shall learn anew that its client is
             self._emit(found, found.stream.flush())
 
     def on_tick(self, now_s: float) -> None:
@@ -446,7 +448,11 @@ class RecognizerService(Service):
             for session, chunks in zip(sessions, self._queued.values(), strict=True)
         ]
         self._queued, self._queued_share = {}, 0.0
-        for session, outputs in zip(sessions, run_scoring_tasks(self._model, tasks), strict=True):
+        results = run_scoring_tasks(self._model, tasks)
+        self._ask_what_changed()  # if this stood still meanwhile, others may serve the sessions
+        for session, outputs in zip(sessions, results, strict=True):
+            if self._sessions.get(session.start.session) is not session:
+                continue
             self._emit(session, outputs)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps)
             session.num_gaps = session.stream.num_gaps

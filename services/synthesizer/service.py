@@ -40,7 +40,7 @@ from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.session import AddShapes, ChooseExpressiveness, Express
 from shared.wire.speech import Acknowledge, ResumeFace, Stalled
 
-SILENCE_S = 2.0  # a live stream without a word from its recognizer for so long has stalled
+LOST_S = 20.0  # without a word from a recognizer, which would tell that its client is silent
 AGAIN_S = 3.0  # for which followers of a session that has moved here may still be on their way
 MADE_UP_S = 0.2  # of frames without sound, when they are late
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
@@ -55,7 +55,7 @@ class _Session:
         self.face = face
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledge)
         self.epoch_in = 0  # of the newest message from the recognizer; 0: there is none
-        self.relaxes_s = time.monotonic() + SILENCE_S  # from when on frames come without sound
+        self.relaxes_s = time.monotonic() + LOST_S  # from when on frames come without sound
         self.sequence_out = 0
         self.shown: FapFrame | None = None  # the newest frame
         self.final = FinalTime()
@@ -214,7 +214,7 @@ class SynthesizerService(Service):
         if session is None:
             return
         now_s = time.monotonic()
-        session.relaxes_s = now_s if isinstance(message, Stalled) else now_s + SILENCE_S
+        session.relaxes_s = now_s if isinstance(message, Stalled) else now_s + LOST_S
         if message.epoch != session.epoch_in:
             self._enter_epoch(session, message)
         if not isinstance(message, Stalled | ResumeFace):

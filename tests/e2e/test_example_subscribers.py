@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from shared.client import Client
-from tests.e2e.following import samples_of_file, stream_into
+from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream_into
 from tests.system import ROOT, VOWELS_FILE, System
 
 FOLDER = ROOT / "examples" / "subscribe"
@@ -59,3 +59,40 @@ def test_they_follow_a_face_to_its_end(system: System, programs: list[list[str]]
     assert sorted(times_s) == list(times_s)
     assert 0.2 < max(jaw) <= 1, "/a/ opens the jaw"
     assert min(jaw) == 0
+
+
+def test_they_follow_a_face_that_another_synthesizer_makes(
+    tmp_path: Path, programs: list[list[str]]
+) -> None:
+    samples = samples_of_file(VOWELS_FILE)[:48000]
+    services = ("control", "recognizer", "synthesizer")
+    with ExitStack() as stack, System(services, tmp_path) as system:
+        client = stack.enter_context(Client(system.control))
+        session = client.open_session(encoding="f32le")
+        address = system.control.partition(" ")[0]
+        running = [
+            stack.enter_context(
+                subprocess.Popen([*each, session.name, address], stdout=subprocess.PIPE, text=True)
+            )
+            for each in programs
+        ]
+        for each in running:
+            assert each.stdout is not None
+            assert each.stdout.readline() == f"following {session.name}\n"
+        output = session.subscribe(*KINDS)
+        collected = Collected()
+        send(session, samples[:16000], output, collected, paced=True)
+        system.start_beside("synthesizer", "other")
+        lost = system.processes.pop("synthesizer")
+        lost.kill()
+        lost.wait()
+        send(session, samples[16000:], output, collected, paced=True)
+        finish(session, output, collected)
+        assert session.opened.epoch > 1
+        outputs = [each.communicate(timeout=60)[0].splitlines() for each in running]
+        session.close()
+    assert [each.returncode for each in running] == [0, 0, 0]
+    for lines in outputs:
+        times = [round(16000 * float(line.split()[0])) for line in lines]
+        assert times == sorted(times)
+        assert {frame.media_time for frame in collected.frames} <= {*times}

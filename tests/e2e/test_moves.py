@@ -50,6 +50,7 @@ def test_a_session_goes_on_when_its_worker_ends(
         session.close()
         assert ended.wait(60) == (0 if how == signal.SIGTERM else -how)
         system.assert_all_alive()
+        assert "session moved to" in system.log("control")
 
     assert before.epoch == 1 < after.epoch
     endpoints = ("audio", "phones", "faps")

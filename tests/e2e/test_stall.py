@@ -23,7 +23,7 @@ def num_standing(collected: Collected) -> int:
 
 
 def test_a_face_waits_for_a_slow_recognizer_and_rests_for_a_silent_client(tmp_path: Path) -> None:
-    samples = samples_of_file(DEMO / "hello-female.wav")[:64_000]
+    samples = samples_of_file(DEMO / "hello-female.wav")[:88_000]
     services = ("control", "recognizer", "synthesizer")
     with System(services, tmp_path) as system, Client(system.control) as client:
         session = client.open_session(encoding="f32le")
@@ -33,10 +33,10 @@ def test_a_face_waits_for_a_slow_recognizer_and_rests_for_a_silent_client(tmp_pa
         recognizer = system.processes["recognizer"]
         recognizer.send_signal(signal.SIGSTOP)
         try:
-            send(session, samples[16_000:32_000], output, collected, paced=True)
+            send(session, samples[16_000:56_000], output, collected, paced=True)
         finally:
             recognizer.send_signal(signal.SIGCONT)
-        send(session, samples[32_000:], output, collected, paced=True)
+        send(session, samples[56_000:], output, collected, paced=True)
         end_s = time.monotonic() + 60
         while (
             collected.frames[-1].media_time < len(samples) - 3200 and num_standing(collected) == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.system.continuity import compare, staleness
+from evaluation.system.continuity import compare, staleness, worst
 from evaluation.system.live import Seen
 from shared.wire.face import FapFrame
 from shared.wire.speech import Phone, Speech
@@ -50,7 +50,7 @@ UNDISTURBED = seen(
 
 
 def test_an_undisturbed_session_has_lost_nothing() -> None:
-    face = compare(UNDISTURBED, UNDISTURBED, "sil", 0.06)
+    face = compare(UNDISTURBED, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert (face.phones, face.phones_lost, face.phones_doubled, face.phones_changed) == (3, 0, 0, 0)
     assert (face.frames_lost, face.frames_doubled, face.rest_frames) == (0, 0, 0)
     assert (face.largest_step, face.largest_step_fap) == (1.0, "open_jaw")
@@ -67,7 +67,7 @@ def test_frames_that_fail_to_come_and_come_twice_are_told_from_rest() -> None:
         (0.50, frame(9, epoch=2)),  # doubled, too
         *in_time(*range(25, 47), epoch=2),
     )
-    face = compare(broken, UNDISTURBED, "sil", 0.06)
+    face = compare(broken, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert face.rest_frames == 2
     assert face.frames_doubled == 2
     assert face.frames_lost == 15
@@ -76,9 +76,9 @@ def test_frames_that_fail_to_come_and_come_twice_are_told_from_rest() -> None:
 
 
 def test_a_face_that_never_moves_again_stands_to_the_end() -> None:
-    assert compare(seen(*in_time(*range(10))), UNDISTURBED, "sil", 0.06).stood_s == pytest.approx(
-        1.0 - 0.24
-    )
+    assert compare(
+        seen(*in_time(*range(10))), UNDISTURBED, "sil", 0.06, fault_s=0.2
+    ).stood_s == pytest.approx(1.0 - 0.24)
 
 
 def test_phones_of_two_epochs_make_one_row() -> None:
@@ -92,12 +92,12 @@ def test_phones_of_two_epochs_make_one_row() -> None:
             phone(2, "sil", epoch=2, at=3),
         ),
     )
-    face = compare(broken, UNDISTURBED, "sil", 0.06)
+    face = compare(broken, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert (face.phones_lost, face.phones_doubled, face.phones_changed) == (0, 0, 1)  # h became i
     revised = seen(
         *in_time(1, 2), phones=(phone(0, "m", final=False), phone(0, "n"), phone(1, "i"))
     )
-    assert compare(revised, UNDISTURBED, "sil", 0.06).phones_lost == 1
+    assert compare(revised, UNDISTURBED, "sil", 0.06, fault_s=0.2).phones_lost == 1
 
 
 def test_phones_that_a_new_recognizer_says_again_count_once() -> None:
@@ -111,8 +111,23 @@ def test_phones_that_a_new_recognizer_says_again_count_once() -> None:
         ),
     )
     broken.speech.append(Speech(session="s", epoch=2, sequence=1, media_time=1600, active=True))
-    face = compare(broken, UNDISTURBED, "sil", 0.06)
+    face = compare(broken, UNDISTURBED, "sil", 0.06, fault_s=0.2)
     assert (face.phones_lost, face.phones_doubled, face.phones_changed) == (0, 0, 0)
+
+
+def test_frames_are_in_time_again_once_none_is_late_for_a_second() -> None:
+    late = seen(*in_time(*range(10)), *((0.9, frame(number)) for number in range(10, 42)))
+    face = compare(late, UNDISTURBED, "sil", 0.06, fault_s=0.2)
+    assert face.late_s == pytest.approx(0.7)
+    assert compare(late, UNDISTURBED, "sil", 0.06, fault_s=-2.0).late_s == 0.0, "it was no fault"
+
+
+def test_the_worst_of_several_sessions_has_the_worst_of_each_figure() -> None:
+    one = compare(seen(*in_time(*range(20, 47))), UNDISTURBED, "sil", 0.06, fault_s=0.2)
+    other = compare(UNDISTURBED, UNDISTURBED, "sil", 0.06, fault_s=0.2)
+    both = worst([other, one])
+    assert (both.frames_lost, both.phones_lost, both.largest_step) == (20, 3, 1.0)
+    assert both.late_p50_ms == max(one.late_p50_ms, other.late_p50_ms)
 
 
 def test_frames_are_as_stale_as_they_come_after_those_in_time() -> None:

@@ -143,6 +143,15 @@ def test_one_more_than_there_is_room_for_is_refused_with_a_time(made: Made) -> N
     assert open_at(made, 300.0) == "recognizer-2"
 
 
+def test_an_idle_worker_may_have_no_load_at_all() -> None:
+    load = WorkerLoad()
+    load.measure(0.0, 0.0)
+    load.measure(0.3, 1.0)
+    load.place(1.0, paced=True)
+    load.measure(0.3, 5.0)
+    assert load.cost == pytest.approx(0.3)
+
+
 def test_a_busy_synthesizer_is_a_reason_too(made: Made) -> None:
     made.lose("synthesizer-2")
     for _ in range(NUM_SURE):

@@ -26,9 +26,11 @@ from services.recognizer.voice import Voice
 from shared.bus import Bus
 from shared.keys import Peer
 from shared.phones.events import LipFrame
+from shared.reliable import ReliableSender
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.control import StartSession
-from shared.wire.message import MAX_AUDIO_BYTES
+from shared.wire.message import MAX_AUDIO_BYTES, Message
+from shared.wire.speech import Stalled
 from tests.e2e.following import samples_of_file
 from tests.system import VOWELS_FILE, free_port
 
@@ -314,3 +316,30 @@ def test_the_shipped_lips_are_used_with_the_network_that_they_were_trained_on(
     frames = [event for event in events if isinstance(event, LipFrame)]
     assert len(frames) > 50
     assert {frame.delay_s for frame in frames} == {0.1}
+
+
+def test_a_face_is_told_of_a_silent_client_once_and_again_when_it_is_another_or_was_flushed(
+    service: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[Message] = []
+    monkeypatch.setattr(
+        ReliableSender, "send", lambda _sender, message, _now_s: told.append(message)
+    )
+    now_s = time.monotonic()
+
+    def num_told(num_ticks: int) -> int:
+        nonlocal now_s
+        told.clear()
+        for _ in range(num_ticks):
+            now_s += 0.01
+            service.on_tick(now_s)
+        return sum(isinstance(each, Stalled) for each in told)
+
+    start = replace(start_of(), paced=True)
+    service.start_session(start)
+    assert num_told(100) == 1
+    assert num_told(100) == 0
+    service.flush_session("s")
+    assert num_told(100) == 1
+    service.start_session(replace(start, epoch=2))
+    assert num_told(100) == 1

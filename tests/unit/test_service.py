@@ -310,3 +310,19 @@ def test_heartbeats_name_a_great_many_sessions_in_turn(control: Control) -> None
     named = [name for beat in control.beats[:3] for name in beat.sessions]
     assert len(named) == 3 * SESSIONS_A_BEAT
     assert {*named} == {*worker.names}
+
+
+def test_a_process_ends_when_it_is_asked_for_its_health_and_its_loop_hangs(
+    slow: Slow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends: list[int] = []
+    monkeypatch.setattr("shared.service.os._exit", ends.append)
+    slow.step(0.0)
+    assert slow.check_health()
+    monkeypatch.setattr("shared.service.ALIVE_S", 0.0)
+    time.sleep(0.02)
+    assert not slow.check_health()
+    assert ends == []
+    monkeypatch.setattr("shared.service.ENDS_S", 0.0)
+    slow.check_health()
+    assert ends == [1]
