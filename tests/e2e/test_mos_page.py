@@ -346,6 +346,7 @@ class Page:
             self.press(f"realism-{scores[condition] - 1}")
             self.press("send")
         browser.wait_for("!document.getElementById('end').hidden")
+        self._check_width()
         assert urlsplit(browser.evaluate("location.href")).query == ""
 
     def _wait_for_place(self, place: int) -> None:
