@@ -183,6 +183,13 @@ def schemes(
     videos: Annotated[
         Path | None, typer.Option(help="Write CONDITION/SENTENCE.mp4 there, unless they exist.")
     ] = None,
+    anchor: Annotated[
+        bool, typer.Option("--anchor", help="With --videos: a mouth at rest, bad on purpose.")
+    ] = False,
+    sound_at_once: Annotated[
+        bool,
+        typer.Option("--sound-at-once", help="With --videos: sound does not wait for live faces."),
+    ] = False,
     json_file: JsonFile = None,
 ) -> None:
     """Compare the four schemes of Li et al. 2011: aligned, recognised, live, next phone.
@@ -214,8 +221,17 @@ def schemes(
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))
     if videos:
-        written = film_all(heard, listeners, lip_models, videos)
+        written = film_all(
+            heard,
+            listeners,
+            lip_models,
+            videos,
+            has_anchor=anchor,
+            sound_at_once=sound_at_once,
+        )
         print_message(f"wrote {len(written)} videos to {videos}")
+        if any(each.aligned is None for each in heard):
+            print_message("none of scheme 1: the text of some sentences is not known")
 
 
 @app.command()

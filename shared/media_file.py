@@ -1,4 +1,4 @@
-"""The sound of media files in any format that FFmpeg knows: m4a, mp4, webm, mkv, mov, aac, amr."""
+"""Media files of any format that FFmpeg knows (m4a, mp4, webm, mkv, mov), above all their sound."""
 
 from __future__ import annotations
 
@@ -69,6 +69,23 @@ def open_media(path: Path, max_rate_hz: int, max_channels: int) -> MediaSound:
     return MediaSound(
         rate_hz, num_channels, duration_s, _blocks(path, container, resampler, num_channels)
     )
+
+
+def check_video(path: Path) -> None:
+    """See whether a file is a video with sound.
+
+    Raises
+    ------
+    UserError
+        If it is not.
+    """
+    try:
+        with av.open(path, options=_OPTIONS) as container:
+            has_both = bool(container.streams.video and container.streams.audio)
+    except (av.error.FFmpegError, OSError, ValueError) as error:
+        raise UserError(f"{path}: this is no video that can be read ({_reason(error)})") from None
+    if not has_both:
+        raise UserError(f"{path}: it needs pictures and sound")
 
 
 def _blocks(

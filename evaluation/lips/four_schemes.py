@@ -13,12 +13,17 @@ since the paper aligns apart from the recognizer, too; the others are made with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.progress import track
 
+from corpora.lip_clips import LipClip
+from evaluation.lips.clip_video import tracked_frames
 from evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted, paper_config
 from evaluation.lips.schemes import animate_live, live_events, once_the_next_begins
 from evaluation.lips.sentences import Sentence
@@ -36,6 +41,7 @@ from services.synthesizer.config import DELAYS_MS, SynthesizerConfig
 from services.synthesizer.face import Face, Frame
 from services.synthesizer.lips.load import load_lip_model
 from shared.errors import UserError
+from shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from shared.face.lip_models import LipModelName
 from shared.phones.events import SoundEvent
 
@@ -186,8 +192,25 @@ def film_all(
     listeners: Sequence[Listener],
     lips: Sequence[LipModelName],
     folder: Path,
+    *,
+    has_anchor: bool = False,
+    sound_at_once: bool = False,
 ) -> list[Path]:
     """Write ``CONDITION/SENTENCE.mp4`` for everything; videos that exist are kept.
+
+    Every condition has every sentence, as a listening test needs it: one that cannot be made of all
+    of them is left out.
+
+    Parameters
+    ----------
+    heard, listeners, lips
+        What is filmed: sentences, recognizers and lip models.
+    folder
+        Where.
+    has_anchor
+        Film a mouth at rest, too, as the condition ``anchor``.
+    sound_at_once
+        Show live frames when they are made, later than their sound; the conditions' names tell it.
 
     Raises
     ------
@@ -195,25 +218,24 @@ def film_all(
         If a file or folder cannot be written.
     """
     missing = [
-        (condition, each, path)
-        for condition in conditions_of(listeners, lips)
+        (make, each, path)
+        for name, make in _films(
+            heard, listeners, lips, has_anchor=has_anchor, sound_at_once=sound_at_once
+        )
         for each in heard
-        if not (path := folder / condition.name / f"{each.sentence.clip.name}.mp4").exists()
-        if condition.scheme != BOUND or each.aligned is not None
+        if not (path := folder / name / f"{each.sentence.clip.name}.mp4").exists()
     ]
     if not missing:
         return []
     head = scene.load_head()
     renderer = Renderer(head, *_VIDEO_PX, camera=scene.camera(head, Framing.FACE))
-    for condition, each, path in track(missing, description="drawing", transient=True):
-        frames = face_of(condition, each, SynthesizerConfig(lips=condition.lips))
-        assert frames is not None  # noqa: S101 - conditions without a face are not among them
+    for make, each, path in track(missing, description="drawing", transient=True):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"{path.parent}: cannot be made: {error.strerror}") from error
         film.render_video(
-            frames,
+            make(each),
             path,
             renderer,
             frame_rate_hz=_IMAGES_PER_S,
@@ -221,3 +243,60 @@ def film_all(
         )
     renderer.close()
     return [path for _, _, path in missing]
+
+
+def _films(
+    heard: Sequence[HeardSentence],
+    listeners: Sequence[Listener],
+    lips: Sequence[LipModelName],
+    *,
+    has_anchor: bool,
+    sound_at_once: bool,
+) -> Iterator[tuple[str, Callable[[HeardSentence], list[Frame]]]]:
+    """Yield each condition's name, and what makes its frames of a sentence."""
+    conditions = [
+        condition
+        for condition in conditions_of(listeners, lips)
+        if condition.scheme != BOUND or all(each.aligned is not None for each in heard)
+    ]
+    for condition in conditions:
+        if sound_at_once and condition.scheme > RECOGNISED:
+            yield f"{condition.name}-sound-at-once", partial(_frames_as_made, condition)
+        else:
+            yield condition.name, partial(_frames, condition)
+    if not conditions:
+        return
+    if has_anchor:
+        yield "anchor", partial(_frames_of_mouth, conditions[0], _mouth_at_rest)
+    clips = [each.sentence.clip for each in heard]
+    if all(len(clip.time_s) and clip.is_in_sync for clip in clips):
+        yield "tracked", partial(_frames_of_mouth, conditions[0], tracked_frames)
+
+
+def _frames(condition: Condition, heard: HeardSentence) -> list[Frame]:
+    frames = face_of(condition, heard, SynthesizerConfig(lips=condition.lips))
+    assert frames is not None  # noqa: S101 - conditions without a face are not among them
+    return frames
+
+
+def _frames_as_made(condition: Condition, heard: HeardSentence) -> list[Frame]:
+    delay_s = DELAYS_MS[condition.lips] / 1e3
+    return [(time_s + delay_s, faps) for time_s, faps in _frames(condition, heard)]
+
+
+def _frames_of_mouth(
+    condition: Condition,
+    mouth_of: Callable[[LipClip, NDArray[np.float64]], NDArray[np.float64]],
+    heard: HeardSentence,
+) -> list[Frame]:
+    """Give a condition's face, with its blinks and head motion, another mouth."""
+    frames = _frames(condition, heard)
+    faps = np.array([faps for _, faps in frames])
+    times_s = np.array([time_s for time_s, _ in frames])
+    mouth = np.array(MOUTH_FAPS) - 1
+    faps[:, mouth] = mouth_of(heard.sentence.clip, times_s)[:, mouth]
+    return [(time_s, row) for (time_s, _), row in zip(frames, faps, strict=True)]
+
+
+def _mouth_at_rest(_clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.zeros((len(times_s), NUM_FAPS))

@@ -26,12 +26,21 @@ def new(
     language: Annotated[
         list[str] | None, typer.Option(help="Of the page: zh, en; repeatable, else both.")
     ] = None,
+    condition: Annotated[
+        list[str] | None, typer.Option(help="Take this condition; repeatable, else all.")
+    ] = None,
 ) -> None:
     """Make a study of videos named CONDITION/SENTENCE.mp4 or SENTENCE_CONDITION.mp4."""
     from evaluation.mos.study import LANGUAGES, new_study
 
-    languages = tuple(language or LANGUAGES)
-    study = new_study(folder, title=title, reference=reference, anchor=anchor, languages=languages)
+    study = new_study(
+        folder,
+        title=title,
+        reference=reference,
+        anchor=anchor,
+        languages=tuple(language or LANGUAGES),
+        conditions=condition or (),
+    )
     sizes = f"{len(study.sentences)} sentences x {len(study.conditions)} conditions"
     print_message(f"a study of {sizes}; next: kouxing mos serve {folder}")
 
@@ -103,4 +112,5 @@ def export(
     from evaluation.mos.study import load_study
 
     check_output(output)
-    write_output(to_csv(read_answers(load_study(folder).folder)), output)
+    study = load_study(folder)
+    write_output(to_csv(study, read_answers(study.folder)), output)

@@ -6,6 +6,9 @@ conditions, two for an odd one. A judge sees as many blocks as there are sentenc
 row of the design, shows every condition once, and sentences that differ as far as they last. Which
 rows follow one another is drawn at random: in turn, the same two conditions would always meet where
 blocks do.
+
+Before that come some videos for practice (ITU-T P.910), which do not count: one sentence in the
+conditions that differ most, as far as the study tells.
 """
 
 from __future__ import annotations
@@ -14,6 +17,10 @@ import random
 
 import numpy as np
 from numpy.typing import NDArray
+
+from evaluation.mos.study import Study
+
+NUM_PRACTICE = 2
 
 
 def williams_design(num_conditions: int) -> NDArray[np.int64]:
@@ -48,3 +55,12 @@ def order_of_judge(
         for block in range(len(sentences))
         for condition in design[(judge + turns.randrange(len(design))) % len(design)]
     ]
+
+
+def places_of_judge(judge: int, study: Study) -> dict[int, tuple[str, str]]:
+    """Return the sentence and condition at every place of a judge's order; below 0: practice."""
+    order = order_of_judge(judge, study.sentences, study.conditions)
+    first = dict.fromkeys((study.reference, study.anchor, *study.conditions))
+    known = [condition for condition in first if condition][:NUM_PRACTICE]
+    practice = [(order[-1][0], condition) for condition in known]  # the sentence returns late
+    return dict(enumerate([*practice, *order], start=-len(practice)))

@@ -4,33 +4,37 @@
 request                     answer
 ==========================  ==============================================================
 ``GET /``, ``GET /NAME``    the page and its files
-``GET /study``              its title, the page's languages and the number of videos
+``GET /study``              its title, the page's languages and the number of videos that count
 ``POST /judges``            ``{"judge": token}``: a new judge
 ``GET /state``              ``{"hears": bool, "place": n}``: whether the sound check is passed, and
-                            which place is next (null: none)
+                            which place is next (below 0: practice; null: none)
 ``GET /beeps``              WAV file of the sound check
 ``POST /beeps``             ``{"beeps": n}``, how many were heard: the state
 ``GET /stimulus/PLACE``     the judge's video at this place, if it is the next
-``POST /answers``           ``{"place": n, "sync": 1..5, "realism": 1..5}``: the state
+``POST /answers``           ``{"place": n, "sync": 1..5, "realism": 1..5, "language": "zh"|"en"}``:
+                            the state
 ==========================  ==============================================================
 
 Those below ``/judges`` take ``?judge=TOKEN``; all but the page's files take what ``Access`` asks
-for. No request names a file or a condition: a judge's places do.
+for. No request names a file or a condition: a judge's places do. A video that was not fetched has
+no answer (409).
 """
 
 from __future__ import annotations
 
 import asyncio
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from aiohttp import web
 
 from evaluation.mos.beeps import make_beeps
-from evaluation.mos.order import order_of_judge
-from evaluation.mos.store import Judge, Store
-from evaluation.mos.study import SCALES, Study
+from evaluation.mos.order import places_of_judge
+from evaluation.mos.store import Answer, Judge, Store
+from evaluation.mos.study import LANGUAGES, SCALES, Study
 from services.gateway import http
 from services.gateway.access import Access
 from services.gateway.config import GatewayConfig
@@ -99,28 +103,34 @@ class ListeningTest:
         return web.Response(body=sound, content_type="audio/wav")
 
     async def _check_sound(self, request: web.Request) -> web.Response:
-        (beeps,) = await _integers(request, "beeps")
-        self._store.check_sound(self._judge(request), beeps)
+        fields = await _read(request, "beeps")
+        self._store.check_sound(self._judge(request), fields["beeps"])
         return self._state(self._judge(request))
 
     async def _play_stimulus(self, request: web.Request) -> web.StreamResponse:
         judge = self._judge(request)
         place = self._next_place(judge)
-        if not judge.hears or place is None or request.match_info["place"] != str(place):
+        if place is None or request.match_info["place"] != str(place):
             raise web.HTTPNotFound
-        return web.FileResponse(self._study.files[self._order(judge)[place]])
+        self._store.note_fetched(judge, place)
+        return web.FileResponse(self._study.files[self._places(judge)[place]])
 
     async def _add_answer(self, request: web.Request) -> web.Response:
+        fields = await _read(request, "place", *SCALES)
+        place, language = fields["place"], fields.get("language")
         judge = self._judge(request)
-        place, *given = await _integers(request, "place", *SCALES)
-        order = self._order(judge)
-        place_due = self._next_place(judge)
-        last = len(order) - 1 if place_due is None else place_due
-        if not judge.hears or not 0 <= place <= last:
-            raise web.HTTPConflict(text="this video is not due\n")
-        if not all(1 <= score <= 5 for score in given):
+        cell = self._places(judge).get(place)
+        if cell is None or judge.number is None or judge.fetched is None or place > judge.fetched:
+            raise web.HTTPConflict(text="this video was not fetched\n")
+        if not all(1 <= fields[scale] <= 5 for scale in SCALES):
             raise web.HTTPBadRequest(text="scores are 1 to 5\n")
-        self._store.add(judge, *order[place], dict(zip(SCALES, given, strict=True)))
+        if language not in LANGUAGES:
+            raise web.HTTPBadRequest(text=f"language is {' or '.join(LANGUAGES)}\n")
+        now_s = time.time()
+        self._store.add(
+            Answer(judge.number, place, *cell, scale, fields[scale], language, now_s)
+            for scale in SCALES
+        )
         return self._state(judge)
 
     def _judge(self, request: web.Request) -> Judge:
@@ -129,17 +139,19 @@ class ListeningTest:
             raise web.HTTPNotFound(text="there is no such judge\n")
         return judge
 
-    def _order(self, judge: Judge) -> list[tuple[str, str]]:
-        return order_of_judge(judge.number, self._study.sentences, self._study.conditions)
+    def _places(self, judge: Judge) -> dict[int, tuple[str, str]]:
+        return {} if judge.number is None else places_of_judge(judge.number, self._study)
 
     def _next_place(self, judge: Judge) -> int | None:
-        """Return the place of the first video without an answer; None: all have one."""
-        answered = self._store.answered(judge)
-        places = (place for place, cell in enumerate(self._order(judge)) if cell not in answered)
-        return next(places, None)
+        """Return the first place without an answer; None: all have one, or none may be seen yet."""
+        places = self._places(judge)
+        last = self._store.last_place(judge)
+        place = min(places, default=0) if last is None else last + 1
+        return place if place in places else None
 
     def _state(self, judge: Judge) -> web.Response:
-        return web.json_response({"hears": judge.hears, "place": self._next_place(judge)})
+        hears = judge.number is not None
+        return web.json_response({"hears": hears, "place": self._next_place(judge)})
 
 
 async def serve(
@@ -185,13 +197,13 @@ async def _serve_page(request: web.Request) -> web.StreamResponse:
     return web.FileResponse(path, headers={"Content-Security-Policy": _POLICY})
 
 
-async def _integers(request: web.Request, *names: str) -> list[int]:
-    """Return fields of a request's JSON, which must be integers."""
+async def _read(request: web.Request, *integers: str) -> dict[str, Any]:
+    """Return the fields of a request's JSON, some of which must be integers."""
     try:
-        fields = await request.json()
-        values = [fields[name] for name in names]
+        fields: dict[str, Any] = await request.json()
+        values = [fields[name] for name in integers]
     except (ValueError, TypeError, KeyError, RecursionError):
         values = [None]
     if not all(type(value) is int and abs(value) < 2**31 for value in values):
-        raise web.HTTPBadRequest(text=f"send JSON with integers: {', '.join(names)}\n")
-    return values
+        raise web.HTTPBadRequest(text=f"send JSON with integers: {', '.join(integers)}\n")
+    return fields

@@ -2,6 +2,9 @@
 
 Li et al. 2011, 3.3, draw box plots of each scheme's scores by the interquartile range, remove the
 outliers and take the mean (table 2). They do not name the fences; these are Tukey's, a box plot's.
+
+Without outliers scores differ less than those of the next judges will, so an interval made of them
+is too narrow. Whatever else is computed here is computed of all scores.
 """
 
 from __future__ import annotations
@@ -23,19 +26,31 @@ CONFIDENCE = 0.95
 Scores = dict[tuple[int, str], int]  # of one condition on one scale, by judge and sentence
 
 
+@dataclass(frozen=True, slots=True)
+class Mean:
+    """A mean of scores."""
+
+    value: float
+    half_width: float | None
+    """Of its 95 % confidence interval; None: there is but one judge.
+
+    By Student's t over judges, since the scores of one are alike. One who gave few counts little.
+    """
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Opinion:
     """How judges find one condition on one scale."""
 
     scale: str
     condition: str
-    mos: float
-    """Mean opinion score, 1 to 5: the mean of all scores without outliers."""
-    half_width: float | None
-    """Of its 95 % confidence interval; None: there is but one judge.
-
-    By Student's t over judges, since the scores of one are alike. One who gave few counts little.
-    """
+    without_outliers: Mean
+    """Mean opinion score, 1 to 5, as the paper has it."""
+    of_all: Mean
+    """Mean opinion score of all scores, whose interval can be trusted."""
+    differential: Mean | None
+    """Mean of a judge's score less that judge's score of the hidden reference in the same sentence,
+    plus 5 (ACR-HR, ITU-T P.910, P.913); None: this is the reference, or there is none."""
     num_judges: int
     num_scores: int
     num_outliers: int
@@ -49,7 +64,7 @@ class Comparison:
     scale: str
     conditions: tuple[str, str]
     num_judges: int
-    """Who have scores of both left, of the same sentence."""
+    """Who have scored both, in the same sentence."""
     difference: float
     """Mean over these judges of the first's scores less the second's."""
     p: float
@@ -86,32 +101,49 @@ def without_outliers(scores: Scores) -> Scores:
     return {key: score for (key, score), keep in zip(scores.items(), kept, strict=True) if keep}
 
 
-def opinion_of(scale: str, condition: str, scores: Scores) -> Opinion:
-    """Return the mean opinion of one condition."""
+def differential_scores(scores: Scores, reference: Scores) -> Scores:
+    """Return score - reference + 5 of every judge and sentence that have both.
+
+    As P.910 has it: 5 and more where the condition is no worse than the hidden reference.
+    """
+    both = scores.keys() & reference.keys()
+    return {key: scores[key] - reference[key] + 5 for key in scores if key in both}
+
+
+def opinion_of(
+    scale: str, condition: str, scores: Scores, reference: Scores | None = None
+) -> Opinion:
+    """Return the mean opinion of one condition; ``reference``: scores of the hidden reference."""
     kept = without_outliers(scores)
-    by_judge: defaultdict[int, list[int]] = defaultdict(list)
-    for (judge, _), score in kept.items():
-        by_judge[judge].append(score)
-    mos = float(np.mean([*kept.values()]))
+    differential = differential_scores(scores, reference or {})
     return Opinion(
         scale=scale,
         condition=condition,
-        mos=mos,
-        half_width=_half_width(mos, [*by_judge.values()]),
-        num_judges=len(by_judge),
+        without_outliers=mean_of(kept),
+        of_all=mean_of(scores),
+        differential=mean_of(differential) if differential else None,
+        num_judges=len({judge for judge, _ in scores}),
         num_scores=len(scores),
         num_outliers=len(scores) - len(kept),
     )
 
 
+def mean_of(scores: Scores) -> Mean:
+    """Return the mean of at least one score."""
+    by_judge: defaultdict[int, list[int]] = defaultdict(list)
+    for (judge, _), score in scores.items():
+        by_judge[judge].append(score)
+    mean = float(np.mean([*scores.values()]))
+    return Mean(mean, _half_width(mean, [*by_judge.values()]))
+
+
 def compare_all(scale: str, groups: dict[str, Scores]) -> list[Comparison]:
     """Compare the conditions of one scale, each with each, where they have pairs of scores."""
-    kept = {condition: without_outliers(scores) for condition, scores in groups.items()}
     found: list[tuple[tuple[str, str], NDArray[np.float64]]] = []
-    for first, second in combinations(kept, 2):
+    for first, second in combinations(groups, 2):
         by_judge: defaultdict[int, list[int]] = defaultdict(list)
-        for key in sorted(kept[first].keys() & kept[second].keys()):
-            by_judge[key[0]].append(kept[first][key] - kept[second][key])
+        for key in sorted(groups[first].keys() & groups[second].keys()):
+            by_judge[key[0]].append(groups[first][key] - groups[second][key])
         if by_judge:
             found.append(((first, second), np.array([np.mean(each) for each in by_judge.values()])))
     corrected = holm([_signed_rank_p(differences) for _, differences in found])
@@ -136,13 +168,13 @@ def holm(ps: Sequence[float]) -> list[float]:
     return [float(p) for p in corrected]
 
 
-def _half_width(mos: float, by_judge: Sequence[Sequence[int]]) -> float | None:
+def _half_width(mean: float, by_judge: Sequence[Sequence[int]]) -> float | None:
     num_judges = len(by_judge)
     if num_judges < 2:
         return None
     # The variance of a ratio, scores to their number, whose parts are sums over judges (Cochran,
     # Sampling Techniques, 1977, section 6.3); with as many scores of each, that of their means.
-    surplus = [sum(scores) - mos * len(scores) for scores in by_judge]
+    surplus = [sum(scores) - mean * len(scores) for scores in by_judge]
     variance = num_judges / (num_judges - 1) * np.sum(np.square(surplus))
     quantile = stats.t.ppf((1 + CONFIDENCE) / 2, num_judges - 1)
     return float(quantile * np.sqrt(variance) / sum(map(len, by_judge)))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from shared.errors import UserError
+from shared.media_file import check_video
 
 FILE_NAME = "study.json"
 SUFFIXES = {".mp4", ".webm", ".mov"}
@@ -36,22 +38,35 @@ class Study:
 
 
 def new_study(
-    folder: Path, *, title: str, reference: str, anchor: str, languages: tuple[str, ...]
+    folder: Path,
+    *,
+    title: str,
+    reference: str,
+    anchor: str,
+    languages: tuple[str, ...],
+    conditions: Collection[str] = (),
 ) -> Study:
     """Find a folder's videos and write them down as a study.
 
     They are named ``CONDITION/SENTENCE.mp4``, or ``SENTENCE_CONDITION.mp4`` where the folder has no
-    subfolders with videos; .webm and .mov are taken, too.
+    subfolders with videos; .webm and .mov are taken, too. ``conditions`` are those to take; empty:
+    all.
 
     Raises
     ------
     UserError
-        If the folder is a study, has no such videos, or lacks a sentence in a condition.
+        If the folder is a study, has no such videos, or lacks a sentence in a condition; if a file
+        is no video with sound.
     """
     file = folder / FILE_NAME
     if file.exists():
         raise UserError(f"{file} is there already; its answers belong to it, take another folder")
-    stimuli = _in_subfolders(folder) or _by_name(folder)
+    found = _in_subfolders(folder) or _by_name(folder)
+    known = {condition for _, condition, _ in found}
+    for name in conditions:
+        if name not in known:
+            raise UserError(f"there is no condition {name!r}; there are {', '.join(sorted(known))}")
+    stimuli = [each for each in found if not conditions or each[1] in conditions]
     content = {
         "title": title or folder.resolve().name,
         "languages": languages,
@@ -63,6 +78,8 @@ def new_study(
         ],
     }
     study = _parse(folder, content)
+    for path in study.files.values():
+        check_video(path)
     try:
         file.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     except OSError as error:

@@ -1,4 +1,4 @@
-"""A listening test over HTTP: crashes, double submits, and a scripted judge in a real browser."""
+"""A listening test over HTTP: crashes, double submits, and scripted judges in a real browser."""
 
 from __future__ import annotations
 
@@ -7,38 +7,27 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from fractions import Fraction
 from http.client import HTTPConnection
 from itertools import product
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import av
-import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from evaluation.mos.order import order_of_judge
+from evaluation.mos.commands import app
+from evaluation.mos.order import places_of_judge
 from evaluation.mos.store import Store, read_answers
 from evaluation.mos.study import load_study, new_study
-from evaluation.system.chromium import Chromium, is_installed
+from evaluation.system.chromium import Chromium
 from tests.system import ROOT, free_port
+from tests.videos import write_video
 
 pytestmark = pytest.mark.e2e
 
 CONDITIONS = ("good", "bad")
 SENTENCES = ("one", "two")
-
-
-def write_video(path: Path) -> None:
-    """Write a quarter of a second of grey with silence."""
-    with av.open(str(path), "w") as file:
-        video = file.add_stream("libvpx", rate=Fraction(20))
-        video.width, video.height, video.pix_fmt = 64, 48, "yuv420p"
-        for _ in range(5):
-            picture = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 128, np.uint8), "rgb24")
-            file.mux(video.encode(picture))
-        file.mux(video.encode())
 
 
 class Served:
@@ -109,7 +98,7 @@ class Served:
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("video") / "video.webm"
+    path = tmp_path_factory.mktemp("video") / "video.mp4"
     write_video(path)
     return path
 
@@ -119,7 +108,7 @@ def folder(tmp_path: Path, video: Path) -> Path:
     folder = tmp_path / "study"
     for sentence, condition in product(SENTENCES, CONDITIONS):
         (folder / condition).mkdir(parents=True, exist_ok=True)
-        shutil.copy(video, folder / condition / f"{sentence}.webm")
+        shutil.copy(video, folder / condition / f"{sentence}.mp4")
     new_study(folder, title="Faces", reference="good", anchor="bad", languages=("zh", "en"))
     return folder
 
@@ -133,70 +122,77 @@ def served(folder: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
 
 def test_answers_survive_a_crash_and_count_once(served: Served, video: Path) -> None:
     token = served.hearing_judge()
-    for place in range(2):
+    for place in range(-2, 2):
         assert served.ask(f"/stimulus/{place}?judge={token}") == (200, video.read_bytes())
-        answer = {"place": place, "sync": 4, "realism": 2 + place}
+        answer = {"place": place, "sync": 4, "realism": 3 + place, "language": "en"}
         assert served.state(f"/answers?judge={token}", answer)["place"] == place + 1
         served.kill()
         served.start()
     assert served.state(f"/state?judge={token}")["place"] == 2
-    again = {"place": 0, "sync": 1, "realism": 1}
+    again = {"place": 0, "sync": 1, "realism": 1, "language": "zh"}
     assert served.state(f"/answers?judge={token}", again)["place"] == 2
     scores = {
-        (each.sentence, each.condition, each.scale): each.score
+        (each.place, each.sentence, each.condition, each.scale): (each.score, each.language)
         for each in read_answers(served.folder)
     }
-    study = load_study(served.folder)
-    order = order_of_judge(0, study.sentences, study.conditions)
-    expected = {(*order[place], "sync"): 4 for place in range(2)}
-    expected |= {(*order[place], "realism"): 2 + place for place in range(2)}
+    places = places_of_judge(0, load_study(served.folder))
+    expected = {(place, *places[place], "sync"): (4, "en") for place in range(-2, 2)}
+    expected |= {(place, *places[place], "realism"): (3 + place, "en") for place in range(-2, 2)}
     assert scores == expected
 
 
 def test_nothing_but_the_next_video_is_given_and_no_nonsense_kept(served: Served) -> None:
     deaf = served.state("/judges", {})["judge"]
-    good = {"place": 0, "sync": 3, "realism": 3}
-    assert served.ask(f"/stimulus/0?judge={deaf}")[0] == 404
+    good = {"place": -2, "sync": 3, "realism": 3, "language": "zh"}
+    assert served.state(f"/state?judge={deaf}") == {"hears": False, "place": None}
+    assert served.ask(f"/stimulus/-2?judge={deaf}")[0] == 404
     assert served.ask(f"/answers?judge={deaf}", good)[0] == 409
     token = served.hearing_judge()
     for path in (
-        f"/stimulus/1?judge={token}",
+        f"/stimulus/-1?judge={token}",
+        f"/stimulus/0?judge={token}",
         f"/stimulus/..%2fstudy.json?judge={token}",
-        "/stimulus/0?judge=nobody",
+        "/stimulus/-2?judge=nobody",
         "/study.json",
         "/answers.sqlite",
         "/..%2f..%2fserver.py",
         "/server.py",
-        "/good/one.webm",
+        "/good/one.mp4",
     ):
         assert served.ask(path)[0] in (403, 404), path
     answers = f"/answers?judge={token}"
+    assert served.ask(answers, good)[0] == 409, "its video was never fetched"
+    assert served.ask(f"/stimulus/-2?judge={token}")[0] == 200
     bodies: list[object] = [
         {**good, "sync": 6},
         {**good, "realism": 0},
         {**good, "sync": True},
         {**good, "sync": "3"},
+        {**good, "language": "fr"},
+        {**good, "language": ["zh"]},
         {**good, "place": 10**30},
-        {"place": 0, "sync": 3},
+        {"place": -2, "sync": 3},
+        {"place": -2, "sync": 3, "realism": 3},
         [],
         3,
     ]
     for body in bodies:
-        assert served.ask(answers, body)[0] in (400, 409), body
-    assert served.ask(answers, {**good, "place": 1})[0] == 409
-    assert served.ask(answers, {**good, "place": -1})[0] == 409
+        assert served.ask(answers, body)[0] == 400, body
+    for place in (-3, -1, 0, 1):
+        assert served.ask(answers, {**good, "place": place})[0] == 409
     assert served.ask(answers, raw=b"[" * 1000)[0] == 400
     assert served.ask(answers, raw=b"x" * 5000)[0] == 413
     assert served.ask(answers, good, Origin="http://evil.example")[0] == 403
     assert served.ask(answers, good, Host="evil.example")[0] == 403
     assert read_answers(served.folder) == []
+    assert served.state(answers, good)["place"] == -1
 
 
 @pytest.mark.parametrize("served", [("--set", "gateway.token=secret")], indirect=True)
 def test_the_gateways_token_guards_everything_but_the_page(served: Served) -> None:
     assert served.line.endswith("/#token=secret\n")
     assert served.ask("/")[0] == served.ask("/main.js")[0] == 200
-    for path in ("/study", "/state", "/beeps", "/stimulus/0"):
+    for path in ("/study", "/state", "/beeps", "/stimulus/-2"):
         assert served.ask(path)[0] == 403
     for path in ("/judges", "/beeps", "/answers"):
         assert served.ask(path, {})[0] == 403
@@ -209,73 +205,179 @@ def test_the_gateways_token_guards_everything_but_the_page(served: Served) -> No
     assert served.ask("/judges?token=secret", {})[0] == 200
 
 
-def test_a_scripted_judge_in_a_browser(served: Served, tmp_path: Path) -> None:
-    if not is_installed():
-        pytest.skip("no Chromium is installed")
-    browser = Chromium(tmp_path / "profile", (390, 844), tmp_path / "none.wav")
-    try:
-        judge_everything(browser, served)
-    finally:
-        browser.close()
-    study = load_study(served.folder)
-    answers = read_answers(served.folder)
-    assert {(each.sentence, each.condition) for each in answers} == set(study.files)
-    assert {each.score for each in answers if each.scale == "sync"} == {4}
-    assert {each.score for each in answers if each.scale == "realism"} == {2}
-    assert len(answers) == 2 * len(study.files)
-    assert {each.judge for each in answers} == {0}
-    store = Store(served.folder)
-    another = store.find_judge(store.add_judge() or "")
-    store.close()
-    assert another is not None
-    assert another.number == 1
-
-
-def judge_everything(browser: Chromium, served: Served) -> None:
-    def press(name: str) -> None:
-        found = f"document.getElementById('{name}')"
-        browser.wait_for(f"{found}?.matches(':enabled') && {found}.checkVisibility()")
-        browser.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
-        browser.click(name)
-
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    folder = tmp_path_factory.mktemp("browser")
+    browser = Chromium(folder, (390, 844), folder / "none.wav")
+    browser.command("Network.enable")
     browser.resize(390, 844, mobile=True)
-    page = f"http://127.0.0.1:{served.port}/"
-    browser.command("Page.navigate", url=page)
-    browser.wait_for("document.getElementById('welcome')?.checkVisibility()")
-    browser.evaluate("for (let n = 0; n < 2; n++) document.getElementById('begin').click()")
-    press("play-beeps")
-    token = browser.evaluate("new URLSearchParams(location.hash.slice(1)).get('judge')")
-    press(f"heard-{served.beeps(token)}")
-    for place in range(4):
-        browser.wait_for(f"document.getElementById('progress').value === {place}")
-        assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")
-        if place < 3:
-            press("play")
-        if place == 2:  # the video is lost with the page, what was answered is not
-            browser.command("Page.reload")
-            browser.wait_for("document.getElementById('progress')?.value === 2")
-            press("play")
-        if place == 3:  # another browser has nothing but the address
-            browser.command("Page.navigate", url=page)
-            browser.wait_for("document.getElementById('welcome')?.checkVisibility()")
-            browser.evaluate(f"location.hash = 'judge={token}'")
-            browser.wait_for("document.getElementById('progress')?.value === 3")
-            stop_when_it_plays(browser)
-            press("play")
-            browser.wait_for("document.getElementById('video').paused")
-            assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")
-            press("play")
-        press("sync-4")
-        press("realism-2")
-        press("send")
-    browser.wait_for("!document.getElementById('end').hidden")
-    assert browser.evaluate("document.documentElement.scrollWidth") <= 390
-    assert urlsplit(browser.evaluate("location.href")).query == ""
+    yield browser
+    browser.close()
+
+
+def test_scripted_judges_in_a_browser_and_their_report(browser: Chromium, served: Served) -> None:
+    english = Page(browser, served, "en-GB")
+    english.judge_everything({"good": 5, "bad": 2}, interruptions=True)
+    chinese = Page(browser, served, "en-GB")
+    chinese.judge_everything({"good": 4, "bad": 2}, by_language_button=True)
     assert browser.complaints == []
-    browser.command("Page.navigate", url="about:blank")
-    browser.command("Page.navigate", url=f"{page}#judge=nobody")
-    browser.wait_for("document.getElementById('begin')?.checkVisibility()")
-    assert browser.evaluate("document.getElementById('notice').checkVisibility()")
+    study = load_study(served.folder)
+    answers = [each for each in read_answers(served.folder) if each.place >= 0]
+    for number, language in enumerate(("en", "zh")):
+        own = [each for each in answers if each.judge == number]
+        assert {(each.sentence, each.condition) for each in own} == set(study.files)
+        assert len(own) == 2 * len(study.files)
+        assert {each.language for each in own} == {language}
+    figures = served.folder.parent / "figures.json"
+    command = ["report", str(served.folder), "--json", str(figures)]
+    result = CliRunner().invoke(app, command, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    report = json.loads(figures.read_text())
+    assert (report["num_judges"], report["num_finished"], report["unsure"]) == (2, 2, [])
+    means = {
+        (each["scale"], each["condition"]): each["of_all"]["value"] for each in report["opinions"]
+    }
+    # Sync was scored 5 and 4, and 2 and 2; realism one less.
+    assert means == {
+        ("sync", "good"): 4.5,
+        ("sync", "bad"): 2.0,
+        ("realism", "good"): 3.5,
+        ("realism", "bad"): 1.0,
+    }
+
+
+def test_a_page_without_its_server_waits_for_it(browser: Chromium, served: Served) -> None:
+    page = Page(browser, served, "zh-CN")
+    page.open()
+    browser.command("Network.setBlockedURLs", urls=["*/study*"])
+    browser.command("Page.reload")
+    browser.wait_for("document.getElementById('notice')?.checkVisibility()")
+    assert "未能送达" in browser.evaluate("document.getElementById('notice').textContent")
+    assert browser.evaluate(f"!({IS_WELCOME})")
+    browser.command("Network.setBlockedURLs", urls=[])
+    browser.wait_for(IS_WELCOME)
+    assert browser.evaluate("document.getElementById('notice').hidden")
+    browser.complaints.clear()
+    page.open("#judge=nobody")
+    browser.wait_for(f"{IS_WELCOME} && document.getElementById('notice').checkVisibility()")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_main_button_is_seen_in_any_browser(
+    browser: Chromium, served: Served, scheme: str
+) -> None:
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.command("Emulation.setEmulatedMedia", features=features)
+    Page(browser, served, "en-GB").open()
+    ground, page = browser.evaluate(
+        "['begin', ''].map((name) => getComputedStyle(document.getElementById(name) ??"
+        " document.body).backgroundColor)"
+    )
+    assert (ground, page) == BACKGROUNDS[scheme]
+    assert b"light-dark(" not in served.ask("/style.css")[1], "browsers of 2023 do not know it"
+
+
+BACKGROUNDS = {
+    "light": ("rgb(178, 60, 48)", "rgb(244, 242, 239)"),
+    "dark": ("rgb(184, 68, 58)", "rgb(27, 28, 35)"),
+}
+IS_WELCOME = "document.getElementById('welcome')?.checkVisibility()"
+
+
+class Page:
+    """The page in a browser of some language."""
+
+    def __init__(self, browser: Chromium, served: Served, language: str) -> None:
+        self._browser = browser
+        self._served = served
+        self._address = f"http://127.0.0.1:{served.port}/"
+        browser.command("Emulation.setUserAgentOverride", userAgent="test", acceptLanguage=language)
+
+    def open(self, secrets: str = "") -> None:
+        self._browser.command("Page.navigate", url="about:blank")
+        self._browser.command("Page.navigate", url=self._address + secrets)
+        self._browser.wait_for(IS_WELCOME if not secrets else "document.readyState === 'complete'")
+
+    def press(self, name: str) -> None:
+        found = f"document.getElementById('{name}')"
+        self._browser.wait_for(f"{found}?.matches(':enabled') && {found}.checkVisibility()")
+        self._browser.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
+        self._browser.click(name)
+
+    def judge_everything(
+        self,
+        scores: dict[str, int],
+        *,
+        interruptions: bool = False,
+        by_language_button: bool = False,
+    ) -> None:
+        """Score sync by condition, realism one less, from the welcome to the thanks."""
+        browser = self._browser
+        self.open()
+        if by_language_button:
+            self.press("language")
+        assert browser.evaluate("document.documentElement.lang") == (
+            "zh" if by_language_button else "en"
+        )
+        browser.evaluate("for (let n = 0; n < 2; n++) document.getElementById('begin').click()")
+        browser.evaluate("document.getElementById('sound').defaultPlaybackRate = 4")
+        self.press("play-beeps")
+        token = browser.evaluate("new URLSearchParams(location.hash.slice(1)).get('judge')")
+        self.press(f"heard-{self._served.beeps(token)}")
+        browser.wait_for("document.getElementById('task').checkVisibility()")
+        self._check_width()
+        store = Store(self._served.folder)
+        judge = store.find_judge(token)
+        store.close()
+        assert judge is not None
+        assert judge.number is not None
+        places = places_of_judge(judge.number, load_study(self._served.folder))
+        for place, (_, condition) in places.items():
+            self._wait_for_place(place)
+            assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")
+            if interruptions and place == 2:  # the video is lost with the page, answers are not
+                self.press("play")
+                browser.command("Page.reload")
+                self._wait_for_place(place)
+            if interruptions and place == 3:
+                self._go_on_elsewhere(token)
+            self.press("play")
+            self.press(f"sync-{scores[condition]}")
+            self.press(f"realism-{scores[condition] - 1}")
+            self.press("send")
+        browser.wait_for("!document.getElementById('end').hidden")
+        self._check_width()
+        assert urlsplit(browser.evaluate("location.href")).query == ""
+
+    def _wait_for_place(self, place: int) -> None:
+        """Wait until the page shows a place, and practice as such in one language."""
+        self._browser.wait_for(
+            f"document.getElementById('video')?.src.split('?')[0].endsWith('/stimulus/{place}')"
+        )
+        hint = "document.getElementById('practice')"
+        shown = self._browser.evaluate(f"{hint}.checkVisibility() ? {hint}.innerText : ''")
+        language = self._browser.evaluate("document.documentElement.lang")
+        mark = {"en": "Practice: this one does not count.", "zh": "练习：此题不计入结果。"}
+        assert shown == (mark[language] if place < 0 else "")
+        progress = self._browser.evaluate("document.getElementById('progress').value")
+        assert progress == max(place, 0)
+
+    def _go_on_elsewhere(self, token: str) -> None:
+        """Go on in another browser, which has but the address; the video is stopped once."""
+        browser = self._browser
+        self.open()
+        browser.evaluate(f"location.hash = 'judge={token}'")
+        self._wait_for_place(3)
+        stop_when_it_plays(browser)
+        self.press("play")
+        browser.wait_for("document.getElementById('video').paused")
+        assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")
+
+    def _check_width(self) -> None:
+        """See that no phone scrolls sideways."""
+        for width_px in (320, 360, 390):
+            self._browser.resize(width_px, 844, mobile=True)
+            assert self._browser.evaluate("document.documentElement.scrollWidth") <= width_px
 
 
 def stop_when_it_plays(browser: Chromium) -> None:

@@ -19,11 +19,17 @@ from evaluation.lips.scheme_report import sentence
 from evaluation.lips.scheme_scores import Order, falls, first_told
 from evaluation.lips.schemes import once_the_next_begins
 from evaluation.lips.sentences import choose
+from evaluation.mos.commands import app as mos
+from services.driver.video import film
 from services.recording_chain import HeardRecording
 from services.synthesizer.config import DELAYS_MS
+from services.synthesizer.face import Frame
+from shared.face.faps import MOUTH_FAPS
 from shared.face.lip_models import LipModelName
+from shared.media_file import check_video
 from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
+from tests.videos import write_video
 
 pytestmark = pytest.mark.unit
 
@@ -191,7 +197,7 @@ def test_a_small_run_of_the_command(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
 
     assert sorted(path.parent.name for path in videos.glob("*/hello.mp4")) == conditions
-    assert (videos / conditions[0] / "hello.mp4").stat().st_size > 1000
+    check_video(videos / conditions[0] / "hello.mp4")
     for name in conditions[1:]:
         assert (videos / name / "hello.mp4").read_bytes() == b"made before", "it is kept"
     figures = json.loads((tmp_path / "figures.json").read_text(encoding="utf-8"))
@@ -207,3 +213,61 @@ def test_a_small_run_of_the_command(tmp_path: Path) -> None:
         score["jerk"] > 0.0 and score["like_real_lips"] is None for score in figures["scores"]
     )
     assert [order["reference"] for order in figures["orders"]] == ["scheme 1"]
+
+
+def write_clip(folder: Path, name: str, transcript: str) -> None:
+    """Write a syllable or two with lips that are 100 units further apart than at rest."""
+    samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=8_000)
+    soundfile.write(folder / f"{name}.flac", samples, rate_hz)
+    about = {"language": "zh", "speaker": name, "transcript": transcript}
+    (folder / f"{name}.json").write_text(json.dumps(about), encoding="utf-8")
+    rows = "".join(f"{number / 25},{number % 2},{-100 + number % 2}\n" for number in range(13))
+    (folder / f"{name}.csv").write_text("t,F4_lower_t_midlip,F5_raise_b_midlip\n" + rows)
+
+
+def test_videos_of_clips_make_a_listening_test(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clips, videos = tmp_path / "clips", tmp_path / "videos"
+    clips.mkdir()
+    write_clip(clips, "told", "你好")
+    write_clip(clips, "untold", "")
+    (clips / "held.txt").write_text("told untold\n")
+    drawn: dict[str, list[Frame]] = {}
+
+    def render_video(frames: list[Frame], path: Path, *_: object, **__: object) -> None:
+        drawn.setdefault(path.parent.name, frames)
+        write_video(path)
+
+    monkeypatch.setattr(film, "render_video", render_video)
+    arguments = ["schemes", "--clips", str(clips), "--acoustic", "neural", "--lips", "learnt"]
+    outputs = ["--videos", str(videos), "--anchor"]
+    for more in ([], ["--sound-at-once"]):
+        result = CliRunner().invoke(app, [*arguments, *outputs, *more], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    live = [f"scheme{number}-learnt-neural" for number in (3, 4)]
+    late = [f"{name}-sound-at-once" for name in live]
+    assert set(drawn) == {"anchor", "tracked", "scheme2-learnt-neural", *live, *late}, (
+        "scheme 1 cannot be made of all"
+    )
+    made = CliRunner().invoke(
+        mos, ["new", str(videos), "--reference", "tracked", "--anchor", "anchor"]
+    )
+    assert made.exit_code == 0, made.output
+
+    delay_s = DELAYS_MS[LipModelName.LEARNT] / 1e3
+    for in_time, as_made in zip(live, late, strict=True):
+        shown_s = [time_s for time_s, _ in drawn[as_made]]
+        assert shown_s == pytest.approx([time_s + delay_s for time_s, _ in drawn[in_time]])
+    mouth, lower_lip = np.array(MOUTH_FAPS) - 1, 4
+    own, still, real = (
+        np.array([faps for _, faps in drawn[name]])
+        for name in ("scheme2-learnt-neural", "anchor", "tracked")
+    )
+    assert np.ptp(own[:, mouth]) > 0.0
+    assert not still[:, mouth].any()
+    assert real[:, lower_lip] == pytest.approx(-100.0, abs=1.0)
+    rest = np.delete(np.arange(own.shape[1]), mouth)
+    assert np.ptp(own[:, rest]) > 0.0, "the head moves"
+    for other in (still, real):
+        assert np.array_equal(other[:, rest], own[:, rest])

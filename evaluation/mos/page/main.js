@@ -13,6 +13,7 @@ const GRADES = [
 ];
 const NUM_BEEPS = [2, 3, 4, 5, 6];
 const PARTS = ["welcome", "check", "task", "end"];
+const RETRY_MS = 2000;
 
 const element = (name) => document.getElementById(name);
 const secrets = new URLSearchParams(location.hash.slice(1)); // never sent with the page's address
@@ -27,7 +28,12 @@ async function ask(path, body) {
     notify("");
     return await answer.json();
   } catch (error) {
-    notify(`${say({ en: "This did not arrive; please try again.", zh: "未能送达，请重试。" })} (${error.message})`);
+    if (error.status === 404) { // who scored nothing is forgotten after a day
+      showPart("welcome");
+      notify(say({ en: "This address is not known here; please begin anew.", zh: "本页地址无效，请重新开始。" }));
+    } else {
+      notify(`${say({ en: "This did not arrive; please try again.", zh: "未能送达，请重试。" })} (${error.message})`);
+    }
     throw error;
   }
 }
@@ -61,7 +67,8 @@ function loadBeeps() {
 
 function loadVideo(next) {
   place = next;
-  element("progress").value = place;
+  element("practice").hidden = place >= 0;
+  element("progress").value = Math.max(place, 0);
   element("scores").reset();
   for (const scale of scales) scale.disabled = true;
   element("send").disabled = true;
@@ -148,26 +155,29 @@ element("scores").addEventListener("submit", async (event) => {
   const scores = [...new FormData(event.target)].map(([name, value]) => [name, Number(value)]);
   element("send").disabled = true; // a second click sends nothing
   try {
-    show(await ask("answers", { place, ...Object.fromEntries(scores) }));
+    const language = document.documentElement.lang;
+    show(await ask("answers", { place, ...Object.fromEntries(scores), language }));
   } catch {
     element("send").disabled = false;
   }
 });
 
-speak(languageFor(navigator.languages));
-const study = await ask("study");
-element("title").textContent = study.title;
-document.title = study.title;
-element("progress").max = study.videos;
-element("language").hidden = study.languages.length < 2;
-if (!study.languages.includes(document.documentElement.lang)) speak(study.languages[0]);
 addEventListener("hashchange", () => location.reload()); // another judge's address
-try {
-  if (secrets.has("judge")) show(await ask("state"));
-  else showPart("welcome");
-} catch (error) {
-  if (error.status === 404) {
-    showPart("welcome");
-    notify(say({ en: "This address is not known here; please begin anew.", zh: "本页地址无效，请重新开始。" }));
+speak(languageFor(navigator.languages));
+await start();
+
+/** Show where the judge is; again and again, if the server does not answer. */
+async function start() {
+  try {
+    const study = await ask("study");
+    element("title").textContent = study.title;
+    document.title = study.title;
+    element("progress").max = study.videos;
+    element("language").hidden = study.languages.length < 2;
+    if (!study.languages.includes(document.documentElement.lang)) speak(study.languages[0]);
+    if (secrets.has("judge")) show(await ask("state"));
+    else showPart("welcome");
+  } catch (error) {
+    if (!(error.status < 500)) setTimeout(start, RETRY_MS);
   }
 }

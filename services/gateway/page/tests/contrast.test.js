@@ -11,13 +11,10 @@ const COLOUR = String.raw`#[0-9a-f]{3,6}|rgb\([^)]*\)`;
 
 /** Return a theme's colours by their names: { rgb, share: 1 if nothing shines through }. */
 function theme(which) {
-  const pattern = new RegExp(`--([a-z-]+): (?:light-dark\\((${COLOUR}), (${COLOUR})\\)|(${COLOUR}));`, "g");
-  return Object.fromEntries(
-    [...STYLE.matchAll(pattern)].map(([, name, light, dark, both]) => [
-      name,
-      read(both ?? (which === "light" ? light : dark)),
-    ]),
-  );
+  const [light, dark] = STYLE.split("prefers-color-scheme: dark");
+  const pattern = new RegExp(`--([a-z-]+): (${COLOUR});`, "g");
+  const found = [...(which === "light" ? light : light + dark).matchAll(pattern)]; // the last counts
+  return Object.fromEntries(found.map(([, name, colour]) => [name, read(colour)]));
 }
 
 function read(colour) {
@@ -47,6 +44,11 @@ function contrast(one, other) {
 }
 
 const [BLACK, WHITE] = [read("#000"), read("#fff")];
+
+test("colours are plain, so that older browsers have them, too", () => {
+  assert.equal(STYLE.includes("light-dark("), false);
+  assert.notDeepEqual(theme("light").ink, theme("dark").ink);
+});
 
 test("contrast is computed as by WCAG", () => {
   assert.equal(contrast(BLACK, WHITE), 21);

@@ -1,0 +1,22 @@
+"""A small video with sound, as phones play it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from services.driver.video.writer import VideoWriter
+from shared.clock import MEDIA_RATE_HZ
+
+DURATION_S = 0.25
+_RATE_HZ = 20.0
+
+
+def write_video(path: Path, *, has_sound: bool = True) -> None:
+    """Write a quarter of a second of grey with a tone: H.264 and AAC in .mp4."""
+    time_s = np.arange(round(DURATION_S * MEDIA_RATE_HZ)) / MEDIA_RATE_HZ
+    with VideoWriter(path, 64, 48, _RATE_HZ, MEDIA_RATE_HZ if has_sound else None) as video:
+        for _ in range(round(DURATION_S * _RATE_HZ)):
+            video.write_image(np.full((48, 64, 3), 128, np.uint8))
+        video.write_sound((0.1 * np.sin(2 * np.pi * 440.0 * time_s)).astype(np.float32))
