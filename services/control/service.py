@@ -296,15 +296,19 @@ class ControlService(Service):
         self._send_to_participants(record, replace(message, shapes=record.shapes))
         return Done(session=message.session, request=message.request)
 
-    def _status(self, message: StatusRequest, _sender: Peer) -> Message:
+    def _status(self, message: StatusRequest, sender: Peer) -> Message:
         """Return one page; sessions are numbered from ``FIRST_SESSION`` on, after the services."""
         now_s = time.monotonic()
+        may_open = self._may_open(sender)
         if message.session:
             record = self._sessions.find(message.session)
             instances = self._sessions.participants(record)
             return StatusReport(
                 request=message.request,
-                services=[self._service_state(self._registry[each], now_s) for each in instances],
+                services=[
+                    self._service_state(self._registry[each], now_s, may_open=may_open)
+                    for each in instances
+                ],
                 sessions=[self._sessions.state(record, now_s)],
             )
         services: list[ServiceState] = []
@@ -315,7 +319,7 @@ class ControlService(Service):
                 sessions.append(self._sessions.state(each, now_s))
                 num_bytes += encoded_size(sessions[-1])
             else:
-                services.append(self._service_state(each, now_s))
+                services.append(self._service_state(each, now_s, may_open=may_open))
                 num_bytes += encoded_size(services[-1])
             if num_bytes > PAGE_BYTES:
                 return StatusReport(
@@ -329,8 +333,27 @@ class ControlService(Service):
         for record in self._sessions.since(number - FIRST_SESSION):
             yield FIRST_SESSION + record.number, record
 
-    def _service_state(self, record: ServiceRecord, now_s: float) -> ServiceState:
+    def _may_open(self, asker: Peer) -> bool:
+        """Return whether somebody may open sessions, or is a service: the page's token lets it."""
+        if self.bus.zap is None:
+            return True
+        guest = self.bus.zap.guests.get(asker.key)
+        return guest is not None and any(
+            role == "client" or role.startswith("service:") for role in guest.roles
+        )
+
+    def _service_state(
+        self, record: ServiceRecord, now_s: float, *, may_open: bool
+    ) -> ServiceState:
+        """Return what is told of a service; the token in a page's address only to who may open."""
         heartbeat = record.heartbeat
+        endpoints = heartbeat.endpoints
+        if not may_open:
+            endpoints = {
+                # a '#' in other endpoints is one of their key
+                name: each.partition("#")[0] if each.startswith("http") else each
+                for name, each in endpoints.items()
+            }
         return ServiceState(
             service=heartbeat.service,
             instance=heartbeat.instance,
@@ -338,7 +361,7 @@ class ControlService(Service):
             state=record.state,
             age_s=self._registry.age_s(heartbeat.instance, now_s),
             clock_offset_ms=record.metrics.get("clock_offset_ms", 0.0),
-            endpoints=heartbeat.endpoints,
+            endpoints=endpoints,
             metrics=dict(record.metrics),
         )
 

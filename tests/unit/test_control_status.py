@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import secrets
 import time
+from pathlib import Path
 
 import pytest
 
 from services.control import service as control_service
-from shared.bus import Socket
+from shared.bus import Bus, Socket
+from shared.endpoints import key_of
+from shared.keys import own_key
 from shared.wire.control import Heartbeat, StatusReport, StatusRequest
 from shared.wire.session import Error
 from tests.control_stage import Stage
@@ -105,3 +108,34 @@ def test_the_first_page_has_a_service_of_every_kind(
     assert isinstance(page, StatusReport)
     assert page.next
     assert {state.service for state in page.services} >= {"a-lamp", "recognizer", "synthesizer"}
+
+
+def test_the_pages_token_is_told_to_those_who_may_open_sessions_and_to_services(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    stage = Stage(insecure=False)
+    page = "https://face.example:8080/"
+    told = {}
+    for role in ("service:gateway", "client", "subscriber:*", "subscriber:s", "operator"):
+        with Bus(own_key(f"key-{len(told)}", (role,))) as bus:
+            asker = bus.connect_dealer(stage.control.endpoints["commands"])
+            if role.startswith("service"):
+                beat = Heartbeat(
+                    service="gateway", instance="gateway", role="observer", state="ready",
+                    sent_ns=0, endpoints={"page": f"{page}#token=secret"},
+                )  # fmt: skip
+                asker.send(beat)
+            report = ask(stage, asker)
+            assert isinstance(report, StatusReport)
+            endpoints = {state.service: state.endpoints for state in report.services}
+            told[role] = endpoints["gateway"]["page"].removeprefix(page)
+            assert len(key_of(endpoints["recognizer"]["audio"])) == 40, "it may have a '#'"
+    assert told == {
+        "service:gateway": "#token=secret",
+        "client": "#token=secret",
+        "subscriber:*": "",
+        "subscriber:s": "",
+        "operator": "",
+    }
+    stage.close()
