@@ -15,6 +15,7 @@ from aiohttp.typedefs import Handler
 
 import shared.face
 from services.gateway.access import Access
+from services.gateway.places import Places
 from shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
@@ -59,20 +60,23 @@ class WebSockets:
         return len(self._open)
 
     @contextlib.asynccontextmanager
-    async def accept(self, request: web.Request) -> AsyncIterator[web.WebSocketResponse]:
-        """Open a WebSocket, and close it in the end."""
+    async def accept(
+        self, request: web.Request, places: Places
+    ) -> AsyncIterator[web.WebSocketResponse]:
+        """Open a WebSocket, if there is a place for it, and close it in the end."""
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway stops\n")
-        browser = web.WebSocketResponse(
-            heartbeat=PING_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=1.0, compress=False
-        )
-        await browser.prepare(request)
-        self._open.add(browser)
-        try:
-            yield browser
-        finally:
-            self._open.discard(browser)
-            await browser.close()
+        with places.held(request):
+            browser = web.WebSocketResponse(
+                heartbeat=PING_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=1.0, compress=False
+            )
+            await browser.prepare(request)
+            self._open.add(browser)
+            try:
+                yield browser
+            finally:
+                self._open.discard(browser)
+                await browser.close()
 
     async def close_all(self) -> None:
         """Close every WebSocket, and accept no more."""

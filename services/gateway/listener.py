@@ -17,12 +17,13 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
+from services.gateway.places import ADDRESS_SHARE, Places
 from shared.errors import UserError
 from shared.logs import LOG
 
 MAX_CONNECTIONS = 256
-MAX_CONNECTIONS_OF_ADDRESS = 192  # many people may come through one proxy
 IDLE_LIMIT_S = 10.0  # for a request to arrive, and for the next one
+BODY_LIMIT_S = 70.0  # for its body, where it may take its time; before that an upload is answered
 ANSWER_LIMIT_S = 120.0  # for a file to leave; a head is 5 MB
 BACKLOG = 128
 _CHECK_S = 1.0
@@ -66,6 +67,8 @@ class Listener:
         Called with the address of a connection that was one too many.
     on_bad_request
         Called when something that is no HTTP arrives.
+    share
+        Of the connections, for one address.
     """
 
     def __init__(
@@ -75,22 +78,29 @@ class Listener:
         *,
         on_refused: Callable[[str], None],
         on_bad_request: Callable[[], None],
+        share: float = ADDRESS_SHARE,
     ) -> None:
         self._listening = listening
         self._tls = tls
         self._on_refused = on_refused
         self._on_bad_request = on_bad_request
-        self._connections: dict[asyncio.Task[None], str] = {}  # and their addresses
+        self._places = Places(MAX_CONNECTIONS, "connections", share)
+        self._connections: set[asyncio.Task[None]] = set()
         self._due_s: dict[asyncio.BaseProtocol, float] = {}  # when each of them is ended
 
     async def start(self, application: web.Application, unlimited: Collection[str]) -> None:
-        """Serve an application from here on; answers of the ``unlimited`` paths take their time."""
+        """Serve an application from here on.
+
+        Answers of the ``unlimited`` paths take their time, once the request is there as a whole.
+        """
 
         @web.middleware
         async def give_time(request: web.Request, handler: Handler) -> web.StreamResponse:
             is_limited = request.path not in unlimited
-            limit_s = ANSWER_LIMIT_S if is_limited else math.inf
+            limit_s = ANSWER_LIMIT_S if is_limited else BODY_LIMIT_S
             self._due_s[request.protocol] = time.monotonic() + limit_s
+            if not is_limited:
+                request.content.on_eof(lambda: self._give_all_time(request.protocol))
             return await handler(request)
 
         application.middlewares.insert(0, give_time)
@@ -117,6 +127,10 @@ class Listener:
             connection.cancel()
         await asyncio.gather(*self._connections, return_exceptions=True)
 
+    def _give_all_time(self, connection: asyncio.BaseProtocol) -> None:
+        if connection in self._due_s:  # it is still open
+            self._due_s[connection] = math.inf
+
     def _resume(self) -> None:
         if self._listening.fileno() >= 0:
             asyncio.get_running_loop().add_reader(self._listening, self._accept)
@@ -132,15 +146,14 @@ class Listener:
             loop.remove_reader(self._listening)
             loop.call_later(_RETRY_S, self._resume)
             return
-        addresses = [*self._connections.values()]
-        is_full = len(addresses) >= MAX_CONNECTIONS
-        if is_full or addresses.count(address) >= MAX_CONNECTIONS_OF_ADDRESS:
+        if not self._places.take(address):
             accepted.close()
             self._on_refused(address)
             return
         connection = loop.create_task(self._serve(accepted))
-        self._connections[connection] = address
-        connection.add_done_callback(self._connections.pop)
+        self._connections.add(connection)
+        connection.add_done_callback(self._connections.discard)
+        connection.add_done_callback(lambda _: self._places.leave(address))
 
     async def _serve(self, accepted: socket.socket) -> None:
         """Serve a connection until it is closed or asks for nothing."""

@@ -13,6 +13,7 @@ from aiohttp import WSMsgType, web
 from services.gateway import wire
 from services.gateway.http import WebSockets
 from services.gateway.own_sessions import OwnSession, OwnSessions, error_text
+from services.gateway.places import Places
 from services.gateway.sound_input import SoundInput
 from shared.audio_file import open_audio
 from shared.errors import UserError
@@ -25,19 +26,27 @@ HELLO_LIMIT_S = 10.0
 
 
 class Microphones:
-    """Streams each browser's microphone into a session of its own."""
+    """Streams each browser's microphone into a session of its own.
 
-    def __init__(self, web_sockets: WebSockets, own_sessions: OwnSessions) -> None:
+    Parameters
+    ----------
+    web_sockets
+        Opens the browsers' connections.
+    share
+        Of the places, for one address.
+    own_sessions
+        Opens the sessions.
+    """
+
+    def __init__(self, web_sockets: WebSockets, share: float, own_sessions: OwnSessions) -> None:
         self._web_sockets = web_sockets
+        self._places = Places(MAX_MICROPHONES, "microphones", share)
         self._own_sessions = own_sessions
         self._open: dict[web.WebSocketResponse, str] = {}  # and their sessions
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one microphone until it is turned off."""
-        if len(self._open) >= MAX_MICROPHONES:
-            text = f"{MAX_MICROPHONES} microphones are open already\n"
-            raise web.HTTPServiceUnavailable(text=text)
-        async with self._web_sockets.accept(request) as browser:
+        async with self._web_sockets.accept(request, self._places) as browser:
             self._open[browser] = ""
             try:
                 await self._stream(browser)

@@ -28,6 +28,7 @@ from services.gateway.listener import Listener, bind
 from services.gateway.microphone import SAMPLE_TEXT, Microphones, Sample
 from services.gateway.outbox import Kind
 from services.gateway.own_sessions import OwnSessions, error_text
+from services.gateway.places import ADDRESS_SHARE
 from services.gateway.sending import Sending
 from services.gateway.viewers import Viewers
 from services.gateway.vosk import VoskClients
@@ -89,8 +90,11 @@ class GatewayService(Service):
         self.endpoints = {"page": entrance.url}
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
+        # Through a proxy all clients come from its address.
+        share = self._share = 1.0 if config.plain_http else ADDRESS_SHARE
         self._viewers = Viewers(
             self._web_sockets,
+            share,
             self.metrics,
             self._play_sample,
             self._choose_sample_lips,
@@ -98,10 +102,11 @@ class GatewayService(Service):
             self._choose_expressiveness,
         )
         self._own_sessions = OwnSessions(self.control_endpoint, self.key, self.warn)
-        self._microphones = Microphones(self._web_sockets, self._own_sessions)
-        self._vosk_clients = VoskClients(self._web_sockets, self._own_sessions)
+        self._microphones = Microphones(self._web_sockets, share, self._own_sessions)
+        self._vosk_clients = VoskClients(self._web_sockets, share, self._own_sessions)
         bound = listening.getsockname()[0]
         self._whip_clients = WhipClients(
+            share,
             self._own_sessions,
             self._viewers,
             [] if ipaddress.ip_address(bound).is_unspecified else [bound],
@@ -206,6 +211,7 @@ class GatewayService(Service):
                 "connections", f"refused a connection of {address}: there are too many"
             ),
             on_bad_request=lambda: self.warn("bad-http", "dropped a request: it is no HTTP"),
+            share=self._share,
         )
 
     def _on_input(self) -> None:

@@ -15,6 +15,7 @@ from services.gateway import wire
 from services.gateway.http import WebSockets
 from services.gateway.outbox import Kind, Outbox
 from services.gateway.pace import COMMAND_S, Pace
+from services.gateway.places import Places
 from services.gateway.shape_view import ShapeView, parse_shape_view
 from shared.errors import UserError
 from shared.metrics import Metrics
@@ -47,6 +48,8 @@ class Viewers:
     ----------
     web_sockets
         Opens the browsers' connections.
+    share
+        Of the places, for one address.
     metrics
         Counts what slow viewers lose.
     play_sample
@@ -63,6 +66,7 @@ class Viewers:
     def __init__(
         self,
         web_sockets: WebSockets,
+        share: float,
         metrics: Metrics,
         play_sample: Callable[[str], str],
         choose_sample_lips: Callable[[str], None],
@@ -70,6 +74,7 @@ class Viewers:
         choose_expressiveness: Callable[[str, float], None],
     ) -> None:
         self._web_sockets = web_sockets
+        self._places = Places(MAX_VIEWERS, "viewers", share)
         self._metrics = metrics
         self._play_sample = play_sample
         self._choose_sample_lips = choose_sample_lips
@@ -158,12 +163,10 @@ class Viewers:
             shapes = parse_shape_view(request.query)
         except UserError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
-        if len(self._viewers) >= MAX_VIEWERS:
-            raise web.HTTPServiceUnavailable(text=f"{MAX_VIEWERS} viewers are looking already\n")
         viewer = Viewer(chosen, shapes)
         self._viewers.add(viewer)
         try:
-            async with self._web_sockets.accept(request) as browser:
+            async with self._web_sockets.accept(request, self._places) as browser:
                 _limit_send_buffer(request)
                 self._welcome(viewer)
                 await self._converse(viewer, browser)

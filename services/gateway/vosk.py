@@ -18,6 +18,7 @@ from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 from services.gateway import wire
 from services.gateway.http import WebSockets
 from services.gateway.own_sessions import OwnSessions
+from services.gateway.places import Places
 from services.gateway.sound_format import SoundFormat, check_text
 from services.gateway.sound_input import SoundInput
 from shared.errors import UserError
@@ -153,10 +154,21 @@ class _Client:
 
 
 class VoskClients:
-    """Streams each client's sound into a session of its own, and tells it the phones."""
+    """Streams each client's sound into a session of its own, and tells it the phones.
 
-    def __init__(self, web_sockets: WebSockets, own_sessions: OwnSessions) -> None:
+    Parameters
+    ----------
+    web_sockets
+        Opens the clients' connections.
+    share
+        Of the places, for one address.
+    own_sessions
+        Opens the sessions.
+    """
+
+    def __init__(self, web_sockets: WebSockets, share: float, own_sessions: OwnSessions) -> None:
         self._web_sockets = web_sockets
+        self._places = Places(MAX_CLIENTS, "vosk clients", share)
         self._own_sessions = own_sessions
         self._open: dict[web.WebSocketResponse, _Client] = {}
 
@@ -177,9 +189,7 @@ class VoskClients:
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
         """Serve one client until it has all phones, or leaves."""
-        if len(self._open) >= MAX_CLIENTS:
-            raise web.HTTPServiceUnavailable(text=f"{MAX_CLIENTS} clients are open already\n")
-        async with self._web_sockets.accept(request) as client:
+        async with self._web_sockets.accept(request, self._places) as client:
             self._open[client] = _Client()
             try:
                 with contextlib.suppress(ConnectionError):

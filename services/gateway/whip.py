@@ -21,6 +21,7 @@ from services.gateway import wire
 from services.gateway.outbox import Kind
 from services.gateway.own_sessions import OwnSession, OwnSessions, error_text, retry_after_s
 from services.gateway.pace import COMMAND_S, Pace
+from services.gateway.places import Places
 from services.gateway.shape_view import ShapeView, parse_shape_view
 from services.gateway.viewers import Viewers
 from shared.errors import UserError
@@ -45,6 +46,7 @@ MISSING = (
 @dataclass(slots=True, eq=False)
 class _Client:
     shapes: ShapeView | None  # that it gets beside FAP frames
+    place: contextlib.ExitStack  # holds it
     peer: Peer | None = None
     session: OwnSession | None = None
     is_ending: bool = False  # the session's end is our own
@@ -56,6 +58,8 @@ class WhipClients:
 
     Parameters
     ----------
+    share
+        Of the places, for one address.
     own_sessions
         Opens the sessions.
     viewers
@@ -65,8 +69,13 @@ class WhipClients:
     """
 
     def __init__(
-        self, own_sessions: OwnSessions, viewers: Viewers, addresses: Sequence[str]
+        self,
+        share: float,
+        own_sessions: OwnSessions,
+        viewers: Viewers,
+        addresses: Sequence[str],
     ) -> None:
+        self._places = Places(MAX_CLIENTS, "WebRTC clients", share)
         self._own_sessions = own_sessions
         self._viewers = viewers
         self._addresses = addresses
@@ -84,13 +93,13 @@ class WhipClients:
         offer = (await request.read()).decode(errors="replace")
         if self._is_closing:
             raise web.HTTPServiceUnavailable(text="the gateway stops\n")
-        if len(self._open) >= MAX_CLIENTS:
-            raise web.HTTPServiceUnavailable(text=f"{MAX_CLIENTS} clients are connected already\n")
         try:
             shapes = parse_shape_view(request.query)
         except UserError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
-        name, client = secrets.token_urlsafe(12), _Client(shapes)
+        place = contextlib.ExitStack()
+        place.enter_context(self._places.held(request))
+        name, client = secrets.token_urlsafe(12), _Client(shapes, place)
         self._open[name] = client
         try:
             client.peer = await self._make_peer(client)
@@ -171,6 +180,7 @@ class WhipClients:
 
     async def _drop(self, name: str) -> None:
         client = self._open.pop(name)
+        client.place.close()
         for task in client.tasks:
             task.cancel()
         if client.peer is not None:

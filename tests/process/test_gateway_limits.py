@@ -5,17 +5,26 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import aiohttp
 import pytest
 from aiohttp import web
+from aiohttp.test_utils import TestServer
+from aiohttp.typedefs import Handler
 
-from services.gateway import listener
+from services.gateway import listener, microphone, viewers, vosk, whip
+from services.gateway.http import WebSockets
 from services.gateway.listener import Listener
+from services.gateway.microphone import Microphones
 from services.gateway.pace import Pace
+from services.gateway.viewers import Viewers
+from services.gateway.vosk import VoskClients
+from services.gateway.whip import WhipClients
+from shared.metrics import Metrics
 
 pytestmark = pytest.mark.process
 
@@ -50,6 +59,7 @@ async def answer(_request: web.Request) -> web.StreamResponse:
 
 
 async def never_end(request: web.Request) -> web.StreamResponse:
+    await request.read()
     response = web.StreamResponse()
     await response.prepare(request)
     await response.write(b"begun")
@@ -67,7 +77,7 @@ async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterat
     port = Listener(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
     application = web.Application()
     application.add_routes(
-        [web.get("/", answer), web.get("/slow", never_end), web.get("/long", never_end)]
+        [web.get("/", answer), web.get("/slow", never_end), web.route("*", "/long", never_end)]
     )
     await port.start(application, {"/long"})
     try:
@@ -112,12 +122,36 @@ def test_an_answer_that_is_never_taken_ends_unless_it_may_take_its_time(
     asyncio.run(wait())
 
 
+@pytest.mark.parametrize(
+    "half",
+    [
+        b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
+        b"POST /long HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n1\r\n1\r\n",
+        b"GET /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
+    ],
+)
+def test_half_a_body_is_not_waited_for_but_a_whole_one_gives_its_answer_all_time(
+    monkeypatch: pytest.MonkeyPatch, half: bytes
+) -> None:
+    async def wait() -> None:
+        async with serve(monkeypatch, BODY_LIMIT_S=0.3) as served:
+            whole = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n"
+            reader = await served.connect(whole)
+            served.writers[-1].write(b"12")
+            held = await served.connect(half)
+            with contextlib.suppress(ConnectionResetError):
+                assert await asyncio.wait_for(held.read(), 20) == b""
+            assert b"200 OK" in await reader.readline()
+            assert not reader.at_eof()
+
+    asyncio.run(wait())
+
+
 def test_one_connection_too_many_is_refused_and_room_returns(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def fill() -> None:
-        limits = {"IDLE_LIMIT_S": 0.5, "MAX_CONNECTIONS_OF_ADDRESS": 5}
-        async with serve(monkeypatch, **limits) as served:
+        async with serve(monkeypatch, IDLE_LIMIT_S=0.5, MAX_CONNECTIONS=6) as served:
             held = [await served.connect() for _ in range(5)]
             with contextlib.suppress(ConnectionResetError):
                 assert await (await served.connect()).read() == b""
@@ -127,6 +161,87 @@ def test_one_connection_too_many_is_refused_and_room_returns(
             async with asyncio.timeout(20):
                 while not await served.answers():
                     await asyncio.sleep(0.02)
+
+    asyncio.run(fill())
+
+
+NOTHING: Any = None
+CLIENTS: dict[str, Callable[[float], Handler]] = {
+    "viewers": lambda share: (
+        Viewers(WebSockets(), share, Metrics(), NOTHING, NOTHING, NOTHING, NOTHING).serve
+    ),
+    "microphones": lambda share: Microphones(WebSockets(), share, NOTHING).serve,
+    "vosk": lambda share: VoskClients(WebSockets(), share, NOTHING).serve,
+}
+
+
+@pytest.mark.parametrize("kind", CLIENTS)
+@pytest.mark.parametrize(("share", "num_of_address"), [(0.75, 3), (1.0, 4)])
+def test_one_address_has_not_all_places_unless_all_come_from_a_proxys(
+    monkeypatch: pytest.MonkeyPatch, kind: str, share: float, num_of_address: int
+) -> None:
+    for module, name in (
+        (viewers, "MAX_VIEWERS"),
+        (microphone, "MAX_MICROPHONES"),
+        (vosk, "MAX_CLIENTS"),
+    ):
+        monkeypatch.setattr(module, name, 4)
+
+    async def fill() -> None:
+        application = web.Application()
+        application.add_routes([web.get("/", CLIENTS[kind](share))])
+        async with TestServer(application) as server, AsyncExitStack() as stack:
+
+            async def connect(address: str) -> aiohttp.ClientWebSocketResponse | None:
+                connector = aiohttp.TCPConnector(local_addr=(address, 0))
+                http = await stack.enter_async_context(aiohttp.ClientSession(connector=connector))
+                try:
+                    return await http.ws_connect(server.make_url("/"))
+                except aiohttp.WSServerHandshakeError as error:
+                    return None if error.status == 503 else pytest.fail(str(error))
+
+            held = [await connect("127.0.0.1") for _ in range(5)]
+            assert sum(each is not None for each in held) == num_of_address
+            others = [await connect("127.0.0.2") for _ in range(5)]
+            assert sum(each is not None for each in others) == 4 - num_of_address
+            assert held[0] is not None
+            await held[0].close()
+            async with asyncio.timeout(20):
+                while await connect("127.0.0.1") is None:
+                    await asyncio.sleep(0.02)
+
+    asyncio.run(fill())
+
+
+def test_one_address_has_not_all_places_of_webrtc(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(whip, "MAX_CLIENTS", 4)
+
+    async def fill() -> None:
+        clients = WhipClients(0.75, NOTHING, NOTHING, [])
+        is_over = asyncio.Event()
+
+        async def wait(_client: object) -> None:
+            await is_over.wait()
+            raise web.HTTPNotImplemented
+
+        monkeypatch.setattr(clients, "_make_peer", wait)
+        application = web.Application()
+        application.add_routes([web.post("/", clients.serve_offer)])
+        async with TestServer(application) as server, aiohttp.ClientSession() as http:
+
+            async def offer() -> int:
+                headers = {"Content-Type": "application/sdp"}
+                async with http.post(server.make_url("/"), data="v=0", headers=headers) as answer:
+                    return answer.status
+
+            held = [asyncio.create_task(offer()) for _ in range(3)]
+            async with asyncio.timeout(20):
+                while len(clients) < 3:
+                    await asyncio.sleep(0.01)
+                assert await offer() == 503
+                is_over.set()
+                assert [await each for each in held] == [501, 501, 501]
+                assert await offer() == 501, "the places are free again"
 
     asyncio.run(fill())
 

@@ -116,7 +116,7 @@ def test_the_pages_token_is_told_to_those_who_may_open_sessions_and_to_services(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     stage = Stage(insecure=False)
     page = "https://face.example:8080/"
-    told = {}
+    told: dict[str, str] = {}
     for role in ("service:gateway", "client", "subscriber:*", "subscriber:s", "operator"):
         with Bus(own_key(f"key-{len(told)}", (role,))) as bus:
             asker = bus.connect_dealer(stage.control.endpoints["commands"])

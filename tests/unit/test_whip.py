@@ -19,7 +19,7 @@ def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "aiortc", None)
     monkeypatch.delitem(sys.modules, "services.gateway.webrtc", raising=False)
     nothing: Any = None
-    clients = WhipClients(nothing, nothing, ["127.0.0.1"])
+    clients = WhipClients(1.0, nothing, nothing, ["127.0.0.1"])
 
     async def post() -> tuple[int, str]:
         application = web.Application()
