@@ -23,16 +23,16 @@ BECOME_USER = f"""
 exec setpriv --reuid={USER} --regid={USER} --clear-groups --no-new-privs \
     --bounding-set=-all,{READ} --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "$@"
 """
-# Arguments: folder of secrets, file of hosts, then the command.
+# Arguments: folder of secrets, file of hosts, a volume and where it is, if any, then the command.
 ENTER = f"""
 mount --make-rprivate /
 mount -t tmpfs tmpfs /run
 mkdir /run/secrets
-cp "$1"/* /run/secrets
+cp -r "$1"/. /run/secrets
 cp "$2" /run/hosts
-shift 2
-chown {USER} /run/secrets/*
-chmod 400 /run/secrets/*
+[ -z "$3" ] || {{ mkdir -p "$4" && mount --bind "$3" "$4" && mount -o remount,bind,ro "$4"; }}
+shift 4
+find /run/secrets -type f -exec chown {USER} {{}} + -exec chmod 400 {{}} +
 mount --bind /run/hosts /etc/hosts
 mount -t tmpfs -o noexec,nosuid,nodev tmpfs /tmp
 findmnt --raw --noheadings --output TARGET | grep -vE '^/(tmp|run|proc|sys|dev)(/|$)' |
@@ -40,10 +40,9 @@ findmnt --raw --noheadings --output TARGET | grep -vE '^/(tmp|run|proc|sys|dev)(
 mount -o remount,bind,ro /run
 {BECOME_USER}"""
 ENTER_WITHOUT_ROOT = f"""
-chown {USER} "$1"/*
-chmod 400 "$1"/*
-export CREDENTIALS_DIRECTORY="$1"
-shift 2
+find "$1" -type f -exec chown {USER} {{}} + -exec chmod 400 {{}} +
+export CREDENTIALS_DIRECTORY="${{3:-$1}}"
+shift 4
 {BECOME_USER}"""
 
 
@@ -83,8 +82,12 @@ class Containers:
         arguments: Sequence[str],
         environment: Mapping[str, str],
         secrets: Mapping[str, Path],
+        volume: tuple[str, str] = ("", ""),
     ) -> subprocess.Popen[bytes]:
-        """Start ``kouxing`` with arguments in a container on a host; its output is in a log."""
+        """Start ``kouxing`` with arguments in a container on a host; its output is in a log.
+
+        ``volume`` is a folder of this machine and where the container has it, to be read.
+        """
         folder = self._folder / f"{host}-secrets"
         folder.mkdir()
         for name, path in secrets.items():
@@ -95,7 +98,7 @@ class Containers:
             folder.parent.chmod(0o755)
             enter = ["sh", "-ec", ENTER_WITHOUT_ROOT]
             environment = {name: self._by_number(each) for name, each in environment.items()}
-        enter += ["sh", str(folder), str(self._hosts)]
+        enter += ["sh", str(folder), str(self._hosts), *volume]
         own = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT)}
         with self.log(host).open("ab") as log:
             return subprocess.Popen(

@@ -44,24 +44,30 @@ def network() -> Iterator[Network]:
 
 
 @pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
-    """Secrets by name, made by the service ``keys``; this process gets them, too."""
+def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the service ``keys`` has made."""
     folder = tmp_path_factory.mktemp("keys")
-    run_keys_service(folder)
+    run_keys_service(folder, *COMPOSE["services"]["keys"]["command"])
     assert (folder / "kouxing" / "control.key").stat().st_uid == USER
+    return folder
+
+
+@pytest.fixture(scope="module")
+def keys(volume: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
+    """Secrets by name; this process gets them, too."""
     own = tmp_path_factory.mktemp("own-keys") / "kouxing"
-    shutil.copytree(folder / "kouxing", own)  # owned by who copies
+    shutil.copytree(volume / "kouxing", own)  # owned by who copies
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(own.parent))
         yield {name: own / Path(each["file"]).name for name, each in COMPOSE["secrets"].items()}
 
 
-def run_keys_service(folder: Path) -> None:
+def run_keys_service(folder: Path, *arguments: str) -> None:
     """Run what makes the keys, on a folder that takes the place of its volume."""
     service = COMPOSE["services"]["keys"]
     shell, option, script, name = service["entrypoint"]
     programs = folder.parent / "programs"
-    programs.mkdir()
+    programs.mkdir(exist_ok=True)
     (programs / "kouxing").write_text(f'#!/bin/sh\nexec {sys.executable} -m services "$@"\n')
     (programs / "kouxing").chmod(0o755)
     script = script.replace("$$", "$").replace("/keys", str(folder))
@@ -69,7 +75,7 @@ def run_keys_service(folder: Path) -> None:
         "setpriv ", f"setpriv --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "
     )
     subprocess.run(
-        [shell, option, script, name, *service["command"]],
+        [shell, option, script, name, *arguments],
         cwd=ROOT,
         env={
             "PATH": f"{programs}:/usr/bin:/bin",
@@ -81,11 +87,14 @@ def run_keys_service(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def containers(
-    network: Network, keys: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+    network: Network,
+    volume: Path,
+    keys: dict[str, Path],
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Containers]:
     made = Containers(tmp_path_factory.mktemp("compose"), network, {"control": "control"})
     running = {
-        host: start(made, host, service, keys, *COMPOSE["services"][service]["command"])
+        host: start(made, host, service, keys, volume, *COMPOSE["services"][service]["command"])
         for host, service in HOSTS.items()
         if service != "client"
     }
@@ -98,19 +107,29 @@ def containers(
 
 
 def start(
-    containers: Containers, host: str, service: str, keys: dict[str, Path], *arguments: str
+    containers: Containers,
+    host: str,
+    service: str,
+    keys: dict[str, Path],
+    volume: Path,
+    *arguments: str,
 ) -> subprocess.Popen[bytes]:
     description = COMPOSE["services"][service]
     environment = description["environment"]
-    if "volumes" in description:  # no volume is mounted here
+    mounted = ("", "")
+    if service == "driver":  # no volume is mounted for it here
         environment = {**environment, "KOUXING_DRIVER_OUT": "/tmp"}  # noqa: S108
-    secrets = {name: keys[name] for name in description["secrets"]}
-    return containers.start(host, arguments, environment, secrets)
+    elif "volumes" in description:
+        ((source, target, mode),) = (each.split(":") for each in description["volumes"])
+        assert mode == "ro"
+        mounted = (str(volume / Path(source).relative_to("deploy/keys")), target)
+    secrets = {name: keys[name] for name in description.get("secrets", ())}
+    return containers.start(host, arguments, environment, secrets, mounted)
 
 
 @pytest.mark.timeout(400)  # of a busy machine
 def test_containers_are_healthy_private_and_speak(
-    containers: Containers, network: Network, keys: dict[str, Path]
+    containers: Containers, network: Network, keys: dict[str, Path], volume: Path
 ) -> None:
     end_s = time.monotonic() + 200
     for host, service in HOSTS.items():
@@ -130,9 +149,25 @@ def test_containers_are_healthy_private_and_speak(
     for host, port in (("recognizer-1", 5560), ("recognizer-2", 5560), ("synthesizer-1", 5571)):
         assert any(each.startswith(f"tcp://{network.bound(host)}:{port} ") for each in told), told
 
-    speaker = start(containers, "client-1", "client", keys, "speak", str(VOWELS_FILE), "--fast")
+    said = "speak", str(VOWELS_FILE), "--fast"
+    speaker = start(containers, "client-1", "client", keys, volume, *said)
     assert speaker.wait(60) == 0, containers.log("client-1").read_text("utf-8")
     assert " phones in " in containers.log("client-1").read_text("utf-8")
+
+
+def test_a_key_is_revoked_without_a_restart(
+    containers: Containers, network: Network, keys: dict[str, Path], volume: Path
+) -> None:
+    address = f"tcp://{network.bound('control')}:5550"
+    with network.on("client-1"), Client(control_endpoint(address, insecure=False)) as client:
+        assert client.status().services
+    run_keys_service(volume, "revoke", "client")
+    with (
+        network.on("client-1"),
+        Client(control_endpoint(address, insecure=False)) as client,
+        pytest.raises(UserError, match="does not accept"),
+    ):
+        client.status()
 
 
 def test_every_service_is_locked_in() -> None:
