@@ -29,7 +29,7 @@ from shared.endpoints import is_loopback, split_endpoint, with_key
 from shared.errors import UserError
 from shared.keys import Guest, Peer, own_key, refusal, save_guests
 from shared.logs import LOG, RateLimit, configure
-from shared.metrics import BusyShare, Metrics, memory_mb
+from shared.metrics import BusyShare, Metrics, give_back_memory, memory_mb
 from shared.prometheus import MetricsServer
 from shared.wire.codec import BadMessage
 from shared.wire.control import (
@@ -280,6 +280,7 @@ class Service:
         server = self._serve_metrics()
         gc.collect()
         gc.freeze()  # a full collection would stop the loop for 100 ms
+        give_back_memory()  # what loading took
         self.announce_ready()
         while not self.stopping:
             self.step(TICK_S)

@@ -112,7 +112,7 @@ class _Cluster:
 
     def __init__(self, stack: ExitStack, control: str, num_workers: int, num_sessions: int) -> None:
         keys = {kind: own_key(kind, (f"service:{kind}",)) for kind in PROVIDED}
-        self._share = -(-2 * num_sessions // num_workers)
+        self._share = -(-2 * (num_sessions + NUM_TIMED) // num_workers)  # of each worker
         self.workers: list[_Worker] = []
         for kind in PROVIDED:
             for number in range(num_workers // 2):
@@ -184,7 +184,7 @@ def measure(num_workers: int, num_sessions: int, console: Console) -> Cost:
     raise_file_limit()
     if resource.getrlimit(resource.RLIMIT_NOFILE)[0] < FILES_OF_WORKER * num_workers + 200:
         raise UserError(f"{num_workers} workers need more open files; see ulimit -n")
-    with _control(2 * num_sessions) as (control, process, log), ExitStack() as stack:
+    with _control(2 * (num_sessions + NUM_TIMED)) as (control, process, log), ExitStack() as stack:
         cluster = _Cluster(stack, control, num_workers, num_sessions)
         console.print(f"{num_workers} workers: opening {num_sessions} sessions")
         cluster.run(2.0)

@@ -291,19 +291,17 @@ class Sessions:
     def replace(self, record: SessionRecord, now_s: float) -> bool:
         """Place a session again after workers were lost; return success.
 
-        A new recognizer beside a synthesizer that stays is told after that one, which knows up to
-        where there are phones.
+        The recognizer is told after the synthesizer: one that stays knows up to where there are
+        phones, and a new one must know the session before it is told what was shown last.
         """
         kept = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
             workers = self._registry.place(kept, now_s, record.language)
         except Refusal:
             return False
-        record.held_back = set()
+        record.held_back = {workers["audio"]}
         if "audio" not in kept:
             record.resume_sequence = record.next_sequence
-            if "faps" in kept:
-                record.held_back = {workers["audio"]}
         record.lost = set()
         self._set_workers(record, workers, now_s)
         record.endpoints = self._registry.endpoints(workers)

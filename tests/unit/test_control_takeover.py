@@ -144,7 +144,7 @@ def test_a_client_is_told_again_that_its_session_moved(
             endpoints=again,
         )
     )  # fmt: skip
-    for service in stage.services:
+    for service in reversed(stage.services):  # the recognizer last
         starts: list[StartSession] = []
         while not starts:
             told = answers(stage, service)

@@ -368,7 +368,7 @@ def test_a_new_recognizer_is_told_after_the_synthesizer_up_to_where_there_are_ph
     assert (record.waiting_for, record.media_time) == (set(), 48_000)
 
 
-def test_with_a_new_synthesizer_all_are_told_at_once_what_the_lost_one_last_said(
+def test_a_recognizer_is_told_after_a_new_synthesizer_what_the_lost_one_last_said(
     made: Made,
 ) -> None:
     record = made.open()
@@ -382,8 +382,18 @@ def test_with_a_new_synthesizer_all_are_told_at_once_what_the_lost_one_last_said
     made.add(worker("recognizer", "recognizer-2"))
     made.add(worker("synthesizer", "synthesizer-2"))
     assert made.sessions.replace(record, 1.0)
-    assert not record.held_back
+    assert record.waiting_for - record.held_back == {"synthesizer-2"}
+    assert made.sessions.take_started(record, "synthesizer-2", 0) == {"recognizer-2"}
     assert made.sessions.start_message(record, 1.0).media_time == 32_000
+
+
+def test_a_recognizer_that_stays_is_told_after_a_new_synthesizer(made: Made) -> None:
+    record = made.open()
+    made.lose("synthesizer-1")
+    made.add(worker("synthesizer", "synthesizer-2"))
+    assert made.sessions.replace(record, 1.0)
+    assert record.waiting_for - record.held_back == {"synthesizer-2"}
+    assert made.sessions.take_started(record, "synthesizer-2", 0) == {"recognizer-1"}
 
 
 def test_services_are_silent_in_the_order_of_their_heartbeats(made: Made) -> None:
