@@ -62,12 +62,18 @@ def run_example(command: list[object], **environment: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a Python that has the built package and what it needs, and nothing else."""
-    folder = tmp_path_factory.mktemp("python")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
     source = shutil.copytree(PYTHON_CLIENT, folder / "source")  # building writes beside it
     pip("wheel", "--no-build-isolation", "--no-deps", "--wheel-dir", folder, source)
     (wheel,) = folder.glob("kouxing_client-*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a Python that has the built package and what it needs, and nothing else."""
+    folder = tmp_path_factory.mktemp("python")
     venv.create(folder / "venv")
     python = folder / "venv" / "bin" / "python"
     pip("--python", python, "install", wheel)
@@ -84,6 +90,30 @@ def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path
     assert max(float(line.split()[-1]) for line in jaw) > 200
     phones = run_example([python, "-I", tmp_path / "awaited.py", SPEECH], KOUXING_CONTROL=control)
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
+
+
+def test_what_is_tested_of_the_python_package_holds_for_the_built_one(
+    wheel: Path, tmp_path: Path
+) -> None:
+    pip("install", "--no-deps", "--target", tmp_path, wheel)
+    # in place of the source, which pytest's configuration names
+    own = ("--override-ini", f"pythonpath={tmp_path}", "-p", "no:cacheprovider", "--quiet")
+    find = "import kouxing_client, sys; sys.exit(kouxing_client.__path__[0] != sys.argv[1])"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    for command in (
+        ["-c", find, str(tmp_path / "kouxing_client")],
+        ["-m", "pytest", *own, "tests/unit/test_client_package.py"],
+    ):
+        result = subprocess.run(
+            [sys.executable, *command],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=110,
+            check=False,
+        )
+        assert result.returncode == 0, result.stdout + result.stderr
 
 
 def test_the_python_package_brings_its_types_and_needs_two_packages(python: Path) -> None:
@@ -168,6 +198,21 @@ def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -
     lines = run_example([NODE, project / "example.mjs", wav], GATEWAY=gateway.page)
     assert max(float(line.split()[-1]) for line in lines if "jaw" in line) > 200
     assert [line.split()[-1] for line in lines if "phone" in line][:4] == ["n", "i", "h", "ao"]
+
+
+def test_the_javascript_package_has_the_types_of_its_api(project: Path) -> None:
+    shutil.copy(JAVASCRIPT_CLIENT / "tests" / "types.ts", project / "types.mts")
+    compiler = JAVASCRIPT_CLIENT / "node_modules" / "typescript" / "bin" / "tsc"
+    options = "--noEmit --strict --module nodenext --target es2023 --lib es2023,dom".split()
+    result = subprocess.run(
+        [NODE, compiler, *options, "types.mts"],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout
 
 
 LIPS = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
