@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import queue
+import shutil
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
@@ -93,21 +95,22 @@ def monitor(name: str = "") -> AudioSource:
     target = device.target if device else "--device=@DEFAULT_MONITOR@"
     command = ["parec", target, "--client-name=kouxing", f"--latency-msec={_LATENCY_MS}"]
     command += ["--format=s16le", f"--rate={_RATE_HZ}", "--channels=1"]
-    try:
-        parec = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # noqa: S603 - no shell
-    except OSError:
-        raise UserError(_NO_SOUND_SERVER) from None
+    if shutil.which(command[0]) is None:
+        raise UserError(_NO_SOUND_SERVER)
 
     def blocks() -> Iterator[Samples]:
-        with parec:
+        with (
+            tempfile.TemporaryFile() as told,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=told) as parec,  # noqa: S603 - no shell
+        ):
             try:
                 has_come = False
                 for block in raw_audio(parec.stdout, _RATE_HZ, 1).blocks:  # type: ignore[arg-type]
                     has_come = True
                     yield block
                 if not has_come:
-                    told = parec.stderr.read().decode().strip()  # type: ignore[union-attr]
-                    raise UserError(f"nothing can be recorded: {told}")
+                    told.seek(0)
+                    raise UserError(f"nothing can be recorded: {told.read().decode().strip()}")
             finally:
                 parec.terminate()
 

@@ -3,8 +3,8 @@
 import { cp, mkdir } from "node:fs/promises";
 
 const SHARED = [
-  ...["joints", "link", "messages", "morph", "playout", "presence", "recent", "sound"],
-  "sound-worklet",
+  ...["joints", "link", "messages", "morph", "pace", "pictures", "playout", "presence", "recent"],
+  ...["sound", "sound-worklet"],
 ];
 const PAGE = new URL("../../services/gateway/page/", import.meta.url);
 const COPY = new URL("page/", import.meta.url);

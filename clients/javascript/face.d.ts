@@ -12,7 +12,7 @@ export class KouxingFace extends HTMLElement {
   /** Let the session be heard; call it from a click. */
   turnSoundOn(): Promise<void>;
   turnSoundOff(): void;
-  /** Play the recording to its end; an audio element may play its sound. */
+  /** Play the recording to its end, or until another begins; an audio element may play its sound. */
   play(audio?: HTMLAudioElement | null): Promise<void>;
 }
 

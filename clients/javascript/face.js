@@ -2,6 +2,8 @@
 
 import * as THREE from "three";
 import { NUM_FAPS } from "./page/messages.js";
+import { Pace } from "./page/pace.js";
+import { Pictures, drawsInSoftware } from "./page/pictures.js";
 import { FapTrack, Playout } from "./page/playout.js";
 import { Presence } from "./page/presence.js";
 import { Sound } from "./page/sound.js";
@@ -15,8 +17,10 @@ const MAX_STEP_S = 0.1; // of hair that swings
 
 /** The element; README.md has its attributes. */
 export class KouxingFace extends HTMLElement {
-  static observedAttributes = ["src", "gateway", "session", "recording"];
+  static observedAttributes = ["src", "gateway", "session", "token", "recording"];
   #renderer = null;
+  #pace = null;
+  #pictures = null;
   #scene = new THREE.Scene();
   #camera = new THREE.PerspectiveCamera(FOV_DEGREES, 1, 0.01, 100);
   #resized = new ResizeObserver(() => this.#resize());
@@ -50,6 +54,10 @@ export class KouxingFace extends HTMLElement {
   connectedCallback() {
     const canvas = this.shadowRoot.querySelector("canvas");
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    const gl = this.#renderer.getContext();
+    const ratio = Math.min(2, devicePixelRatio);
+    this.#pace = new Pace(ratio, ratio, drawsInSoftware(gl));
+    this.#pictures = new Pictures(gl, this.#pace);
     this.#resized.observe(this);
     this.#drawing = requestAnimationFrame((nowMs) => this.#draw(nowMs));
     this.#load();
@@ -95,13 +103,14 @@ export class KouxingFace extends HTMLElement {
    * Play the recording.
    *
    * @param audio an HTMLAudioElement that plays its sound; without one it is silent
-   * @returns a promise that is fulfilled at its end
+   * @returns a promise that is fulfilled at its end, or when another begins
    */
   async play(audio = null) {
     const { names, frames } = readRecording(await (await fetch(this.getAttribute("recording"))).text());
     const beganMs = performance.now();
     await audio?.play();
     await new Promise((ended) => {
+      this.#recording?.ended();
       const nowS = () => (audio ? audio.currentTime : (performance.now() - beganMs) / 1000);
       this.#recording = { names, frames, nowS, ended };
     });
@@ -156,7 +165,9 @@ export class KouxingFace extends HTMLElement {
     const handlers = {
       ...source,
       sound: (mediaTime, samples) => {
-        this.#playout.soundArrived(performance.now(), mediaTime, samples.length);
+        const nowMs = performance.now();
+        this.#playout.soundArrived(nowMs, mediaTime, samples.length);
+        this.#keepTime(nowMs);
         this.#sound.push(mediaTime, samples);
       },
       session: (message) => {
@@ -173,7 +184,8 @@ export class KouxingFace extends HTMLElement {
     this.#link?.close();
     this.#link = null;
     this.#recording?.ended();
-    this.#recording = this.#rest = null;
+    this.#recording = this.#rest = this.#values = null;
+    this.#names = [];
     this.#forget();
   }
 
@@ -184,20 +196,27 @@ export class KouxingFace extends HTMLElement {
 
   #draw(nowMs) {
     this.#drawing = requestAnimationFrame((nextMs) => this.#draw(nextMs));
-    if (this.#puppet === null) return;
+    this.#playout.pictureMs = this.#pace.untilSeenMs;
+    this.#keepTime(nowMs);
+    if (this.#puppet === null || !this.#pictures.isDue(nowMs)) return;
+    if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#resize();
     if (this.#recording) this.#poseRecording();
     else this.#poseStream(nowMs);
     this.#puppet.update(Math.min(MAX_STEP_S, (nowMs - this.#drawnMs) / 1000));
     this.#drawnMs = nowMs;
-    this.#renderer.render(this.#scene, this.#camera);
+    this.#pictures.draw(nowMs, () => this.#renderer.render(this.#scene, this.#camera));
   }
 
-  #poseStream(nowMs) {
+  /** Keep sound and picture in step; where the page is hidden and nothing drawn, as sound arrives. */
+  #keepTime(nowMs) {
     this.#playout.isHeard = this.#sound.isPlaying;
     this.#playout.outputLatencyMs = this.#sound.outputLatencyMs;
     this.#playout.adjust(nowMs);
     if (this.#playout.offsetMs !== null) this.#sound.align(nowMs, this.#playout.offsetMs);
-    const mediaTime = this.#playout.mediaAt(nowMs);
+  }
+
+  #poseStream(nowMs) {
+    const mediaTime = this.#playout.mediaAt(nowMs + this.#playout.pictureMs); // when it is seen
     const values = new Float32Array(this.#names.length || NUM_FAPS);
     const speaks = mediaTime !== null && this.#track.sample(mediaTime, values) !== null;
     const share = this.#presence.update(nowMs, speaks);
@@ -207,7 +226,7 @@ export class KouxingFace extends HTMLElement {
 
   #poseRecording() {
     const { names, frames, nowS, ended } = this.#recording;
-    const mediaTime = nowS() * RATE_HZ;
+    const mediaTime = (nowS() + this.#pace.untilSeenMs / 1000) * RATE_HZ;
     const next = frames.findIndex(([time]) => time > mediaTime);
     if (next === -1) {
       this.#show(frames.at(-1)[1], names ?? []);
@@ -231,7 +250,7 @@ export class KouxingFace extends HTMLElement {
   #resize() {
     const { clientWidth, clientHeight } = this;
     if (clientWidth === 0 || clientHeight === 0) return;
-    this.#renderer.setPixelRatio(Math.min(2, devicePixelRatio));
+    this.#renderer.setPixelRatio(this.#pace.ratio);
     this.#renderer.setSize(clientWidth, clientHeight, false);
     this.#camera.aspect = clientWidth / clientHeight;
     this.#camera.updateProjectionMatrix();

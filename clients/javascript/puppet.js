@@ -8,6 +8,7 @@ import { MorphedMesh } from "./page/morph.js";
 
 const SPAN = 1.6; // what is seen, by the height of the face
 const VRM_FACE_M = 0.24;
+const READY_PLAYER_ME = { viseme_i: "ih", viseme_o: "oh", viseme_u: "ou" }; // glb_head.py, too
 
 /**
  * Load a model.
@@ -108,10 +109,6 @@ function vrmPuppet(vrm) {
 
 /** Return a shape's name as all programs write it: mouthSmile_L, Face.mouthSmileLeft, viseme_aa. */
 function plainName(name) {
-  return name
-    .replace(/^.*\./, "")
-    .replace(/^viseme_/, "")
-    .replace(/_L$/, "Left")
-    .replace(/_R$/, "Right")
-    .toLowerCase();
+  const plain = name.replace(/^.*\./, "").replace(/_L$/, "Left").replace(/_R$/, "Right").toLowerCase();
+  return READY_PLAYER_ME[plain] ?? plain.replace(/^viseme_/, "");
 }

@@ -2,7 +2,8 @@
 
 A client may send ``{"config": {...}}`` first, then PCM in binary messages, and ``{"eof": 1}`` in
 the end. Each message but a config gets one reply: ``{"partial": TEXT}``, or what was said since the
-last one, ``{"result": [{"word", "start", "end", "conf"}, ...], "text": TEXT}``.
+last one, ``{"result": [{"word", "start", "end", "conf"}, ...], "text": TEXT}``, which
+``{"reset": 1}`` asks for.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ DEFAULT_RATE_HZ = 8000  # as vosk-server's own
 SOUND_LIMIT_S = 60.0  # for the first sound: somebody may have to allow the microphone
 LAST_FRAME_LIMIT_S = 10.0  # for the last phones: they are what the client waits for
 MAX_UTTERANCE_S = 20.0  # of speech without a pause; then what is final is told
-EXPECTED = 'binary messages of samples, {"config": {...}}, {"flush": 1} or {"eof": 1}'
+COMMANDS = {"config", "flush", "reset", "eof"}
+EXPECTED = 'binary messages of samples, {"config": {...}}, {"flush": 1}, {"reset": 1} or {"eof": 1}'
 
 
 class Utterances:
@@ -39,12 +41,15 @@ class Utterances:
 
     def __init__(self) -> None:
         self._phones: dict[tuple[int, int], Phone] = {}  # by epoch and index; not yet told
+        self._told = (0, -1)  # epoch and index until which all is, be it revised or not
         self._epoch = 0
         self._is_speaking = False
 
     def accept(self, phone: Phone, *, is_silence: bool) -> None:
         """Take a phone, or what it is revised to."""
         number = self._epoch, phone.index
+        if number <= self._told:
+            return
         if is_silence:
             self._phones.pop(number, None)
         else:
@@ -75,8 +80,9 @@ class Utterances:
         return [phone for phone in phones if phone.final]
 
     def take_all(self) -> list[Phone]:
-        """Return all that was not told."""
-        phones, self._phones = [*self._phones.values()], {}
+        """Return all that was not told, final or not; it is told once."""
+        phones, self._told = [*self._phones.values()], max(self._phones, default=self._told)
+        self._phones = {}
         return phones
 
 
@@ -237,8 +243,9 @@ class VoskClients:
                     await sound_input.accept(first[header_bytes:])
                     await client.send_str(config.reply(state.utterances))
                     async for message in sound_input.messages(client):
-                        if await _handle(message, config, sound_input, state.utterances):
-                            await client.send_str(config.reply(state.utterances))
+                        reply = await _handle(message, config, sound_input, state.utterances)
+                        if reply:
+                            await client.send_str(reply)
                         for error in session.errors():
                             raise error
             finally:
@@ -260,32 +267,38 @@ async def _first_sound(client: web.WebSocketResponse, config: _Config) -> bytes 
         elif fields.get("eof"):
             await client.send_str(config.result_of([]))
             break
+        elif fields.get("reset"):
+            await client.send_str(config.result_of([]))
+        else:
+            await client.send_str(config.reply(Utterances()))
     return None
 
 
 async def _handle(
     message: WSMessage, config: _Config, sound_input: SoundInput, utterances: Utterances
-) -> bool:
-    """Handle a message; return whether it gets a reply now."""
+) -> str:
+    """Handle a message; return the reply that it gets now, if it gets one."""
     if message.type is WSMsgType.BINARY:
         await sound_input.accept(message.data)
-        return True
+        return config.reply(utterances)
     fields = _parse(message.data)
     if "config" in fields:
         config.update(fields["config"])
-        return False
+        return ""
     if fields.get("eof"):
         sound_input.end()
-        return False
+        return ""
+    if fields.get("reset"):
+        return config.result_of(utterances.take_all())
     utterances.restart()
     await sound_input.flush()
-    return True
+    return config.reply(utterances)
 
 
 def _parse(message: str) -> dict[str, object]:
     check_text(message, EXPECTED)
     fields = wire.parse_object(message)
-    if not fields.keys() & {"config", "flush", "eof"}:
+    if not fields.keys() & COMMANDS:
         raise UserError(f"expected {EXPECTED}")
     return fields
 

@@ -30,7 +30,7 @@ class Face:
     faps
         Facial animation parameters (68,), FAP units.
     time_s
-        Media time, seconds; of a face at rest since that was first shown.
+        Media time, seconds; at rest it goes on from the last frame's, and before any from 0.
     """
 
     def __init__(self, faps: NDArray[np.float32], time_s: float) -> None:

@@ -3,7 +3,7 @@
 ======================  =====  ====================================================================
 address                 types  value
 ======================  =====  ====================================================================
-``/kouxing/time``       f      media time, seconds
+``/kouxing/time``       f      media time, seconds; it goes on while the face is at rest
 ``/kouxing/head``       fff    degrees down, to the head's left, and tilted to its right
 ``/kouxing/jawOpen`` …  f      weight of a shape from 0 to 1, one message each
 ======================  =====  ====================================================================

@@ -77,7 +77,8 @@ class Senders:
         self._rest = RestingFace(idle_motion_seed)
         self._playout = Playout()
         self._shown = np.zeros(NUM_FAPS, np.float32)  # newest frame of a session,
-        self._shown_s = -STALL_S - FADE_S  # and when it came
+        self._shown_s = time.monotonic() - STALL_S - FADE_S  # when it came,
+        self._session_time_s = -STALL_S - FADE_S  # and its media time
         self._timer: asyncio.TimerHandle | None = None  # of the next tick, while there are senders
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -177,7 +178,7 @@ class Senders:
         return states
 
     def _accept(self, session_time_s: float, faps: Faps, came_s: float) -> None:
-        self._shown, self._shown_s = faps, came_s
+        self._shown, self._shown_s, self._session_time_s = faps, came_s, session_time_s
         self._show(Face(faps, session_time_s), self._playout.best_s(session_time_s, came_s))
 
     def _tick(self) -> None:
@@ -191,7 +192,8 @@ class Senders:
         if stalled_s > 0:
             share = max(0.0, 1.0 - stalled_s / FADE_S)
             rest = self._rest.at(now_s)
-            self._show(Face(rest + np.float32(share) * (self._shown - rest), now_s), now_s)
+            time_s = self._session_time_s + now_s - self._shown_s
+            self._show(Face(rest + np.float32(share) * (self._shown - rest), time_s), now_s)
         for url, sender in self._senders.items():
             problem = sender.connection.problem
             if problem != sender.reported:

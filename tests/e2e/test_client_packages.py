@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import http.server
 import json
@@ -11,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 import venv
 import wave
 from collections.abc import Iterator
@@ -20,8 +20,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from evaluation.system import sync
 from shared.client import Client
+from shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.e2e.following import samples_of_file
 from tests.glb_writer import Mesh, write_glb
@@ -59,12 +62,18 @@ def run_example(command: list[object], **environment: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a Python that has the built package and what it needs, and nothing else."""
-    folder = tmp_path_factory.mktemp("python")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
     source = shutil.copytree(PYTHON_CLIENT, folder / "source")  # building writes beside it
     pip("wheel", "--no-build-isolation", "--no-deps", "--wheel-dir", folder, source)
     (wheel,) = folder.glob("kouxing_client-*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a Python that has the built package and what it needs, and nothing else."""
+    folder = tmp_path_factory.mktemp("python")
     venv.create(folder / "venv")
     python = folder / "venv" / "bin" / "python"
     pip("--python", python, "install", wheel)
@@ -81,6 +90,30 @@ def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path
     assert max(float(line.split()[-1]) for line in jaw) > 200
     phones = run_example([python, "-I", tmp_path / "awaited.py", SPEECH], KOUXING_CONTROL=control)
     assert [line.split()[-1] for line in phones[:4]] == ["n", "i", "h", "ao"]
+
+
+def test_what_is_tested_of_the_python_package_holds_for_the_built_one(
+    wheel: Path, tmp_path: Path
+) -> None:
+    pip("install", "--no-deps", "--target", tmp_path, wheel)
+    # in place of the source, which pytest's configuration names
+    own = ("--override-ini", f"pythonpath={tmp_path}", "-p", "no:cacheprovider", "--quiet")
+    find = "import kouxing_client, sys; sys.exit(kouxing_client.__path__[0] != sys.argv[1])"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    for command in (
+        ["-c", find, str(tmp_path / "kouxing_client")],
+        ["-m", "pytest", *own, "tests/unit/test_client_package.py"],
+    ):
+        result = subprocess.run(
+            [sys.executable, *command],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=110,
+            check=False,
+        )
+        assert result.returncode == 0, result.stdout + result.stderr
 
 
 def test_the_python_package_brings_its_types_and_needs_two_packages(python: Path) -> None:
@@ -167,108 +200,236 @@ def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -
     assert [line.split()[-1] for line in lines if "phone" in line][:4] == ["n", "i", "h", "ao"]
 
 
+def test_the_javascript_package_has_the_types_of_its_api(project: Path) -> None:
+    shutil.copy(JAVASCRIPT_CLIENT / "tests" / "types.ts", project / "types.mts")
+    compiler = JAVASCRIPT_CLIENT / "node_modules" / "typescript" / "bin" / "tsc"
+    options = "--noEmit --strict --module nodenext --target es2023 --lib es2023,dom".split()
+    result = subprocess.run(
+        [NODE, compiler, *options, "types.mts"],
+        cwd=project,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode == 0, result.stdout
+
+
 LIPS = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
 DOWN = np.array([[0.0, -0.1, 0.0], [0.0, -0.1, 0.0], [0.0, 0.0, 0.0]])
 TOWARDS = np.array([[0.0, 0.0, 1.0]] * 3)
+TURNED = np.array([-1.0, 1.0, -1.0])  # VRM 0 looks along -z
 TRIANGLE = np.array([[0, 1, 2]])
+VISEMES = "sil PP FF TH DD kk CH SS nn RR aa E I O U".split()  # as Ready Player Me names them
 BONES = (
     *("hips", "spine", "head"),
     *(side + limb for side in ("left", "right") for limb in ("UpperArm", "LowerArm", "Hand")),
     *(side + limb for side in ("left", "right") for limb in ("UpperLeg", "LowerLeg", "Foot")),
 )
+VRM_1 = {
+    "specVersion": "1.0",
+    "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
+    "humanoid": {"humanBones": {name: {"node": node} for node, name in enumerate(BONES)}},
+    "expressions": {
+        "preset": {"aa": {"morphTargetBinds": [{"node": len(BONES), "index": 0, "weight": 1.0}]}}
+    },
+}
+VRM_0 = {
+    "meta": {"title": "x"},
+    "humanoid": {"humanBones": [{"bone": name, "node": node} for node, name in enumerate(BONES)]},
+    "blendShapeMaster": {
+        "blendShapeGroups": [
+            {
+                "name": "A",
+                "presetName": "a",
+                "binds": [{"mesh": 0, "index": 0, "weight": 100.0}],
+            }
+        ]
+    },
+}
 
 
-def write_face(path: Path, shape: str, *nodes: dict[str, Any], **rest: Any) -> None:
-    """Write a mouth of one triangle that a shape opens; it comes behind other nodes."""
-    targets = {shape: DOWN} if shape else {}
-    mouth = Mesh("mouth", LIPS, TRIANGLE, targets, normals=TOWARDS)
+def write_face(
+    path: Path, shapes: list[str], *nodes: dict[str, Any], turned: bool = False, **rest: Any
+) -> None:
+    """Write a mouth of one triangle that each shape opens; it comes behind other nodes."""
+    turn = TURNED if turned else 1.0
+    targets = dict.fromkeys(shapes, DOWN * turn)
+    mouth = Mesh("mouth", LIPS * turn, TRIANGLE, targets, normals=TOWARDS * turn)
     scenes = [{"nodes": list(range(len(nodes) + 1))}]
     write_glb(path, [mouth], nodes=list(nodes), scenes=scenes, **rest)
 
 
 def write_faces(folder: Path) -> None:
-    """Write a head as ``kouxing head export`` does, one with ARKit's shape, a VRM and no face."""
+    """Write a head as ``kouxing head export`` does, and what other programs make."""
     faps = [{"name": "open_jaw", "number": 3, "unitsPerWeight": 500.0}]
     camera = {"target": [0, 0, 0], "position": [0, 0, 1], "fovYDegrees": 20}
     about = {"name": "kouxing", "extras": {"kouxing": {"faps": faps, "camera": camera}}}
-    write_face(folder / "own.glb", "open_jaw", about)
-    write_face(folder / "arkit.glb", "Face.jawOpen")
-    vrm = {
-        "specVersion": "1.0",
-        "meta": {"name": "x", "authors": ["x"], "licenseUrl": "https://vrm.dev/licenses/1.0/"},
-        "humanoid": {"humanBones": {name: {"node": node} for node, name in enumerate(BONES)}},
-        "expressions": {
-            "preset": {
-                "aa": {"morphTargetBinds": [{"node": len(BONES), "index": 0, "weight": 1.0}]}
-            }
-        },
-    }
-    bones = [{"name": name} for name in BONES]
-    extension = {"extensionsUsed": ["VRMC_vrm"], "extensions": {"VRMC_vrm": vrm}}
-    write_face(folder / "avatar.vrm", "a", *bones, **extension)
-    write_face(folder / "none.glb", "")
+    write_face(folder / "own.glb", ["open_jaw"], about)
+    write_face(folder / "arkit.glb", ["Face.jawOpen"])
+    write_face(folder / "oculus.glb", [f"viseme_{name}" for name in VISEMES])
+    write_face(folder / "none.glb", [])
+    for name, extension, about_vrm in (("vrm", "VRMC_vrm", VRM_1), ("vrm-0", "VRM", VRM_0)):
+        write_face(
+            folder / f"{name}.vrm",
+            ["a"],
+            *({"name": bone} for bone in BONES),
+            turned=extension == "VRM",
+            extensionsUsed=[extension],
+            extensions={extension: about_vrm},
+        )
 
 
 def write_recording(path: Path, shapes: str, name: str) -> None:
+    """Write a face that takes on a shape, and at its end has no other."""
     lines = [
-        {"time_s": number / 50, "sequence": number, shapes: {name: number / 10}}
+        {
+            "time_s": number / 50,
+            "sequence": number,
+            shapes: {
+                each: number / 10 if each == name else 0.0 for each in SHAPE_SETS[shapes].names
+            },
+        }
         for number in range(11)
     ]
     path.write_text("\n".join(map(json.dumps, lines)), encoding="utf-8")
 
 
-def test_the_web_component_lets_models_speak(
-    project: Path, site: str, gateway: Gateway, system: System, tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def faces(
+    project: Path, site: str, gateway: Gateway, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Browser]:
+    """A browser with a page as the README has it, of many faces beside each other."""
     write_faces(project)
-    write_recording(project / "arkit.jsonl", "arkit", "jawOpen")
-    write_recording(project / "vrm.jsonl", "vrm", "aa")
     (page,) = examples(JAVASCRIPT_CLIENT / "README.md", "html")
-    faces = {
-        "own": f'src="own.glb" gateway="{gateway.page}" session="seen"',
-        "arkit": 'src="arkit.glb" recording="arkit.jsonl"',
-        "vrm": 'src="avatar.vrm" recording="vrm.jsonl"',
-        "live": f'src="arkit.glb" gateway="{gateway.page}" session="seen"',
+    live = f'gateway="{gateway.page}" session="seen"'
+    attributes = {
+        "arkit": 'src="arkit.glb" recording',
+        "oculus": 'src="oculus.glb" recording',
+        "vrm": 'src="vrm.vrm" recording',
+        "old": 'src="vrm-0.vrm" recording',
+        "own": f'src="own.glb" onclick="this.turnSoundOn()" {live}',
+        "live": f'src="arkit.glb" {live}',
         "none": 'src="none.glb"',
     }
-    listen = "onerror='this.failure = event.message'"
-    elements = [
-        f"<kouxing-face id={name} {listen} style='width: 100px'{attributes}></kouxing-face>"
-        for name, attributes in faces.items()
-    ]
-    page = re.sub(r"<kouxing-face.*</kouxing-face>", "".join(elements), page)
+    elements = "".join(
+        f"<kouxing-face id={name} onerror='this.failure = event.message'"
+        f" style='width: 80px' {each}></kouxing-face>"
+        for name, each in attributes.items()
+    )
+    page = re.sub(r"<kouxing-face.*</kouxing-face>", elements, page)
     (project / "index.html").write_text(
-        f"<!doctype html><link rel=icon href='data:,'><body style='margin: 0'>{page}",
+        "<!doctype html><link rel=icon href='data:,'>"
+        f"<body style='margin: 0; display: flex'>{page}",
         encoding="utf-8",
     )
-    browser = Browser(tmp_path, SPEECH)
-    try:
-        browser.command("Page.navigate", url=f"{site}/index.html")
-        browser.wait_for("['own', 'arkit', 'vrm', 'live'].every((name) => window[name]?.set)")
-        sets = browser.evaluate("['own', 'arkit', 'vrm'].map((name) => window[name].set)")
-        assert sets == ["faps", "arkit", "vrm"]
-        browser.wait_for("none.failure?.includes('no morph targets')")
-        before = browser.steady_image()
-        browser.evaluate("Promise.all([arkit.play(), vrm.play()])")
-        assert browser.evaluate("[arkit.shown.jawOpen, vrm.shown.aa]") == [1, 1]
-        after = browser.steady_image()
-        for row in (1, 2):
-            part = np.s_[100 * row : 100 * (row + 1), :100]
-            assert not np.array_equal(before[part], after[part])
-        browser.evaluate(
-            "window.most = window.widest = 0; setInterval(() => {"
-            " most = Math.max(most, own.shown?.[2] ?? 0);"
-            " widest = Math.max(widest, live.shown?.jawOpen ?? 0); }, 10)"
-        )
-        samples = samples_of_file(SPEECH)[:24000]
-        with Client(system.control) as client:
-            session = client.open_session(session="seen", encoding="f32le")
+    browser = Browser(tmp_path_factory.mktemp("browser"), SPEECH)
+    sync.install(browser)
+    browser.command("Page.navigate", url=f"{site}/index.html")
+    names = [name for name in attributes if name != "none"]
+    browser.wait_for(f"{names}.every((name) => window[name]?.set)")
+    yield browser
+    browser.close()
+
+
+def test_the_web_component_knows_what_moves_a_model(faces: Browser) -> None:
+    sets = faces.evaluate("[arkit, oculus, vrm, old, own].map((face) => face.set)")
+    assert sets == ["arkit", "oculus", "vrm", "vrm", "faps"]
+    faces.wait_for("none.failure?.includes('no morph targets')")
+
+
+@pytest.mark.parametrize(
+    ("face", "shapes"),
+    [
+        ("arkit", ["jawOpen"]),
+        ("oculus", ["PP", "aa", "E", "ih", "oh", "ou"]),
+        ("vrm", ["aa"]),
+        ("old", ["aa"]),
+    ],
+)
+def test_the_web_component_plays_recordings_on_models_of_all_kinds(
+    faces: Browser, project: Path, face: str, shapes: list[str]
+) -> None:
+    closed = play(faces, project, face, "")
+    for shape in shapes:
+        assert (play(faces, project, face, shape) != closed).any(), shape
+        assert faces.evaluate(f"{face}.shown.{shape}") == 1
+
+
+def play(faces: Browser, project: Path, face: str, shape: str) -> NDArray[np.uint8]:
+    """Return how a face looks after it has taken on a shape, or after nothing."""
+    name = f"{face}-{shape}.jsonl"
+    write_recording(project / name, faces.evaluate(f"{face}.set"), shape)
+    faces.evaluate(f"{face}.setAttribute('recording', '{name}')")
+    faces.evaluate(f"{face}.play()")
+    left, width = faces.evaluate(f"[{face}.offsetLeft, {face}.offsetWidth]")
+    return faces.steady_image()[:width, left : left + width]
+
+
+def test_a_recording_that_is_played_again_ends_the_first(faces: Browser, project: Path) -> None:
+    write_recording(project / "again.jsonl", "arkit", "jawOpen")
+    faces.evaluate("arkit.setAttribute('recording', 'again.jsonl')")
+    faces.evaluate("Promise.all([arkit.play(), arkit.play()])")
+    assert faces.evaluate("arkit.shown.jawOpen") == 1
+
+
+@contextlib.contextmanager
+def speech(system: System) -> Iterator[None]:
+    """Speak in the session that the faces show."""
+    samples = np.resize(samples_of_file(SPEECH)[:24000], 240_000)
+    ended = threading.Event()
+    with Client(system.control) as client:
+        session = client.open_session(session="seen", encoding="f32le")
+
+        def speak() -> None:
             for begin in range(0, len(samples), 1600):
                 session.send(samples[begin : begin + 1600])
-                time.sleep(0.1)
-            browser.wait_for("most > 200 && widest > 0.1")
+                if ended.wait(0.1):
+                    return
+
+        thread = threading.Thread(target=speak)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
             session.close()
-        driver = "GL Driver Message"  # the processor draws
-        assert [each for each in browser.complaints if driver not in each] == []
-    finally:
-        browser.close()
+
+
+def test_the_web_component_shows_a_session_and_keeps_its_sound_in_step(
+    faces: Browser, system: System
+) -> None:
+    faces.evaluate(
+        "import('/node_modules/kouxing-client/page/playout.js').then(({ Playout }) => {"
+        " const { adjust } = Playout.prototype;"
+        " Playout.prototype.adjust = function (nowMs) {"
+        "   if (this.isHeard) window.heard = { ...this, count: (window.heard?.count ?? 0) + 1 };"
+        "   adjust.call(this, nowMs); }; })"
+    )
+    faces.evaluate(
+        "window.most = window.widest = 0; window.told = []; setInterval(() => {"
+        " most = Math.max(most, own.shown?.[2] ?? 0);"
+        " widest = Math.max(widest, live.shown?.jawOpen ?? 0); }, 10);"
+        "live.addEventListener('session', ({ detail }) => told.push(detail.session))"
+    )
+    faces.click("own")  # sound begins with a gesture
+    with speech(system):
+        faces.wait_for("most > 200 && widest > 0.1")
+        faces.wait_for("probe.clicks.size > 0")  # loud samples leave the page
+        faces.wait_for("heard.pictureMs > 0")  # for so long they wait for their picture
+        faces.evaluate(
+            "window.tick = requestAnimationFrame; window.ticks = [];"
+            "window.requestAnimationFrame = (act) => ticks.push(act)"
+        )
+        faces.wait_for("ticks.length >= 7")  # each face waits to be drawn,
+        faces.evaluate("heard.count = 0")
+        faces.wait_for("heard.count > 5")  # and its sound goes on in step
+        faces.evaluate("window.requestAnimationFrame = tick; ticks.forEach(tick)")
+        faces.evaluate("told.length = 0; live.setAttribute('token', 'another')")
+        faces.wait_for("told.includes('seen')")  # it has connected anew
+        faces.evaluate("live.setAttribute('src', 'own.glb')")
+        faces.wait_for("live.set === 'faps' && live.shown?.length === 68")
+        faces.wait_for("live.shown[2] > 100")
+    driver = "GL Driver Message"  # the processor draws
+    assert [each for each in faces.complaints if driver not in each] == []

@@ -240,6 +240,22 @@ def test_a_face_without_frames_goes_to_rest(senders: Senders, receiver: socket.s
     assert time.monotonic() - began_s > STALL_S / 2
 
 
+def test_time_goes_on_at_rest(senders: Senders, receiver: socket.socket) -> None:
+    def next_time_s() -> float:
+        while (first := next(iter(OscBundle(receiver.recv(2000))))).address != "/kouxing/time":
+            pass
+        return float(first.params[0])
+
+    senders.start(parse_target(f"osc://127.0.0.1:{receiver.getsockname()[1]}"))
+    assert 0.0 <= next_time_s() < LIMIT_S  # nobody has spoken
+    senders.accept(1000.0, open_mouth())
+    while next_time_s() < 1000.0:
+        pass
+    rest_s = [next_time_s() for _ in range(5)]
+    assert 1000.0 + STALL_S <= rest_s[0] < 1000.0 + LIMIT_S
+    assert all(0 < step_s < LIMIT_S for step_s in np.diff(rest_s))
+
+
 # --- to VTube Studio ----------------------------------------------------------------------------
 
 

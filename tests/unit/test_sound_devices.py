@@ -47,7 +47,9 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_a_monitor_is_recorded_by_its_name(server: Path, name: str, target: str) -> None:
-    blocks = [*monitor(name).blocks]
+    source = monitor(name)
+    assert not (server / "asked").exists()  # nothing runs until somebody wants it
+    blocks = [*source.blocks]
     np.testing.assert_array_equal(np.concatenate(blocks), np.full((1000, 1), 0.5))
     assert target in (server / "asked").read_text().split()
 
@@ -67,6 +69,13 @@ def test_without_a_sound_server_it_is_said_what_to_do(monkeypatch: pytest.Monkey
     for name in ("", "firefox"):
         with pytest.raises(UserError, match=r"PulseAudio or PipeWire.*BlackHole"):
             monitor(name)
+
+
+def test_a_recorder_that_complains_much_is_still_heard(server: Path) -> None:
+    (server / "parec").write_text(
+        f"#!/bin/sh\nhead -c 200000 /dev/zero >&2; cat {server / 'pcm'}\n"
+    )
+    assert len(np.concatenate([*monitor().blocks])) == 1000
 
 
 def test_what_cannot_be_recorded_says_why(server: Path) -> None:

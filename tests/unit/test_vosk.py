@@ -58,3 +58,18 @@ def test_after_a_restart_what_is_final_stays_and_indices_count_anew() -> None:
     said.restart()
     said.accept(phone(0, "e", 0.2), is_silence=False)
     assert symbols(said.take_all()) == "n e"
+
+
+def test_what_was_told_before_it_was_final_is_not_told_again() -> None:
+    said = Utterances()
+    said.hear(active=True)
+    said.accept(phone(0, "n", 0.1), is_silence=False)
+    said.accept(phone(1, "i", 0.2, final=False), is_silence=False)
+    assert symbols(said.take_all()) == "n i"
+    said.accept(phone(1, "e", 0.2), is_silence=False)
+    said.accept(phone(2, "h", 0.3), is_silence=False)
+    assert symbols(said.take_all()) == "h"
+    assert said.take_all() == []
+    said.restart()
+    said.accept(phone(0, "ao", 0.4), is_silence=False)
+    assert symbols(said.take_all()) == "ao"

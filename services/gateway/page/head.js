@@ -4,14 +4,14 @@ import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { coarsen } from "./coarse.js";
 import { findJoints, turnJoints } from "./joints.js";
-import { dim, drawsInSoftware, physicalMaterial, plainMaterial, release, studio } from "./materials.js";
+import { dim, physicalMaterial, plainMaterial, release, studio } from "./materials.js";
 import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
 import { Pace } from "./pace.js";
+import { Pictures, drawsInSoftware } from "./pictures.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
-const LOOK_EVERY_MS = 2; // whether a picture is done
 const OVERLAY_SHARE = 0.6;
 const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
 
@@ -31,10 +31,9 @@ export class Head {
   #stale = true;
   #software; // the processor draws
   #pace;
-  #isDrawing = false;
+  #pictures;
   #isFilmed = false;
   #size = [0, 0]; // on the page
-  #numPictures = 0;
 
   /** @param canvas to draw into; @param overlay the element that covers its lower edge */
   constructor(canvas, overlay) {
@@ -42,9 +41,11 @@ export class Head {
     // Smooth edges come from more pixels than the screen has: multisampling speckles a mesh whose
     // triangles are as small as pixels.
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
-    this.#software = drawsInSoftware(this.#renderer.getContext());
+    const gl = this.#renderer.getContext();
+    this.#software = drawsInSoftware(gl);
     const full = Math.min(2, Math.max(1.5, devicePixelRatio));
     this.#pace = this.#software ? new Pace(0.5, 1, true) : new Pace(full, full, false);
+    this.#pictures = new Pictures(gl, this.#pace);
     if (!this.#software) this.#light();
     this.#controls = new OrbitControls(this.#camera, canvas);
     this.#controls.enablePan = false;
@@ -116,31 +117,17 @@ export class Head {
   }
 
   /**
-   * Draw, if anything has changed, and if the picture before is done: a slow machine is to have
-   * fewer pictures rather than a queue of late ones that block the page.
+   * Draw, if anything has changed and it is time for a picture.
    *
    * @param seen called with when this picture is seen first, ms, if it is drawn
    */
   draw(nowMs, seen) {
-    if (!this.#stale || this.#isDrawing || !this.#pace.isDue(nowMs)) return;
+    if (!this.#stale || !this.#pictures.isDue(nowMs)) return;
     if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#resize(); // which blanks the canvas
     this.#stale = false;
     if (this.#faps !== null) this.#apply(this.#faps);
     this.#faps = null;
-    this.#isDrawing = true;
-    const begunMs = performance.now();
-    this.#render();
-    this.#whenDone(() => {
-      this.#isDrawing = false;
-      this.#numPictures++;
-      const doneMs = performance.now();
-      this.#pace.drew(begunMs, doneMs);
-      requestAnimationFrame((tickMs) => {
-        const seenMs = Math.max(tickMs, doneMs); // a busy page hears of a tick after it
-        this.#pace.saw(nowMs, seenMs);
-        seen(seenMs);
-      });
-    });
+    this.#pictures.draw(nowMs, () => this.#render(), seen);
   }
 
   /**
@@ -177,28 +164,13 @@ export class Head {
       isCoarse: this.#software,
       width,
       height,
-      numPictures: this.#numPictures,
+      numPictures: this.#pictures.numDrawn,
       pictureMs: this.#pace.pictureMs,
     };
   }
 
   #render() {
     this.#renderer.render(this.#scene, this.#camera);
-  }
-
-  #whenDone(act) {
-    const gl = this.#renderer.getContext();
-    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-    gl.flush();
-    const look = () => {
-      if (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) {
-        setTimeout(look, LOOK_EVERY_MS);
-      } else {
-        gl.deleteSync(fence);
-        act();
-      }
-    };
-    setTimeout(look);
   }
 
   #frame({ target, position, fovYDegrees }) {

@@ -7,14 +7,7 @@ import * as THREE from "three";
 const EYES = ["eye_left", "eye_right"];
 const HAIR = ["hair", "hair_tips"];
 const UNKNOWN = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // of files that do not say
-const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 const LIGHT = await (await fetch("light.glsl")).text(); // GLSL, the driver's, too
-
-/** Say whether the processor draws, and not a graphics card. */
-export function drawsInSoftware(gl) {
-  const info = gl.getExtension("WEBGL_debug_renderer_info");
-  return SOFTWARE.test(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-}
 
 const PLAIN_VERTEX = `
 ${LIGHT}

@@ -1,0 +1,42 @@
+// The API as a TypeScript program uses it; only its types are checked.
+
+import { FapTrack, Playout, Speaker, Viewer, readMessage, readRecording } from "kouxing-client";
+import type { KouxingFace } from "kouxing-client/face";
+
+const gateway = "http://localhost:8080";
+const speaker: Speaker = await Speaker.open(gateway, { sampleRateHz: 24000, encoding: "f32le", ahead: true });
+await speaker.push(new Float32Array(480));
+speaker.flush();
+await speaker.finish();
+
+const [track, playout] = [new FapTrack(), new Playout()];
+const viewer = new Viewer(
+  gateway,
+  {
+    weights: (mediaTime, weights, names) => {
+      const opening: number = weights[names.indexOf("jawOpen")];
+      if (track.push(mediaTime, weights)) playout.frameArrived(performance.now(), mediaTime + opening);
+    },
+    phone: ({ symbol, final }) => console.log(symbol.length, final),
+    session: ({ session }) => console.log(session?.length),
+  },
+  { session: speaker.session, shapes: "arkit" },
+);
+await viewer.ready;
+viewer.send({ express: { joy: 0.5 } });
+viewer.close();
+
+const [[time, values]] = readRecording("").frames;
+const message = readMessage(new ArrayBuffer(16));
+if (message !== null && "samples" in message) console.log(message.samples.length, time, values.length);
+
+const face: KouxingFace = document.createElement("kouxing-face");
+await face.turnSoundOn();
+if (face.set !== "faps" && face.shown !== null && !Array.isArray(face.shown)) console.log(face.shown.jawOpen);
+
+// @ts-expect-error: there are no such shapes
+new Viewer(gateway, {}, { shapes: "apple" });
+// @ts-expect-error: a speaker comes from Speaker.open
+new Speaker();
+// @ts-expect-error: sound is no text
+await speaker.push("sound");

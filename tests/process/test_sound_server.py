@@ -1,0 +1,82 @@
+"""What a machine plays, recorded from a real sound server: PulseAudio, with no loudspeaker."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+from collections.abc import Generator, Iterator
+
+import numpy as np
+import pytest
+
+from evaluation.system.chromium import wait_until
+from shared.sound_devices import monitor, sound_devices
+
+pytestmark = pytest.mark.process
+RATE_HZ, TONE_HZ = 16_000, 1000
+MAX_BLOCKS = 1000  # 20 s: what is played without a loudspeaker may begin late
+SERVER = (
+    *"pulseaudio -n --daemonize=no --exit-idle-time=-1 --use-pid-file=no --disable-shm=yes".split(),
+    *("-L", "module-null-sink sink_properties=device.description=Loudspeaker"),
+    *("-L", "module-native-protocol-unix"),
+)
+PLAYER = (
+    *"pacat --client-name=Player --format=s16le --channels=1 --latency-msec=50".split(),
+    f"--rate={RATE_HZ}",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A sound server of the test's own, and a program that plays a tone on it."""
+    folder = tmp_path_factory.mktemp("sound")
+    tone = 16384 * np.sin(2 * np.pi * TONE_HZ / RATE_HZ * np.arange(60 * RATE_HZ))
+    (folder / "tone").write_bytes(tone.astype("<i2").tobytes())
+    quiet = subprocess.DEVNULL
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HOME", str(folder))
+        patch.setenv("XDG_RUNTIME_DIR", str(folder))
+        server = subprocess.Popen(SERVER, stderr=quiet)
+        try:
+            ask = ["pactl", "info"]
+            wait_until(lambda: subprocess.call(ask, stdout=quiet, stderr=quiet) == 0, 30)
+            with (folder / "tone").open("rb") as sound:
+                player = subprocess.Popen(PLAYER, stdin=sound, stderr=quiet)
+            wait_until(lambda: len(programs()) == 1, 30)
+            yield
+            player.terminate()
+            player.wait(30)
+        finally:
+            server.terminate()
+            server.wait(30)
+
+
+def programs() -> list[str]:
+    return [each.name for each in sound_devices() if each.kind == "program"]
+
+
+def num_listeners() -> int:
+    return len(subprocess.check_output("pactl list short source-outputs".split()).splitlines())
+
+
+@pytest.mark.parametrize("name", ["", "loudspeaker", "player"])
+def test_what_is_played_is_heard_until_nobody_listens(name: str) -> None:
+    blocks = monitor(name).blocks
+    assert num_listeners() == 0
+    num_heard = 0
+    for block in itertools.islice(blocks, MAX_BLOCKS):
+        peak_hz = np.argmax(np.abs(np.fft.rfft(block[:, 0]))) * RATE_HZ / len(block)
+        num_heard += int(abs(peak_hz - TONE_HZ) < 60 and np.abs(block).max() > 0.3)
+        if num_heard == 10:
+            break
+    assert num_heard == 10
+    assert isinstance(blocks, Generator)
+    blocks.close()
+    wait_until(lambda: num_listeners() == 0, 30)
+
+
+def test_outputs_and_programs_are_listed() -> None:
+    assert [each.name for each in sound_devices() if each.kind == "monitor"] == [
+        "Monitor of Loudspeaker"
+    ]
+    assert programs() == ["Player"]
