@@ -31,6 +31,10 @@ from shared.errors import UserError
 CONTROL = "control"
 CLIENT = "client"
 CLIENT_ROLES = ("client", "operator")  # of whoever uses control's machine
+# What one message from control can tell the services.
+MAX_KEYS = 1000
+MAX_ROLES = 16  # of a key
+_MAX_ALLOWED_BYTES = 768 * 1024
 _ALLOWED = "allowed"
 _SUBSCRIBER = "subscriber:"
 _PUBLIC = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")  # Z85 of 32 bytes
@@ -176,7 +180,7 @@ def revoke_guest(name: str) -> None:
         If there is no key of that name.
     """
     with _locked_folder() as folder:
-        guests = _read_guests(folder / _ALLOWED)
+        guests = _parse_guests(folder / _ALLOWED)  # of too many it may revoke some
         kept = {public: guest for public, guest in guests.items() if guest.name != name}
         if len(kept) == len(guests):
             raise UserError(f"no key is called {name!r}; 'kouxing keys list' shows all")
@@ -227,8 +231,9 @@ def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> Non
     if any(guest.name == name for guest in guests.values()):
         raise UserError(f"a key is called {name!r}; first 'kouxing keys revoke {name}'")
     text = _new_key(read_key(folder / "control.key").public)
-    _write(path, text)
     guests[json.loads(text)["public"]] = Guest(name, tuple(roles))
+    _check_number(guests)
+    _write(path, text)
     _write(folder / _ALLOWED, _lines(guests))
 
 
@@ -250,15 +255,42 @@ def read_key(path: Path) -> Key:
 
 
 def _read_guests(path: Path) -> dict[str, Guest]:
+    guests = _parse_guests(path)
+    try:
+        _check_number(guests)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    return guests
+
+
+def _parse_guests(path: Path) -> dict[str, Guest]:
     if not path.exists():
         return {}
     guests = {}
     for line in _read(path).splitlines():
         public, *named = line.split() or [""]
-        if not (named and _PUBLIC.fullmatch(public) and all(map(_ROLE.fullmatch, named[1:]))):
+        name, *roles = named or [""]
+        is_whole = _PUBLIC.fullmatch(public) and _NAME.fullmatch(name)
+        if not (is_whole and all(map(_ROLE.fullmatch, roles))):
             raise UserError(f"{path}: {line!r} is not PUBLIC-KEY NAME ROLE...")
-        guests[public] = Guest(named[0], tuple(named[1:]))
+        guests[public] = Guest(name, tuple(roles))
     return guests
+
+
+def _check_number(guests: Guests) -> None:
+    """Refuse more than the services can be told."""
+    for guest in guests.values():
+        if len(guest.roles) > MAX_ROLES:
+            raise UserError(
+                f"{guest.name} has {len(guest.roles)} roles, a key may have {MAX_ROLES};"
+                " 'subscriber:*' follows all sessions"
+            )
+    if len(guests) > MAX_KEYS:
+        raise UserError(
+            f"{len(guests)} keys would be allowed, {MAX_KEYS} may be; 'kouxing keys revoke' some"
+        )
+    if len(_lines(guests)) > _MAX_ALLOWED_BYTES:
+        raise UserError("the keys have too many roles in all; 'kouxing keys revoke' some")
 
 
 def _lines(guests: Guests) -> str:

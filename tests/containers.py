@@ -23,16 +23,22 @@ BECOME_USER = f"""
 exec setpriv --reuid={USER} --regid={USER} --clear-groups --no-new-privs \
     --bounding-set=-all,{READ} --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "$@"
 """
-# Arguments: folder of secrets, file of hosts, a volume and where it is, if any, then the command.
+# Arguments: folder of secrets, file of hosts, where the folder is mounted if it is, the command.
 ENTER = f"""
 mount --make-rprivate /
 mount -t tmpfs tmpfs /run
-mkdir /run/secrets
-cp -r "$1"/. /run/secrets
 cp "$2" /run/hosts
-[ -z "$3" ] || {{ mkdir -p "$4" && mount --bind "$3" "$4" && mount -o remount,bind,ro "$4"; }}
-shift 4
-find /run/secrets -type f -exec chown {USER} {{}} + -exec chmod 400 {{}} +
+if test "$3"; then
+    mkdir "$3"
+    mount --bind "$1" "$3"
+    mount -o remount,bind,ro "$3"
+else
+    mkdir /run/secrets
+    cp "$1"/* /run/secrets
+    chown {USER} /run/secrets/*
+    chmod 400 /run/secrets/*
+fi
+shift 3
 mount --bind /run/hosts /etc/hosts
 mount -t tmpfs -o noexec,nosuid,nodev tmpfs /tmp
 findmnt --raw --noheadings --output TARGET | grep -vE '^/(tmp|run|proc|sys|dev)(/|$)' |
@@ -40,9 +46,12 @@ findmnt --raw --noheadings --output TARGET | grep -vE '^/(tmp|run|proc|sys|dev)(
 mount -o remount,bind,ro /run
 {BECOME_USER}"""
 ENTER_WITHOUT_ROOT = f"""
-find "$1" -type f -exec chown {USER} {{}} + -exec chmod 400 {{}} +
-export CREDENTIALS_DIRECTORY="${{3:-$1}}"
-shift 4
+if test -z "$3"; then
+    chown {USER} "$1"/*
+    chmod 400 "$1"/*
+fi
+export CREDENTIALS_DIRECTORY="$1"
+shift 3
 {BECOME_USER}"""
 
 
@@ -82,23 +91,24 @@ class Containers:
         arguments: Sequence[str],
         environment: Mapping[str, str],
         secrets: Mapping[str, Path],
-        volume: tuple[str, str] = ("", ""),
+        mounted: tuple[Path, str] | None = None,
     ) -> subprocess.Popen[bytes]:
         """Start ``kouxing`` with arguments in a container on a host; its output is in a log.
 
-        ``volume`` is a folder of this machine and where the container has it, to be read.
+        Instead of secrets it may have a folder of keys, ``mounted`` somewhere.
         """
-        folder = self._folder / f"{host}-secrets"
-        folder.mkdir()
+        folder, target = mounted or (self._folder / f"{host}-secrets", "")
+        if not mounted:
+            folder.mkdir()
         for name, path in secrets.items():
             (folder / name).write_bytes(path.read_bytes())
         program = [sys.executable, "-m", "services", *arguments]
         enter = ["unshare", "--mount", "sh", "-ec", ENTER]
         if not self._has_root:
-            folder.parent.chmod(0o755)
+            self._folder.chmod(0o755)
             enter = ["sh", "-ec", ENTER_WITHOUT_ROOT]
             environment = {name: self._by_number(each) for name, each in environment.items()}
-        enter += ["sh", str(folder), str(self._hosts), *volume]
+        enter += ["sh", str(folder), str(self._hosts), target]
         own = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT)}
         with self.log(host).open("ab") as log:
             return subprocess.Popen(

@@ -183,6 +183,7 @@ async def serve(
         entrance.tls,
         on_refused=lambda address: LOG.warning("refused a connection of %s: too many", address),
         on_bad_request=lambda: LOG.warning("dropped a request: it is no HTTP"),
+        share=config.address_share,
     )
     await listener.start(ListeningTest(study, store).make_application(entrance.access), ())
     on_ready(entrance.url)

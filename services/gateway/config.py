@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field
 
+from services.gateway.places import ADDRESS_SHARE
 from services.senders.target import parse_target
 from shared.config import BoundHost, BoundPort, Form, ServiceConfig, Switch
 from shared.errors import UserError
@@ -62,7 +63,8 @@ class GatewayConfig(ServiceConfig):
     """PEM file with a certificate and its private key, for https; if there is no such file, a
     self-signed certificate is written there."""
     token: str = ""
-    """Secret that the page's address carries; with a certificate one is made if this is empty."""
+    """Secret that the page's address carries; with a certificate or plain_http one is made if this
+    is empty."""
     plain_http: Switch = False
     """Serve an address that others can reach unencrypted: where only a proxy that encrypts, or a
     port that is published to this machine alone, leads there."""
@@ -80,3 +82,8 @@ class GatewayConfig(ServiceConfig):
     def is_encrypted(self) -> bool:
         """Whether what others can reach is encrypted, here or by a proxy."""
         return bool(self.certificate) or self.plain_http
+
+    @property
+    def address_share(self) -> float:
+        """How many of the places one address may have: all where that is a proxy's."""
+        return 1.0 if self.plain_http else ADDRESS_SHARE

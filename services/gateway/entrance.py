@@ -34,7 +34,7 @@ def make_entrance(config: GatewayConfig, port: int) -> Entrance:
         If the certificate can neither be read nor made.
     """
     host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
-    token = config.token or (secrets.token_urlsafe(16) if config.certificate else "")
+    token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
     names = {host, *own_names(), *config.names.split()}
     tls = None
     if config.certificate:

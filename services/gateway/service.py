@@ -28,7 +28,6 @@ from services.gateway.listener import Listener, bind
 from services.gateway.microphone import SAMPLE_TEXT, Microphones, Sample
 from services.gateway.outbox import Kind
 from services.gateway.own_sessions import OwnSessions, error_text
-from services.gateway.places import ADDRESS_SHARE
 from services.gateway.sending import Sending
 from services.gateway.viewers import Viewers
 from services.gateway.vosk import VoskClients
@@ -90,8 +89,7 @@ class GatewayService(Service):
         self.endpoints = {"page": entrance.url}
         self._sessions: dict[str, _Session] = {}
         self._web_sockets = http.WebSockets()
-        # Through a proxy all clients come from its address.
-        share = self._share = 1.0 if config.plain_http else ADDRESS_SHARE
+        share = self._share = config.address_share
         self._viewers = Viewers(
             self._web_sockets,
             share,

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from shared.keys import MAX_KEYS, MAX_ROLES
 from shared.wire.message import (
     Address,
     ChosenLips,
@@ -149,14 +150,14 @@ class AllowedKey:
     """Whose key it is and what its owner may do."""
 
     name: Name
-    roles: Annotated[list[Name], Meta(max_length=16)]
+    roles: Annotated[list[Name], Meta(max_length=MAX_ROLES)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AllowedKeys(Message):
     """Control tells a service who may connect to its sockets; again when that changes."""
 
-    keys: Annotated[dict[Name, AllowedKey], Meta(max_length=1000)]  # by public key
+    keys: Annotated[dict[Name, AllowedKey], Meta(max_length=MAX_KEYS)]  # by public key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

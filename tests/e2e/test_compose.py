@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import yaml
 from evaluation.system.network import Link, Network
 from shared.client import Client
 from shared.errors import UserError
-from shared.keys import control_endpoint
+from shared.keys import control_endpoint, read_key
 from tests.containers import READ, USER, Containers
 from tests.system import ROOT, VOWELS_FILE
 
@@ -44,28 +46,22 @@ def network() -> Iterator[Network]:
 
 
 @pytest.fixture(scope="module")
-def volume(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the service ``keys`` has made."""
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Folder of the keys, made by the service ``keys``; this process gets them, too."""
     folder = tmp_path_factory.mktemp("keys")
     run_keys_service(folder, *COMPOSE["services"]["keys"]["command"])
-    assert (folder / "kouxing" / "control.key").stat().st_uid == USER
-    return folder
-
-
-@pytest.fixture(scope="module")
-def keys(volume: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
-    """Secrets by name; this process gets them, too."""
+    made = folder / "kouxing"
+    assert (made / "control.key").stat().st_uid == USER
     own = tmp_path_factory.mktemp("own-keys") / "kouxing"
-    shutil.copytree(volume / "kouxing", own)  # owned by who copies
+    shutil.copytree(made, own)  # owned by who copies
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(own.parent))
-        yield {name: own / Path(each["file"]).name for name, each in COMPOSE["secrets"].items()}
+        yield made
 
 
-def run_keys_service(folder: Path, *arguments: str) -> None:
+def run_keys_service(folder: Path, *command: str) -> None:
     """Run what makes the keys, on a folder that takes the place of its volume."""
-    service = COMPOSE["services"]["keys"]
-    shell, option, script, name = service["entrypoint"]
+    shell, option, script, name = COMPOSE["services"]["keys"]["entrypoint"]
     programs = folder.parent / "programs"
     programs.mkdir(exist_ok=True)
     (programs / "kouxing").write_text(f'#!/bin/sh\nexec {sys.executable} -m services "$@"\n')
@@ -75,7 +71,7 @@ def run_keys_service(folder: Path, *arguments: str) -> None:
         "setpriv ", f"setpriv --inh-caps=-all,{READ} --ambient-caps=-all,{READ} "
     )
     subprocess.run(
-        [shell, option, script, name, *arguments],
+        [shell, option, script, name, *command],
         cwd=ROOT,
         env={
             "PATH": f"{programs}:/usr/bin:/bin",
@@ -87,14 +83,11 @@ def run_keys_service(folder: Path, *arguments: str) -> None:
 
 @pytest.fixture(scope="module")
 def containers(
-    network: Network,
-    volume: Path,
-    keys: dict[str, Path],
-    tmp_path_factory: pytest.TempPathFactory,
+    network: Network, keys: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Containers]:
     made = Containers(tmp_path_factory.mktemp("compose"), network, {"control": "control"})
     running = {
-        host: start(made, host, service, keys, volume, *COMPOSE["services"][service]["command"])
+        host: start(made, host, service, keys, *COMPOSE["services"][service]["command"])
         for host, service in HOSTS.items()
         if service != "client"
     }
@@ -107,29 +100,24 @@ def containers(
 
 
 def start(
-    containers: Containers,
-    host: str,
-    service: str,
-    keys: dict[str, Path],
-    volume: Path,
-    *arguments: str,
+    containers: Containers, host: str, service: str, keys: Path, *arguments: str
 ) -> subprocess.Popen[bytes]:
     description = COMPOSE["services"][service]
     environment = description["environment"]
-    mounted = ("", "")
-    if service == "driver":  # no volume is mounted for it here
+    if service == "driver":  # no volume is mounted here
         environment = {**environment, "KOUXING_DRIVER_OUT": "/tmp"}  # noqa: S108
-    elif "volumes" in description:
-        ((source, target, mode),) = (each.split(":") for each in description["volumes"])
-        assert mode == "ro"
-        mounted = (str(volume / Path(source).relative_to("deploy/keys")), target)
-    secrets = {name: keys[name] for name in description.get("secrets", ())}
-    return containers.start(host, arguments, environment, secrets, mounted)
+    if service == "control":
+        (volume,) = description["volumes"]
+        assert (volume["source"], volume["read_only"]) == ("./deploy/keys/kouxing", True)
+        return containers.start(host, arguments, environment, {}, (keys, volume["target"]))
+    files = {name: COMPOSE["secrets"][name]["file"] for name in description["secrets"]}
+    secrets = {name: keys / Path(path).name for name, path in files.items()}
+    return containers.start(host, arguments, environment, secrets)
 
 
 @pytest.mark.timeout(400)  # of a busy machine
 def test_containers_are_healthy_private_and_speak(
-    containers: Containers, network: Network, keys: dict[str, Path], volume: Path
+    containers: Containers, network: Network, keys: Path
 ) -> None:
     end_s = time.monotonic() + 200
     for host, service in HOSTS.items():
@@ -146,28 +134,46 @@ def test_containers_are_healthy_private_and_speak(
             assert time.monotonic() < end_s, services
             time.sleep(0.2)
         told = {each for state in services for each in state.endpoints.values()}
+        check_page(told, network.bound("gateway-1"))
     for host, port in (("recognizer-1", 5560), ("recognizer-2", 5560), ("synthesizer-1", 5571)):
         assert any(each.startswith(f"tcp://{network.bound(host)}:{port} ") for each in told), told
 
-    said = "speak", str(VOWELS_FILE), "--fast"
-    speaker = start(containers, "client-1", "client", keys, volume, *said)
+    speaker = start(containers, "client-1", "client", keys, "speak", str(VOWELS_FILE), "--fast")
     assert speaker.wait(60) == 0, containers.log("client-1").read_text("utf-8")
     assert " phones in " in containers.log("client-1").read_text("utf-8")
 
 
-def test_a_key_is_revoked_without_a_restart(
-    containers: Containers, network: Network, keys: dict[str, Path], volume: Path
+def test_a_key_is_added_and_revoked_without_a_restart(
+    containers: Containers, network: Network, keys: Path, tmp_path: Path
 ) -> None:
-    address = f"tcp://{network.bound('control')}:5550"
-    with network.on("client-1"), Client(control_endpoint(address, insecure=False)) as client:
+    made, own = keys.parent / "laptop.key", tmp_path / "laptop.key"
+    run_keys_service(keys.parent, "add", "laptop", "-o", str(made))
+    shutil.copyfile(made, own)
+    own.chmod(0o600)
+    control = control_endpoint(f"tcp://{network.bound('control')}:5550", insecure=False)
+    with network.on("client-1"), Client(control, key=read_key(own)) as client:
         assert client.status().services
-    run_keys_service(volume, "revoke", "client")
-    with (
-        network.on("client-1"),
-        Client(control_endpoint(address, insecure=False)) as client,
-        pytest.raises(UserError, match="does not accept"),
-    ):
-        client.status()
+        run_keys_service(keys.parent, "revoke", "laptop")
+        end_s = time.monotonic() + 60
+        while not client.bus.is_refused(control):
+            assert time.monotonic() < end_s
+            time.sleep(0.2)
+
+
+def check_page(told: Collection[str], gateway: str) -> None:
+    """Check that the page is where compose publishes it, and needs the token that it tells."""
+    (published,) = COMPOSE["services"]["gateway"]["ports"]
+    host, port, own_port = published.split(":")
+    (secret,) = [
+        each.removeprefix(address)
+        for address in [f"http://{host}:{port}/#"]
+        for each in told
+        if each.startswith(address)
+    ]
+    for query, status in (("", 403), (f"?{secret}", 200)):
+        with contextlib.closing(HTTPConnection(gateway, int(own_port), timeout=60)) as http:
+            http.request("GET", f"/senders{query}")
+            assert http.getresponse().status == status
 
 
 def test_every_service_is_locked_in() -> None:
@@ -176,7 +182,8 @@ def test_every_service_is_locked_in() -> None:
         assert service["cap_drop"] == ["ALL"], name
         assert service["security_opt"] == ["no-new-privileges:true"], name
         assert "KOUXING_INSECURE" not in service["environment"], name
-        assert "KOUXING_ADVERTISE" not in service["environment"], "replicas share the environment"
+        advertised = service["environment"].get("KOUXING_ADVERTISE")  # which replicas would share
+        assert advertised == ("127.0.0.1" if name == "gateway" else None), name
         assert (service.get("user") == "root") == (name == "keys"), name
     dockerfile = (ROOT / "deploy" / "Dockerfile").read_text("utf-8")
     assert f"\nUSER {USER}:{USER}\n" in dockerfile

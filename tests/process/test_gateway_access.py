@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import socket
 import ssl
 import stat
 import subprocess
 import sys
 from collections.abc import Iterator
-from http.client import HTTPResponse, HTTPSConnection
+from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -168,6 +169,35 @@ def test_only_its_own_names_are_answered(
 
 def test_the_made_certificate_is_for_its_owner_alone(gateway: Gateway, certificate: Path) -> None:
     assert stat.S_IMODE(certificate.stat().st_mode) == 0o600
+
+
+def test_plain_http_to_a_proxy_needs_a_token_too_which_is_made_and_shown() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "services.gateway"],
+        cwd=ROOT,
+        env={
+            **os.environ,
+            "KOUXING_CONTROL": NO_CONTROL,
+            "KOUXING_GATEWAY_HOST": "0.0.0.0",  # noqa: S104
+            "KOUXING_GATEWAY_PORT": "0",
+            "KOUXING_GATEWAY_PLAIN_HTTP": "true",
+            "KOUXING_ADVERTISE": "127.0.0.1",
+        },
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stderr is not None
+        shown = (re.search(r"page=http://127.0.0.1:(\d+)/#token=([\w-]{22})", line)
+                 for line in process.stderr)  # fmt: skip
+        port, token = next(filter(None, shown)).groups()
+        for query, status in (("", 403), (f"?token={token}", 101)):
+            with contextlib.closing(HTTPConnection("127.0.0.1", int(port), timeout=60)) as http:
+                http.request("GET", f"/viewer{query}", headers=UPGRADE)
+                assert http.getresponse().status == status
+    finally:
+        process.terminate()
+        process.communicate(timeout=60)
 
 
 @pytest.mark.parametrize(

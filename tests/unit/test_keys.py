@@ -12,6 +12,8 @@ import pytest
 
 from shared.errors import UserError
 from shared.keys import (
+    MAX_KEYS,
+    MAX_ROLES,
     Guest,
     add_guest,
     key_folder,
@@ -22,6 +24,9 @@ from shared.keys import (
     save_guests,
     user_key,
 )
+from shared.wire.codec import decode, encode
+from shared.wire.control import AllowedKey, AllowedKeys
+from shared.wire.message import MAX_MESSAGE_BYTES
 
 pytestmark = pytest.mark.unit
 
@@ -153,6 +158,45 @@ def test_a_revoked_key_is_allowed_no_longer_and_its_name_is_free(tmp_path: Path)
 def test_a_wrong_name_or_role_is_refused(tmp_path: Path, name: str, role: str) -> None:
     with pytest.raises(UserError, match=role if name == "a" else name):
         add_guest(name, (role,), tmp_path / "new")
+
+
+def test_more_roles_than_services_can_be_told_are_refused(tmp_path: Path) -> None:
+    roles = [f"subscriber:s{number}" for number in range(MAX_ROLES + 1)]
+    add_guest("few", roles[1:], tmp_path / "few.key")
+    before = read_guests()
+    with pytest.raises(UserError, match="many has 17 roles, a key may have 16"):
+        add_guest("many", roles, tmp_path / "many.key")
+    assert read_guests() == before
+    assert not (tmp_path / "many.key").exists()
+
+
+@pytest.mark.parametrize(
+    ("roles", "number"),
+    [(["client"], MAX_KEYS - 1), ([f"subscriber:{n:064}" for n in range(MAX_ROLES)], 580)],
+)
+def test_more_keys_than_services_can_be_told_are_refused_and_may_be_revoked(
+    tmp_path: Path, roles: list[str], number: int
+) -> None:
+    lines = [f"{n:040} name-{n:055} {' '.join(roles)}\n" for n in range(number + 20)]
+    add_guest("first", ("client",), tmp_path / "first.key")
+    allowed = key_folder() / "allowed"
+    with allowed.open("a", encoding="ascii") as file:
+        file.writelines(lines[:number])
+    told = AllowedKeys(
+        keys={
+            public: AllowedKey(name=guest.name, roles=list(guest.roles))
+            for public, guest in read_guests().items()
+        }
+    )
+    assert decode(encode(told)) == told
+    assert sum(map(len, encode(told))) < MAX_MESSAGE_BYTES
+    with allowed.open("a", encoding="ascii") as file:
+        file.writelines(lines[number:])
+    with pytest.raises(UserError, match=f"{allowed}: .*'kouxing keys revoke' some"):
+        read_guests()
+    with pytest.raises(UserError, match="'kouxing keys revoke' some"):
+        add_guest("last", roles, tmp_path / "last.key")
+    revoke_guest("first")
 
 
 @pytest.mark.parametrize(
