@@ -48,6 +48,8 @@ check: .venv/installed-dev $(PAGE)/node_modules/.bin/eslint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/gdlint examples/godot/*.gd
+	$(BIN)/gdformat --check --diff examples/godot/*.gd
 	$(NPM) $(PAGE) run lint
 	cd $(MOS) && PATH="$(CURDIR)/$(BIN):$$PATH" $(CURDIR)/$(PAGE)/node_modules/.bin/eslint --max-warnings 0 -c $(CURDIR)/$(PAGE)/eslint.config.mjs .
 	$(NPM) $(RIVALS) run lint

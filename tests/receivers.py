@@ -19,6 +19,18 @@ from services.senders.vtube_studio import Dialogue, parameters
 SENT = (
     "vmc://", "vmc://?shapes=arkit", "livelink://", "osc://", "osc://?shapes=oculus", "vts://",
 )  # fmt: skip
+# the weights of Live Link Face in their order, as the protocol numbers them from 0
+LIVE_LINK_ORDER = """
+    eyeBlinkLeft eyeLookDownLeft eyeLookInLeft eyeLookOutLeft eyeLookUpLeft eyeSquintLeft
+    eyeWideLeft eyeBlinkRight eyeLookDownRight eyeLookInRight eyeLookOutRight eyeLookUpRight
+    eyeSquintRight eyeWideRight jawForward jawLeft jawRight jawOpen mouthClose mouthFunnel
+    mouthPucker mouthLeft mouthRight mouthSmileLeft mouthSmileRight mouthFrownLeft mouthFrownRight
+    mouthDimpleLeft mouthDimpleRight mouthStretchLeft mouthStretchRight mouthRollLower
+    mouthRollUpper mouthShrugLower mouthShrugUpper mouthPressLeft mouthPressRight
+    mouthLowerDownLeft mouthLowerDownRight mouthUpperUpLeft mouthUpperUpRight browDownLeft
+    browDownRight browInnerUp browOuterUpLeft browOuterUpRight cheekPuff cheekSquintLeft
+    cheekSquintRight noseSneerLeft noseSneerRight tongueOut
+""".split()
 Messages = list[tuple[str, list[Any]]]
 
 

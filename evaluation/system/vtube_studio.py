@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 import time
 from types import TracebackType
@@ -11,6 +12,8 @@ from types import TracebackType
 from aiohttp import WSMsgType, web
 
 Answer = tuple[str, dict[str, object]]  # kind and data
+API = {"apiName": "VTubeStudioPublicAPI", "apiVersion": "1.0"}
+MAX_VALUE = 1e6
 PARAMETERS = ("MouthOpen", "MouthSmile", "EyeOpenLeft", "FaceAngleX", "MousePositionX")
 
 
@@ -75,26 +78,26 @@ class VTubeStudioStub:
             if message.type is not WSMsgType.TEXT:
                 continue
             asked = json.loads(message.data)
-            kind, data = asked["messageType"], asked.get("data", {})
+            kind, data = asked.get("messageType"), asked.get("data", {})
             if kind == "AuthenticationRequest":
-                authenticated_by = data["authenticationToken"]
+                authenticated_by = data.get("authenticationToken", "")
             is_authenticated = bool(self.token) and authenticated_by == self.token
-            answered, answer = self._answer(kind, data, is_authenticated)
+            fault = _fault(asked) or _plugin_fault(kind, data)
+            answered, answer = fault or self._answer(kind, data, is_authenticated)
             await client.send_json(
                 {
-                    "apiName": "VTubeStudioPublicAPI",
-                    "apiVersion": "1.0",
+                    **API,
                     "timestamp": 1625405710728,
-                    "requestID": asked["requestID"],
+                    "requestID": asked.get("requestID", ""),
                     "messageType": answered,
                     "data": answer,
                 }
             )
         return client
 
-    def _answer(self, kind: str, data: dict[str, object], is_authenticated: bool) -> Answer:
+    def _answer(self, kind: object, data: dict[str, object], is_authenticated: bool) -> Answer:
         if kind != "InjectParameterDataRequest":
-            self.requests.append(kind)
+            self.requests.append(str(kind))
         if kind == "AuthenticationTokenRequest":
             return self._give_token()
         if kind == "AuthenticationRequest":
@@ -107,7 +110,9 @@ class VTubeStudioStub:
                 "defaultParameters": listed,
                 "customParameters": [],
             }
-        return self._inject(data)
+        if kind == "InjectParameterDataRequest":
+            return self._inject(data)
+        return _error(7, f"Unknown request type: {kind}")
 
     def _give_token(self) -> Answer:
         if self.is_asking:
@@ -118,12 +123,44 @@ class VTubeStudioStub:
         return "AuthenticationTokenResponse", {"authenticationToken": self.token}
 
     def _inject(self, data: dict[str, object]) -> Answer:
-        values = data["parameterValues"]
-        if not isinstance(values, list) or any(each["id"] not in PARAMETERS for each in values):
+        values = data.get("parameterValues")
+        if not isinstance(values, list) or not values:
+            return _error(450, "No data was provided")
+        if data.get("mode", "set") not in ("set", "add"):
+            return _error(455, "Unknown mode")
+        if not all(isinstance(each["value"], int | float) for each in values):
+            return _error(451, "A value is no number")
+        if any(not abs(each["value"]) <= MAX_VALUE for each in values):
+            return _error(451, "A value is out of range")
+        if any(each["id"] not in PARAMETERS for each in values):
             return _error(453, "Parameter not found")
         self.arrived_s.append(time.perf_counter())
         self.frames.append({each["id"]: each["value"] for each in values})
         return "InjectParameterDataResponse", {}
+
+
+def _fault(asked: dict[str, object]) -> Answer | None:
+    """Return what is wrong with a request of whatever kind."""
+    for number, key in ((3, "apiName"), (4, "apiVersion")):
+        if asked.get(key) != API[key]:
+            return _error(number, f"{key} must be {API[key]}")
+    if not re.fullmatch("[0-9A-Za-z]{1,64}", str(asked.get("requestID", "-"))):
+        return _error(5, "requestID must be alphanumeric, with 1 to 64 characters")
+    return None
+
+
+def _plugin_fault(kind: object, data: dict[str, object]) -> Answer | None:
+    """Return what is wrong with how a plugin presents itself, where it does."""
+    if kind not in ("AuthenticationTokenRequest", "AuthenticationRequest"):
+        return None
+    number = 52 if kind == "AuthenticationTokenRequest" else 101
+    for name in ("pluginName", "pluginDeveloper"):
+        if not 3 <= len(str(data.get(name, ""))) <= 32:
+            return _error(number, f"{name} must have 3 to 32 characters")
+        number += 1
+    if kind == "AuthenticationRequest" and not data.get("authenticationToken"):
+        return _error(100, "authenticationToken is missing")
+    return None
 
 
 def _error(number: int, text: str) -> Answer:

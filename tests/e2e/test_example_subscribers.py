@@ -8,13 +8,16 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from shared.client import Client
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream_into
-from tests.system import ROOT, VOWELS_FILE, System
+from tests.scripted_system import Gateway
+from tests.system import ROOT, VOWELS_FILE, System, free_port
 
 FOLDER = ROOT / "examples" / "subscribe"
+STREAM = ROOT / "examples" / "unity" / "KouxingStream.cs"
 NODE = str(Path(sys.executable).with_name("node"))
 
 pytestmark = pytest.mark.e2e
@@ -96,3 +99,42 @@ def test_they_follow_a_face_that_another_synthesizer_makes(
         times = [round(16000 * float(line.split()[0])) for line in lines]
         assert times == sorted(times)
         assert {frame.media_time for frame in collected.frames} <= {*times}
+
+
+def test_the_one_in_c_sharp_follows_a_face_through_the_gateway(
+    system: System, tmp_path: Path
+) -> None:
+    program = tmp_path / "follow.exe"
+    subprocess.run(["mcs", f"-out:{program}", FOLDER / "Follow.cs", STREAM], check=True)
+    gateway = Gateway(system.control, free_port())
+    address = gateway.page.replace("http", "ws").rstrip("/")
+    name = "followed-by-c-sharp"
+    try:
+        with (
+            Client(system.control) as client,
+            subprocess.Popen(
+                ["mono", program, name, address], stdout=subprocess.PIPE, text=True
+            ) as running,
+        ):
+            try:
+                jaw = open_jaw(client, name, running)
+            finally:
+                running.terminate()
+    finally:
+        assert gateway.stop() == 0
+    assert 0.2 < jaw <= 1
+
+
+def open_jaw(client: Client, name: str, follower: subprocess.Popen[str]) -> float:
+    """Speak in a session until a program that follows it prints that the jaw is open."""
+    assert follower.stdout is not None
+    assert follower.stdout.readline() == "0.00\n", "a face at rest"
+    session = client.open_session(session=name, encoding="f32le", paced=False)
+    samples = samples_of_file(VOWELS_FILE)
+    jaw = 0.0
+    while jaw <= 0.2:
+        session.send(samples[:1600])
+        samples = np.roll(samples, -1600)
+        jaw = float(follower.stdout.readline())
+    session.close()
+    return jaw

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from pythonosc.dispatcher import Dispatcher
 from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_server import BlockingOSCUDPServer
+from websockets.sync import client as websockets
 
 from evaluation.system.vtube_studio import VTubeStudioStub
 from services.senders.playout import PAUSE_S, WINDOW_S, Playout
@@ -276,6 +279,51 @@ def test_vtube_studio_asks_once_and_shows_the_face(senders: Senders) -> None:
         wait_until(lambda: bool(stub.frames))
         assert stub.requests == ["AuthenticationRequest", "InputParameterListRequest"]
         assert problem(senders, url) == ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "changed", "data", "number"),
+    [
+        ("AuthenticationTokenRequest", {"apiName": "VTubeStudio"}, {}, 3),
+        ("AuthenticationTokenRequest", {"apiVersion": "2.0"}, {}, 4),
+        ("AuthenticationTokenRequest", {"requestID": "-"}, {}, 5),
+        ("AuthenticationTokenRequest", {}, {"pluginName": "k"}, 52),
+        ("AuthenticationTokenRequest", {}, {"pluginDeveloper": "k" * 33}, 53),
+        ("AuthenticationRequest", {}, {"authenticationToken": ""}, 100),
+        ("AuthenticationRequest", {}, {"pluginName": ""}, 101),
+        ("AuthenticationRequest", {}, {"pluginDeveloper": ""}, 102),
+        ("MoveRequest", {}, {}, 7),
+        ("InjectParameterDataRequest", {}, {"parameterValues": []}, 450),
+        ("InjectParameterDataRequest", {}, {"mode": "mix"}, 455),
+        (
+            "InjectParameterDataRequest",
+            {},
+            {"parameterValues": [{"id": "MouthOpen", "value": 2e6}]},
+            451,
+        ),
+        ("InjectParameterDataRequest", {}, {"parameterValues": [{"id": "Jaw", "value": 1}]}, 453),
+    ],
+)
+def test_the_vtube_studio_of_these_tests_refuses_what_the_true_one_does(
+    kind: str, changed: dict[str, str], data: dict[str, object], number: int
+) -> None:
+    plugin = {"pluginName": "kouxing", "pluginDeveloper": "kouxing", "authenticationToken": "t"}
+    values = {"parameterValues": [{"id": "MouthOpen", "value": 1.0}], "mode": "set"}
+    request = {"apiName": "VTubeStudioPublicAPI", "apiVersion": "1.0", "requestID": "1"}
+    with (
+        VTubeStudioStub(token="t") as stub,
+        websockets.connect(f"ws://127.0.0.1:{stub.port}") as api,
+    ):
+
+        def ask(kind: str, changed: dict[str, str], data: dict[str, object]) -> dict[str, Any]:
+            api.send(json.dumps({**request, "messageType": kind, "data": data} | changed))
+            return dict(json.loads(api.recv(LIMIT_S)))
+
+        assert ask("AuthenticationRequest", {}, {**plugin})["data"]["authenticated"]
+        answer = ask("InjectParameterDataRequest", {}, {**values})
+        assert answer["messageType"] == "InjectParameterDataResponse"
+        answer = ask(kind, changed, {**plugin, **values, **data})
+        assert (answer["messageType"], answer["data"]["errorID"]) == ("APIError", number)
 
 
 def test_a_user_who_denies_is_not_asked_again(senders: Senders) -> None:
