@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import resource
-import socket
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from random import Random
 from typing import Self
 
 import numpy as np
@@ -23,6 +21,7 @@ from shared.client import Client, Session
 from shared.connections import MAX_CONNECTIONS
 from shared.wire.face import FapFrame
 from tests.e2e.following import stream
+from tests.raw_bytes import pour
 from tests.system import System
 
 pytestmark = pytest.mark.e2e
@@ -168,33 +167,7 @@ def test_with_very_many_connections_sessions_still_open(few_files: System) -> No
     few_files.assert_all_alive()
 
 
-def raw_bytes(random: Random) -> bytes:
-    """Return what no peer says, after a beginning that some peer might say."""
-    beginnings = [
-        b"",
-        attackers.GREETING,
-        attackers.GREETING + attackers.ready("DEALER"),
-        attackers.GREETING + attackers.ready("SUB"),
-        attackers.GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32),
-        b"\xff" + bytes(8) + b"\x7f\x01\x05",
-        b"\x01\x00",
-        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n",
-        b"POST / HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\nffffffff\r\n",
-        b"\x16\x03\x01",
-    ]
-    return random.choice(beginnings) + random.randbytes(random.choice([1, 10, 100, 10_000]))
-
-
 def test_raw_bytes_at_every_port_harm_nobody(system: System, witness: Session) -> None:
-    random = Random(1)  # noqa: S311 - the same bytes every time
     for port in system.ports:
-        end_s = time.monotonic() + SECONDS
-        while time.monotonic() < end_s:
-            with (
-                contextlib.suppress(OSError),
-                socket.create_connection(("127.0.0.1", port), timeout=0.02) as connection,
-            ):
-                for _ in range(random.choice([1, 1, 20])):
-                    connection.sendall(raw_bytes(random))
-                connection.recv(1000)
+        pour(port, SECONDS)
     system.assert_all_alive()

@@ -10,6 +10,7 @@ from evaluation.system import attackers
 from evaluation.system.attacks import wait_until_let_in
 from evaluation.system.memory import Memory
 from shared.client import Client, Session
+from tests.raw_bytes import pour
 from tests.system import System
 
 pytestmark = pytest.mark.e2e
@@ -50,3 +51,10 @@ def test_a_key_that_is_allowed_is_bounded(
     attackers.ALLOWED[attack](system.endpoints()[target], SECONDS)
     assert memory.growth_mb < MAX_GROWTH_MB
     assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
+
+
+def test_raw_bytes_at_every_port_harm_nobody(system: System, witness: Session) -> None:
+    for port in system.ports:
+        pour(port, SECONDS / 4)
+    system.assert_all_alive()
+    wait_until_let_in(system.control)

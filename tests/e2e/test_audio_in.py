@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import difflib
 import json
 import socket
 import wave
 from collections.abc import Callable, Coroutine, Iterator
+from random import Random
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -24,6 +26,7 @@ from services.gateway.wire import FAP_TYPE, SHAPES_TYPE
 from shared.face.shapes import ARKIT
 from shared.phones.inventory import load_inventory
 from tests.e2e.following import samples_of_file, stream
+from tests.raw_bytes import pour
 from tests.scripted_system import Gateway
 from tests.system import DEMO, System, free_port
 
@@ -255,3 +258,44 @@ def test_what_is_no_offer_of_opus_is_refused(
             assert (answer.status, told in await answer.text()) == (status, True)
 
     asyncio.run(post())
+
+
+NONSENSE: list[str | bytes] = [
+    "", "{", "null", "[]", "5", '"x"', '{"type": "x"}', '{"a":' * 1000, "\0", "人" * 1000,
+    '{"config": 5}', '{"config": {"sample_rate": "x"}}', '{"config": {"sample_rate": -1}}',
+    '{"config": {"encoding": []}}', '{"session": {}}', '{"lips": 1}', '{"flush": "x"}',
+    '{"reset": 0}', '{"expressions": {"joy": NaN}}', '{"voice": "%%"}', '{"eof": 1}',
+    b"", b"\0", b"\xff" * 7, bytes(20_000), b"RIFF" + bytes(60),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("path", ["viewer", "microphone", "vosk"])
+def test_nonsense_at_the_gateway_harms_nobody(
+    gateway: Gateway, vosk_port: int, expected: list[str], path: str
+) -> None:
+    random = Random(path)  # noqa: S311 - the same every time
+    url = f"{gateway.page}{path}".replace("http", "ws")
+
+    async def talk() -> None:
+        for _ in range(20):
+            with contextlib.suppress(websockets.WebSocketException, TimeoutError):
+                async with asyncio.timeout(1), websockets.connect(url, close_timeout=1) as client:
+                    for _ in range(random.choice([1, 3, 10])):
+                        await client.send(random.choice(NONSENSE))
+                    await client.recv()
+
+    for port in (int(urlsplit(gateway.page).port or 0), vosk_port):
+        pour(port, 0.5)
+    asyncio.run(talk())
+    assert gateway.process.poll() is None
+    replies: list[dict[str, Any]] = []
+
+    async def recognize(client: Socket) -> None:
+        with SPOKEN.open("rb") as file:
+            while data := file.read(8000):
+                replies.append(await ask(client, data))
+        replies.append(await ask(client, '{"eof" : 1}'))
+
+    if path == "vosk":  # once for all: the others' sessions have ended
+        connect(url, recognize)
+        assert [word["word"] for word in words_of(replies)] == expected

@@ -19,6 +19,7 @@ from shared.audio_file import read_audio
 from shared.client import Client
 from shared.config import variable
 from shared.wire.face import EndOfFaps, FapFrame
+from tests.raw_bytes import pour
 from tests.system import ROOT, VOWELS_FILE, System, free_port
 
 pytestmark = pytest.mark.process
@@ -46,6 +47,8 @@ def families(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, lis
             assert output.wait(60.0)
         before = _heartbeats(client)
         system.wait_until(lambda _: _heartbeats(client) > before + 2)  # they set the gauges
+        for port in ports.values():
+            pour(port, 0.2)  # which the pages outlast
         yield {
             name: list(text_string_to_metric_families(_page(port))) for name, port in ports.items()
         }
