@@ -170,6 +170,10 @@ class Socket:
         if self._guarded is not None:
             self._guarded.drained()
 
+    def is_open(self, connection: int) -> bool:
+        """Return whether the connection of a number, to this bound socket, has not ended."""
+        return self._guarded is not None and self._guarded.is_open(connection)
+
     def ended(self) -> Iterator[int]:
         """Yield the numbers of connections to this bound socket that have ended since."""
         if self._guarded is not None:
