@@ -350,18 +350,23 @@ class Bus:
         return socket
 
     def is_refused(self, endpoint: str) -> bool:
-        """Return whether somebody listens there who does not accept this key, or has another."""
+        """Return whether somebody listens there who does not accept this key, or has another.
+
+        Whoever refuses closes the connection, when the time for a handshake is over at the latest;
+        who only says nothing hangs.
+        """
         probe = self._connect(zmq.DEALER, queue_length=1)
+        probe.raw.setsockopt(zmq.HANDSHAKE_IVL, 3 * HANDSHAKE_MS)  # not closed from here first
         ends = {zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_CONNECT_RETRIED}
         monitor = probe.raw.get_monitor_socket(sum({zmq.EVENT_CONNECTED, *ends}))
         probe.connect(endpoint)
         events: set[int] = set()
-        while not events & ends and monitor.poll(HANDSHAKE_MS):
+        while not events & ends and monitor.poll(2 * HANDSHAKE_MS):
             events.add(recv_monitor_message(monitor)["event"])
         probe.raw.disable_monitor()
         monitor.close()
         self.drop(probe, linger_s=0.0)
-        return zmq.EVENT_CONNECTED in events and zmq.EVENT_HANDSHAKE_SUCCEEDED not in events
+        return {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
 
     def poller(self) -> Poller:
         """Return a poller for sockets of this bus."""
