@@ -185,6 +185,10 @@ class Socket:
         if self._guarded is not None:
             self._guarded.drained()
 
+    def is_open(self, connection: int) -> bool:
+        """Return whether the connection of a number, to this bound socket, has not ended."""
+        return self._guarded is not None and self._guarded.is_open(connection)
+
     def ended(self) -> Iterator[int]:
         """Yield the numbers of connections to this bound socket that have ended since."""
         if self._guarded is not None:
@@ -380,18 +384,23 @@ class Bus:
         return socket
 
     def is_refused(self, endpoint: str) -> bool:
-        """Return whether somebody listens there who does not accept this key, or has another."""
+        """Return whether somebody listens there who does not accept this key, or has another.
+
+        Whoever refuses closes the connection, when the time for a handshake is over at the latest;
+        who only says nothing hangs.
+        """
         probe = self._connect(zmq.DEALER, queue_length=1)
+        probe.raw.setsockopt(zmq.HANDSHAKE_IVL, 3 * HANDSHAKE_MS)  # not closed from here first
         ends = {zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_CONNECT_RETRIED}
         monitor = probe.raw.get_monitor_socket(sum({zmq.EVENT_CONNECTED, *ends}))
         probe.connect(endpoint)
         events: set[int] = set()
-        while not events & ends and monitor.poll(HANDSHAKE_MS):
+        while not events & ends and monitor.poll(2 * HANDSHAKE_MS):
             events.add(recv_monitor_message(monitor)["event"])
         probe.raw.disable_monitor()
         monitor.close()
         self.drop(probe, linger_s=0.0)
-        return zmq.EVENT_CONNECTED in events and zmq.EVENT_HANDSHAKE_SUCCEEDED not in events
+        return {zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_RETRIED} <= events
 
     def poller(self) -> Poller:
         """Return a poller for sockets of this bus."""

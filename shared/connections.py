@@ -320,6 +320,10 @@ class Guarded:
         """Note that a connection has ended."""
         self._ended.append(connection.inode)
 
+    def is_open(self, number: int) -> bool:
+        """Return whether the connection of a number has not ended."""
+        return self._guard.is_open(number)
+
     def ended(self) -> Iterator[int]:
         """Yield the numbers of the connections that have ended since the last call."""
         while self._ended:
@@ -411,6 +415,11 @@ class Guard:
         if known is not None or inode is None or port != _port(descriptor):
             return known
         return self._connections.setdefault(inode, Connection(descriptor, inode))
+
+    def is_open(self, inode: int) -> bool:
+        """Return whether a connection has not ended."""
+        known = self._connections.get(inode)
+        return known is not None and known.exists()
 
     def connections_to(self, guarded: Guarded) -> list[Connection]:
         """Return the connections to a socket."""

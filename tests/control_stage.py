@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import zmq
 
@@ -10,6 +11,7 @@ from evaluation.system.attackers import connect
 from services.control.config import ControlConfig
 from services.control.service import ControlService
 from shared.bus import Bus, Socket
+from shared.endpoints import key_of, with_key
 from shared.keys import Key, own_key
 from shared.wire.codec import decode, encode
 from shared.wire.control import Heartbeat, StartSession
@@ -55,27 +57,33 @@ class Stage:
         for bus in (*self.buses, self.control.bus):
             bus.close()
 
-    def stranger(self, key: Key | None) -> zmq.Socket[bytes]:
-        """Return a socket that calls itself as all others do."""
+    def stranger(self, key: Key | None, address: str = "") -> zmq.Socket[bytes]:
+        """Return a socket that calls itself as all others do; it may connect by a forwarder."""
         raw = self.sockets.socket(zmq.DEALER)
         self.strangers.append(raw)
         raw.setsockopt(zmq.ROUTING_ID, b"the same")
         endpoint = self.control.endpoints["commands"]
+        if address:
+            endpoint = with_key(address, key_of(endpoint))
         raw.connect(endpoint) if key is None else connect(raw, endpoint, key)
         return raw
 
     def open(self, raw: zmq.Socket[bytes], session: str, request: str = "1") -> Message:
         """Ask for a session; return the answer."""
         raw.send_multipart(encode(OpenSession(request=request, session=session)))
+        self.step_until(lambda: bool(raw.poll(0)))
+        answer = decode(raw.recv_multipart())
+        assert isinstance(answer, Message)
+        return answer
+
+    def step_until(self, condition: Callable[[], object]) -> None:
+        """Let control and the services work."""
         end_s = time.monotonic() + 20
-        while not raw.poll(0):
+        while not condition():
             assert time.monotonic() < end_s
             self.control.step(0.01)
             for service in self.services:
                 self._start(service)
-        answer = decode(raw.recv_multipart())
-        assert isinstance(answer, Message)
-        return answer
 
     def _start(self, service: Socket) -> None:
         for received in service.receive():

@@ -253,6 +253,11 @@ class ControlService(Service):
         known = self._sessions.opened_by(message, sender)
         if known is not None and known.restored:
             return self._sessions.opened_message(known, self.endpoints["events"])
+        if known is not None and not self._commands.is_open(known.client.connection):
+            known.client = sender  # who was cut off, and waits here now
+            if known.announced and known.next_sequence == 1:  # without the token no audio comes
+                self._end(known, "its client was cut off before it was told")
+                known = None
         if known is not None and not known.announced:
             return None  # the same request again while the services start
         record = self._sessions.open(message, sender, time.monotonic())

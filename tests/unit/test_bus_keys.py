@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import zmq
 from evaluation.system.attackers import connect
 from shared import connections
 from shared.bus import Bus, Socket
+from shared.client import Client
 from shared.config import ServiceConfig
 from shared.endpoints import split_endpoint, with_key
 from shared.errors import UserError
@@ -23,6 +27,7 @@ from shared.wire.control import AllowedKey, AllowedKeys, StatusRequest
 from shared.wire.face import FapFrame
 from shared.wire.message import Message
 from shared.wire.session import Joined
+from tests.system import ROOT
 
 pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"
@@ -140,6 +145,29 @@ def test_one_key_has_not_all_connections_wherever_they_come_from(
 def test_nobody_is_refused_where_nobody_listens(server: Server) -> None:
     with Bus(server.key) as bus:
         assert not bus.is_refused(with_key("tcp://127.0.0.1:1", server.key.public))
+
+
+def test_who_hangs_does_not_answer_and_refuses_nobody() -> None:
+    program = (
+        "import sys, time; from tests.unit.test_bus_keys import Server;"
+        "_, endpoint = Server().router('control.commands');"
+        "print(endpoint, flush=True); time.sleep(600)"
+    )
+    key = key_of("laptop", "client")
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    ) as control:
+        assert control.stdout is not None
+        endpoint = control.stdout.readline().strip()
+        control.send_signal(signal.SIGSTOP)
+        try:
+            with (
+                Client(endpoint, key=key, deadline_s=0.5) as client,
+                pytest.raises(UserError, match="does not answer"),
+            ):
+                client.status()
+        finally:
+            control.kill()
 
 
 @pytest.mark.parametrize("with_keys", [True, False])

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import zmq
 
 from shared.keys import user_key
-from shared.wire.session import SessionOpened
+from shared.wire.codec import encode
+from shared.wire.control import SessionInput
+from shared.wire.session import OpenSession, SessionOpened
 from tests.control_stage import Stage
+from tests.forwarders import Link
 
 pytestmark = pytest.mark.unit
 
@@ -29,6 +36,54 @@ def test_a_request_that_is_repeated_has_the_same_answer(stage: Stage) -> None:
     first = stage.open(client, "mine")
     assert isinstance(first, SessionOpened)
     assert stage.open(client, "mine") == first
+
+
+@pytest.fixture
+def link(stage: Stage) -> Iterator[Link]:
+    """Pass on what comes to control."""
+    port = stage.control.endpoints["commands"].partition(" ")[0].rpartition(":")[2]
+    made = Link((), socket.create_server(("127.0.0.1", 0)), ("127.0.0.1", int(port)))
+    made.start()
+    yield made
+    made.close()
+
+
+def cut_off_before_it_is_told(stage: Stage, link: Link) -> tuple[zmq.Socket[bytes], str]:
+    """Return a client that never gets the answer to its request, and the token in it."""
+    address = f"tcp://127.0.0.1:{link.listener.getsockname()[1]}"
+    client = stage.stranger(stage.control.key and user_key(), address)
+    client.send_multipart(encode(OpenSession(request="1", session="mine")))
+    stage.step_until(lambda: stage.control._sessions.get("mine"))
+    link.is_open.clear()
+    lost = stage.control._sessions.find("mine")
+    stage.step_until(lambda: lost.announced)
+    for end in link.ends:
+        with contextlib.suppress(OSError):
+            end.shutdown(socket.SHUT_RDWR)
+    link.is_open.set()
+    stage.step_until(lambda: not stage.control._commands.is_open(lost.client.connection))
+    return client, lost.token
+
+
+def test_who_is_cut_off_before_it_is_told_opens_the_session_anew(stage: Stage, link: Link) -> None:
+    client, lost = cut_off_before_it_is_told(stage, link)
+    opened = stage.open(client, "mine")
+    assert isinstance(opened, SessionOpened)
+    assert opened.token not in ("", lost)
+    assert len(stage.control._sessions) == 1
+    assert stage.open(client, "mine") == opened
+
+
+def test_a_session_with_sound_is_not_opened_anew(stage: Stage, link: Link) -> None:
+    client, _ = cut_off_before_it_is_told(stage, link)
+    record = stage.control._sessions.find("mine")
+    recognizer = dataclasses.replace(
+        stage.control._registry["recognizer"].heartbeat, sessions={"mine": SessionInput(sequence=1)}
+    )
+    endpoints = dict.fromkeys(recognizer.endpoints, "tcp://127.0.0.1:1")
+    stage.services[0].send(dataclasses.replace(recognizer, endpoints=endpoints))
+    stage.step_until(lambda: record.next_sequence == 2)
+    assert getattr(stage.open(client, "mine"), "code", "") == "session-exists"
 
 
 def test_whoever_takes_anothers_name_and_key_gets_no_answer_of_it(stage: Stage) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import time
 from pathlib import Path
@@ -114,17 +115,21 @@ def test_the_pages_token_is_told_to_those_who_may_open_sessions_and_to_services(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    stage = Stage(insecure=False)
     page = "https://face.example:8080/"
+    beat = Heartbeat(
+        service="gateway",
+        instance="gateway",
+        role="observer",
+        state="ready",
+        sent_ns=0,
+        endpoints={"page": f"{page}#token=secret"},
+    )
     told: dict[str, str] = {}
-    for role in ("service:gateway", "client", "subscriber:*", "subscriber:s", "operator"):
-        with Bus(own_key(f"key-{len(told)}", (role,))) as bus:
+    with contextlib.closing(Stage(insecure=False)) as stage, contextlib.ExitStack() as buses:
+        for role in ("service:gateway", "client", "subscriber:*", "subscriber:s", "operator"):
+            bus = buses.enter_context(Bus(own_key(f"key-{len(told)}", (role,))))
             asker = bus.connect_dealer(stage.control.endpoints["commands"])
             if role.startswith("service"):
-                beat = Heartbeat(
-                    service="gateway", instance="gateway", role="observer", state="ready",
-                    sent_ns=0, endpoints={"page": f"{page}#token=secret"},
-                )  # fmt: skip
                 asker.send(beat)
             report = ask(stage, asker)
             assert isinstance(report, StatusReport)
@@ -138,4 +143,3 @@ def test_the_pages_token_is_told_to_those_who_may_open_sessions_and_to_services(
         "subscriber:s": "",
         "operator": "",
     }
-    stage.close()
