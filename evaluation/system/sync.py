@@ -18,6 +18,8 @@ from rich.table import Table
 from evaluation.system.chromium import Chromium
 
 APART_MS = 200.0  # between a click and its picture at most, and between two clicks at least
+AROUND_MS = (500.0, 250.0)  # of a click: the time before it and after it for which it counts
+MAX_GAP_MS = 70.0  # between two pictures; a page that the processor draws has one each 50 ms
 # Before the page's own scripts: what is connected to the loudspeaker is also looked at.
 _PROBE = """
 window.probe = { clicks: new Map(), pictures: [] };
@@ -101,6 +103,24 @@ def offsets_ms(clicks_ms: NDArray[np.float64], seen_ms: NDArray[np.float64]) -> 
     """Return how long after what was seen each click was heard, ms, of those with a picture."""
     nearest = [float(min(click - seen_ms, key=abs)) for click in clicks_ms if len(seen_ms)]
     return [offset for offset in nearest if abs(offset) <= APART_MS]
+
+
+def with_pictures(
+    clicks_ms: NDArray[np.float64], seen_ms: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the clicks around which pictures could be drawn: none waited for long for the next."""
+    gaps_ms = np.diff(seen_ms)
+    before, after = AROUND_MS
+    return np.array(
+        [
+            click
+            for click in clicks_ms
+            if seen_ms[0] < click - before
+            and seen_ms[-1] > click + after
+            and gaps_ms[(seen_ms[1:] > click - before) & (seen_ms[:-1] < click + after)].max()
+            < MAX_GAP_MS
+        ]
+    )
 
 
 def summary(offsets: Sequence[float]) -> Offsets:
