@@ -30,10 +30,8 @@ from shared.phones.events import LipFrame
 
 PRE_ROLL_S = 0.20  # sound before the detector's decision that counts as speech: weak consonants
 _FIRST_NEWEST_FRAME = 2  # the last one that the network's first position has seen
-# Speech begins at such a frame that blocks of the network always lie at multiples of 100 ms of the
-# sound, also in another recognizer that goes on in the midst of it. At an odd one every position
-# ends POSITION_LAG_S before a multiple of 20 ms, and speech at the very beginning loses little.
-_START_GRID, _FIRST_ON_GRID = 10, 1  # frames
+# Speech begins at an odd frame. So every position ends POSITION_LAG_S before a multiple of 20 ms.
+_FIRST_FRAME_PARITY = 1
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
 
 
@@ -103,7 +101,7 @@ class SpeechScores:
     def _reset_frames(self) -> None:
         self._front_end = self._model.front_end()
         self._block = np.empty(0, dtype=np.float32)
-        self._recent: deque[NDArray[np.float32]] = deque(maxlen=_PRE_ROLL_FRAMES + _START_GRID - 1)
+        self._recent: deque[NDArray[np.float32]] = deque(maxlen=_PRE_ROLL_FRAMES)
         self._num_frames = 0
         self._speaking = False
         self._lip_frames: list[LipFrame] = []  # not yet returned
@@ -163,16 +161,15 @@ class SpeechScores:
     def _detect(self) -> ScoringTask[list[ScoreEvent]]:
         """Begin or end speech by the block that is complete."""
         speech = self._detector.accept_block(self._block).is_speech
-        oldest = self._num_frames - len(self._recent)
-        num_skipped = (_FIRST_ON_GRID - oldest) % _START_GRID
-        has_begun = len(self._recent) - num_skipped >= FRAMES_PER_POSITION
-        if speech and not self._speaking and has_begun:
+        if speech and not self._speaking and len(self._recent) >= FRAMES_PER_POSITION:
             self._speaking = True
-            start = SpeechStart(oldest + num_skipped)
+            if (self._num_frames - len(self._recent)) % FRAMES_PER_POSITION != _FIRST_FRAME_PARITY:
+                self._recent.popleft()
+            start = SpeechStart(self._num_frames - len(self._recent))
             self._next_newest = start.frame + _FIRST_NEWEST_FRAME
             if self._lips is not None:
                 self._lips.reset()
-            pre_roll = np.array(self._recent)[num_skipped:]
+            pre_roll = np.array(self._recent)
             self._recent.clear()
             return [start, *(yield from self._score(pre_roll))]
         if self._speaking and not speech:

@@ -180,7 +180,7 @@ def test_phones_too_many_are_withdrawn() -> None:
     recognizer = Recognizer(model, sample_rate_hz=16_000, min_confidence=0.0)
     events = recognizer.decode([SpeechStart(0)])
     for start in range(0, len(rows), 10):  # provisional scores of other sounds
-        other = np.roll(rows, 40, axis=0)[start : start + 20]
+        other = np.roll(rows, 50, axis=0)[start : start + 20]
         events += recognizer.decode([FrameScores(rows[start : start + 10], other)])
     events += recognizer.decode([SpeechEnd(len(rows))])
     phones = [event for event in events if isinstance(event, Phone)]
