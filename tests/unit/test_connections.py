@@ -9,6 +9,7 @@ import socket
 import stat
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -348,7 +349,8 @@ def test_what_a_reused_descriptor_brings_counts_against_nobody(
 
 def sockets() -> set[int]:
     """The descriptors of this process that are sockets."""
-    return {each for each in map(int, os.listdir("/proc/self/fd")) if is_socket(each)}
+    descriptors = [int(each.name) for each in Path("/proc/self/fd").iterdir()]
+    return {each for each in descriptors if is_socket(each)}
 
 
 def is_socket(descriptor: int) -> bool:
