@@ -219,6 +219,7 @@ def test_one_that_sends_only_what_is_refused_is_cut(bus: Bus) -> None:
     with connected(port_of(audio)) as hostile:
         hostile.settimeout(0.001)
         bad = frame(b"nothing/s/", more=True) + frame(b"\x80")
+        bad *= 10  # a busy machine gives credit back meanwhile
         for _ in range(10_000):
             try:
                 hostile.sendall(bad)
