@@ -13,6 +13,7 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 
 from tests.system import System
+from tests.videos import write_video
 
 STARTS_SERVICES = {"bench", "e2e", "process"}  # folders whose tests start services
 PARTS = ("e2e/test_co", "e2e/test_o")  # where the second and the third third of them begin
@@ -64,3 +65,11 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     folder = tmp_path_factory.mktemp("system")
     with System(("control", "recognizer", "synthesizer", "driver"), folder) as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny video with sound."""
+    path = tmp_path_factory.mktemp("video") / "video.mp4"
+    write_video(path)
+    return path

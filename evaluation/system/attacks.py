@@ -48,6 +48,7 @@ PHASE_S = 3.0
 SLACK_S = 0.5  # in which a session opens
 RETURN_S = 3.0  # for memory to come back
 LET_IN_S = 0.5  # that a connection lasts unless it is cut
+AT_ENDPOINT = {**ALLOWED, **SESSIONS}  # the others attack a port
 ATTACKED = {  # sockets, by whether others have keys; then nobody else gets far
     False: ("commands", "audio", "faps"),
     True: ("audio",),
@@ -219,8 +220,8 @@ def _attack(attack: str, target: str, endpoint: str, begins: Event) -> None:
         if not endpoint:
             continue
         with contextlib.suppress(OSError):  # refused
-            if attack in (at_endpoint := {**ALLOWED, **SESSIONS}):
-                at_endpoint[attack](endpoint, 1.0)
+            if attack in AT_ENDPOINT:
+                AT_ENDPOINT[attack](endpoint, 1.0)
             else:
                 address = endpoint.partition(" ")[0].rstrip("/")
                 kind = TARGETS[target][2] if target in TARGETS else ""

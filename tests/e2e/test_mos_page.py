@@ -22,7 +22,6 @@ from evaluation.mos.store import Store, read_answers
 from evaluation.mos.study import load_study, new_study
 from evaluation.system.chromium import Chromium
 from tests.system import ROOT, free_port
-from tests.videos import write_video
 
 pytestmark = pytest.mark.e2e
 
@@ -94,13 +93,6 @@ class Served:
         store.close()
         assert judge is not None
         return judge.beeps
-
-
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("video") / "video.mp4"
-    write_video(path)
-    return path
 
 
 @pytest.fixture

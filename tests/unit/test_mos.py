@@ -39,13 +39,6 @@ CONDITIONS = ("real", "live", "late", "still")
 SENTENCES = tuple("abcdefgh")
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("video") / "video.mp4"
-    write_video(path)
-    return path
-
-
 @pytest.fixture
 def folder(tmp_path: Path, video: Path) -> Path:
     """Return a folder of videos of every sentence in every condition."""
