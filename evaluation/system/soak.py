@@ -147,10 +147,7 @@ def measure(
                     num_phones=len(symbols),
                     num_unfinished=num_unfinished,
                     num_lost=lost_phones(second, symbols) if is_compared else None,
-                    memory_mb={
-                        state.service: state.metrics["memory_mb"]
-                        for state in client.status().services
-                    },
+                    memory_mb=_memory_mb(client),
                 )
             )
             on_round(rounds)
@@ -206,6 +203,18 @@ def _wait_until(condition: Callable[[], bool], listener: Listener) -> None:
         elif time.monotonic() > end_s:
             raise UserError("the services take no more sound")
     listener.wait(0.0)
+
+
+def _memory_mb(client: Client) -> dict[str, float]:
+    """Return what each service takes; one that is taken for lost is waited for."""
+    end_s = time.monotonic() + LIMIT_S
+    while True:
+        states = {state.service: state.metrics["memory_mb"] for state in client.status().services}
+        if states.keys() >= {*SERVING}:
+            return states
+        if time.monotonic() > end_s:
+            raise UserError(f"{', '.join({*SERVING} - states.keys())}: lost for {LIMIT_S:g} s")
+        time.sleep(0.1)
 
 
 def lost_phones(before: Sequence[str], symbols: Sequence[str]) -> int:

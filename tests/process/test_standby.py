@@ -23,7 +23,15 @@ def standing_by() -> list[int]:
     """Return the numbers of the processes of this one that stand by."""
     lists = [each.read_text("ascii") for each in Path("/proc/self/task").glob("*/children")]
     numbers = map(int, " ".join(lists).split())
-    return [each for each in numbers if b"standby" in Path(f"/proc/{each}/cmdline").read_bytes()]
+    return [each for each in numbers if b"standby" in command_of(each)]
+
+
+def command_of(number: int) -> bytes:
+    """Return what a process was started with, nothing if it has ended."""
+    try:
+        return Path(f"/proc/{number}/cmdline").read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return b""
 
 
 @pytest.mark.timeout(120)
