@@ -22,20 +22,29 @@ SERVICES = ("control", "recognizer", "synthesizer")
 SETTINGS = {"KOUXING_CONTROL_MAX_LOAD": "0.1"}  # less than a session takes
 
 
-def test_one_session_too_many_is_refused_and_the_others_go_on_unharmed(tmp_path: Path) -> None:
+def test_one_session_too_many_is_refused_and_the_others_go_on_unharmed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
     samples = samples_of_file(VOWELS_FILE)[:48000]
     with System(SERVICES, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
+        gateway = Gateway(system.control, free_port())
+        system.processes["gateway"] = gateway.process
+        system.wait_ready()
         alone = stream(system.control, samples)
         sessions = [client.open_session(encoding="f32le") for _ in range(NUM_SURE)]
         with pytest.raises(Refused, match="as many sessions as it can serve in time") as caught:
             client.open_session(encoding="f32le")
-        assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
         all_seen = speak(sessions, samples)
+        told, answer = asyncio.run(_refused(gateway.page))
         with pytest.raises(Refused, match="busy"):
             client.open_session(encoding="f32le")
         for session in sessions:
             session.close()
 
+    assert (caught.value.code, caught.value.retry_after_s) == ("busy", RETRY_AFTER_S)
+    assert (told["code"], told["retry_after_s"]) == ("busy", RETRY_AFTER_S)
+    assert (answer.status, answer.headers["Retry-After"]) == (503, f"{RETRY_AFTER_S:.0f}")
     times = {frame.media_time for frame in alone.frames}
     for seen in all_seen:
         assert (seen.ended, seen.error) == (True, "")
@@ -44,33 +53,17 @@ def test_one_session_too_many_is_refused_and_the_others_go_on_unharmed(tmp_path:
         assert [phones[index] for index in sorted(phones)] == alone.symbols
 
 
-def test_the_gateway_passes_on_when_to_try_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
-
-    async def refused(page: str) -> tuple[dict[str, object], aiohttp.ClientResponse]:
-        """Return what a microphone and a WebRTC client are told."""
-        peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
-        peer.addTransceiver("audio")
-        await peer.setLocalDescription(await peer.createOffer())
-        sdp, headers = peer.localDescription.sdp, {"Content-Type": "application/sdp"}
-        async with aiohttp.ClientSession() as http:
-            async with http.ws_connect(f"{page}microphone") as microphone:
-                await microphone.send_str('{"sample_rate_hz": 16000}')
-                told = await microphone.receive_json(timeout=60)
-            async with http.post(f"{page}whip", data=sdp, headers=headers) as answer:
-                await answer.read()
-        await peer.close()
-        return told, answer
-
-    with System(SERVICES, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
-        gateway = Gateway(system.control, free_port())
-        system.processes["gateway"] = gateway.process
-        system.wait_ready()
-        sessions = [client.open_session(encoding="f32le") for _ in range(NUM_SURE)]
-        told, answer = asyncio.run(refused(gateway.page))
-        for session in sessions:
-            session.close()
-    assert (told["code"], told["retry_after_s"]) == ("busy", RETRY_AFTER_S)
-    assert (answer.status, answer.headers["Retry-After"]) == (503, f"{RETRY_AFTER_S:.0f}")
+async def _refused(page: str) -> tuple[dict[str, object], aiohttp.ClientResponse]:
+    """Return what the gateway tells a microphone and a WebRTC client."""
+    peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+    peer.addTransceiver("audio")
+    await peer.setLocalDescription(await peer.createOffer())
+    sdp, headers = peer.localDescription.sdp, {"Content-Type": "application/sdp"}
+    async with aiohttp.ClientSession() as http:
+        async with http.ws_connect(f"{page}microphone") as microphone:
+            await microphone.send_str('{"sample_rate_hz": 16000}')
+            told = await microphone.receive_json(timeout=60)
+        async with http.post(f"{page}whip", data=sdp, headers=headers) as answer:
+            await answer.read()
+    await peer.close()
+    return told, answer
