@@ -198,6 +198,15 @@ class Socket:
         """Return whether something arrived within the time."""
         return bool(self._raw.poll(int(timeout_s * 1000)))
 
+    @property
+    def can_send(self) -> bool:
+        """Whether a message would be queued.
+
+        A connected socket whose peer once answered the handshake with what no peer says takes no
+        more, as its queue is gone: libzmq never connects it again.
+        """
+        return bool(self._raw.getsockopt(zmq.EVENTS) & zmq.POLLOUT)
+
     def connect(self, endpoint: str) -> None:
         """Connect to one more peer.
 

@@ -46,6 +46,7 @@ SHORT_CUT_S = 2.5  # until the next attempt, in which who was near before is tak
 NEAREST_MS = 100  # for one connection, at least
 HURRIED_ANSWER_S = 5.0  # at first, where audio comes as fast as it is taken and may wait for long
 LAST_ANSWER_S = 2.0  # for the end of the audio to be acknowledged before a session is closed
+JOIN_STEP_S = 0.1  # at most, until a subscription is in effect: it may have to be made anew
 ANSWER_WAIT_S = 0.02  # between looks for it
 REJOIN_S = 1.0  # for subscriptions to be in effect again before audio is sent again
 MOVE_LIMIT_S = 5.0  # for a session that its recognizer does not know to move
@@ -530,7 +531,7 @@ class Subscription:
             left_s = end_s - time.monotonic()
             if left_s <= 0:
                 raise UserError("a publisher did not confirm the subscription")
-            self._loop.step(left_s)
+            self._loop.step(min(left_s, JOIN_STEP_S))
 
     def has_joined(self) -> bool:
         """Take what has arrived; return whether the subscription is in effect."""

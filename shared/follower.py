@@ -23,6 +23,7 @@ from shared.wire.kinds import PUBLISHER_OF
 from shared.wire.message import Message
 from shared.wire.session import Joined
 
+UNCONFIRMED_S = 3.0  # until a subscription that is not in effect is made anew
 KEPT_S = 3.0  # a connection that may be dead, for what TCP still brings
 CATCH_UP_S = 0.1  # after the process was stopped, within which all comes that waited
 MAX_OLD = 8  # live frames of these that are taken
@@ -36,6 +37,7 @@ class MessageLoop(Protocol):
     bus: Bus
     metrics: Metrics
     went_on_s: float  # when it went on after the process had been stopped, if ever
+    at_each_step: set[Callable[[], None]]  # what it calls besides, at least at each tick
 
     def register(self, socket: Socket, handlers: SocketHandlers) -> None:
         """Handle messages that arrive on a socket, by their type."""
@@ -49,7 +51,8 @@ class SessionFollower:
 
     After a move it stays subscribed where it was until the new subscriptions are in effect, and
     where the session stays ``KEPT_S`` longer. It takes once what comes both ways, and a frame that
-    is made again in a new epoch.
+    is made again in a new epoch. Where a publisher does not confirm, it subscribes again: if
+    another program was at its address before, libzmq never connects that socket again.
 
     Parameters
     ----------
@@ -104,7 +107,9 @@ class SessionFollower:
         self._socket: Socket | None = None
         self._socket_before: Socket | None = None  # until the new one is complete, or longer
         self._leave_s = math.inf  # when it is left
+        self._again_s = math.inf  # when the new one is given up unless it is complete
         self._addresses: set[str] = set()
+        self._frame_addresses: set[str] = set()  # those of them with live frames
         self._stays = False  # it subscribed again at the same addresses
         self._confirmed: set[str] = set()
         self._first_epoch = 0  # that of the first start
@@ -138,25 +143,16 @@ class SessionFollower:
             raise UserError(f"session {self.session}: no endpoint is named for {missing[0]!r}")
         addresses = {endpoints[name] for name in names}
         frames = {endpoints["faps"]} & addresses if self._live and "faps" in names else set()
-        socket = self._loop.bus.connect_subscriber(*sorted(addresses - frames), live=frames)
+        socket = self._connect(addresses, frames)
         self._leave_socket_before()
-        self._socket_before, self._socket = self._socket, socket
+        self._socket_before = self._socket
         self._newest_before, self._taken = dict(self._newest), set()
         self._leave_s = math.inf
         self._stays = addresses == self._addresses
-        self._addresses = addresses
-        self._confirmed.clear()
-        self.is_complete = False
+        self._addresses, self._frame_addresses = addresses, frames
         self._first_epoch = self._first_epoch or epoch
         self.epoch = self.epoch or epoch
-        self._loop.register(
-            socket,
-            {
-                Joined: lambda message, _: self._on_joined(message, socket),
-                **dict.fromkeys(self._handlers, lambda message, _: self._on_message(message)),
-            },
-        )
-        socket.subscribe_session(self._handlers, self.session)
+        self._subscribe(socket)
 
     def close(self) -> None:
         """Unsubscribe; nothing is called any more."""
@@ -166,6 +162,30 @@ class SessionFollower:
         self._socket = self._socket_before = None
         self._confirmed.clear()
         self.is_complete = False
+        self._loop.at_each_step.discard(self._subscribe_again_if_due)
+
+    def _connect(self, addresses: set[str], frames: set[str]) -> Socket:
+        return self._loop.bus.connect_subscriber(*sorted(addresses - frames), live=frames)
+
+    def _subscribe(self, socket: Socket) -> None:
+        self._socket = socket
+        self._confirmed.clear()
+        self.is_complete = False
+        self._again_s = time.monotonic() + UNCONFIRMED_S
+        self._loop.at_each_step.add(self._subscribe_again_if_due)
+        self._loop.register(
+            socket,
+            {
+                Joined: lambda message, _: self._on_joined(message, socket),
+                **dict.fromkeys(self._handlers, lambda message, _: self._on_message(message)),
+            },
+        )
+        socket.subscribe_session(self._handlers, self.session)
+
+    def _subscribe_again_if_due(self) -> None:
+        if self._socket is not None and time.monotonic() >= self._again_s:
+            self._loop.unregister(self._socket)
+            self._subscribe(self._connect(self._addresses, self._frame_addresses))
 
     def _leave_if_due(self) -> None:
         if time.monotonic() >= self._leave_s:
@@ -194,6 +214,7 @@ class SessionFollower:
             self._leave_s = time.monotonic() + (KEPT_S if self._stays else 0.0)
             self._leave_if_due()
             self.is_complete = True
+            self._loop.at_each_step.discard(self._subscribe_again_if_due)
             self._on_complete()
 
     def _on_message(self, message: Any) -> None:
@@ -263,6 +284,7 @@ class PollingLoop:
         self.bus = bus
         self.metrics = Metrics()
         self.went_on_s = -math.inf
+        self.at_each_step: set[Callable[[], None]] = set()
         self._poller = bus.poller()
         self._handlers: dict[Socket, SocketHandlers] = {}
 
@@ -279,6 +301,8 @@ class PollingLoop:
 
     def step(self, timeout_s: float) -> bool:
         """Handle what has arrived, waiting up to the timeout; return whether anything had."""
+        for call in tuple(self.at_each_step):
+            call()
         begin_s = time.monotonic()
         sockets = self._poller.wait(timeout_s)
         if was_stopped(begin_s, timeout_s):

@@ -122,25 +122,8 @@ class Service:
         self._tick_due_s = 0.0
         self._busy = BusyShare(LOAD_PERIOD_S, time.monotonic())
         self.session_at_work = ""  # whose message is being handled; a crash is its
-        self.control: Socket | None = None
-        if control:
-            self.control = self.bus.connect_dealer(self.control_endpoint)
-            self.register(
-                self.control,
-                {
-                    HeartbeatSeen: self._on_heartbeat_seen,
-                    AllowedKeys: self._on_allowed_keys,
-                    StartSession: self._on_start,
-                    StopSession: self._on_stop,
-                    FlushNow: lambda message, _: self.flush_session(message.session),
-                    UseLips: self._on_use_lips,
-                    Express: self._on_express,
-                    ChooseExpressiveness: self._on_choose_expressiveness,
-                    AddShapes: self._on_add_shapes,
-                    Error: self._on_error,
-                    Done: lambda _message, _sender: None,
-                },
-            )
+        self.at_each_step: set[Callable[[], None]] = set()
+        self.control = self._connect_to_control() if control else None
 
     # --- what a subclass provides ----------------------------------------------------------------
 
@@ -256,6 +239,8 @@ class Service:
         now_s = time.monotonic()
         if now_s >= self._tick_due_s:
             self._tick_due_s = now_s + TICK_S
+            for call in tuple(self.at_each_step):
+                call()
             self.on_tick(now_s)
         self.beat_if_due()
 
@@ -317,6 +302,26 @@ class Service:
         LOG.info("stopped")
 
     # --- inside ----------------------------------------------------------------------------------
+
+    def _connect_to_control(self) -> Socket:
+        socket = self.bus.connect_dealer(self.control_endpoint)
+        self.register(
+            socket,
+            {
+                HeartbeatSeen: self._on_heartbeat_seen,
+                AllowedKeys: self._on_allowed_keys,
+                StartSession: self._on_start,
+                StopSession: self._on_stop,
+                FlushNow: lambda message, _: self.flush_session(message.session),
+                UseLips: self._on_use_lips,
+                Express: self._on_express,
+                ChooseExpressiveness: self._on_choose_expressiveness,
+                AddShapes: self._on_add_shapes,
+                Error: self._on_error,
+                Done: lambda _message, _sender: None,
+            },
+        )
+        return socket
 
     def _ask_what_changed(self) -> None:
         """Learn, before more is published, what control has decided if this stood still."""
@@ -436,6 +441,9 @@ class Service:
     def _ask_why_unanswered(self, now_s: float) -> None:
         if self.control is not None and now_s - self._answered_s > UNANSWERED_S:
             self._answered_s = now_s
+            if not self.control.can_send:  # something else was at its address, or its keys differed
+                self.unregister(self.control)
+                self.control = self._connect_to_control()
             threading.Thread(target=self._warn_if_refused, daemon=True).start()
 
     def _warn_if_refused(self) -> None:

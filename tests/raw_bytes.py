@@ -24,6 +24,17 @@ def pour(port: int, seconds: float) -> None:
             connection.recv(1000)
 
 
+def answer_handshake(listener: socket.socket, curve: bool, rest: bytes) -> None:
+    """Answer a ZeroMQ socket as another program or one of other keys would, and leave the port."""
+    greeting = attackers.GREETING
+    if curve:
+        greeting = greeting[:12] + b"CURVE".ljust(20, b"\0") + greeting[32:]
+    with listener, listener.accept()[0] as connection, contextlib.suppress(OSError):
+        connection.sendall(greeting + rest)
+        while connection.recv(1000):  # until it is given up
+            pass
+
+
 def _nonsense(random: Random) -> bytes:
     """Return random bytes after a beginning that some peer might say."""
     beginnings = [

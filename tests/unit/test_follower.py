@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import socket
 import time
 from collections.abc import Callable, Iterator
 
@@ -16,6 +17,7 @@ from shared.follower import PollingLoop, SessionFollower
 from shared.wire.audio import Sound
 from shared.wire.face import EndOfFaps, FapFrame, Shapes
 from shared.wire.message import Message
+from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit
 
@@ -94,6 +96,22 @@ def test_one_kind_needs_its_own_publisher_alone() -> None:
     studio.follower.start(1, {"faps": studio.faps.endpoint})
     studio.complete()
     studio.bus.close()
+
+
+def test_it_follows_where_something_else_answered_before(
+    studio: Studio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(follower, "UNCONFIRMED_S", 0.5)
+    listener = socket.create_server(("127.0.0.1", 0))
+    faps = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    studio.follower.start(1, {"phones": studio.phones.endpoint, "faps": faps})
+    answer_handshake(listener, False, b"\x00\x05hello")
+    studio.faps = studio.bus.bind_publisher(faps, "faps")
+    studio.complete()
+    studio.faps.send(frame(1))
+    studio.step_until(lambda: studio.received == [frame(1)])
+    assert studio.num_completed == 1
+    assert not studio.loop.at_each_step
 
 
 def test_from_confirmation_on_nothing_is_missed_and_other_sessions_stay_out(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
+from services.control.config import ControlConfig
+from services.control.service import ControlService
 from shared.bus import Bus
 from shared.config import ServiceConfig
 from shared.keys import NOBODY, Peer
@@ -24,6 +27,7 @@ from shared.wire.control import (
 )
 from shared.wire.session import AddShapes, ChooseExpressiveness, Done, Express
 from shared.wire.speech import Progress, Speech
+from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit
 
@@ -283,6 +287,43 @@ def test_a_new_control_is_told_the_sessions_with_what_was_chosen(
     assert (told.lips, told.expressiveness, told.expressions) == ("learnt", 2.0, {"joy": 1.0})
     assert 0 < told.hold_s < 3
     assert told.shapes == ["vrm"]
+
+
+@pytest.mark.parametrize(
+    ("curve", "rest"), [(True, b""), (False, b"\x00\x05hello")], ids=["other keys", "no ZeroMQ"]
+)
+def test_it_registers_where_something_else_answered_before(
+    monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
+) -> None:
+    monkeypatch.setattr("shared.service.UNANSWERED_S", 0.3)
+    monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
+    listener = socket.create_server(("127.0.0.1", 0))
+    commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    worker = Worker(commands)
+    worker.endpoints = {"input": worker.input.endpoint}
+    answer_handshake(listener, curve, rest)
+    config = ControlConfig(commands=commands, events="tcp://127.0.0.1:*", insecure=True)
+    control = ControlService(config)
+    end_s = time.monotonic() + 30
+    while worker.instance not in control._registry:
+        assert time.monotonic() < end_s
+        worker.step(0.01)
+        control.step(0.01)
+    for service in (worker, control):
+        service.bus.close()
+
+
+def test_where_control_hangs_what_is_meant_for_it_waits(
+    monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
+) -> None:
+    monkeypatch.setattr("shared.service.UNANSWERED_S", 0.0)
+    monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
+    connected = worker.control
+    for _ in range(3):
+        worker._beat_due_s = 0.0
+        worker.beat_if_due()
+    assert worker.control is connected
+    run_until(control, worker, lambda: len(control.beats) >= 3)
 
 
 def test_one_that_stops_says_so_before_it_finishes_its_sessions(control: Control) -> None:
