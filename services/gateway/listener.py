@@ -174,8 +174,8 @@ class Listener:
             handler.force_close()
 
     def _is_worth_logging(self, record: logging.LogRecord) -> bool:
-        """Keep bytes that are no HTTP, and were answered so, from filling the log."""
-        if record.exc_info and isinstance(record.exc_info[1], HttpProcessingError):
+        """Keep from filling the log: bytes that are no HTTP, and were answered so; half a body."""
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, HttpProcessingError):
             self._on_bad_request()
-            return False
-        return True
+        return not isinstance(error, HttpProcessingError | ConnectionResetError)
