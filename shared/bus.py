@@ -205,7 +205,7 @@ class Socket:
         A connected socket whose peer once answered the handshake with what no peer says takes no
         more, as its queue is gone: libzmq never connects it again.
         """
-        return bool(self._raw.getsockopt(zmq.EVENTS) & zmq.POLLOUT)
+        return bool(self._raw.poll(0, zmq.POLLOUT))
 
     def connect(self, endpoint: str) -> None:
         """Connect to one more peer.

@@ -240,6 +240,9 @@ class Client:
                         return answer
             if self.bus.is_refused(self._control):
                 raise UserError(refusal(self._control, CLIENT, ("client",)))
+            if not self._commands.can_send:  # something else was at its address
+                self.bus.drop(self._commands)
+                self._commands = self.bus.connect_dealer(self._control)
         address = self._control.partition(" ")[0]
         raise UserError(
             f"control at {address} does not answer; is it running? to start it: kouxing run"

@@ -39,6 +39,7 @@ from shared.wire.control import (
     HeartbeatSeen,
     SessionInput,
     StartSession,
+    StatusReport,
     StopSession,
     UseLips,
 )
@@ -149,6 +150,9 @@ class Service:
     def add_shapes(self, message: AddShapes) -> None:
         """Publish sets of shapes of a session, if its face is made here."""
 
+    def on_status(self, report: StatusReport) -> None:
+        """Take what control answers to a request for its status."""
+
     def on_start(self) -> None:
         """Begin what needs the loop; called once, before the service says that it is ready."""
 
@@ -176,8 +180,7 @@ class Service:
 
     def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
         """Send the heartbeat to control."""
-        if self.control is not None:
-            self.control.send(heartbeat)
+        self.tell_control(heartbeat)
 
     # --- for subclasses --------------------------------------------------------------------------
 
@@ -206,9 +209,12 @@ class Service:
 
         ``media_time`` is up to where its phones are final here, in samples at 16 kHz.
         """
+        self.tell_control(Done(session=start.session, request=start.request, media_time=media_time))
+
+    def tell_control(self, message: Message) -> None:
+        """Send a message to control, unless this is control."""
         if self.control is not None:
-            done = Done(session=start.session, request=start.request, media_time=media_time)
-            self.control.send(done)
+            self.control.send(message)
 
     def warn(self, reason: str, text: str, session: str = "") -> None:
         """Count a problem, and log it at a limited rate."""
@@ -317,6 +323,7 @@ class Service:
                 Express: self._on_express,
                 ChooseExpressiveness: self._on_choose_expressiveness,
                 AddShapes: self._on_add_shapes,
+                StatusReport: lambda report, _: self.on_status(report),
                 Error: self._on_error,
                 Done: lambda _message, _sender: None,
             },
@@ -458,9 +465,9 @@ class Service:
         self.clock_offset.update(seen.sent_ns, seen.received_ns, seen.replied_ns, now_ns())
         is_another = self._control_instance not in ("", seen.control)
         self._control_instance = seen.control
-        if is_another and "audio" in self.endpoints and self.control is not None:
+        if is_another and "audio" in self.endpoints:
             for served in self._served.values():  # which it does not know yet
-                self.control.send(served.present_start(time.monotonic()))
+                self.tell_control(served.present_start(time.monotonic()))
 
     def _on_allowed_keys(self, allowed: AllowedKeys, _sender: Peer) -> None:
         guests = {key: Guest(each.name, tuple(each.roles)) for key, each in allowed.keys.items()}
@@ -482,10 +489,7 @@ class Service:
                 self.session_started(start)
         except UserError as error:
             self.warn("start", str(error), start.session)
-            if self.control is not None:
-                self.control.send(
-                    Error(session=start.session, code=ErrorCode.TIMEOUT, text=str(error))
-                )
+            self.tell_control(Error(session=start.session, code=ErrorCode.TIMEOUT, text=str(error)))
 
     def _on_stop(self, stop: StopSession, _sender: Peer) -> None:
         self._served.pop(stop.session, None)

@@ -1,4 +1,9 @@
-import type { ShapeSet } from "./index.js";
+import type { PhoneMessage, SessionMessage, ShapeSet } from "./index.js";
+
+export interface KouxingFaceEventMap extends HTMLElementEventMap {
+  session: CustomEvent<SessionMessage>;
+  phone: CustomEvent<PhoneMessage>;
+}
 
 /**
  * `<kouxing-face>`. Attributes: `src` (a GLB or VRM), `gateway`, `session`, `token`, or `recording`.
@@ -14,6 +19,16 @@ export class KouxingFace extends HTMLElement {
   turnSoundOff(): void;
   /** Play the recording to its end, or until another begins; an audio element may play its sound. */
   play(audio?: HTMLAudioElement | null): Promise<void>;
+  addEventListener<K extends keyof KouxingFaceEventMap>(
+    type: K,
+    listener: (this: KouxingFace, event: KouxingFaceEventMap[K]) => void,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
 }
 
 declare global {

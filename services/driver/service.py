@@ -179,17 +179,15 @@ class DriverService(Service):
     def _report_written(self, session: str, recording: Recording) -> None:
         self.metrics.count("videos")
         LOG.info("wrote %s", recording.path, extra={"session": session})
-        if self.control is not None:
-            self.control.send(
-                Recorded(
-                    session=session,
-                    path=str(recording.path),
-                    num_images=recording.num_images,
-                    duration_s=recording.duration_s,
-                )
+        self.tell_control(
+            Recorded(
+                session=session,
+                path=str(recording.path),
+                num_images=recording.num_images,
+                duration_s=recording.duration_s,
             )
+        )
 
     def _report_failure(self, session: str, reason: str) -> None:
         LOG.error(reason, extra={"session": session})
-        if self.control is not None:
-            self.control.send(Error(session=session, code=ErrorCode.NO_VIDEO, text=reason))
+        self.tell_control(Error(session=session, code=ErrorCode.NO_VIDEO, text=reason))

@@ -46,7 +46,7 @@ from shared.wire.control import SessionInput, StartSession, StatusReport, Status
 from shared.wire.events import phone_of
 from shared.wire.face import EndOfFaps, FapFrame
 from shared.wire.message import Message
-from shared.wire.session import ChooseExpressiveness, Done, Error, Express
+from shared.wire.session import ChooseExpressiveness, Express
 from shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
@@ -143,17 +143,6 @@ class GatewayService(Service):
         self._report_s = -math.inf
         self._complete_s = -math.inf  # when the newest report came that named all services
         self._request_s = 0.0
-        self._commands = self.bus.connect_dealer(self.control_endpoint)
-        self.register(
-            self._commands,
-            {
-                StatusReport: lambda report, _: self._on_report(report),
-                Done: lambda _message, _sender: None,
-                Error: lambda error, _: self.warn(
-                    error.code, f"control says: {error.text}", error.session
-                ),
-            },
-        )
 
     # --- the loop --------------------------------------------------------------------------------
 
@@ -264,11 +253,12 @@ class GatewayService(Service):
         answered = self._report_s >= self._request_s
         if now_s - self._request_s > (STATUS_S if answered else STATUS_LOST_S):
             self._request_s = now_s
-            self._commands.send(StatusRequest(request=secrets.token_hex(8)))
+            self.tell_control(StatusRequest(request=secrets.token_hex(8)))
         if now_s - self._report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
 
-    def _on_report(self, report: StatusReport) -> None:
+    def on_status(self, report: StatusReport) -> None:
+        """Take note which services run."""
         self._report_s = time.monotonic()
         running = {state.service for state in report.services if state.state == "ready"}
         needed = ("recognizer", "synthesizer")
@@ -279,7 +269,7 @@ class GatewayService(Service):
             self._viewers.set_missing(missing)
 
     def _express(self, session: str, expressions: wire.Expressions) -> None:
-        self._commands.send(
+        self.tell_control(
             Express(
                 session=session,
                 request=secrets.token_hex(8),
@@ -290,7 +280,7 @@ class GatewayService(Service):
 
     def _choose_expressiveness(self, session: str, amount: float) -> None:
         request = secrets.token_hex(8)
-        self._commands.send(
+        self.tell_control(
             ChooseExpressiveness(session=session, request=request, expressiveness=amount)
         )
 

@@ -507,8 +507,8 @@ class RecognizerService(Service):
             if isinstance(output, Phone | LipFrame | SpeechChange | Waveform):
                 session.sequence_out += 1
                 self._phones.send(_addressed(message, session))
-            if isinstance(output, SpeechChange) and self.control is not None:
-                self.control.send(_addressed(message, session))
+            if isinstance(output, SpeechChange):
+                self.tell_control(_addressed(message, session))
 
     def _connect(self, endpoint: str) -> Socket:
         if endpoint not in self._synthesizers:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -27,6 +28,7 @@ from shared.wire.session import (
     SessionOpened,
 )
 from shared.wire.speech import Acknowledge, Phone
+from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit
 LOCAL = "tcp://127.0.0.1:*"
@@ -266,3 +268,15 @@ def test_skipped_audio_advances_media_time(stage: Stage) -> None:
     stage.session.skip(800)
     stage.send(1)
     assert [chunk.media_time for chunk in stage.take(0, 2)] == [0, 2400]
+
+
+def test_control_is_asked_where_something_else_answered_before() -> None:
+    listener = socket.create_server(("127.0.0.1", 0))
+    commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+    with Bus() as bus, Client(commands) as client, ThreadPoolExecutor(1) as pool:
+        closing = pool.submit(client.close_session, "s", "t")
+        answer_handshake(listener, False, b"\x00\x05hello")
+        control = bus.bind_router(commands, "commands")
+        message, sender = next_of(CloseSession, control)
+        control.send(Done(session="s", request=message.request), to=sender)
+        closing.result()

@@ -31,6 +31,7 @@ const message = readMessage(new ArrayBuffer(16));
 if (message !== null && "samples" in message) console.log(message.samples.length, time, values.length);
 
 const face: KouxingFace = document.createElement("kouxing-face");
+face.addEventListener("session", ({ detail }) => console.log(detail.epoch));
 await face.turnSoundOn();
 if (face.set !== "faps" && face.shown !== null && !Array.isArray(face.shown)) console.log(face.shown.jawOpen);
 
