@@ -385,13 +385,16 @@ def endpoints(
 @app.command()
 def attacks(
     audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
+    attack: Annotated[
+        list[str] | None, typer.Option(help="Only this one, by its name; repeatable.")
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Measure what hostile peers cost: memory of the services, and delay of others' faces."""
     from evaluation.system.attacks import measure, show
 
     check_output(json_file)
-    damages = measure(audio, CONSOLE)
+    damages = measure(audio, attack or (), CONSOLE)
     show(damages, Console())
     write_json(json_file, [asdict(damage) for damage in damages])
 

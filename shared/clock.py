@@ -10,6 +10,7 @@ import time
 from collections import deque
 
 MEDIA_RATE_HZ = 16_000  # media time counts samples at this rate
+MAX_GAP_S = 10.0  # of media time without sound that is filled with frames
 STOPPED_S = 0.5  # longer than a busy machine keeps a process waiting
 
 

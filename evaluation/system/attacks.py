@@ -15,7 +15,7 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -43,6 +43,7 @@ from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
 from shared.connections import BAN_S, KIB
+from shared.errors import UserError
 
 PHASE_S = 3.0
 SLACK_S = 0.5  # in which a session opens
@@ -69,22 +70,41 @@ class Damage:
     after_p95_ms: float | None
 
 
-def measure(path: Path, console: Console) -> list[Damage]:
+def measure(path: Path, names: Collection[str], console: Console) -> list[Damage]:
     """Start the services and attack them; return the figures.
+
+    Parameters
+    ----------
+    names
+        Of attacks; empty: all.
 
     Raises
     ------
     UserError
-        If the file is no audio or the services cannot start.
+        If there is no such attack, the file is no audio, or the services cannot start.
     """
+    known = dict.fromkeys(name for keys in (False, True) for name, _ in _attacks(keys))
+    if unknown := [name for name in names if name not in known]:
+        raise UserError(f"{unknown[0]!r} is no attack; there are {', '.join(known)}")
     samples, rate_hz = read_audio(path)
     sound = np.resize(samples, (round((3 * PHASE_S + 2 * SLACK_S) * rate_hz), samples.shape[1]))
-    return [damage for keys in (False, True) for damage in _measure(sound, rate_hz, keys, console)]
+    return [
+        damage
+        for keys in (False, True)
+        for damage in _measure(sound, rate_hz, keys, names or known, console)
+    ]
 
 
 def _measure(
-    sound: NDArray[np.float32], rate_hz: int, keys: bool, console: Console
+    sound: NDArray[np.float32],
+    rate_hz: int,
+    keys: bool,
+    names: Collection[str],
+    console: Console,
 ) -> list[Damage]:
+    attacks = [(name, target) for name, target in _attacks(keys) if name in names]
+    if not attacks:
+        return []
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalSystem(Path(folder), console, insecure=not keys) as system,
@@ -94,7 +114,7 @@ def _measure(
         endpoints = _endpoints(system.control)
         return [
             _damage(keys, attack, target, numbers, endpoints, sound, rate_hz)
-            for attack, target in _attacks(keys)
+            for attack, target in attacks
         ]
 
 

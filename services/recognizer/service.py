@@ -29,7 +29,7 @@ from services.recognizer.recognizer import warm_up
 from services.recognizer.resumption import WARM_UP_S, Resumption
 from services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Waveform
 from shared.bus import Socket
-from shared.clock import MEDIA_RATE_HZ, to_samples, to_seconds
+from shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from shared.errors import UserError
 from shared.keys import NOBODY, Peer
 from shared.logs import LOG
@@ -87,6 +87,7 @@ class _Session:
         self.num_gaps = 0  # of the stream's, counted
         self.late_since_s: float | None = None  # since when the synthesizer owes too much
         self._lead_s, self._lead_at_s = 0.0, time.monotonic()  # before the clock, and when
+        self._end_s: float | None = None  # media time of the end of the newest sound taken
 
     @property
     def num_taken(self) -> int:
@@ -95,13 +96,19 @@ class _Session:
             return self.order.last
         return min(self.order.last, self.end.sequence - 1)
 
-    def is_ahead(self, duration_s: float, now_s: float) -> bool:
-        """Return whether sound of a live client comes too long before its time."""
+    def is_ahead(self, begin_s: float, duration_s: float, now_s: float) -> bool:
+        """Return whether sound of a live client comes too long before its time.
+
+        So does a gap before it that would be filled with frames.
+        """
+        gap_s = 0.0 if self._end_s is None else max(0.0, begin_s - self._end_s)
         passed_s = (now_s - self._lead_at_s) * CLOCK_RATE
         lead_s = max(self._lead_s - passed_s, -MAX_LEAD_S) + duration_s
+        lead_s += gap_s if gap_s <= MAX_GAP_S else 0.0
         if lead_s > MAX_LEAD_S:
             return True
         self._lead_s, self._lead_at_s = lead_s, now_s
+        self._end_s = begin_s + duration_s
         return False
 
 
@@ -366,12 +373,12 @@ class RecognizerService(Service):
         except BadAudio as error:
             self._refuse(session.socket, chunk, sender, ErrorCode.BAD_AUDIO, str(error))
             return
-        rate_hz = start.sample_rate_hz
-        if start.paced and session.is_ahead(len(samples) / rate_hz, time.monotonic()):
+        rate_hz, media_time = start.sample_rate_hz, chunk.media_time
+        begin_s, duration_s = to_seconds(media_time), len(samples) / rate_hz
+        if start.paced and session.is_ahead(begin_s, duration_s, time.monotonic()):
             text = f"it is more than {MAX_LEAD_S:g} s ahead of the clock; open with paced false"
             self._refuse(session.socket, chunk, sender, ErrorCode.BAD_AUDIO, text)
             return
-        media_time = chunk.media_time
         end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
         session.needed.append((chunk.sequence, end))
         if session.resumption is not None and not session.has_begun:

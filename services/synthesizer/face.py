@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -29,6 +29,7 @@ from services.synthesizer.modifiers.expressiveness import JAW, Expressiveness
 from services.synthesizer.modifiers.life import Life
 from services.synthesizer.modifiers.modifier import Modifier, Moment
 from services.synthesizer.phone_numbers import PhoneNumbers
+from shared.clock import MAX_GAP_S
 from shared.errors import UserError
 from shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, SpeechChange
@@ -37,7 +38,6 @@ Faps: TypeAlias = NDArray[np.float64]  # (68,)
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
 MAX_DELAY_S = 1.5  # live at most 0.3; further ahead a viseme weighs less than a face can show
-MAX_GAP_S = 10.0  # of media time that is filled with frames
 REST_S = 0.3  # frames that lead to rest after the end of the sound
 _RECENT_S = 2.0  # of events that a new lip model is told
 _CATCH_UP_FRAMES = 10  # that it makes before it is seen
@@ -134,15 +134,21 @@ class Face:
         After a gap of more than ``MAX_GAP_S`` the face starts again behind it. The end of the sound
         brings the frames still owed and those that lead to rest.
         """
+        return list(self.frames_of(event))
+
+    def frames_of(self, event: SoundEvent) -> Iterator[Frame]:
+        """Yield what ``accept`` returns: take all before the next event, but when you like."""
         time_s = _time_of(event)
         if time_s - self._event_s > MAX_GAP_S:
             self._begin(self._number_at(max(0.0, time_s - self._delay_s)))
         self._event_s = time_s
         if isinstance(event, EndOfSound):
             self._accept(SpeechChange(active=False, time_s=time_s))
-            return self._frames_until(time_s + self._delay_s + REST_S)
+            yield from self._frames_until(time_s + self._delay_s + REST_S)
+            return
         self._accept(event)
-        return self._frames_until(time_s) if isinstance(event, Progress) else []
+        if isinstance(event, Progress):
+            yield from self._frames_until(time_s)
 
     def restart(self) -> None:
         """Go on with another recognizer's events; phones that were not final are void.
@@ -252,22 +258,21 @@ class Face:
         """Return the number of the frame at or after a media time."""
         return math.ceil(time_s * self._frame_rate_hz - _ROUNDING)
 
-    def _frames_until(self, time_s: float) -> list[Frame]:
-        """Frames not made yet that are due when the sound is known up to ``time_s``."""
-        frames = []
+    def _frames_until(self, time_s: float) -> Iterator[Frame]:
+        """Yield frames not made yet that are due when the sound is known up to ``time_s``."""
         last = math.floor((time_s - self._delay_s) * self._frame_rate_hz + _ROUNDING)
         if last >= self._next_frame:
             self._withdraw()
-        for number in range(self._next_frame, last + 1):
+        while self._next_frame <= last:
+            number = self._next_frame
+            self._next_frame += 1
             self._time_s = number / self._frame_rate_hz
             self._follow_speech(self._time_s)
             mouth = self._lips.frame_at(self._time_s)
             if number >= self._first_seen:
-                frames.append(self._frame(mouth))
+                yield self._frame(mouth)
             else:
                 self._rehearse(mouth)
-        self._next_frame = max(self._next_frame, last + 1)
-        return frames
 
     def _follow_speech(self, time_s: float) -> None:
         while self._changes and self._changes[0].time_s <= time_s:

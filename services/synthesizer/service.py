@@ -11,9 +11,11 @@ clock take over, to lead the face to rest.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +31,7 @@ from shared.face.faps import MASK_BYTES, NUM_FAPS
 from shared.face.shapes import SHAPE_SETS
 from shared.keys import Peer
 from shared.logs import LOG
-from shared.phones.events import EndOfSound, Phone, Progress
+from shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent
 from shared.phones.final_time import FinalTime
 from shared.phones.inventory import load_inventory
 from shared.reliable import ReliableReceiver
@@ -42,6 +44,8 @@ from shared.wire.speech import Acknowledge, ResumeFace, Stalled
 
 LOST_S = 20.0  # without a word from a recognizer, which would tell that its client is silent
 AGAIN_S = 3.0  # for which followers of a session that has moved here may still be on their way
+MAX_AT_ONCE_S = 0.06  # of frames of a session: those of a gap must not hold others up
+MAX_WAITING = 200  # messages while they are made; the recognizer sends the next ones again
 MADE_UP_S = 0.2  # of frames without sound, when they are late
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
@@ -59,6 +63,9 @@ class _Session:
         self.sequence_out = 0
         self.shown: FapFrame | None = None  # the newest frame
         self.final = FinalTime()
+        self.waiting: deque[SoundEvent] = deque()  # while frames are made of the one before
+        self.frames: Iterator[Frame] | None = None  # of it, not made yet
+        self.ends = False  # with it
         self.finished = False
         self._resumed_s = -math.inf  # when it took another synthesizer's place
         self.since_then: list[FapFrame | Shapes | EndOfFaps] = []  # published of late
@@ -100,6 +107,7 @@ class SynthesizerService(Service):
         self.delay_ms = config.delay_ms
         self.lips = config.lips
         self._sessions: dict[str, _Session] = {}
+        self._turn = 0  # of sessions with many frames to make
         self._dropped_s = 0.0  # when frames were dropped that nobody takes
         self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input", PHONES)
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_joined)
@@ -143,6 +151,9 @@ class SynthesizerService(Service):
         """Drop what is queued; the frames to come lead to rest."""
         found = self._sessions.get(session)
         if found is not None:
+            found.waiting = deque(
+                event for event in found.waiting if not isinstance(event, Phone | LipFrame)
+            )
             found.face.flush()
 
     def use_lips(self, session: str, lips: str) -> None:
@@ -177,8 +188,12 @@ class SynthesizerService(Service):
             self._faps.drop_stopped((FapFrame, Shapes), live)
         for session in self._sessions.values():
             session.receiver.tick()
-            if session.start.paced and not session.finished:
+            if session.start.paced and not session.finished and session.frames is None:
                 self._relax(session, now_s)
+        owing = [session for session in self._sessions.values() if session.frames is not None]
+        if owing:  # one after the other gets its turn
+            self._turn += 1
+            self._make_frames(owing[self._turn % len(owing)])
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Return up to where the phones of each session are final."""
@@ -242,6 +257,8 @@ class SynthesizerService(Service):
             )
         elif message.epoch != session.start.epoch:  # sent again until control has told both ends
             self.metrics.count("other_epoch")
+        elif len(session.waiting) >= MAX_WAITING:
+            self.metrics.count("too_early")
         elif not session.receiver.accept(message, sender):
             self.metrics.count("repeated")
         else:
@@ -255,13 +272,29 @@ class SynthesizerService(Service):
             text = f"{event.symbol!r} is no phone of {language}"
             self.warn("unknown-phone", text, message.session)
             return
-        started_s = time.perf_counter()
         session.final.accept(event)
-        self._publish(session, session.face.accept(event))
-        if isinstance(event, Progress):
-            self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
-        elif isinstance(event, EndOfSound):
-            self._end(session)
+        session.waiting.append(event)
+        if session.frames is None:
+            self._make_frames(session)
+
+    def _make_frames(self, session: _Session) -> None:
+        """Publish frames of what came for a session, but not too many at a time."""
+        num_left = max(1, round(MAX_AT_ONCE_S * self.frame_rate_hz))
+        while session.frames is not None or session.waiting:
+            if session.frames is None:
+                event = session.waiting.popleft()
+                session.frames = session.face.frames_of(event)
+                session.ends = isinstance(event, EndOfSound)
+            started_s = time.perf_counter()
+            frames = list(itertools.islice(session.frames, num_left))
+            self.metrics.observe("frames_ms", (time.perf_counter() - started_s) * 1e3)
+            self._publish(session, frames)
+            num_left -= len(frames)
+            if num_left == 0:
+                return
+            session.frames = None
+            if session.ends:
+                self._end(session)
 
     # --- out -------------------------------------------------------------------------------------
 

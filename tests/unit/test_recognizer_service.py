@@ -198,11 +198,15 @@ def test_live_audio_far_ahead_of_the_clock_is_refused(service: Watched) -> None:
 def test_the_clock_counts_from_where_live_audio_last_waited(service: Watched) -> None:
     service.start_session(replace(start_of(), paced=True))
     session = service._sessions["s"]
-    now_s = session._lead_at_s
+    now_s, end_s = session._lead_at_s, 0.0
 
-    def take(duration_s: float) -> bool:
-        """Whether so much sound is taken."""
-        return not session.is_ahead(duration_s, now_s)
+    def take(duration_s: float, gap_s: float = 0.0) -> bool:
+        """Whether so much sound is taken, after a gap."""
+        nonlocal end_s
+        if session.is_ahead(end_s + gap_s, duration_s, now_s):
+            return False
+        end_s += gap_s + duration_s
+        return True
 
     assert all(take(1.0) for _ in range(int(MAX_LEAD_S)))
     assert not take(1.0)
@@ -216,6 +220,12 @@ def test_the_clock_counts_from_where_live_audio_last_waited(service: Watched) ->
     for _ in range(24 * 3600):  # its clock is faster by 1 in 1000
         now_s += 1.0
         assert take(1.001)
+    now_s += 600.0
+    assert take(1.0, gap_s=600.0)  # no frames are made of it
+    assert take(1.0, gap_s=9.9)
+    assert take(1.0, gap_s=9.9)
+    assert not take(1.0, gap_s=9.9)
+    assert take(1.0, gap_s=5.0)
 
 
 def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:

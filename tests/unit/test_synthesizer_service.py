@@ -1,0 +1,113 @@
+"""The synthesizer's sessions among each other, without sockets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from services.synthesizer.config import SynthesizerConfig
+from services.synthesizer.service import MAX_AT_ONCE_S, MAX_WAITING, SynthesizerService
+from shared.clock import to_samples
+from shared.keys import Peer
+from shared.wire.control import StartSession
+from shared.wire.face import EndOfFaps, FapFrame, Shapes
+from shared.wire.speech import EndOfPhones, Progress
+from tests.samples import SAMPLES
+from tests.system import free_port
+
+pytestmark = pytest.mark.unit
+LOCAL = "tcp://127.0.0.1:*"
+RATE_HZ = 50
+START = replace(
+    next(sample for sample in SAMPLES if isinstance(sample, StartSession)), epoch=1, endpoints={}
+)
+
+
+class Watched(SynthesizerService):
+    """A synthesizer without control that keeps what it publishes."""
+
+    def __init__(self) -> None:
+        self.sent: list[FapFrame | Shapes | EndOfFaps] = []
+        control = f"tcp://127.0.0.1:{free_port()}"
+        super().__init__(
+            SynthesizerConfig(phone_input=LOCAL, faps=LOCAL, control=control, insecure=True)
+        )
+
+    def _send(self, _session: object, message: FapFrame | Shapes | EndOfFaps) -> None:
+        self.sent.append(message)
+
+    def take(self, session: str, sequence: int, time_s: float) -> None:
+        """Take a message about sound up to a time."""
+        progress = Progress(
+            session=session,
+            epoch=1,
+            sequence=sequence,
+            media_time=to_samples(time_s),
+            level_db=-60.0,
+        )
+        self._on_input(progress, Peer())
+
+    def frames(self, session: str) -> list[FapFrame]:
+        """Return the frames of a session so far."""
+        return [
+            each for each in self.sent if isinstance(each, FapFrame) and each.session == session
+        ]
+
+
+@pytest.fixture
+def service() -> Iterator[Watched]:
+    service = Watched()
+    for name in ("gap", "other"):
+        service.start_session(replace(START, session=name, shapes=[]))
+    yield service
+    service.bus.close()
+
+
+def test_frames_of_a_gap_do_not_hold_others_up(service: Watched) -> None:
+    service.take("gap", 1, 9.9)
+    assert len(service.frames("gap")) == round(MAX_AT_ONCE_S * RATE_HZ)
+    service.take("other", 1, 0.02 + service.delay_ms / 1e3)
+    assert len(service.frames("other")) == 2
+    service.take("gap", 2, 9.92)
+    service._on_input(EndOfPhones(session="gap", epoch=1, sequence=3, media_time=158_720), Peer())
+    ended, num_ticks = EndOfFaps, 0
+    while not isinstance(service.sent[-1], ended):
+        before = len(service.frames("gap"))
+        service.on_tick(0.0)
+        num_ticks += 1
+        assert len(service.frames("gap")) <= before + round(MAX_AT_ONCE_S * RATE_HZ)
+    times = [frame.media_time for frame in service.frames("gap")]
+    assert times == list(range(0, times[-1] + 1, to_samples(1 / RATE_HZ)))
+    assert times[-1] >= to_samples(9.92)
+    assert num_ticks > 100
+
+
+def test_two_with_gaps_take_turns_and_show_what_others_would(service: Watched) -> None:
+    for name in ("gap", "other"):
+        service.take(name, 1, 3.0)
+    for _ in range(10):
+        service.on_tick(0.0)
+    numbers = [len(service.frames(name)) for name in ("gap", "other")]
+    assert abs(numbers[0] - numbers[1]) <= round(MAX_AT_ONCE_S * RATE_HZ)
+    for _ in range(200):
+        service.on_tick(0.0)
+    gap, other = (
+        np.array([np.frombuffer(each.values, "<f4") for each in service.frames(name)])
+        for name in ("gap", "other")
+    )
+    assert len(gap) == 1 + round((3.0 - service.delay_ms / 1e3) * RATE_HZ)
+    assert np.array_equal(gap, other)
+
+
+def test_what_comes_too_early_is_left_to_be_sent_again(service: Watched) -> None:
+    for sequence in range(1, MAX_WAITING + 10):
+        service.take("gap", sequence, 5.0 + sequence * 0.02)
+    assert len(service._sessions["gap"].waiting) == MAX_WAITING
+    for _ in range(300):
+        service.on_tick(0.0)
+    assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_WAITING * 0.02 + 0.02)
+    service.take("gap", MAX_WAITING + 2, 9.9)
+    assert not service._sessions["gap"].waiting
