@@ -9,8 +9,10 @@ every step works on whole frames and whole blocks of the voice detector, in orde
 
 from __future__ import annotations
 
+import weakref
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +95,9 @@ class SpeechScores:
         self._stream = model.stream()
         self._lips = lips
         if lips is not None and isinstance(self._stream, PositionStream):
-            self._stream.on_position = self._take_position
+            # weakly: in a cycle all would stay until Python looks for cycles
+            own = weakref.proxy(self)
+            self._stream.on_position = partial(SpeechScores._take_position, own)
         self._resampler = Resampler(sample_rate_hz, num_channels)
         self._detector = VoiceActivityDetector()
         self._reset_frames()
