@@ -19,7 +19,8 @@ from typing import Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from shared.connections import BAN_FAULTS, KIB, Bounds, Connection, Guard, Guarded
+from shared.connection import BAN_FAULTS, KIB, Bounds, Connection
+from shared.connections import Guard, Guarded
 from shared.endpoints import split_endpoint
 from shared.errors import UserError
 from shared.keys import NOBODY, Guest, Key, Peer, may_follow

@@ -10,37 +10,41 @@ held. An honest peer is never cut: its queue fills, ZeroMQ stops reading, and it
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import ipaddress
 import os
 import resource
 import select
-import socket
-import stat
 import struct
-import sys
-import termios
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
 
 import zmq
 
-from shared.logs import LOG, RateLimit
+from shared.connection import (
+    BAN_FAULTS,
+    CREDIT,
+    FAULTS_S,
+    HANDSHAKE,
+    KIB,
+    MAX_FAULTS,
+    MIB,
+    OVERHEAD,
+    STUCK_S,
+    Bounds,
+    Connection,
+    Credit,
+)
+from shared.kernel_sockets import SEES_BYTES, address_of, inode_of, network_of, port_of
 from shared.metrics import give_back_memory
 
-KIB, MIB = 1024, 1024 * 1024
 RECEIVE_BUFFER = 256 * KIB  # of the kernel; a few segments of loopback, or it stalls
 LOOK_S = 0.02  # between looks while bytes arrive
 NEAR_LOOK_S = 0.005  # while much waits, and at first: a flood takes some 5 MB in that time
 NEAR_S = 0.2  # after a connection has come
 MUCH = 128 * KIB  # more than honest peers' messages take as a rule
 SWEEP_S = 1.0  # between looks at all connections: some have ended, or ZeroMQ was too quick to see
-STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscriber stands still
 STUCK_SMALL = 4 * KIB  # of each connection, that a busy ZeroMQ may not have passed on yet
-STUCK_S = 0.02  # that bytes wait though all complete messages were delivered
 MAX_WAITING = 24 * MIB  # of all connections
 MAX_UNREAD = 16 * MIB  # of all connections; in memory twice that where messages are small
 MAX_CONNECTIONS = 1024  # each takes up to 50 KiB
@@ -50,198 +54,9 @@ MAX_SUBSCRIPTION = 128  # bytes of a topic's beginning
 MAX_SUBSCRIBED = 32 * KIB  # of a connection: 64 sessions; in memory up to 60 times that, or 120
 MAX_ALL_SUBSCRIBED = 192 * KIB  # of all connections
 SUBSCRIBED_FAULTS = 10  # of a connection that has subscribed to too much
-HANDSHAKE = 1 * KIB  # more than a handshake takes on the wire
-OVERHEAD = 128  # more than a message's frames, keys and heartbeats take on the wire
-CREDIT = 5000.0  # that a connection may spend at once
-CREDIT_S = 500.0  # that it gets back in a second
-MAX_FAULTS = 100  # of an address, whose new connections are cut then
-FAULTS_S = 2  # that an address is forgiven in a second
-BAN_S = 3  # until an address with too many faults is let in again, at the longest
-BAN_FAULTS = MAX_FAULTS + FAULTS_S * BAN_S  # of one that has sent what no honest one can
 NUM_TRIMS = 3  # in the seconds after a cut, for libzmq frees what it held a little later
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and a value, here the descriptor
-_RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
-# where struct tcp_info has tcpi_bytes_acked and tcpi_bytes_received
-_BYTES_ACKED, _BYTES_RECEIVED = 120, 128
-_SINK = bytearray(MIB)
-_DISCARD = socket.MSG_DONTWAIT | socket.MSG_TRUNC
-_SEES_BYTES = sys.platform == "linux"
-_ONCE = select.EPOLLIN | select.EPOLLONESHOT if _SEES_BYTES else 0
-_WARNINGS = RateLimit()
-
-
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """What a bound socket takes; ``cost`` is the credit that each of its messages takes."""
-
-    message_bytes: int  # the largest part
-    queue_length: int  # messages of a connection that wait for delivery
-    num_slow: int  # connections that may be in the midst of the largest message
-    num_answers: int = 20_000  # that wait for one peer; more are lost
-    cost: float = 0.0
-
-    @property
-    def one_message(self) -> int:
-        """Bytes of a connection in the midst of its largest message."""
-        return self.message_bytes + 16 * KIB  # and what libzmq reads at once
-
-    @property
-    def full_queue(self) -> int:
-        """Bytes of a connection whose queue is full of the largest messages."""
-        return self.queue_length * (self.message_bytes + OVERHEAD) + self.one_message
-
-
-class Credit:
-    """What a peer may make this process do; it comes back with time."""
-
-    def __init__(self, left: float = CREDIT) -> None:
-        self._left = left
-        self._since_s = time.monotonic()
-
-    @property
-    def left(self) -> float:
-        """What may be spent at once."""
-        return min(CREDIT, self._left + (time.monotonic() - self._since_s) * CREDIT_S)
-
-    def spend(self, cost: float) -> None:
-        """Take some away; less than nothing may be left."""
-        self._left, self._since_s = self.left - cost, time.monotonic()
-
-
-class Connection:
-    """One connection to a bound socket."""
-
-    def __init__(self, descriptor: int, inode: int) -> None:
-        self.descriptor = descriptor
-        self.inode = inode  # of the TCP socket: the descriptor's number is used again
-        self.guarded: Guarded | None = None  # once the guard has seen it
-        self.address = ""
-        self.key = ""  # of the peer, once something was delivered
-        self.owner = ""  # then also: the key, or without keys the address
-        self.credit = Credit()
-        self.delivered = HANDSHAKE  # bytes; only the socket's thread writes it
-        self.answered = 0  # bytes sent to it alone; the same
-        self.unread = 0  # bytes that libzmq holds for the peer; the guard's
-        self.waiting = 0  # bytes that libzmq holds; the guard's, as all that follows
-        self.stuck = 0  # of them, those that waited while all complete messages were delivered
-        self.subscribed_bytes = 0
-        self._subscriptions: set[bytes] = set()
-        self.is_cut = False
-        self._num_faults = 0  # that its address was blamed for
-        self._surplus = 0  # by which delivered is too high, as overhead is estimated
-        self._mark = (0, 0, 0, 0.0)  # delivered, waiting, turns and time at an earlier look
-        self._out_mark = (0, 0)  # answered, and given to the kernel, at an earlier look
-        self._taken = (-1, 0.0)  # bytes that the peer has acknowledged, and since when no more
-
-    def charge(self, cost: float) -> None:
-        """Take credit for what the connection makes this process do; without any it is cut."""
-        self.credit.spend(cost)
-        if self.credit.left < 0:
-            self.cut("it sends too much that is of no use")
-
-    def subscribe(self, topic: bytes) -> None:
-        """Note a subscription."""
-        if topic not in self._subscriptions:
-            self._subscriptions.add(topic)
-            self.subscribed_bytes += len(topic)
-
-    def unsubscribe(self, topic: bytes) -> None:
-        """Note the end of a subscription."""
-        if topic in self._subscriptions:
-            self._subscriptions.remove(topic)
-            self.subscribed_bytes -= len(topic)
-
-    def wants(self, topics: Iterable[bytes]) -> bool:
-        """Return whether it has subscribed to one of some topics."""
-        begins = tuple(self._subscriptions)
-        return any(topic.startswith(begins) for topic in topics)
-
-    def is_stopped(self, now_s: float) -> bool:
-        """Return whether the peer has taken nothing for a while, though something waits for it."""
-        before, since_s = self._taken
-        taken, waiting = _bytes_taken(self.descriptor) if _SEES_BYTES else (0, 0)
-        if taken == before and waiting:
-            return now_s - since_s > STOPPED_S
-        self._taken = (taken, now_s)
-        return False
-
-    def look_out(self, published: Mapping[bytes, int]) -> None:
-        """Find what waits for the peer, from what was sent and what the kernel has taken of it.
-
-        ``published`` has the bytes of each topic since the last look.
-        """
-        if not self.exists():
-            return
-        taken, waiting = _bytes_taken(self.descriptor) if _SEES_BYTES else (0, 0)
-        answered, given = self.answered, taken + waiting
-        answered_before, given_before = self._out_mark
-        self._out_mark = (answered, given)
-        if not waiting:  # the kernel has room: nothing waits before it
-            self.unread = 0
-            return
-        begins = tuple(self._subscriptions)
-        sent = sum(size for topic, size in published.items() if topic.startswith(begins))
-        sent += answered - answered_before
-        self.unread = max(0, self.unread + sent - (given - given_before))
-
-    def exists(self) -> bool:
-        """Return whether it is not closed yet."""
-        return _inode(self.descriptor) == self.inode
-
-    def look(self, now_s: float) -> None:
-        """Find what waits, and what of that is stuck; cut the connection if it is too much.
-
-        A whole turn and a while after bytes came, their message was delivered if it is complete.
-        Messages are delivered while this looks, which may take long on a busy machine. So what
-        waits is rather taken for too little than for too much: what was delivered is read again.
-        """
-        if self.guarded is None:
-            return
-        bounds, turns, before = self.guarded.bounds, self.guarded.turns, self.delivered
-        least, most = _bytes_read(self.descriptor)
-        if not self.exists():  # the figures are those of whoever has its descriptor now
-            self.waiting = self.stuck = 0
-            return
-        delivered = self.delivered
-        self._surplus = max(self._surplus, before - max(most, HANDSHAKE))
-        self.waiting = max(0, least - delivered + self._surplus)
-        marked, waiting, turn, time_s = self._mark
-        is_due = turns > turn + 1 and now_s >= time_s + STUCK_S
-        if delivered != marked:
-            self.stuck = 0
-        elif is_due:
-            self.stuck = waiting
-        if delivered != marked or is_due:
-            self._mark = (delivered, self.waiting, self.guarded.turns, time.monotonic())
-        if self.waiting > bounds.full_queue:
-            self.cut("more waits than a queue holds", BAN_FAULTS)
-        elif self.stuck > bounds.one_message:
-            self.cut("its message does not end", BAN_FAULTS)
-
-    def cut(self, reason: str, num_faults: int = 1) -> None:
-        """End the connection; libzmq then frees what it holds. Any thread may call this.
-
-        Faults count against its address, for each connection those of the worst reason.
-        """
-        if self.guarded is not None and num_faults > self._num_faults:
-            self.guarded.blame(self.address, num_faults - self._num_faults)
-            self._num_faults = num_faults
-        if self.is_cut:
-            return
-        self.is_cut = True
-        with contextlib.suppress(OSError):  # it may have ended by itself
-            own = os.dup(self.descriptor)  # which nobody else closes
-            try:
-                if _inode(own) == self.inode:
-                    with _borrowed(own) as connection:  # reset when libzmq closes it
-                        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
-                        connection.shutdown(socket.SHUT_RDWR)
-                        while connection.recv_into(_SINK, 0, _DISCARD):  # else libzmq reads it
-                            pass
-            finally:
-                os.close(own)
-        if _WARNINGS.allows(reason):
-            LOG.warning("cut a connection from %s: %s", self.address or "a peer", reason)
+_ONCE = select.EPOLLIN | select.EPOLLONESHOT if SEES_BYTES else 0
 
 
 class Guarded:
@@ -267,7 +82,7 @@ class Guarded:
         if connection is None:
             return None
         if connection.guarded is None:  # the guard has not come to it yet
-            connection.guarded, connection.address = self, _address(descriptor)
+            connection.guarded, connection.address = self, address_of(descriptor)
         if not connection.owner:
             connection.key, connection.owner = key, key or connection.address
             self._guard.bound_owner(connection)
@@ -376,8 +191,8 @@ class Guard:
         self._max_connections = 0
         self._is_stopping = False
         self._thread = threading.Thread(target=self._run, name="guard", daemon=True)
-        self._events = select.epoll() if _SEES_BYTES else None
-        self._wake = os.eventfd(0) if _SEES_BYTES else -1
+        self._events = select.epoll() if SEES_BYTES else None
+        self._wake = os.eventfd(0) if SEES_BYTES else -1
 
     @property
     def num_connections(self) -> int:
@@ -410,9 +225,9 @@ class Guard:
 
         Then another socket of the process may have the descriptor, which is not watched.
         """
-        inode = _inode(descriptor)
+        inode = inode_of(descriptor)
         known = None if inode is None else self._connections.get(inode)
-        if known is not None or inode is None or port != _port(descriptor):
+        if known is not None or inode is None or port != port_of(descriptor):
             return known
         return self._connections.setdefault(inode, Connection(descriptor, inode))
 
@@ -439,7 +254,7 @@ class Guard:
 
     def is_shut_out(self, address: str) -> bool:
         """Return whether nobody may connect from an address for now."""
-        return self.faults[_network(address)] > MAX_FAULTS
+        return self.faults[network_of(address)] > MAX_FAULTS
 
     def bound_owner(self, connection: Connection) -> None:
         """Let a connection begin with the credit that its owner has left from those before.
@@ -525,7 +340,7 @@ class Guard:
             connection = self.connection(descriptor, guarded.port)
             if connection is None:
                 continue
-            connection.address = _address(descriptor)
+            connection.address = address_of(descriptor)
             connection.guarded = guarded
             self._descriptors[descriptor] = connection
             is_silent = connection.delivered == HANDSHAKE  # else it came before
@@ -651,81 +466,3 @@ def raise_file_limit() -> None:
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     with contextlib.suppress(ValueError, OSError):  # macOS takes no more than it has
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-
-
-def _inode(descriptor: int) -> int | None:
-    """Return the number of the socket that a descriptor stands for, None if it is no socket."""
-    try:
-        status = os.fstat(descriptor)
-    except OSError:
-        return None
-    return status.st_ino if stat.S_ISSOCK(status.st_mode) else None
-
-
-def _address(descriptor: int) -> str:
-    """Return the other end's address, empty if it is gone.
-
-    All that one host has at its hand counts as one: loopback, and an IPv6 network.
-    """
-    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
-        return _network(str(connection.getpeername()[0]))
-    return ""
-
-
-def _port(descriptor: int) -> int:
-    """Return the port of this end, 0 if it has none."""
-    with contextlib.suppress(OSError), _borrowed(descriptor) as connection:
-        name = connection.getsockname()
-        return int(name[1]) if isinstance(name, tuple) else 0
-    return 0
-
-
-def _network(host: str) -> str:
-    try:
-        address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:  # the other end is gone
-        return ""
-    if address.version == 6:
-        address = address.ipv4_mapped or address
-    if address.is_loopback:
-        return "loopback"
-    prefix = 64 if address.version == 6 else 32
-    return str(ipaddress.ip_network((address, prefix), strict=False).network_address)
-
-
-def _bytes_read(descriptor: int) -> tuple[int, int]:
-    """Return how many bytes libzmq has read at least, and at most; the kernel has others still."""
-    with contextlib.suppress(OSError):
-        before = _tcp_figure(descriptor, _BYTES_RECEIVED)
-        waiting = _kernel_figure(descriptor, termios.FIONREAD)
-        return before - waiting, _tcp_figure(descriptor, _BYTES_RECEIVED) - waiting
-    return 0, 0
-
-
-def _bytes_taken(descriptor: int) -> tuple[int, int]:
-    """Return how many bytes the peer has acknowledged, and how many it has still to."""
-    with contextlib.suppress(OSError):
-        waiting = _kernel_figure(descriptor, termios.TIOCOUTQ)
-        return _tcp_figure(descriptor, _BYTES_ACKED), waiting
-    return 0, 0
-
-
-def _tcp_figure(descriptor: int, offset: int) -> int:
-    """Return a 64-bit figure of struct tcp_info."""
-    with _borrowed(descriptor) as connection:
-        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, offset + 8)
-    return int(struct.unpack_from("Q", info, offset)[0])
-
-
-def _kernel_figure(descriptor: int, request: int) -> int:
-    return int(struct.unpack("i", fcntl.ioctl(descriptor, request, bytes(4)))[0])
-
-
-@contextlib.contextmanager
-def _borrowed(descriptor: int) -> Iterator[socket.socket]:
-    """Yield a socket of Python for a descriptor that stays libzmq's."""
-    connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fileno=descriptor)
-    try:
-        yield connection
-    finally:
-        connection.detach()

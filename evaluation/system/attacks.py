@@ -42,7 +42,7 @@ from services.kinds import KINDS
 from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
 from shared.client import Client
-from shared.connections import BAN_S, KIB
+from shared.connection import BAN_S, KIB
 from shared.errors import UserError
 
 PHASE_S = 3.0

@@ -14,7 +14,7 @@ import pytest
 import zmq
 
 from evaluation.system.attackers import connect
-from shared import connections
+from shared import connections, kernel_sockets
 from shared.bus import Bus, Socket
 from shared.client import Client
 from shared.config import ServiceConfig
@@ -124,7 +124,7 @@ def test_one_key_has_not_all_connections_wherever_they_come_from(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-    monkeypatch.setattr(connections, "_network", lambda host: host)  # each is one of its own
+    monkeypatch.setattr(kernel_sockets, "network_of", lambda host: host)  # each is one of its own
     router, endpoint = server.router("recognizer.audio")
     key = key_of("guest", "client")
     with zmq.Context() as context:

@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 
 from evaluation.system.attackers import connected, frame
-from shared import connections
+from shared import connection, connections, kernel_sockets
 from shared.bus import COMMANDS, MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
-from shared.connections import CREDIT, MAX_SUBSCRIBED, MAX_SUBSCRIPTION, Connection
+from shared.connection import CREDIT, MIB, Connection
+from shared.connections import MAX_SUBSCRIBED, MAX_SUBSCRIPTION
 from shared.keys import NOBODY, Peer
 from shared.wire.audio import AudioChunk
 from shared.wire.codec import encode
@@ -81,7 +82,7 @@ def test_many_fast_senders_wait_while_nothing_is_received(bus: Bus) -> None:
 def test_a_fast_sender_stays_while_the_guard_is_not_given_the_processor(
     bus: Bus, monkeypatch: pytest.MonkeyPatch, is_late: tuple[bool, bool]
 ) -> None:
-    figure = connections._tcp_figure
+    figure = kernel_sockets.tcp_figure
 
     def late_figure(descriptor: int, offset: int) -> int:
         time.sleep(0.1 * is_late[0])
@@ -89,7 +90,7 @@ def test_a_fast_sender_stays_while_the_guard_is_not_given_the_processor(
         time.sleep(0.1 * is_late[1])
         return found
 
-    monkeypatch.setattr(connections, "_tcp_figure", late_figure)
+    monkeypatch.setattr(kernel_sockets, "tcp_figure", late_figure)
     audio = bus.bind_router(LOCAL, "audio")
     sender = bus.connect_dealer(audio.endpoint)
     chunks = [chunk(number, 20_000) for number in range(500)]
@@ -235,7 +236,7 @@ def test_one_that_sends_only_what_is_refused_is_cut(bus: Bus) -> None:
 def test_one_that_takes_nothing_is_cut_once_too_much_waits(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "MAX_UNREAD", connections.MIB)
+    monkeypatch.setattr(connections, "MAX_UNREAD", MIB)
     faps = bus.bind_publisher(LOCAL, "faps")
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
@@ -248,7 +249,7 @@ def test_one_that_takes_nothing_is_cut_once_too_much_waits(
 def test_one_that_takes_no_answers_is_cut_once_too_much_waits(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "MAX_UNREAD", connections.MIB)
+    monkeypatch.setattr(connections, "MAX_UNREAD", MIB)
     commands = bus.bind_router(LOCAL, "commands", COMMANDS)
     with connected(port_of(commands)) as silent:
         silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -419,7 +420,7 @@ def test_an_address_that_floods_once_is_shut_out_for_a_while(
     ],
 )
 def test_the_addresses_of_one_host_count_as_one(first: str, second: str, is_one: bool) -> None:
-    assert (connections._network(first) == connections._network(second)) == is_one
+    assert (kernel_sockets.network_of(first) == kernel_sockets.network_of(second)) == is_one
 
 
 @pytest.mark.parametrize("kind", ["DEALER", "SUB"])
@@ -446,7 +447,7 @@ def test_a_message_of_very_many_parts_is_given_up_little_by_little(
 def test_who_comes_again_has_no_more_credit_than_before(
     bus: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "CREDIT_S", 0.0)
+    monkeypatch.setattr(connection, "CREDIT_S", 0.0)
     audio = bus.bind_router(LOCAL, "audio")
     bad = frame(b"nothing/s/", more=True) + frame(b"\x80")
     num_refused = 0
