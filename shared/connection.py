@@ -98,7 +98,13 @@ class Connection:
         self._taken = (-1, 0.0)  # bytes that the peer has acknowledged, and since when no more
 
     def charge(self, cost: float) -> None:
-        """Take credit for what the connection makes this process do; without any it is cut."""
+        """Take credit for what the connection makes this process do; without any it is cut.
+
+        What still waits of one that is cut costs nothing: it is dropped, and those who come next
+        from its address shall not pay for it.
+        """
+        if self.is_cut:
+            return
         self.credit.spend(cost)
         if self.credit.left < 0:
             self.cut("it sends too much that is of no use")

@@ -464,3 +464,17 @@ def test_who_comes_again_has_no_more_credit_than_before(
         while not list(audio.ended()) and time.monotonic() < end_s:
             list(audio.receive())
     assert num_refused < CREDIT / REFUSAL_COST + 10
+
+
+def test_nobody_pays_for_what_waits_of_a_connection_that_is_cut(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "CREDIT_S", 0.0)
+    commands = bus.bind_router(LOCAL, "commands", COMMANDS)
+    with connected(port_of(commands)) as hostile:
+        hostile.sendall(frame(b"x") * round(2 * CREDIT / COMMANDS.cost))
+        while not has_ended(hostile):
+            list(commands.receive())
+    while bus._guard.num_connections:
+        list(commands.receive())
+    assert bus._guard._credits["loopback"].left > -2 * COMMANDS.cost
