@@ -179,6 +179,13 @@ class System:
             services = client.status().services
         return {name: each for state in services for name, each in state.endpoints.items()}
 
+    def num_gaps(self) -> float:
+        """Return how many gaps there were in the sound of all sessions."""
+        time.sleep(0.6)  # until the next heartbeat
+        with Client(self.control) as client:
+            metrics = {state.service: state.metrics for state in client.status().services}
+        return metrics["recognizer"].get("audio_gaps", 0.0)
+
     def assert_all_alive(self) -> None:
         for service, process in self.processes.items():
             assert process.poll() is None, f"{service} ended: {self.log(service)}"

@@ -8,6 +8,7 @@ import re
 from collections.abc import AsyncIterator, Callable, Sequence
 
 import aioice
+import numpy as np
 from aiortc import (
     MediaStreamTrack,
     RTCConfiguration,
@@ -21,6 +22,7 @@ from av import AudioFrame
 from shared.errors import UserError
 
 CONNECT_LIMIT_S = 20.0  # from the answer to the first sound
+CONCEALED = 4800  # samples at most: what was lost is replaced, so that speech goes on
 MAX_GAP = 600 * 48_000  # samples; a longer one is a new beginning
 _TIMESTAMPS = 2**32  # then RTP's timestamps begin anew
 _OPUS = re.compile(r"^a=rtpmap:\d+ opus/48000/2\s*$", re.IGNORECASE | re.MULTILINE)
@@ -72,11 +74,14 @@ class Peer:
     async def sound(self) -> AsyncIterator[tuple[int, bytes, int]]:
         """Yield what comes until the connection ends.
 
+        Up to ``CONCEALED`` samples that were lost are replaced by what came before, ever softer.
+
         Yields
         ------
-            How many samples of each channel were lost before it, PCM, and its number of samples.
+            How many samples of each channel are missing before it, PCM, and its number of samples.
         """
         expected: int | None = None
+        pcm = b""
         while self._track is not None:
             limit_s = CONNECT_LIMIT_S if expected is None else None
             try:
@@ -89,8 +94,18 @@ class Peer:
             if lost > _TIMESTAMPS // 2:  # it comes too late
                 continue
             expected = frame.pts + frame.samples
-            size = frame.samples * self.num_channels * 2
-            yield lost if lost <= MAX_GAP else 0, bytes(frame.planes[0])[:size], frame.samples
+            if 0 < lost <= CONCEALED:
+                yield 0, self._fading(pcm, lost), lost
+                lost = 0
+            pcm = bytes(frame.planes[0])[: frame.samples * self.num_channels * 2]
+            yield lost if lost <= MAX_GAP else 0, pcm, frame.samples
+
+    def _fading(self, pcm: bytes, num_samples: int) -> bytes:
+        """Return PCM again and again, each time half as loud."""
+        samples = np.frombuffer(pcm, "<i2").reshape(-1, self.num_channels)
+        num_times = -(-num_samples // len(samples))
+        faded = np.concatenate([samples * 0.5**time for time in range(1, num_times + 1)])
+        return faded[:num_samples].astype("<i2").tobytes()
 
     async def close(self) -> None:
         """End the connection."""

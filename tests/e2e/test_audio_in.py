@@ -20,6 +20,7 @@ import pytest
 import websockets
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
 from aiortc.contrib.media import MediaPlayer
+from aiortc.rtcdtlstransport import RTCDtlsTransport
 
 from evaluation.system.chromium import wait_until
 from services.gateway.wire import FAP_TYPE, SHAPES_TYPE
@@ -35,6 +36,7 @@ pytestmark = pytest.mark.e2e
 SDP = "application/sdp"
 OPEN_JAW = 2  # index of FAP 3
 SPOKEN = DEMO / "lake-male.wav"
+Send = Callable[[RTCDtlsTransport, bytes], Coroutine[None, None, None]]
 Socket = websockets.ClientConnection  # of the library that the clients of vosk-server use
 
 
@@ -181,18 +183,38 @@ def test_sound_in_a_wrong_format_is_an_error_and_the_end(gateway: Gateway) -> No
     connect(f"{gateway.page}vosk".replace("http", "ws"), send)
 
 
+def losing(send: Send, share_lost: float) -> Send:
+    """Return what sends packets but a share, the same ones every time."""
+    random = Random(0)  # noqa: S311 - the same every time
+
+    async def send_most(transport: RTCDtlsTransport, packet: bytes) -> None:
+        if random.random() >= share_lost:
+            await send(transport, packet)
+
+    return send_most
+
+
 async def offer(peer: RTCPeerConnection) -> str:
     await peer.setLocalDescription(await peer.createOffer())
     return peer.localDescription.sdp
 
 
+@pytest.mark.parametrize("share_lost", [0.0, 0.1])
 def test_webrtc_brings_sound_and_takes_frames_back(
-    gateway: Gateway, expected: list[str], monkeypatch: pytest.MonkeyPatch
+    system: System,
+    gateway: Gateway,
+    expected: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    share_lost: float,
 ) -> None:
     monkeypatch.setattr(aioice.ice, "get_host_addresses", lambda **_: ["127.0.0.1"])
+    monkeypatch.setattr(
+        RTCDtlsTransport, "_send_rtp", losing(RTCDtlsTransport._send_rtp, share_lost)
+    )
     faces: list[np.ndarray] = []
     weights: list[np.ndarray] = []
     phones: dict[int, str] = {}
+    before = system.num_gaps()
 
     def receive(message: str | bytes) -> None:
         if isinstance(message, bytes):
@@ -232,6 +254,7 @@ def test_webrtc_brings_sound_and_takes_frames_back(
     silence = load_inventory().silence
     heard = [phones[index] for index in sorted(phones) if phones[index] != silence]
     assert difflib.SequenceMatcher(None, heard, expected[: len(heard)]).ratio() > 0.5
+    assert system.num_gaps() == before
     assert max(face[OPEN_JAW] for face in faces) > 100
     assert max(each[ARKIT.names.index("jawOpen")] for each in weights) > 0.1
 

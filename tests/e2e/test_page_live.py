@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
 import pytest
 
 from tests.browser import Browser
-from tests.system import DEMO
+from tests.system import DEMO, ROOT
 from tests.watched import Watched
 
 pytestmark = pytest.mark.e2e
 
 STATUS = "document.getElementById('status').textContent"
+WEBRTC_PAGE = ROOT / "docs" / "clients" / "webrtc.md"
+CODE = re.compile(r"```js\n(.*?)```", re.DOTALL)
 IS_LIVE = f"{STATUS}.includes('live') && window.kouxing.state.voiceToPictureMs !== null"
 
 
@@ -73,6 +76,19 @@ def test_a_crash_is_told_and_the_microphone_goes_on(
     watched.kill(service)
     live.wait_for(f"window.told.some((text) => text.includes('{told}'))")
     live.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
+
+
+def test_the_script_of_the_documents_speaks_over_webrtc(browser: Browser) -> None:
+    script = CODE.search(WEBRTC_PAGE.read_text("utf-8"))
+    assert script is not None
+    browser.evaluate("window.logged = []; console.log = (value) => window.logged.push(value)")
+    told = browser.command(
+        "Runtime.evaluate", expression=script[1], replMode=True, awaitPromise=True
+    )
+    assert "exceptionDetails" not in told, told
+    browser.wait_for("window.logged.some((value) => value > 0.1)")
+    browser.wait_for("window.logged.filter((value) => typeof value === 'string').length > 5")
+    browser.evaluate("peer.close()")
 
 
 def test_nobody_notices_that_control_starts_again(watched: Watched, live: Browser) -> None:
