@@ -1,12 +1,14 @@
-"""What arrives at other programs that are sent the face: how many frames, and how evenly.
+"""What arrives at other programs that show the face: how many frames, and how evenly.
 
-The services run as under ``kouxing run``, ``kouxing send`` beside them as a process of its own, and
-a sound is streamed in real time. Each receiver notes when a frame is complete there. *Jitter* is
-by how much the time between two frames differs from the frames' own period.
+The services run as under ``kouxing run``, ``kouxing send`` beside them as a process of its own, a
+viewer is at the gateway, and a sound is streamed in real time. Each receiver notes when a frame is
+complete there. *Jitter* is by how much the time between two frames differs from the frames' own
+period.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import shutil
@@ -19,7 +21,9 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
+import aiohttp
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -27,6 +31,7 @@ from rich.table import Table
 from evaluation.system.latency import percentiles, stream
 from evaluation.system.vtube_studio import VTubeStudioStub
 from services.cli.supervisor import Supervisor
+from services.gateway.wire import SHAPES_TYPE
 from services.kinds import free_addresses
 from services.synthesizer.config import SynthesizerConfig
 from shared.audio_file import read_audio
@@ -41,6 +46,7 @@ TARGETS = {
     "livelink://{}": b"kouxing",
     "osc://{}": b"/kouxing/time",
 }
+VIEWER = "viewer?shapes=arkit"
 SETTLE_S = 3.0  # for the senders to start; of the speech, what is not counted
 
 
@@ -86,6 +92,7 @@ def measure(path: Path, min_s: float, console: Console) -> list[Arrival]:
         supervisor.wait_ready(control)
         with (
             _sending([*urls, f"vts://127.0.0.1:{stub.port}"], environment, folder),
+            _Viewer(int(environment["KOUXING_GATEWAY_PORT"])) as viewer,
             Client(control) as client,
         ):
             time.sleep(SETTLE_S)
@@ -94,6 +101,7 @@ def measure(path: Path, min_s: float, console: Console) -> list[Arrival]:
             end_s = begin_s - SETTLE_S + len(speech) / rate_hz
             arrived = {url.format("HOST"): each.arrived_s for url, each in receivers.items()}
             arrived["vts://HOST"] = stub.arrived_s
+            arrived[f"ws://HOST/{VIEWER}"] = viewer.arrived_s
             return [
                 _figures(target, [t for t in times if begin_s <= t < end_s], config.frame_rate_hz)
                 for target, times in arrived.items()
@@ -120,7 +128,7 @@ class _Receiver:
         self.port = self._socket.getsockname()[1]
         self._thread = threading.Thread(target=self._run)
 
-    def __enter__(self) -> _Receiver:
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
@@ -134,6 +142,33 @@ class _Receiver:
         while datagram := self._socket.recv(2000):
             if self._mark in datagram:
                 self.arrived_s.append(time.perf_counter())
+
+
+class _Viewer:
+    """A program at the gateway's WebSocket that notes when frames come."""
+
+    def __init__(self, port: int) -> None:
+        self.arrived_s: list[float] = []
+        self._url = f"ws://127.0.0.1:{port}/{VIEWER}"
+        self._loop = asyncio.new_event_loop()
+        self._task = self._loop.create_task(self._run())
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=[self._task])
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._task.cancel)
+        self._thread.join()
+        self._loop.close()
+
+    async def _run(self) -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            async with aiohttp.ClientSession() as http, http.ws_connect(self._url) as viewer:
+                async for message in viewer:
+                    if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == SHAPES_TYPE:
+                        self.arrived_s.append(time.perf_counter())
 
 
 @contextlib.contextmanager

@@ -6,9 +6,14 @@ import asyncio
 import contextlib
 import difflib
 import json
+import re
 import socket
+import subprocess
+import sys
+import textwrap
 import wave
 from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
 from random import Random
 from typing import Any
 from urllib.parse import urlsplit
@@ -29,13 +34,14 @@ from shared.phones.inventory import load_inventory
 from tests.e2e.following import samples_of_file, stream
 from tests.raw_bytes import pour
 from tests.scripted_system import Gateway
-from tests.system import DEMO, System, free_port
+from tests.system import DEMO, ROOT, System, free_port
 
 pytestmark = pytest.mark.e2e
 
 SDP = "application/sdp"
 OPEN_JAW = 2  # index of FAP 3
 SPOKEN = DEMO / "lake-male.wav"
+VOSK_PAGE = ROOT / "docs" / "clients" / "vosk.md"
 Send = Callable[[RTCDtlsTransport, bytes], Coroutine[None, None, None]]
 Socket = websockets.ClientConnection  # of the library that the clients of vosk-server use
 
@@ -149,6 +155,19 @@ def test_a_client_may_say_what_is_not_known_here_and_ask_for_results(
     symbols = " ".join(reply.get("text", "") for reply in replies).split()
     # the phone that was under way may have been told as it was not in the end
     assert difflib.SequenceMatcher(None, symbols, expected).ratio() > 0.9
+
+
+def test_the_program_of_the_documents_prints_what_is_recognized(
+    gateway: Gateway, vosk_port: int, expected: list[str], tmp_path: Path
+) -> None:
+    code = re.search(r"```python\n(.*?)```", VOSK_PAGE.read_text("utf-8"), re.DOTALL)
+    assert code is not None
+    program = tmp_path / "test.py"
+    program.write_text(textwrap.dedent(code[1]).replace(":2700", f":{vosk_port}"), "utf-8")
+    command = [sys.executable, str(program), str(SPOKEN)]
+    printed = subprocess.check_output(command, timeout=60, text=True)
+    replies = [json.loads(line) for line in printed.splitlines()]
+    assert [word["word"] for word in words_of(replies)] == expected
 
 
 def test_speech_that_is_synthesized_ahead_can_be_interrupted(
