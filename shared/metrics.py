@@ -19,6 +19,7 @@ import numpy as np
 WINDOW = 1000  # newest values, of which the percentiles are taken
 PERCENTS = (50, 95, 99)
 BUCKETS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits, ms
+_ARENA_MAX = -8  # number of this parameter of glibc's mallopt
 
 
 class Distribution:
@@ -99,6 +100,16 @@ def memory_mb() -> float:
         unit = 1 if sys.platform == "darwin" else 1024
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**20
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def keep_one_arena() -> None:
+    """Let all threads take memory from the same place; to be called before there are others.
+
+    Of the places that glibc makes for further threads, such as ZeroMQ's, ``give_back_memory`` does
+    not give back what is free at the end.
+    """
+    with contextlib.suppress(AttributeError):
+        ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 def give_back_memory() -> None:

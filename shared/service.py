@@ -29,7 +29,7 @@ from shared.endpoints import is_loopback, split_endpoint, with_key
 from shared.errors import UserError
 from shared.keys import Guest, Peer, own_key, refusal, save_guests
 from shared.logs import LOG, RateLimit, configure
-from shared.metrics import BusyShare, Metrics, give_back_memory, memory_mb
+from shared.metrics import BusyShare, Metrics, give_back_memory, keep_one_arena, memory_mb
 from shared.prometheus import MetricsServer
 from shared.wire.codec import BadMessage
 from shared.wire.control import (
@@ -533,6 +533,7 @@ def run_service(make: Callable[[], Service], section: str, log_level: str) -> in
     A user's mistake gives one line and status 2, an internal error a traceback and status 1.
     """
     configure(section, log_level)
+    keep_one_arena()
     raise_file_limit()
     try:
         service = make()

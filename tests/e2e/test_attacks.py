@@ -27,7 +27,7 @@ from tests.system import System
 pytestmark = pytest.mark.e2e
 
 MAX_GROWTH_MB = 64.0
-MAX_KEPT_MB = 32.0
+MAX_KEPT_MB = 8.0
 SECONDS = 1.0
 
 
