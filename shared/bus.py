@@ -48,7 +48,7 @@ SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=32, num_slow=128, cost=1.
 REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
 ANSWER_COST = 0.25  # that each KiB of an answer takes: the longest status has 15 MB
 MAX_PARTS = 4
-MAX_DROPPED = 5000  # parts of a message of too many, before other sockets get their turn
+MAX_DROPPED = 20_000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
 RECONNECT_MS = (20, 50)  # between attempts to connect, at first and later
 CONNECT_MS = 300  # for one; whoever is further away cannot be reached
