@@ -472,6 +472,8 @@ class ControlService(Service):
         record = self._sessions.get(speech.session)
         if record is None or (record.epoch, record.workers["audio"]) != (speech.epoch, instance):
             return
+        if not record.speaking:  # a recognizer that goes on says again that somebody speaks
+            record.speech_time = speech.media_time
         record.speaking = speech.active
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
         self._publish(name, record.name, media_time=speech.media_time)

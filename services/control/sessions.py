@@ -44,6 +44,7 @@ class SessionRecord:
     moved: bool = False  # placed again, and the client was not told yet
     restored: bool = False  # it was opened at an earlier control
     speaking: bool = False
+    speech_time: int = 0  # media time at which that began
     expressiveness: float = 0.0  # that was chosen; 0: none was
     expressions: dict[str, float] = field(default_factory=dict)  # that the face shows
     expressions_end_s: float = 0.0  # when these begin to fade
@@ -340,6 +341,7 @@ class Sessions:
             client_key=record.client.key,
             client_request=record.opening.request,
             media_time=record.media_time,
+            speech_time=record.speech_time if record.speaking else 0,
         )
 
     def opened_message(self, record: SessionRecord, events: str) -> SessionOpened:

@@ -87,6 +87,8 @@ class Recognizer:
     lips
         The session's lips, if lip frames are to be emitted; their model's streams must be
         ``PositionStream``s.
+    under_way
+        Frame at which speech began that another recognizer has begun, as in ``SpeechScores``.
 
     Raises
     ------
@@ -109,12 +111,13 @@ class Recognizer:
         num_stable_frames: int = DEFAULT_RULE[0],
         min_confidence: float = DEFAULT_RULE[1],
         lips: LipFrameStream | None = None,
+        under_way: int | None = None,
     ) -> None:
         self._model = model
         self._symbols = model.inventory.phones
         self._silence = model.inventory.index[model.inventory.silence]
         self._durations_s = model.topology.duration_mean_s
-        self._scores = SpeechScores(model, sample_rate_hz, num_channels, lips)
+        self._scores = SpeechScores(model, sample_rate_hz, num_channels, lips, under_way)
         self._settled = Decoder(model.topology)  # the search over settled scores
         self._ahead: Decoder | None = None  # the same, and on over provisional ones, if they come
         self._rule = OutputRule(num_stable_frames, min_confidence, last_emitted=self._silence)

@@ -13,7 +13,7 @@ from services.recognizer.stream import Chunk, StreamOutput, Waveform
 from shared.clock import MEDIA_RATE_HZ, to_samples
 from shared.phones.events import LipFrame, Phone, Progress, SpeechChange
 
-WARM_UP_S = 2.0  # of sound before that time; docs/recognition.md tells how it was chosen
+WARM_UP_S = 2.8  # of sound before that time; docs/recognition.md tells how it was chosen
 # Sound begins at a multiple of this: of the voice detector's blocks, the networks' positions and
 # the feature frames, which then lie as in a session without a loss.
 GRID_S = 0.16

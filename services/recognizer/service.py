@@ -210,6 +210,7 @@ class RecognizerService(Service):
             min_confidence=self._config.min_confidence,
             lips=lips,
             face_delay_s=start.delay_ms / 1e3,
+            speech_time=start.speech_time,
         )
 
     def stop_session(self, session: str) -> None:

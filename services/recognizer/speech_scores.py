@@ -34,6 +34,7 @@ PRE_ROLL_S = 0.20  # sound before the detector's decision that counts as speech:
 _FIRST_NEWEST_FRAME = 2  # the last one that the network's first position has seen
 # Speech begins at an odd frame. So every position ends POSITION_LAG_S before a multiple of 20 ms.
 _FIRST_FRAME_PARITY = 1
+_BLOCK_FRAMES = 10  # of the longest blocks of a network; they begin with the speech
 _PRE_ROLL_FRAMES = round((PRE_ROLL_S + BLOCK_SAMPLES / SAMPLE_RATE_HZ) / HOP_S)
 
 
@@ -67,6 +68,11 @@ def frame_time_s(frame: int) -> float:
     return frame * HOP_S + (WINDOW_S - HOP_S) / 2
 
 
+def frame_at(time_s: float) -> int:
+    """Return the feature frame whose boundary before it is nearest to a time."""
+    return round((time_s - (WINDOW_S - HOP_S) / 2) / HOP_S)
+
+
 class SpeechScores:
     """Yields state scores for speech frames, interleaved with speech-start and speech-end events.
 
@@ -82,6 +88,9 @@ class SpeechScores:
         Channels of the input.
     lips
         The session's lips; they need a model whose streams are ``PositionStream``s.
+    under_way
+        Frame at which speech that another recognizer has begun began, negative before the sound:
+        the first speech begins where blocks lie as there. None: where it is found.
     """
 
     def __init__(
@@ -90,6 +99,7 @@ class SpeechScores:
         sample_rate_hz: int,
         num_channels: int = 1,
         lips: LipFrameStream | None = None,
+        under_way: int | None = None,
     ) -> None:
         self._model = model
         self._stream = model.stream()
@@ -100,12 +110,15 @@ class SpeechScores:
             self._stream.on_position = partial(SpeechScores._take_position, own)
         self._resampler = Resampler(sample_rate_hz, num_channels)
         self._detector = VoiceActivityDetector()
+        self._under_way = under_way
         self._reset_frames()
 
     def _reset_frames(self) -> None:
         self._front_end = self._model.front_end()
         self._block = np.empty(0, dtype=np.float32)
-        self._recent: deque[NDArray[np.float32]] = deque(maxlen=_PRE_ROLL_FRAMES)
+        self._recent: deque[NDArray[np.float32]] = deque(
+            maxlen=_PRE_ROLL_FRAMES + _BLOCK_FRAMES - 1
+        )
         self._num_frames = 0
         self._speaking = False
         self._lip_frames: list[LipFrame] = []  # not yet returned
@@ -165,20 +178,30 @@ class SpeechScores:
     def _detect(self) -> ScoringTask[list[ScoreEvent]]:
         """Begin or end speech by the block that is complete."""
         speech = self._detector.accept_block(self._block).is_speech
-        if speech and not self._speaking and len(self._recent) >= FRAMES_PER_POSITION:
+        begin = self._first_frame()
+        if speech and not self._speaking and self._num_frames - begin >= FRAMES_PER_POSITION:
             self._speaking = True
-            if (self._num_frames - len(self._recent)) % FRAMES_PER_POSITION != _FIRST_FRAME_PARITY:
-                self._recent.popleft()
-            start = SpeechStart(self._num_frames - len(self._recent))
+            self._under_way = None
+            start = SpeechStart(begin)
             self._next_newest = start.frame + _FIRST_NEWEST_FRAME
             if self._lips is not None:
                 self._lips.reset()
-            pre_roll = np.array(self._recent)
+            pre_roll = np.array(self._recent)[begin - self._num_frames :]
             self._recent.clear()
             return [start, *(yield from self._score(pre_roll))]
         if self._speaking and not speech:
             return (yield from self._end())
         return []
+
+    def _first_frame(self) -> int:
+        """Return the frame at which speech begins if it is found now."""
+        oldest = self._num_frames - len(self._recent)
+        begin = max(oldest, self._num_frames - _PRE_ROLL_FRAMES)
+        begin += (_FIRST_FRAME_PARITY - begin) % FRAMES_PER_POSITION
+        if self._under_way is not None:
+            begin -= (begin - self._under_way) % _BLOCK_FRAMES
+            begin += _BLOCK_FRAMES * (begin < oldest)
+        return begin
 
     def _end(self) -> ScoringTask[list[ScoreEvent]]:
         self._speaking = False

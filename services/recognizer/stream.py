@@ -25,6 +25,7 @@ from services.recognizer.front_end.pitch import Pitch
 from services.recognizer.front_end.resample import Resampler
 from services.recognizer.lip_source import LipsFromSound, delay_for
 from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
+from services.recognizer.speech_scores import frame_at
 from shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent, SpeechChange
 
@@ -68,6 +69,9 @@ class SpeechStream:
     face_delay_s
         How much later than its sound a frame of the face is made: the lip frames have the longest
         delay that is in time for it.
+    speech_time
+        Media time, samples at 16 kHz, at which speech that another recognizer has begun began: the
+        networks' blocks lie as there. 0: there is none, or nobody knows.
 
     Attributes
     ----------
@@ -90,8 +94,10 @@ class SpeechStream:
         min_confidence: float = DEFAULT_RULE[1],
         lips: LipsFromSound | None = None,
         face_delay_s: float = 0.0,
+        speech_time: int = 0,
     ) -> None:
         self.num_gaps = 0
+        self._speech_time = speech_time
         self._model = model
         self._rate_hz = sample_rate_hz
         self._num_channels = num_channels
@@ -173,12 +179,17 @@ class SpeechStream:
         lips = None
         if self._lips is not None:
             lips = self._lips.stream([delay_for(self._lips.delays_s, self._face_delay_s)])
+        under_way = None
+        if self._speech_time and self._first_chunk is not None:
+            under_way = frame_at(to_seconds(self._speech_time - media_time))
+            self._speech_time = 0
         recognizer = Recognizer(
             self._model,
             sample_rate_hz=MEDIA_RATE_HZ,
             num_stable_frames=num_stable_frames,
             min_confidence=min_confidence,
             lips=lips,
+            under_way=under_way,
         )
         self._index_base = self._next_index
         return _Segment(media_time, Resampler(self._rate_hz, self._num_channels), recognizer)

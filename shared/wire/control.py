@@ -187,6 +187,7 @@ class StartSession(Message):
     client: Address = b""  # what the client calls itself at control
     client_key: NameOrNone = ""  # its public key; empty where all is plain
     client_request: NameOrNone = ""  # its open-session
+    speech_time: Samples = 0  # when the speech began that is under way; 0: nobody speaks, or knows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

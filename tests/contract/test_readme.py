@@ -73,6 +73,7 @@ def test_every_client_has_a_picture_and_numbered_steps() -> None:
         if page.stem not in ("README", "troubleshooting"):
             assert "![" in text, page.name
             assert re.search(r"^4\. ", text, re.MULTILINE), page.name
+            assert "\nTimed" in text, page.name
             assert f"({page.name})" in (page.parent / "README.md").read_text("utf-8")
 
 

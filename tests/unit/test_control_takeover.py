@@ -11,6 +11,7 @@ from shared.bus import Bus, Socket
 from shared.wire.control import Heartbeat, SessionInput, StartSession, StopSession
 from shared.wire.message import Message
 from shared.wire.session import CloseSession, Done, Error, OpenSession, SessionMoved, SessionOpened
+from shared.wire.speech import Speech
 from tests.control_stage import Stage
 
 pytestmark = pytest.mark.unit
@@ -130,13 +131,16 @@ def test_a_client_is_told_again_that_its_session_moved(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control_service, "MOVED_AGAIN_S", (0.1, 0.2))
-    _, synthesizer = stage.services
+    recognizer, synthesizer = stage.services
     client.send(OpenSession(session="mine", request="1"))
     for service in stage.services:
         _, start = answers(stage, service, 2)
         assert isinstance(start, StartSession)
         service.send(Done(session="mine", request=start.request))
     answers(stage, client)
+    for media_time in (2840, 5000):  # said again, as one does that goes on
+        speech = Speech(session="mine", epoch=1, sequence=1, media_time=media_time, active=True)
+        recognizer.send(speech)
     again = {"phone_input": "tcp://127.0.0.1:9", "faps": "tcp://127.0.0.1:9"}
     synthesizer.send(
         Heartbeat(
@@ -149,6 +153,7 @@ def test_a_client_is_told_again_that_its_session_moved(
         while not starts:
             told = answers(stage, service)
             starts = [message for message in told if isinstance(message, StartSession)]
+        assert starts[0].speech_time == 2840
         service.send(Done(session="mine", request=starts[0].request))
     first, *others = answers(stage, client, 3)
     assert isinstance(first, SessionMoved)

@@ -55,10 +55,14 @@ def joined(outputs: list[list[StreamOutput]]) -> list[StreamOutput]:
 
 
 def recognized(
-    model: AcousticModel, samples: NDArray[np.float32], begin: int, resumption: Resumption
+    model: AcousticModel,
+    samples: NDArray[np.float32],
+    begin: int,
+    resumption: Resumption,
+    speech_time: int = 0,
 ) -> list[list[StreamOutput]]:
     """Return the outputs after each chunk from a sample on, and after the end."""
-    stream = SpeechStream(model, num_stable_frames=2, min_confidence=0.95)
+    stream = SpeechStream(model, num_stable_frames=2, min_confidence=0.95, speech_time=speech_time)
     outputs = []
     for start in range(begin, len(samples), CHUNK):
         chunk = (start, samples[start : start + CHUNK])
@@ -94,6 +98,39 @@ def test_the_phones_of_both_recognizers_are_those_of_one(
     assert [each.symbol for each in got] == [each.symbol for each in expected]
     shifts = [abs(a.onset_s - b.onset_s) for a, b in zip(expected, got, strict=True)]
     assert max(shifts) <= TOLERANCE_S
+
+
+@pytest.mark.parametrize("lost_s", [2.8, 3.1, 3.4, 4.0, 4.4])
+def test_phones_come_as_soon_as_if_nothing_had_been_lost(
+    model: AcousticModel,
+    samples: NDArray[np.float32],
+    whole: list[list[StreamOutput]],
+    lost_s: float,
+) -> None:
+    before = joined(whole[: round(lost_s * 10)])
+    final = FinalTime()
+    for output in before:
+        if not isinstance(output, Waveform):
+            final.accept(output)
+    (speech,) = (each for each in before if isinstance(each, SpeechChange) and each.active)
+    begin = max(0, round((final.time_s - WARM_UP_S) * 16_000) // CHUNK * CHUNK)
+    resumption = Resumption(final.time_s, "sil")
+    after = recognized(model, samples, begin, resumption, to_samples(speech.time_s))
+    from_s = final.time_s + 0.3
+    expected = first_chunks(whole[begin // CHUNK :], from_s)
+    assert first_chunks(after, from_s) == expected
+
+
+def first_chunks(outputs: list[list[StreamOutput]], from_s: float) -> list[tuple[str, int]]:
+    """Return phones that begin after a time, as they were at first, and with which chunk."""
+    seen: set[int] = set()
+    found = []
+    for number, each in enumerate(outputs):
+        for output in each:
+            if isinstance(output, Phone) and output.onset_s > from_s and output.index not in seen:
+                seen.add(output.index)
+                found.append((output.symbol, number))
+    return found
 
 
 def test_what_others_have_said_is_not_said_again() -> None:
