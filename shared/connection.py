@@ -9,13 +9,10 @@ import struct
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from shared.kernel_sockets import SEES_BYTES, borrowed, bytes_read, bytes_taken, inode_of
 from shared.logs import LOG, RateLimit
-
-if TYPE_CHECKING:
-    from shared.connections import Guarded
 
 KIB, MIB = 1024, 1024 * 1024
 STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscriber stands still
@@ -72,13 +69,26 @@ class Credit:
         self._left, self._since_s = self.left - cost, time.monotonic()
 
 
+class BoundSocket(Protocol):
+    """The socket to which a connection is, as ``shared.connections.Guarded``."""
+
+    bounds: Bounds
+    turns: int  # times that every connection's next complete message was delivered
+
+    def blame(self, address: str, num_faults: int) -> None:
+        """Count faults against an address."""
+
+    def note_end(self, connection: Connection) -> None:
+        """Note that a connection has ended."""
+
+
 class Connection:
     """One connection to a bound socket."""
 
     def __init__(self, descriptor: int, inode: int) -> None:
         self.descriptor = descriptor
         self.inode = inode  # of the TCP socket: the descriptor's number is used again
-        self.guarded: Guarded | None = None  # once the guard has seen it
+        self.guarded: BoundSocket | None = None  # once the guard has seen it
         self.address = ""
         self.key = ""  # of the peer, once something was delivered
         self.owner = ""  # then also: the key, or without keys the address
