@@ -43,7 +43,8 @@ MAX_KEPT = 5000  # messages of that
 MAX_UNSENT = 500  # messages; then whoever sends must wait
 ANSWER_S = (0.6, 10.0)  # without an acknowledgement, at first and at most, to connect again
 SHORT_CUT_S = 2.5  # until the next attempt, in which who was near before is taken to be so still
-NEAREST_MS = 100  # for one connection, at least
+NEAREST_MS = 50  # for one connection, at least
+MAX_TIMED = 200  # messages whose time is known
 HURRIED_ANSWER_S = 5.0  # at first, where audio comes as fast as it is taken and may wait for long
 LAST_ANSWER_S = 2.0  # for the end of the audio to be acknowledged before a session is closed
 JOIN_STEP_S = 0.1  # at most, until a subscription is in effect: it may have to be made anew
@@ -274,7 +275,8 @@ class Session:
         self._progress_s = 0.0  # when something was acknowledged, or the first message waited
         self._least_answer_s = ANSWER_S[0] if opening.paced else HURRIED_ANSWER_S
         self._answer_s = self._least_answer_s  # how long to wait for more
-        self._near_ms = CONNECT_MS  # in which the recognizer can be reached, by its first answer
+        self._near_ms = CONNECT_MS  # in which the recognizer can be reached, by its quickest answer
+        self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED)  # numbers and times
         self._rejoin_end_s = 0.0  # until then audio waits for subscriptions
         self._errors: deque[Error] = deque()
         self._unknown: tuple[float, Error] | None = (
@@ -425,8 +427,10 @@ class Session:
             return False
         else:
             self._next += 1
+        now_s = time.monotonic()
         if self._acknowledged == self._sequence:
-            self._progress_s = time.monotonic()
+            self._progress_s = now_s
+        self._sent_s.append((message.sequence, now_s))
         self._sequence = message.sequence
         self._kept.append(message)
         oldest_needed = message.media_time - RESEND_S * MEDIA_RATE_HZ
@@ -471,9 +475,11 @@ class Session:
                 self._errors.append(message)
             elif isinstance(message, Acknowledge) and message.sequence > self._acknowledged:
                 now_s = time.monotonic()
-                if not self._acknowledged:
-                    answer_ms = round(1e3 * (now_s - self._progress_s))
-                    self._near_ms = min(max(2 * answer_ms, NEAREST_MS), CONNECT_MS)
+                while self._sent_s and self._sent_s[0][0] <= message.sequence:
+                    number, sent_s = self._sent_s.popleft()
+                    if number == message.sequence:
+                        near_ms = max(round(2e3 * (now_s - sent_s)), NEAREST_MS)
+                        self._near_ms = min(near_ms, self._near_ms)
                 self._acknowledged = min(message.sequence, self._sequence)
                 self._progress_s = now_s
                 self._answer_s = max(self._least_answer_s, self._answer_s / 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import socket
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -13,7 +14,7 @@ import pytest
 
 from shared import client as client_module
 from shared.bus import Bus, Socket
-from shared.client import RESEND_S, Client, Session
+from shared.client import NEAREST_MS, RESEND_S, Client, Session
 from shared.keys import Peer
 from shared.wire.audio import AudioChunk, EndOfAudio
 from shared.wire.message import Message
@@ -160,6 +161,22 @@ def test_what_is_not_acknowledged_is_sent_again(
     first, other = next_of(AudioChunk, stage.audio[0])
     assert (first.sequence, first.epoch) == (3, 1)
     assert other.address != sender.address, "the old connection may be dead"
+
+
+def test_the_quickest_answer_tells_how_near_the_recognizer_is(stage: Stage) -> None:
+    stage.send(1)
+    _, sender = next_of(AudioChunk, stage.audio[0])
+    time.sleep(0.14)
+    stage.acknowledge(0, 1, sender)
+    first_ms = stage.session._near_ms
+    assert first_ms >= 280
+    end_s = time.monotonic() + 20
+    while stage.session._near_ms == first_ms:
+        assert time.monotonic() < end_s
+        stage.send(2)  # the newest that is acknowledged counts
+        stage.take(0, 2)
+        stage.acknowledge(0, stage.session._sequence, sender)
+    assert NEAREST_MS <= stage.session._near_ms < first_ms
 
 
 def test_a_recognizer_that_acknowledges_nothing_gets_audio_once(
