@@ -22,7 +22,7 @@ from av import AudioFrame
 from shared.errors import UserError
 
 CONNECT_LIMIT_S = 20.0  # from the answer to the first sound
-CONCEALED = 4800  # samples at most: what was lost is replaced, so that speech goes on
+CONCEALED = 14_400  # samples at most: what was lost is replaced, so that speech goes on
 MAX_GAP = 600 * 48_000  # samples; a longer one is a new beginning
 _TIMESTAMPS = 2**32  # then RTP's timestamps begin anew
 _OPUS = re.compile(r"^a=rtpmap:\d+ opus/48000/2\s*$", re.IGNORECASE | re.MULTILINE)

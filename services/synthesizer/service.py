@@ -287,7 +287,7 @@ class SynthesizerService(Service):
                 session.ends = isinstance(event, EndOfSound)
             started_s = time.perf_counter()
             frames = list(itertools.islice(session.frames, num_left))
-            self.metrics.observe("frames_ms", (time.perf_counter() - started_s) * 1e3)
+            self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
             self._publish(session, frames)
             num_left -= len(frames)
             if num_left == 0:

@@ -32,6 +32,7 @@ DIGESTS = {
     "version2-audio.json": "d30442ccf40c9d67b261ab9e4b0779ae035150c71484b62345180cb6a046139c",
     "version2-pages.json": "1f357c1fa65c5af61af8e85168ade64bb7c69083d3f66d4aa8eb08f7d5bf86ce",
     "version2-shapes.json": "991008823cc7b9721e95e913f8cf99bd7e0acd3f2655571676cd9f04f860f0a6",
+    "version2-speech.json": "390cd4c46f5cfa02de1744893571dbef0cdfe015a732e5fe62a3e4c6bef2e202",
 }
 
 
