@@ -348,6 +348,18 @@ def test_control_refuses(stage: Stage) -> None:
     assert (caught.value.code, caught.value.retry_after_s) == ("busy", 2.0)
 
 
+def test_an_error_is_raised_where_audio_waits_for_room(stage: Stage) -> None:
+    session = stage.open()
+    session.push(CHUNK)
+    _, sender = next_of(AudioChunk, stage.audio[0])
+    pushing = stage.pool.submit(push_on, session)
+    while session._has_room():
+        time.sleep(0.01)
+    stage.audio[0].send(Error(session="s", code="bad-voice", text="x"), to=sender)
+    with pytest.raises(Refused, match="bad-voice"):
+        pushing.result(20)
+
+
 def test_errors_of_audio_are_raised_once_and_an_unknown_session_ends(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -357,6 +369,8 @@ def test_errors_of_audio_are_raised_once_and_an_unknown_session_ends(
     stage.audio[0].send(Error(session="s", code="bad-voice", text="x"), to=sender)
     with pytest.raises(Refused, match="bad-voice"):
         push_on(session)
+    taken = speech.Acknowledge(session="s", sequence=session._session.num_added)
+    stage.audio[0].send(taken, to=sender)  # there may be no room else
     session.push(CHUNK)
     monkeypatch.setattr(session_link, "MOVE_LIMIT_S", 0.0)
     stage.audio[0].send(Error(session="s", code="unknown-session", text="x"), to=sender)

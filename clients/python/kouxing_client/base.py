@@ -123,7 +123,8 @@ class BaseSession:
             raise self._session.errors.popleft()
 
     def _has_room(self) -> bool:
-        return self._session.is_over or self._num_waiting() < MAX_UNACKNOWLEDGED
+        has_news = self._session.is_over or bool(self._session.errors)  # which are raised then
+        return has_news or self._num_waiting() < MAX_UNACKNOWLEDGED
 
     def _is_delivered(self) -> bool:
         return self._session.is_over or not self._has_finished or self._num_waiting() == 0
