@@ -37,7 +37,7 @@ CHUNK = RATE_HZ // 25  # samples: 40 ms
 SAME_EVERY = 10  # rounds
 PAUSE_S = 1.6  # after each round: its phones are final then
 AHEAD_S = 4.0  # of the frames that have come; what waits on the way is no growth
-QUIET_S = 1.0  # without a frame: all have come
+QUIET_S = 3.0  # without a frame, on a busy machine, too: all have come
 LIMIT_S = 60.0  # without a frame, though some are owed
 _GRID = 2560  # samples at 16 kHz: whole blocks of the voice detector, frames and slices
 

@@ -12,7 +12,7 @@ from evaluation.commands import app
 from evaluation.system.sending import TARGETS, VIEWER
 from tests.system import VOWELS_FILE
 
-pytestmark = pytest.mark.bench
+pytestmark = [pytest.mark.bench, pytest.mark.alone]
 
 
 def test_frames_arrive_at_every_receiver(tmp_path: Path) -> None:
