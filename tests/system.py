@@ -9,11 +9,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Self
 
-from services.kinds import free_addresses
+from services.kinds import KINDS, free_addresses
 from shared.client import Client
 from shared.config import variable
 from shared.errors import UserError
@@ -26,13 +27,38 @@ VOWELS_FILE = ROOT / "tests" / "sounds" / "vowels-male.wav"  # a o e i u ü, wit
 PATIENT = {"KOUXING_CONTROL_LOST_AFTER_S": "60"}  # no service is lost on a busy machine
 ANY_LOAD = {"KOUXING_CONTROL_MAX_LOAD": "1000"}  # nor is a session refused
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"}
+MAX_KEPT = 200
+
+_kept: deque[socket.socket] = deque()
 
 
-def free_port(host: str = "127.0.0.1") -> int:
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        port: int = probe.getsockname()[1]
-    return port
+def free_port() -> int:
+    """Return a port that no other program is given before a test binds it."""
+    return _keep("127.0.0.1", 0)
+
+
+def own_addresses(
+    names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
+) -> dict[str, str]:
+    """Return an environment in which services bind ports that no other program is given."""
+    addresses = free_addresses(names, hosts)
+    for address in set(addresses.values()):
+        host, _, port = address.removeprefix("tcp://").rpartition(":")
+        _keep(host or "127.0.0.1", int(port))
+    return addresses
+
+
+def _keep(host: str, port: int) -> int:
+    # Bound but not listening, so that only those can bind it, too, that allow it (SO_REUSEADDR), as
+    # servers do, and are told the port.
+    kept = socket.socket()
+    kept.bind((host, port))
+    kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    _kept.append(kept)
+    if len(_kept) > MAX_KEPT:
+        _kept.popleft().close()
+    found: int = kept.getsockname()[1]
+    return found
 
 
 def own_environment(folder: Path) -> dict[str, str]:
@@ -43,7 +69,7 @@ def own_environment(folder: Path) -> dict[str, str]:
         **ONE_THREAD,
         **headless(folder),
         **ANY_LOAD,
-        **free_addresses(),
+        **own_addresses(),
         **own,
     }
 
@@ -97,7 +123,7 @@ class System:
         self.folder = folder
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._services = list(services)
-        addresses = free_addresses(self._services, hosts)
+        addresses = own_addresses(self._services, hosts)
         self.ports = {int(address.rpartition(":")[2]) for address in addresses.values()}
         self.environment = {
             **os.environ,
@@ -147,7 +173,7 @@ class System:
 
     def start_beside(self, service: str, name: str) -> None:
         """Start one more service of a kind that runs already and wait until control knows it."""
-        addresses = free_addresses([service])
+        addresses = own_addresses([service])
         self.start(service, name, **addresses, **{variable(service, "instance"): name})
         self.wait_until(lambda report: name in {state.instance for state in report.services})
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.kinds import KINDS, free_addresses
+from services.kinds import KINDS
 from shared.keys import key_folder, read_guests
 from tests.e2e.following import stream
-from tests.system import System, kouxing
+from tests.system import System, kouxing, own_addresses
 
 pytestmark = pytest.mark.e2e
 WORKERS = ("recognizer", "synthesizer")
@@ -43,7 +43,7 @@ def test_copied_keys_make_a_system_of_several_machines_until_they_are_revoked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "control"))
-    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1", **free_addresses(WORKERS)}
+    settings = {"KOUXING_CONTROL_LOST_AFTER_S": "1", **own_addresses(WORKERS)}
     with System(["control"], tmp_path, settings=settings) as system:
         for kind in WORKERS:
             own = machine(tmp_path, f"{kind}-host", f"service:{kind}", kind)

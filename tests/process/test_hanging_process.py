@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 from services.cli.service_process import LOOK_S, SILENT_S, WORKED_S, ServiceProcess
-from services.kinds import free_addresses
 from shared.client import Client
 from shared.keys import control_endpoint
-from tests.system import PATIENT
+from tests.system import PATIENT, own_addresses
 
 pytestmark = pytest.mark.process
 WAITS_S = 2.0
@@ -31,7 +30,7 @@ signal.signal(signal.SIGUSR2, lambda *_: time.sleep({WAITS_S}))
 @pytest.fixture
 def control(tmp_path: Path) -> Iterator[ServiceProcess]:
     (tmp_path / "sitecustomize.py").write_text(BLOWS, encoding="utf-8")
-    addresses = free_addresses(["control"])
+    addresses = own_addresses(["control"])
     environment = {**os.environ, **PATIENT, **addresses, "PYTHONPATH": str(tmp_path)}
     process = ServiceProcess("control", environment=environment)
     with process, Client(control_endpoint(addresses["KOUXING_CONTROL"], insecure=False)) as client:

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from services.kinds import KINDS, free_addresses
+from services.kinds import KINDS
 from shared.client import Client
 from shared.config import variable
-from tests.system import ROOT, System
+from tests.system import ROOT, System, own_addresses
 
 pytestmark = pytest.mark.process
 
@@ -45,7 +45,7 @@ def test_every_service_stops_cleanly_on_sigterm(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
-    addresses = free_addresses(["recognizer"])
+    addresses = own_addresses(["recognizer"])
     port = int(addresses[variable("recognizer", "audio")].rpartition(":")[2])
     process = subprocess.Popen(
         [sys.executable, "-m", "services.recognizer"],
@@ -124,7 +124,7 @@ def test_a_service_ends_with_its_supervisor(tmp_path: Path) -> None:
     )
     parent = subprocess.run(
         [sys.executable, "-c", starter],
-        env={**os.environ, **free_addresses(["synthesizer"])},
+        env={**os.environ, **own_addresses(["synthesizer"])},
         cwd=ROOT,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from services.cli import supervisor as supervisors
 from services.cli.supervisor import Supervisor
-from services.kinds import free_addresses
 from shared.client import Client
 from shared.keys import control_endpoint
+from tests.system import own_addresses
 
 pytestmark = pytest.mark.process
 
@@ -37,7 +37,7 @@ def command_of(number: int) -> bytes:
 @pytest.mark.timeout(120)
 def test_it_becomes_a_service_that_crashed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisors, "STANDBY_S", 0.0)
-    environment = free_addresses(["control"])
+    environment = own_addresses(["control"])
     control = control_endpoint(environment["KOUXING_CONTROL"], insecure=False)
     supervisor = Supervisor([], tmp_path, Console(quiet=True), environment, services=["control"])
     try:
