@@ -31,7 +31,7 @@ from shared.face.faps import MASK_BYTES, NUM_FAPS
 from shared.face.shapes import SHAPE_SETS
 from shared.keys import Peer
 from shared.logs import LOG
-from shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent
+from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent
 from shared.phones.final_time import FinalTime
 from shared.phones.inventory import load_inventory
 from shared.reliable import ReliableReceiver
@@ -63,9 +63,8 @@ class _Session:
         self.sequence_out = 0
         self.shown: FapFrame | None = None  # the newest frame
         self.final = FinalTime()
-        self.waiting: deque[SoundEvent] = deque()  # while frames are made of the one before
-        self.frames: Iterator[Frame] | None = None  # of it, not made yet
-        self.ends = False  # with it
+        self.waiting: deque[SoundEvent] = deque()  # while frames are made of the first
+        self.frames: Iterator[Frame] | None = None  # of that, not made yet
         self.finished = False
         self._resumed_s = -math.inf  # when it took another synthesizer's place
         self.since_then: list[FapFrame | Shapes | EndOfFaps] = []  # published of late
@@ -188,9 +187,9 @@ class SynthesizerService(Service):
             self._faps.drop_stopped((FapFrame, Shapes), live)
         for session in self._sessions.values():
             session.receiver.tick()
-            if session.start.paced and not session.finished and session.frames is None:
+            if session.start.paced and not session.finished and not session.waiting:
                 self._relax(session, now_s)
-        owing = [session for session in self._sessions.values() if session.frames is not None]
+        owing = [session for session in self._sessions.values() if session.waiting]
         if owing:  # one after the other gets its turn
             self._turn += 1
             self._make_frames(owing[self._turn % len(owing)])
@@ -274,26 +273,27 @@ class SynthesizerService(Service):
             return
         session.final.accept(event)
         session.waiting.append(event)
-        if session.frames is None:
+        if len(session.waiting) == 1:
             self._make_frames(session)
 
     def _make_frames(self, session: _Session) -> None:
         """Publish frames of what came for a session, but not too many at a time."""
         num_left = max(1, round(MAX_AT_ONCE_S * self.frame_rate_hz))
-        while session.frames is not None or session.waiting:
+        while session.waiting:
+            event = session.waiting[0]
             if session.frames is None:
-                event = session.waiting.popleft()
                 session.frames = session.face.frames_of(event)
-                session.ends = isinstance(event, EndOfSound)
             started_s = time.perf_counter()
             frames = list(itertools.islice(session.frames, num_left))
-            self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
             self._publish(session, frames)
+            if isinstance(event, Progress):
+                self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
             num_left -= len(frames)
             if num_left == 0:
                 return
             session.frames = None
-            if session.ends:
+            session.waiting.popleft()
+            if isinstance(event, EndOfSound):
                 self._end(session)
 
     # --- out -------------------------------------------------------------------------------------
