@@ -23,4 +23,4 @@ def test_frames_arrive_at_every_receiver(tmp_path: Path) -> None:
     arrivals = json.loads(figures.read_text("utf-8"))
     targets = [*(url.format("HOST") for url in TARGETS), "vts://HOST", f"ws://HOST/{VIEWER}"]
     assert [each["target"] for each in arrivals] == targets
-    assert all(each["num_frames"] > 10 for each in arrivals)
+    assert all(each["num_frames"] > 100 for each in arrivals)

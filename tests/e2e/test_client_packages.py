@@ -26,6 +26,7 @@ from evaluation.system import sync
 from shared.client import Client
 from shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
+from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file
 from tests.glb_writer import Mesh, write_glb
 from tests.scripted_system import Gateway
@@ -41,10 +42,6 @@ PYTHON_CLIENT = ROOT / "clients" / "python"
 def pip(*arguments: object) -> None:
     command = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*command, *map(str, arguments)], check=True)
-
-
-def examples(document: Path, language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", document.read_text("utf-8"), re.DOTALL)
 
 
 def run_example(command: list[object], **environment: str) -> list[str]:
@@ -81,7 +78,7 @@ def python(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_python_package_speaks_a_file(system: System, python: Path, tmp_path: Path) -> None:
-    plain, awaited = examples(PYTHON_CLIENT / "README.md", "python")
+    plain, awaited = code_blocks(PYTHON_CLIENT / "README.md", "python")
     (tmp_path / "plain.py").write_text(plain, encoding="utf-8")
     (tmp_path / "awaited.py").write_text(awaited, encoding="utf-8")
     control = system.control.partition(" ")[0]
@@ -189,7 +186,7 @@ def test_the_javascript_package_works_in_node(project: Path, gateway: Gateway) -
         check=False,
     )
     assert result.returncode == 0, result.stdout
-    (example,) = examples(JAVASCRIPT_CLIENT / "README.md", "js")
+    (example,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "js")
     (project / "example.mjs").write_text(example, encoding="utf-8")
     wav = project / "two-seconds.wav"  # it is spoken in real time
     with wave.open(str(SPEECH)) as whole, wave.open(str(wav), "wb") as part:
@@ -301,7 +298,7 @@ def faces(
 ) -> Iterator[Browser]:
     """A browser with a page as the README has it, of many faces beside each other."""
     write_faces(project)
-    (page,) = examples(JAVASCRIPT_CLIENT / "README.md", "html")
+    (page,) = code_blocks(JAVASCRIPT_CLIENT / "README.md", "html")
     live = f'gateway="{gateway.page}" session="seen"'
     attributes = {
         "arkit": 'src="arkit.glb" recording',

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import struct
 import subprocess
 import sys
@@ -20,6 +19,7 @@ import zmq
 
 from evaluation.system.attackers import connect
 from shared.keys import Key, key_folder, own_key, user_key
+from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System
 
@@ -204,7 +204,7 @@ def test_a_client_of_version_1_is_told_in_version_1_what_to_do(spread: System) -
 def test_the_examples_in_the_document_run(
     language: str, program: str, spread: System, tmp_path: Path
 ) -> None:
-    (example,) = re.findall(rf"```{language}\n(.*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL)
+    (example,) = code_blocks(DOCUMENT, language)
     address = "tcp://127.0.0.1:5550"
     assert address in example
     assert KEY_FILE in example
@@ -226,8 +226,7 @@ def test_the_examples_in_the_document_run(
 
 
 def test_the_example_in_the_readme_follows_a_face(spread: System, tmp_path: Path) -> None:
-    readme = (ROOT / "README.md").read_text("utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    (example,) = code_blocks(ROOT / "README.md", "python")
     faps = spread.endpoints()["faps"].partition(" ")[0]
     for default, own in (
         ("tcp://127.0.0.1:5571", faps),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 
 import pytest
 
 from tests.browser import Browser
+from tests.documents import code_blocks
 from tests.system import DEMO, ROOT
 from tests.watched import Watched
 
@@ -15,7 +15,6 @@ pytestmark = pytest.mark.e2e
 
 STATUS = "document.getElementById('status').textContent"
 WEBRTC_PAGE = ROOT / "docs" / "clients" / "webrtc.md"
-CODE = re.compile(r"```js\n(.*?)```", re.DOTALL)
 IS_LIVE = f"{STATUS}.includes('live') && window.kouxing.state.voiceToPictureMs !== null"
 
 
@@ -79,12 +78,9 @@ def test_a_crash_is_told_and_the_microphone_goes_on(
 
 
 def test_the_script_of_the_documents_speaks_over_webrtc(browser: Browser) -> None:
-    script = CODE.search(WEBRTC_PAGE.read_text("utf-8"))
-    assert script is not None
+    (script,) = code_blocks(WEBRTC_PAGE, "js")
     browser.evaluate("window.logged = []; console.log = (value) => window.logged.push(value)")
-    told = browser.command(
-        "Runtime.evaluate", expression=script[1], replMode=True, awaitPromise=True
-    )
+    told = browser.command("Runtime.evaluate", expression=script, replMode=True, awaitPromise=True)
     assert "exceptionDetails" not in told, told
     browser.wait_for("window.logged.some((value) => value > 0.1)")
     browser.wait_for("window.logged.filter((value) => typeof value === 'string').length > 5")

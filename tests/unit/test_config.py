@@ -15,6 +15,7 @@ from services.recognizer.config import RecognizerConfig
 from services.synthesizer.config import SynthesizerConfig
 from shared.config import ServiceConfig, Settings
 from shared.errors import UserError
+from tests.documents import code_blocks
 
 pytestmark = pytest.mark.unit
 
@@ -206,8 +207,7 @@ def test_the_variables_in_documents_are_known(name: str) -> None:
 
 
 def test_the_one_file_for_all_hosts_is_understood(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "hosts.md").read_text(encoding="utf-8")
-    (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (text,) = code_blocks(Path(__file__).parents[2] / "docs" / "hosts.md", "toml")
     given = settings(written(tmp_path, text))
     control = given.load(ControlConfig)
     assert control.reachable(control.commands) == given.load(RecognizerConfig).control

@@ -79,6 +79,19 @@ def whole(model: AcousticModel, samples: NDArray[np.float32]) -> list[list[Strea
     return recognized(model, samples, 0, Resumption(0.0, "sil"))
 
 
+def known_until(
+    whole: list[list[StreamOutput]], lost_s: float
+) -> tuple[list[StreamOutput], float, int]:
+    """Return what came until a loss, up to when phones are final, and the first sample again."""
+    before = joined(whole[: round(lost_s * 10)])
+    final = FinalTime()
+    for output in before:
+        if not isinstance(output, Waveform):
+            final.accept(output)
+    begin = max(0, round((final.time_s - WARM_UP_S) * 16_000) // CHUNK * CHUNK)
+    return before, final.time_s, begin
+
+
 @pytest.mark.parametrize("lost_s", [2.5, 3.1, 4.0])
 def test_the_phones_of_both_recognizers_are_those_of_one(
     model: AcousticModel,
@@ -86,14 +99,9 @@ def test_the_phones_of_both_recognizers_are_those_of_one(
     whole: list[list[StreamOutput]],
     lost_s: float,
 ) -> None:
-    before = joined(whole[: round(lost_s * 10)])
-    final = FinalTime()
-    for output in before:
-        if not isinstance(output, Waveform):
-            final.accept(output)
-    assert 0.0 < final.time_s < lost_s
-    begin = max(0, round((final.time_s - WARM_UP_S) * 16_000) // CHUNK * CHUNK)
-    after = joined(recognized(model, samples, begin, Resumption(final.time_s, "sil")))
+    before, final_s, begin = known_until(whole, lost_s)
+    assert 0.0 < final_s < lost_s
+    after = joined(recognized(model, samples, begin, Resumption(final_s, "sil")))
     expected, got = final_phones(joined(whole)), final_phones(before) + final_phones(after)
     assert [each.symbol for each in got] == [each.symbol for each in expected]
     shifts = [abs(a.onset_s - b.onset_s) for a, b in zip(expected, got, strict=True)]
@@ -107,16 +115,11 @@ def test_phones_come_as_soon_as_if_nothing_had_been_lost(
     whole: list[list[StreamOutput]],
     lost_s: float,
 ) -> None:
-    before = joined(whole[: round(lost_s * 10)])
-    final = FinalTime()
-    for output in before:
-        if not isinstance(output, Waveform):
-            final.accept(output)
+    before, final_s, begin = known_until(whole, lost_s)
     (speech,) = (each for each in before if isinstance(each, SpeechChange) and each.active)
-    begin = max(0, round((final.time_s - WARM_UP_S) * 16_000) // CHUNK * CHUNK)
-    resumption = Resumption(final.time_s, "sil")
+    resumption = Resumption(final_s, "sil")
     after = recognized(model, samples, begin, resumption, to_samples(speech.time_s))
-    from_s = final.time_s + 0.3
+    from_s = final_s + 0.3
     expected = first_chunks(whole[begin // CHUNK :], from_s)
     assert first_chunks(after, from_s) == expected
 

@@ -1,0 +1,13 @@
+"""Programs that stand in documents, so that the tests run what readers copy."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from pathlib import Path
+
+
+def code_blocks(document: Path, language: str) -> list[str]:
+    """Return the blocks of code in a language, also those within a list."""
+    blocks = re.findall(rf"```{language}\n(.*?)```", document.read_text("utf-8"), re.DOTALL)
+    return [textwrap.dedent(block) for block in blocks]
