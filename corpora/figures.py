@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
-from shared.errors import UserError
+from shared.errors import UserError, install_command
 
 _DOTS_PER_INCH = 80
 
@@ -23,9 +22,7 @@ def new_figure(width_in: float, height_in: float) -> Any:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (optional)
         from matplotlib.figure import Figure  # noqa: PLC0415
     except ImportError:
-        raise UserError(
-            f"pictures need matplotlib; type: {sys.executable} -m pip install matplotlib"
-        ) from None
+        raise UserError(f"pictures need matplotlib: {install_command('matplotlib')}") from None
     figure = Figure(figsize=(width_in, height_in), dpi=_DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from services.cli.terminal import check_output, print_message
-from shared.errors import UserError
+from shared.errors import UserError, install_command
 from shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from training import SYNTHETIC_WEIGHT
 
@@ -63,7 +63,7 @@ def _neural_training() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise UserError(
-            f"{error.name} is missing; install it: pip install 'kouxing[neural-training]'"
+            f"{error.name} is missing: {install_command('kouxing[neural-training]')}"
         ) from error
 
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from services.cli.services import ConfigFile
 from services.kinds import KINDS, read_settings
 from shared.config import parse_assignments
-from shared.errors import UserError
+from shared.errors import UserError, install_command
 
 Number = Annotated[int | None, typer.Option(min=0, max=1000, help="How many are to run.")]
 
@@ -37,7 +37,8 @@ def cluster(
     try:
         from services.cli.ray_workers import RayWorkers
     except ModuleNotFoundError:
-        raise UserError("Ray is missing; on every host: pip install 'kouxing[cluster]'") from None
+        command = install_command("kouxing[cluster]")
+        raise UserError(f"Ray is missing; on every host, too: {command}") from None
     with RayWorkers(address) as workers:
         for name, number in (("recognizer", recognizers), ("synthesizer", synthesizers)):
             if number is not None:

@@ -38,8 +38,8 @@ MAX_COMMANDS = 100  # of one client that wait
 MAX_BUFFERED_BYTES = 64 * 1024  # of a data channel; then messages wait, and old frames are dropped
 BUFFER_WAIT_S = 0.02
 MISSING = (
-    "this gateway has no WebRTC; for that type, where it is installed: pip install "
-    "'kouxing[webrtc]'\n"
+    "this gateway has no WebRTC; for that type in kouxing's folder, where the gateway runs: "
+    ".venv/bin/pip install 'kouxing[webrtc]'\n"
 )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
+from shared.errors import UserError, install_command
 
 
 class Transcriber(Protocol):
@@ -59,7 +59,7 @@ def _recognizer_in(folder: Path) -> Any:
         from sherpa_onnx import OfflineRecognizer  # noqa: PLC0415 (optional)
     except ImportError:
         raise UserError(
-            "speech to text needs sherpa-onnx: pip install 'kouxing[speech-to-text]'"
+            f"speech to text needs sherpa-onnx: {install_command('kouxing[speech-to-text]')}"
         ) from None
     tokens = folder / "tokens.txt"
     parts = {name: _model_in(folder, name) for name in ("encoder", "decoder", "joiner", "model")}

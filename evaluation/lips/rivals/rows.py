@@ -29,7 +29,7 @@ from scipy.signal import resample_poly
 
 from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from services.recognizer.acoustic.acoustic_model import AcousticModel
-from shared.errors import UserError
+from shared.errors import UserError, install_command
 from shared.face.shapes import OCULUS
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def package_rows(package: str, samples: NDArray[np.float32], profile: Any = None
     folders = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
     node = shutil.which("node", path=folders)
     if node is None:
-        raise UserError("other lip sync needs Node: pip install 'kouxing[page]'")
+        raise UserError(f"other lip sync needs Node: {install_command('kouxing[page]')}")
     if not (FOLDER / "node_modules").is_dir():
         raise UserError(f"the packages to compare with are missing; run 'npm ci' in {FOLDER}")
     sound = np.append(samples, np.zeros(round(_SILENCE_AFTER_S * SAMPLE_RATE_HZ)))

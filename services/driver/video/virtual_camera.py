@@ -8,7 +8,7 @@ import numpy as np
 
 from services.driver.head.head import Float32
 from services.driver.render.renderer import Renderer
-from shared.errors import UserError
+from shared.errors import UserError, install_command
 
 
 class VirtualCamera:
@@ -25,7 +25,7 @@ class VirtualCamera:
             library = importlib.import_module("pyvirtualcam")
         except ImportError:
             raise UserError(
-                "driver.virtual_camera needs pyvirtualcam; pip install 'kouxing[camera]'"
+                f"driver.virtual_camera needs pyvirtualcam: {install_command('kouxing[camera]')}"
             ) from None
         self._renderer = renderer
         self._interval_s = 1.0 / frame_rate_hz
