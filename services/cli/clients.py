@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +19,7 @@ from services.cli.terminal import (
     CONSOLE,
     CurveForm,
     JsonFile,
+    Shown,
     VoiceFile,
     print_message,
     write_json,
@@ -36,14 +36,6 @@ Control = Annotated[
     str,
     typer.Option(help="Address of control; else $KOUXING_CONTROL, else the system you run here."),
 ]
-
-
-class Shown(StrEnum):
-    """What ``kouxing listen`` prints."""
-
-    FAPS = "faps"
-    SYLLABLES = "syllables"
-    PHONES = "phones"
 
 
 def speak(

@@ -12,9 +12,8 @@ from typing import IO, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from services.cli.clients import Shown
 from services.cli.curves import check_curves, row_writer
-from services.cli.terminal import CONSOLE, CurveForm, check_output, print_message
+from services.cli.terminal import CONSOLE, CurveForm, Shown, check_output, print_message
 from shared.client import Client, Refused
 from shared.clock import to_seconds
 from shared.errors import UserError

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from services.cli.offline import Timing
 from services.cli.sound_file import read_mono_16k
 from services.cli.spoken_text import does_not_fit, read_text
-from services.cli.terminal import CONSOLE, check_output, print_message, write_text
+from services.cli.terminal import CONSOLE, Timing, check_output, print_message, write_text
 from services.driver.video.writer import VideoWriter, write_picture
 from services.recognizer.acoustic.load import load_live_model
 from services.recognizer.alignment import align_syllables, spoken, timed_syllables

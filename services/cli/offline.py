@@ -9,7 +9,14 @@ from typing import Annotated
 import typer
 
 from services.cli.heads import DEFAULT_HEAD, HeadName
-from services.cli.terminal import CONSOLE, CurveForm, VoiceFile, print_message, write_output
+from services.cli.terminal import (
+    CONSOLE,
+    CurveForm,
+    Timing,
+    VoiceFile,
+    print_message,
+    write_output,
+)
 from services.driver.config import Framing
 from shared.errors import UserError
 from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
@@ -25,13 +32,6 @@ class PhoneFormat(StrEnum):
     CSV = "csv"
     JSON = "json"
     TEXTGRID = "textgrid"
-
-
-class Timing(StrEnum):
-    """What tells when the phones of a text are spoken."""
-
-    ENDPOINTS = "endpoints"  # energy and zero crossings
-    ALIGN = "align"  # the acoustic model
 
 
 Form = Annotated[

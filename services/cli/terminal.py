@@ -1,4 +1,4 @@
-"""What commands share: the console, and writing results."""
+"""What commands share: choices of options, the console, and writing results."""
 
 from __future__ import annotations
 
@@ -29,6 +29,21 @@ class CurveForm(StrEnum):
     ARKIT = ShapeSetName.ARKIT
     OCULUS = ShapeSetName.OCULUS
     VRM = ShapeSetName.VRM
+
+
+class Shown(StrEnum):
+    """What ``kouxing listen`` prints."""
+
+    FAPS = "faps"
+    SYLLABLES = "syllables"
+    PHONES = "phones"
+
+
+class Timing(StrEnum):
+    """What tells when the phones of a text are spoken."""
+
+    ENDPOINTS = "endpoints"  # energy and zero crossings
+    ALIGN = "align"  # the acoustic model
 
 
 def print_message(text: str) -> None:

@@ -13,7 +13,8 @@ import pytest
 from matplotlib.font_manager import findfont
 
 from services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
-from services.cli.offline import Timing, lips
+from services.cli.offline import lips
+from services.cli.terminal import Timing
 from services.driver import picture
 from services.synthesizer.lips.ferguson import drawing
 from services.synthesizer.lips.ferguson.contour import LINES, contour
