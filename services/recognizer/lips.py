@@ -94,6 +94,25 @@ class LipPredictor:
         """Delays that it offers, seconds, rising."""
         return tuple(round(float(delay_s), 6) for delay_s in self.delays)
 
+    @cached_property
+    def _of_delays(self) -> dict[tuple[int, ...], tuple[Floats, Floats]]:
+        return {}
+
+    def weights_of(self, delays: Sequence[int]) -> tuple[Floats, Floats]:
+        """Return A and B of some delays, for all streams that have these.
+
+        Their shapes are (history components, delays 17) and (2 units, delays 17).
+        """
+        key = tuple(delays)
+        if key not in self._of_delays:
+            chosen = [
+                weights[..., list(delays), :]
+                for weights in (self.history_weights, self.output_weights)
+            ]
+            history, output = (weights.reshape(-1, len(delays) * NUM_OUTPUTS) for weights in chosen)
+            self._of_delays[key] = history, output
+        return self._of_delays[key]
+
     def stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
         """Start a session's lips with these of the delays.
 
@@ -174,12 +193,7 @@ class LipPredictorStream:
     def __init__(self, model: LipPredictor, delays: Sequence[int]) -> None:
         self._model = model
         self._delays_s = [model.delays_s[delay] for delay in delays]
-        history, components, _, outputs = model.history_weights.shape
-        size = len(delays) * outputs
-        self._history_weights = _columns_of(model.history_weights, delays).reshape(
-            history * components, size
-        )
-        self._output_weights = _columns_of(model.output_weights, delays).reshape(-1, size)
+        self._history_weights, self._output_weights = model.weights_of(delays)
         self._output_bias = model.output_bias[list(delays)]
         self.reset()
 
@@ -248,11 +262,6 @@ def mouth_faps(lips: Floats) -> Floats:
     for one, other in _PAIRS:
         faps[other] = faps[one]
     return faps
-
-
-def _columns_of(weights: Floats, delays: Sequence[int]) -> Floats:
-    """Return the weights of some delays, the last axis but one, in one piece of memory."""
-    return np.ascontiguousarray(weights[..., list(delays), :])
 
 
 def _sigmoid(x: Floats) -> Floats:

@@ -219,7 +219,7 @@ class _Segment:
         self._start = start  # media time, samples at 16 kHz
         self._num_samples = 0  # processed since then
         self._slice: list[NDArray[np.float32]] = []  # pieces of the 20 ms under way
-        self._pitch = Pitch()
+        self._pitch = Pitch(start // SLICE)
         self._resampler = resampler
         self._recognizer = recognizer
 

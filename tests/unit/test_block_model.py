@@ -9,7 +9,7 @@ import torch
 
 from services.recognizer.acoustic import blocks as blocks_module
 from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.blocks import BlockModel, Past
+from services.recognizer.acoustic.blocks import BlockModel
 from services.recognizer.acoustic.load import MODELS, load_model
 from services.recognizer.acoustic.model_file import read_archive, write_archive
 from services.recognizer.acoustic.neural import NeuralModel
@@ -201,8 +201,8 @@ def scores_of_encoder(model: BlockModel, frames: np.ndarray) -> np.ndarray:
     kept = []
     for start in range(0, len(frames), 8):
         stream.accept(frames[start : start + 8])
-        kept.append(stream._past.caches.copy() if stream._past else None)
-    return np.stack([each for each in kept if each is not None])
+        kept.append(stream.past.cache.rings.copy())
+    return np.stack(kept)
 
 
 def test_a_segment_begins_afresh() -> None:
@@ -233,7 +233,7 @@ def test_a_talking_session_takes_less_than_two_megabytes() -> None:
     sizes = blocks().session.sizes
     assert sizes.past == 125
     whisper = blocks_module.BlockSizes(5, 15, 125, 512, 192, layers=6, heads=8, head_size=64)
-    assert Past.empty(whisper).caches.nbytes < 1.6e6
+    assert whisper.cache.num_bytes < 1.6e6
 
 
 # --- the file

@@ -20,8 +20,8 @@ def voice(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.asarray(0.1 * np.sum(tones, axis=0), np.float32)
 
 
-def pitches(samples: NDArray[np.float32]) -> NDArray[np.float64]:
-    pitch = Pitch()
+def pitches(samples: NDArray[np.float32], num_before: int = 0) -> NDArray[np.float64]:
+    pitch = Pitch(num_before)
     return np.array([pitch.accept_slice(each) for each in samples.reshape(-1, SLICE)])
 
 
@@ -45,9 +45,15 @@ def test_it_follows_a_rising_voice_and_noise_and_silence_have_none() -> None:
     assert np.count_nonzero(found[80:]) < 5
 
 
-def test_a_long_session_starts_again_in_a_pause_and_goes_on() -> None:
+def test_a_long_voice_is_followed_throughout() -> None:
     pause = noise(RATE_HZ)
     spoken = voice(np.full(11 * RATE_HZ, 200.0))
     found = pitches(np.concatenate([spoken, pause, spoken[: 2 * RATE_HZ]]))
     np.testing.assert_allclose(found[10:545], 200.0, rtol=0.03)
     np.testing.assert_allclose(found[12 * 50 + 10 :], 200.0, rtol=0.03)
+
+
+def test_who_begins_later_soon_hears_the_same() -> None:
+    samples = voice(np.linspace(150.0, 250.0, 4 * RATE_HZ)) + noise(4 * RATE_HZ)
+    whole, later = pitches(samples), pitches(samples[70 * SLICE :], num_before=70)
+    np.testing.assert_array_equal(later[80:], whole[150:])

@@ -50,6 +50,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
+from services.recognizer.acoustic.caches import (
+    Cache,
+    CacheMemory,
+    CacheSizes,
+    Halves,
+    cache_names,
+)
 from services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -58,7 +65,6 @@ from services.recognizer.acoustic.model_file import (
 )
 from services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
-    MAX_BATCH,
     MAX_POSITIONS,
     Floats,
     open_session,
@@ -73,10 +79,9 @@ _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # bef
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
+_MAX_BATCH = 4  # sessions in a run; with more each takes no less time, but memory
 _MAX_SIZE = 4096
 _MAX_CACHE_BYTES = 3_000_000  # of a session
-
-Halves = NDArray[np.float16]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +103,11 @@ class BlockModel:
         """The network, ready to run."""
         return BlockSession(self.network)
 
+    @cached_property
+    def caches(self) -> CacheMemory:
+        """Keys and values of all sessions."""
+        return CacheMemory(self.session.sizes.cache, _MAX_BATCH)
+
     def front_end(self) -> WhisperMel:
         """Start a front end for one session."""
         return WhisperMel()
@@ -112,12 +122,13 @@ class BlockModel:
         for stream, (_, frames) in zip(streams, work, strict=True):
             stream.take_frames(frames)
         while ready := [stream for stream in streams if stream.is_due]:
-            for start in range(0, len(ready), MAX_BATCH):
-                self._run(ready[start : start + MAX_BATCH])
+            for numbers, rings in self.caches.runs([stream.past.cache for stream in ready]):
+                self._run([ready[number] for number in numbers], rings)
         return [stream.take_settled() for stream in streams]
 
-    def _run(self, streams: Sequence[BlockStream]) -> None:
-        log_posteriors, states, new = self.session.run([stream.block() for stream in streams])
+    def _run(self, streams: Sequence[BlockStream], rings: Halves) -> None:
+        blocks = [stream.block() for stream in streams]
+        log_posteriors, states, new = self.session.run(blocks, rings)
         scores = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
         for row, stream in enumerate(streams):  # copies: a row would keep all of them
             stream.take_outputs(scores[row].copy(), states[row].copy(), new[row])
@@ -147,20 +158,19 @@ class BlockSizes:
     heads: int
     head_size: int
 
+    @property
+    def cache(self) -> CacheSizes:
+        """Sizes of a session's cache."""
+        return CacheSizes(2 * self.layers, self.heads, self.past, self.head_size)
+
 
 @dataclass(slots=True)
 class Past:
     """What a session's network has computed before a block."""
 
-    caches: Halves  # rings: keys of all layers, then values (2 layers, heads, PAST, size)
+    cache: Cache  # rings: keys of all layers, then values (2 layers, heads, PAST, size)
     state: Floats  # of the recurrent layer, (width,)
-    num_cached: int = 0  # positions in the caches
-
-    @classmethod
-    def empty(cls, sizes: BlockSizes) -> Past:
-        """Return the past of a segment that begins."""
-        rings = (2 * sizes.layers, sizes.heads, sizes.past, sizes.head_size)
-        return cls(np.zeros(rings, np.float16), np.zeros(sizes.state, np.float32))
+    num_cached: int = 0  # positions in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,14 +200,19 @@ class BlockSession:
     def __init__(self, file: NDArray[np.uint8]) -> None:
         self._session = open_session(file)
         self.sizes = _sizes_of(self._session)
-        self._names = _cache_names(self.sizes.layers)
+        self._names = cache_names(self.sizes.layers)
         unused = np.zeros((self.sizes.length, self.sizes.width), np.float32)
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
-        # Of the sessions in a run, (2 layers, sessions, heads, PAST, size).
-        self._caches = np.empty((0, 0), np.float16)
 
-    def run(self, blocks: Sequence[Block]) -> tuple[Floats, Floats, Halves]:
+    def run(self, blocks: Sequence[Block], rings: Halves) -> tuple[Floats, Floats, Halves]:
         """Run the network on a block of each session, with ``n`` the number of sessions.
+
+        Parameters
+        ----------
+        blocks
+            The sessions' next ones.
+        rings
+            Their caches, (2 layers, n, heads, PAST, size).
 
         Returns
         -------
@@ -221,25 +236,13 @@ class BlockSession:
             "num_positions": np.array([block.num_positions for block in blocks]),
             "num_cached": np.array([block.past.num_cached for block in blocks]),
             "state": np.stack([block.past.state for block in blocks]),
-            **dict(zip(self._names, self._joined([block.past for block in blocks]), strict=True)),
+            **dict(zip(self._names, rings, strict=True)),
         }
         try:
             log_posteriors, state, new = self._session.run(_OUTPUTS, inputs)
         except Exception as error:  # onnxruntime's errors have no base of their own
             raise ValueError(f"its network does not run ({error})") from error
         return log_posteriors, state, new
-
-    def _joined(self, pasts: Sequence[Past]) -> Halves:
-        """Return the sessions' caches as one array, (2 layers, n, heads, PAST, size)."""
-        if len(pasts) == 1:
-            return pasts[0].caches[:, None]
-        if self._caches.shape[1] < len(pasts):
-            rings, *of_ring = pasts[0].caches.shape
-            self._caches = np.zeros((rings, len(pasts), *of_ring), np.float16)
-        joined = self._caches[:, : len(pasts)]
-        for row, past in enumerate(pasts):  # what lies beyond is masked
-            joined[:, row, :, : past.num_cached] = past.caches[:, :, : past.num_cached]
-        return joined
 
 
 class BlockStream:
@@ -250,7 +253,8 @@ class BlockStream:
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
         self._nothing = no_scores(model.topology.num_states)
-        self._past: Past | None = None  # made when speech first comes
+        state = np.zeros(self._sizes.state, np.float32)
+        self.past = Past(model.caches.open(), state)
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
@@ -276,8 +280,7 @@ class BlockStream:
         """Go to the first row of the table of positions, with nothing before it."""
         self._row = 0  # of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
-        if self._past is not None:
-            self._past.num_cached, self._past.state = 0, np.zeros_like(self._past.state)
+        self.past.num_cached, self.past.state = 0, np.zeros_like(self.past.state)
 
     def take_frames(self, frames: Floats | None) -> None:
         """Take frames, (n, 80), or the segment's end, at which its last frame is repeated."""
@@ -305,11 +308,9 @@ class BlockStream:
 
     def block(self) -> Block:
         """Return what the network must compute next."""
-        if self._past is None:
-            self._past = Past.empty(self._sizes)
         num_positions = min(self._num_positions, self._num_due)
         frames = self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1]
-        return Block(frames, self._row, num_positions, self._past)
+        return Block(frames, self._row, num_positions, self.past)
 
     def take_outputs(self, scores: Floats, state: Floats, new: Halves) -> None:
         """Take what the network computed: scores, (2 (B + R), states), state, keys and values."""
@@ -328,7 +329,7 @@ class BlockStream:
             return
         if num_settled:
             slot = self._row % sizes.past
-            block.past.caches[:, :, slot : slot + sizes.block] = new
+            block.past.cache.rings[:, :, slot : slot + sizes.block] = new
             block.past.num_cached = min(block.past.num_cached + sizes.block, sizes.past)
             block.past.state = state
             self._row += num_settled
@@ -347,16 +348,12 @@ class BlockStream:
         return rows
 
 
-def _cache_names(num_layers: int) -> list[str]:
-    return [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
-
-
 def _sizes_of(session: Any) -> BlockSizes:
     """Read a network's sizes from its inputs and outputs, after checking names and shapes."""
     shapes = {node.name: list(node.shape[1:]) for node in session.get_inputs()}
     outputs = {node.name: list(node.shape[1:]) for node in session.get_outputs()}
     num_layers = sum(name.startswith("keys_") for name in shapes)
-    if list(shapes) != [*_INPUTS, *_cache_names(num_layers)] or list(outputs) != _OUTPUTS:
+    if list(shapes) != [*_INPUTS, *cache_names(num_layers)] or list(outputs) != _OUTPUTS:
         raise ValueError(f"its network has the inputs {', '.join(shapes)}")
     try:
         length, width = shapes["positions"]
@@ -401,7 +398,10 @@ def blocks_from(archive: Archive) -> BlockModel:
     )
     sizes = model.session.sizes
     frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
-    outputs = model.session.run([Block(frames, 0, sizes.length, Past.empty(sizes))])
+    past = model.stream().past
+    outputs = model.session.run(
+        [Block(frames, 0, sizes.length, past)], past.cache.rings[:, np.newaxis]
+    )
     new = (1, 2 * sizes.layers, sizes.heads, sizes.block, sizes.head_size)
     expected = [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new]
     if [array.shape for array in outputs] != expected:

@@ -6,7 +6,6 @@ See :mod:`services.recognizer.acoustic.neural` for what it computes and
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from services.recognizer.acoustic.caches import CacheSizes, cache_names
 from services.recognizer.front_end.whisper_mel import NUM_MELS
 from services.recognizer.onnx_session import open_network
 
@@ -22,7 +22,6 @@ NUM_INPUTS = NUM_MELS
 WINDOW = 128  # positions that one attends to, itself included
 MAX_POSITIONS = 1500  # rows of the table of positions
 SEEN_FRAMES = 5  # feature frames that enter at one position
-MAX_BATCH = 16  # sessions in a run; more would only take memory
 FRAMES_PER_POSITION = 2  # feature frames from one position to the next
 
 _OUTPUTS = ["log_posteriors", "keys", "values"]
@@ -31,7 +30,6 @@ _MAX_LAYERS = 64
 _LONGEST_WAVE = 10_000.0  # of the sinusoids, over 2 pi
 
 Floats = NDArray[np.float32]
-Halves = NDArray[np.float16]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,69 +41,10 @@ class NetworkSizes:
     num_heads: int  # of attention
     head_size: int  # numbers in a head's key or value
 
-
-class KeyValueCache:
-    """Keys and values of a session's earlier positions, as the network takes them.
-
-    Each is a ring of ``WINDOW`` slots, in 16 bits, shape (layers, 1, heads, WINDOW, size).
-    """
-
-    _numbers = itertools.count()
-
-    def __init__(self, sizes: NetworkSizes) -> None:
-        self.keys, self.values = _rings(sizes, 1)
-        self._number = next(self._numbers)
-        self._num_written = 0
-
     @property
-    def state(self) -> tuple[int, int]:
-        """Tells this cache, with what it holds, from all others and from what it held before."""
-        return self._number, self._num_written
-
-    def write(self, slot: int, keys: Floats, values: Floats) -> None:
-        """Write a position's keys and values, each (layers, heads, size)."""
-        self.keys[:, 0, :, slot], self.values[:, 0, :, slot] = keys, values
-        self._num_written += 1
-
-
-class JointCache:
-    """The caches of the sessions in a run side by side, in memory that is used again and again.
-
-    What a row holds already is not copied once more: sessions that run together stay there.
-    """
-
-    def __init__(self, sizes: NetworkSizes) -> None:
-        self._sizes = sizes
-        self._keys, self._values = _rings(sizes, 0)
-        self._states: list[tuple[int, int] | None] = []  # of the caches in the rows
-
-    def join(self, caches: Sequence[KeyValueCache]) -> tuple[Halves, Halves]:
-        """Return keys and values, each (layers, sessions, heads, WINDOW, size)."""
-        if len(caches) == 1:
-            return caches[0].keys, caches[0].values
-        if len(self._states) < len(caches):
-            self._keys, self._values = _rings(self._sizes, len(caches))
-            self._states = [None] * len(caches)
-        for row, cache in enumerate(caches):
-            if self._states[row] != cache.state:
-                self._keys[:, row], self._values[:, row] = cache.keys[:, 0], cache.values[:, 0]
-                self._states[row] = cache.state
-        return self._keys[:, : len(caches)], self._values[:, : len(caches)]
-
-    def write(
-        self, caches: Sequence[KeyValueCache], slots: Sequence[int], keys: Floats, values: Floats
-    ) -> None:
-        """Write a position of the caches that were joined last; each (sessions, layers, ...)."""
-        for row, (cache, slot) in enumerate(zip(caches, slots, strict=True)):
-            cache.write(slot, keys[row], values[row])
-            if len(caches) > 1:
-                self._keys[:, row, :, slot], self._values[:, row, :, slot] = keys[row], values[row]
-                self._states[row] = cache.state
-
-
-def _rings(sizes: NetworkSizes, num_sessions: int) -> tuple[Halves, Halves]:
-    shape = (sizes.num_layers, num_sessions, sizes.num_heads, WINDOW, sizes.head_size)
-    return np.zeros(shape, np.float16), np.zeros(shape, np.float16)
+    def cache(self) -> CacheSizes:
+        """Sizes of a session's cache."""
+        return CacheSizes(2 * self.num_layers, self.num_heads, WINDOW, self.head_size)
 
 
 def position_table(width: int) -> Floats:
@@ -127,8 +66,7 @@ def past_masks() -> Floats:
 
 def input_names(num_layers: int) -> list[str]:
     """Return the names of the network's inputs, in order."""
-    caches = [f"{kind}_{layer}" for kind in ("keys", "values") for layer in range(num_layers)]
-    return ["frames", "position", "output_layer", "past_mask", *caches]
+    return ["frames", "position", "output_layer", "past_mask", *cache_names(num_layers)]
 
 
 def open_session(file: NDArray[np.uint8]) -> Any:

@@ -45,12 +45,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import OnPosition, Topology, Work, no_scores
+from services.recognizer.acoustic.caches import CacheMemory, Halves, cache_names
 from services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -58,14 +59,11 @@ from services.recognizer.acoustic.model_file import (
     write_archive,
 )
 from services.recognizer.acoustic.network import (
-    MAX_BATCH,
     MAX_POSITIONS,
     NUM_INPUTS,
     SEEN_FRAMES,
     WINDOW,
     Floats,
-    JointCache,
-    KeyValueCache,
     NetworkSession,
     past_masks,
     position_table,
@@ -79,7 +77,8 @@ FORMAT = "neural 6"
 
 _PAST = WINDOW - 1
 _PADDING = 2  # frames of zeros before a segment's first
-_MIN_ROWS = 2  # in a call
+_MIN_ROWS = 2  # in a run
+_MAX_BATCH = 16  # sessions in a run; with more each takes no less time
 _MAX_LOOK_AHEAD = 100  # feature frames
 _PAST_MASKS = past_masks()
 
@@ -111,8 +110,9 @@ class NeuralModel:
         return NetworkSession(self.network)
 
     @cached_property
-    def _joint(self) -> JointCache:
-        return JointCache(self.session.sizes)
+    def caches(self) -> CacheMemory:
+        """Keys and values of all sessions."""
+        return CacheMemory(self.session.sizes.cache, _MAX_BATCH)
 
     @cached_property
     def positions(self) -> Floats:
@@ -136,8 +136,8 @@ class NeuralModel:
         for stream, (_, frames) in zip(streams, work, strict=True):
             stream.take_frames(frames)
         while ready := [stream for stream in streams if stream.num_pending]:
-            for start in range(0, len(ready), MAX_BATCH):
-                self._advance(ready[start : start + MAX_BATCH])
+            for numbers, rings in self.caches.runs([stream.cache for stream in ready]):
+                self._advance([ready[number] for number in numbers], rings)
         scores = []
         for stream, (_, frames) in zip(streams, work, strict=True):
             rows = stream.new_log_posteriors(is_end=frames is None)
@@ -146,15 +146,26 @@ class NeuralModel:
                 stream.reset()
         return scores
 
-    def _advance(self, streams: Sequence[NeuralStream]) -> None:
-        log_posteriors, keys, values = self.run(streams, self.output_layer)
-        caches, slots = [stream.cache for stream in streams], [stream.slot for stream in streams]
-        self._joint.write(caches, slots, keys, values)
+    def _advance(self, streams: Sequence[NeuralStream], rings: Halves) -> None:
+        log_posteriors, keys, values = self.run(streams, rings, self.output_layer)
+        new = np.concatenate([keys, values], axis=1)
         for row, stream in enumerate(streams):
+            rings[:, row, :, stream.slot] = new[row]
             stream.take_outputs(log_posteriors[row], values[row])
 
-    def run(self, streams: Sequence[NeuralStream], output_layer: int) -> list[Floats]:
+    def run(
+        self, streams: Sequence[NeuralStream], rings: Halves, output_layer: int
+    ) -> list[Floats]:
         """Run the network at the next position of every stream, with one of its output layers.
+
+        Parameters
+        ----------
+        streams
+            Of some sessions.
+        rings
+            Their caches, (2 layers, sessions, heads, 128, size).
+        output_layer
+            Which one.
 
         Returns
         -------
@@ -162,18 +173,15 @@ class NeuralModel:
             Log posteriors, (rows, 2, states); keys and values, (rows, layers, heads, size). The
             first rows are those of the streams.
         """
-        all_keys, all_values = self._joint.join([stream.cache for stream in streams])
         rows = [*streams, streams[0]] if len(streams) < _MIN_ROWS else streams
-        inputs = {
+        inputs: dict[str, NDArray[Any]] = {
             "frames": np.stack([stream.next_frames() for stream in rows]),
             "position": self.positions[[stream.position for stream in rows]],
             "output_layer": np.array(output_layer),
             "past_mask": _PAST_MASKS[[min(stream.position, _PAST) for stream in streams]],
         }
-        for layer, (keys, values) in enumerate(zip(all_keys, all_values, strict=True)):
-            inputs[f"keys_{layer}"] = keys
-            inputs[f"values_{layer}"] = values
-        return self.session.run(inputs)
+        caches = dict(zip(cache_names(self.session.sizes.num_layers), rings, strict=True))
+        return self.session.run({**inputs, **caches})
 
     def with_look_ahead(self, look_ahead_ms: float) -> NeuralModel:
         """Return the model with another look-ahead.
@@ -217,10 +225,9 @@ class NeuralStream:
     def __init__(self, model: NeuralModel) -> None:
         self.on_position: OnPosition | None = None
         self._model = model
-        self.sizes = model.session.sizes
         self.look_ahead_frames = model.look_ahead_frames
         self.provisional = no_scores(len(model.log_prior))
-        self.cache = KeyValueCache(self.sizes)  # what lies beyond a segment's positions is masked
+        self.cache = model.caches.open()  # what lies beyond a segment's positions is masked
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
@@ -326,7 +333,7 @@ def _check_network(model: NeuralModel) -> None:
     own = (_MIN_ROWS, sizes.num_layers, sizes.num_heads, sizes.head_size)
     expected = [(_MIN_ROWS, 2, model.topology.num_states), own, own]
     for output_layer in range(len(model.look_aheads)):
-        outputs = model.run([stream], output_layer)
+        outputs = model.run([stream], stream.cache.rings[:, None], output_layer)
         if [array.shape for array in outputs] != expected:
             raise ValueError(f"its network scores {outputs[0].shape}, expected {expected[0]}")
         if not all(np.isfinite(array).all() for array in outputs):

@@ -1,0 +1,89 @@
+"""Caches of sessions side by side: what is in them stays theirs, wherever they lie."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.recognizer.acoustic.caches import NUM_PLACES, Cache, CacheMemory, CacheSizes
+from shared.metrics import memory_mb
+
+pytestmark = pytest.mark.unit
+
+SIZES = CacheSizes(rings=4, heads=2, slots=64, head_size=64)  # a ring: 16 kB
+LARGE = CacheSizes(rings=4, heads=8, slots=128, head_size=128)  # 1 MiB
+
+
+def marked(memory: CacheMemory, number: int) -> list[Cache]:
+    """Open caches that are full of their numbers, from 1."""
+    caches = [memory.open() for _ in range(number)]
+    for mark, cache in enumerate(caches, start=1):
+        cache.rings[:] = mark
+    return caches
+
+
+def test_any_sessions_run_as_neighbours_and_keep_what_is_theirs() -> None:
+    rng = np.random.default_rng(0)
+    memory = CacheMemory(SIZES, NUM_PLACES)
+    caches = marked(memory, NUM_PLACES)
+    del caches[::5]  # there are free places among them
+    marks = [int(cache.rings.flat[0]) for cache in caches]
+    for _ in range(100):
+        chosen = rng.permutation(len(caches))[: rng.integers(1, len(caches) + 1)]
+        ((numbers, rings),) = memory.runs([caches[each] for each in chosen])
+        assert sorted(numbers) == [*range(len(chosen))]
+        assert rings.shape == (4, len(chosen), 2, 64, 64)
+        for row, number in enumerate(numbers):
+            assert (rings[:, row] == marks[chosen[number]]).all()
+        assert all((c.rings == mark).all() for c, mark in zip(caches, marks, strict=True))
+
+
+def test_a_run_writes_where_the_caches_are() -> None:
+    memory = CacheMemory(SIZES, NUM_PLACES)
+    caches = marked(memory, 5)
+    ((numbers, rings),) = memory.runs([caches[4], caches[0]])
+    rings[:, numbers.index(0)] = 40
+    rings[:, numbers.index(1)] = 10
+    assert [int(cache.rings.flat[0]) for cache in caches] == [10, 2, 3, 4, 40]
+
+
+def test_neighbours_stay_where_they_are() -> None:
+    memory = CacheMemory(SIZES, NUM_PLACES)
+    caches = marked(memory, 6)
+    for chosen in ([1, 2, 3], [5, 4], [3]):
+        before = [cache.place for cache in caches]
+        list(memory.runs([caches[each] for each in chosen]))
+        assert [cache.place for cache in caches] == before
+    places = [cache.place for cache in caches]
+    list(memory.runs([caches[0], caches[5]]))
+    assert sum(cache.place != before for cache, before in zip(caches, places, strict=True)) == 2
+
+
+def test_more_sessions_than_a_run_has_are_in_several_runs() -> None:
+    memory = CacheMemory(SIZES, NUM_PLACES)
+    caches = marked(memory, 2 * NUM_PLACES + 1)
+    runs = list(memory.runs(caches))
+    assert [len(numbers) for numbers, _ in runs] == [NUM_PLACES, NUM_PLACES, 1]
+    for numbers, rings in runs:
+        assert [int(mark) for mark in rings[0, :, 0, 0, 0]] == [each + 1 for each in numbers]
+
+
+def test_a_place_is_free_once_its_cache_is_gone() -> None:
+    memory = CacheMemory(SIZES, NUM_PLACES)
+    caches = marked(memory, NUM_PLACES)
+    shelf, place = caches[3].shelf, caches[3].place
+    del caches[3]
+    again = memory.open()
+    assert (again.shelf, again.place) == (shelf, place)
+
+
+def test_memory_is_taken_where_something_is_written_and_given_back() -> None:
+
+    memory = CacheMemory(LARGE, NUM_PLACES)
+    first = memory.open()
+    before_mb = memory_mb()
+    caches = marked(memory, 8)
+    assert 7.9 < memory_mb() - before_mb < 9.0
+    list(memory.runs([first, caches[7]]))
+    del caches[:7]
+    assert memory_mb() - before_mb < 3.0
