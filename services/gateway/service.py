@@ -51,7 +51,7 @@ from shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
 STATUS_LOST_S = 3.0  # after which it is asked again
-MISSING_S = 2.0  # after which a service that does not run is told: control may be new itself
+MISSING_S = 3.0  # after which a service that control does not know is told: it may be new itself
 CONTROL_MISSING_S = 8.0  # the same of control, which may start again unnoticed
 
 
@@ -141,7 +141,7 @@ class GatewayService(Service):
         self._resting_face = RestingFace(config.idle_motion_seed)
         self._rest_due_s = 0.0
         self._report_s = -math.inf
-        self._complete_s = -math.inf  # when the newest report came that named all services
+        self._incomplete_s = math.inf  # since when reports do not name all services
         self._request_s = 0.0
 
     # --- the loop --------------------------------------------------------------------------------
@@ -264,8 +264,10 @@ class GatewayService(Service):
         needed = ("recognizer", "synthesizer")
         missing = tuple(service for service in needed if service not in running)
         if not missing:
-            self._complete_s = self._report_s
-        if not missing or self._report_s > self._complete_s + MISSING_S:
+            self._incomplete_s = math.inf
+        else:
+            self._incomplete_s = min(self._incomplete_s, self._report_s)
+        if not missing or self._report_s > self._incomplete_s + MISSING_S:
             self._viewers.set_missing(missing)
 
     def _express(self, session: str, expressions: wire.Expressions) -> None:
