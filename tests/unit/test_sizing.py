@@ -12,7 +12,7 @@ from tests.system import ROOT
 
 pytestmark = pytest.mark.unit
 PAGE = (ROOT / "docs" / "sizing.md").read_text("utf-8")
-WORKERS_OF_CONTROL = 500
+WORKERS_OF_CONTROL = 1000
 CORES_OF_HOST = 32
 
 
