@@ -27,6 +27,8 @@ from evaluation.system.systems import LocalSystem
 from services.kinds import read_settings
 from services.synthesizer.config import SynthesizerConfig
 from shared.client import Client
+from shared.errors import UserError
+from shared.wire.control import ServiceState
 
 LIMIT_MS = 60.0  # that 95 % of the frames must come within
 SERVING = ("control", "recognizer", "synthesizer")  # who watches is no part of the load
@@ -34,6 +36,7 @@ MAX_STEPS = 8  # beside the first, of one session
 SETTLE_S = 3.0  # of a step, that are not measured
 DRAIN_S = 0.3  # from the last chunk to the end of the sessions
 REST_S = 1.0  # between steps
+LOST_LIMIT_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,13 +184,30 @@ class _Usage:
     memory_mb: float
 
 
+def states_of(client: Client) -> dict[str, ServiceState]:
+    """Return the state of each service; one that is taken for lost is waited for.
+
+    Raises
+    ------
+    UserError
+        If one stays lost.
+    """
+    end_s = time.monotonic() + LOST_LIMIT_S
+    while True:
+        states = {state.service: state for state in client.status().services}
+        if states.keys() >= {*SERVING}:
+            return states
+        if time.monotonic() > end_s:
+            raise UserError(f"{', '.join({*SERVING} - states.keys())}: lost for {LOST_LIMIT_S:g} s")
+        time.sleep(0.1)
+
+
 def _usage(client: Client) -> dict[str, _Usage]:
+    states = states_of(client)
     now_s = time.monotonic()
     return {
-        state.service: _Usage(
-            now_s - state.age_s, state.metrics["cpu_s"], state.metrics["memory_mb"]
-        )
-        for state in client.status().services
+        service: _Usage(now_s - state.age_s, state.metrics["cpu_s"], state.metrics["memory_mb"])
+        for service, state in states.items()
     }
 
 

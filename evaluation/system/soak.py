@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from corpora.figures import new_figure
-from evaluation.system.load import SERVING
+from evaluation.system.load import SERVING, states_of
 from evaluation.system.speakers import read_text, voiced
 from evaluation.system.systems import LocalSystem
 from shared.client import Client, Session
@@ -147,7 +147,10 @@ def measure(
                     num_phones=len(symbols),
                     num_unfinished=num_unfinished,
                     num_lost=lost_phones(second, symbols) if is_compared else None,
-                    memory_mb=_memory_mb(client),
+                    memory_mb={
+                        service: state.metrics["memory_mb"]
+                        for service, state in states_of(client).items()
+                    },
                 )
             )
             on_round(rounds)
@@ -203,18 +206,6 @@ def _wait_until(condition: Callable[[], bool], listener: Listener) -> None:
         elif time.monotonic() > end_s:
             raise UserError("the services take no more sound")
     listener.wait(0.0)
-
-
-def _memory_mb(client: Client) -> dict[str, float]:
-    """Return what each service takes; one that is taken for lost is waited for."""
-    end_s = time.monotonic() + LIMIT_S
-    while True:
-        states = {state.service: state.metrics["memory_mb"] for state in client.status().services}
-        if states.keys() >= {*SERVING}:
-            return states
-        if time.monotonic() > end_s:
-            raise UserError(f"{', '.join({*SERVING} - states.keys())}: lost for {LIMIT_S:g} s")
-        time.sleep(0.1)
 
 
 def lost_phones(before: Sequence[str], symbols: Sequence[str]) -> int:
