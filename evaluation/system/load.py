@@ -28,7 +28,6 @@ from services.kinds import read_settings
 from services.synthesizer.config import SynthesizerConfig
 from shared.client import Client
 from shared.errors import UserError
-from shared.wire.control import ServiceState
 
 LIMIT_MS = 60.0  # that 95 % of the frames must come within
 SERVING = ("control", "recognizer", "synthesizer")  # who watches is no part of the load
@@ -146,10 +145,10 @@ def _step(control: str, text: Any, number: int, step_s: float, delay_s: float) -
         from_s = time.perf_counter() + SETTLE_S
         crowd.speak_until(from_s)
         crowd.lateness_s.clear()
-        before, client_before_s = _usage(client), time.process_time()
+        before, client_before_s = usage_of(client), time.process_time()
         until_s = from_s + step_s
         crowd.speak_until(until_s)
-        after, client_after_s = _usage(client), time.process_time()
+        after, client_after_s = usage_of(client), time.process_time()
         delays_ms = [
             np.fromiter(each.delays_s(delay_s, from_s, until_s), float) * 1e3
             for each in crowd.spoken
@@ -176,7 +175,7 @@ def _step(control: str, text: Any, number: int, step_s: float, delay_s: float) -
 
 
 @dataclass(frozen=True, slots=True)
-class _Usage:
+class Usage:
     """What a service had used at its last heartbeat."""
 
     at_s: float
@@ -184,8 +183,8 @@ class _Usage:
     memory_mb: float
 
 
-def states_of(client: Client) -> dict[str, ServiceState]:
-    """Return the state of each service; one that is taken for lost is waited for.
+def usage_of(client: Client) -> dict[str, Usage]:
+    """Return what each service has used; one that is taken for lost is waited for.
 
     Raises
     ------
@@ -194,21 +193,19 @@ def states_of(client: Client) -> dict[str, ServiceState]:
     """
     end_s = time.monotonic() + LOST_LIMIT_S
     while True:
-        states = {state.service: state for state in client.status().services}
-        if states.keys() >= {*SERVING}:
-            return states
-        if time.monotonic() > end_s:
-            raise UserError(f"{', '.join({*SERVING} - states.keys())}: lost for {LOST_LIMIT_S:g} s")
+        states = client.status().services
+        now_s = time.monotonic()
+        usage = {
+            state.service: Usage(
+                now_s - state.age_s, state.metrics["cpu_s"], state.metrics["memory_mb"]
+            )
+            for state in states
+        }
+        if usage.keys() >= {*SERVING}:
+            return usage
+        if now_s > end_s:
+            raise UserError(f"{', '.join({*SERVING} - usage.keys())}: lost for {LOST_LIMIT_S:g} s")
         time.sleep(0.1)
-
-
-def _usage(client: Client) -> dict[str, _Usage]:
-    states = states_of(client)
-    now_s = time.monotonic()
-    return {
-        service: _Usage(now_s - state.age_s, state.metrics["cpu_s"], state.metrics["memory_mb"])
-        for service, state in states.items()
-    }
 
 
 def show(load: Load, console: Console) -> None:

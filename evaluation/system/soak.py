@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from corpora.figures import new_figure
-from evaluation.system.load import SERVING, states_of
+from evaluation.system.load import SERVING, usage_of
 from evaluation.system.speakers import read_text, voiced
 from evaluation.system.systems import LocalSystem
 from shared.client import Client, Session
@@ -148,8 +148,7 @@ def measure(
                     num_unfinished=num_unfinished,
                     num_lost=lost_phones(second, symbols) if is_compared else None,
                     memory_mb={
-                        service: state.metrics["memory_mb"]
-                        for service, state in states_of(client).items()
+                        service: usage.memory_mb for service, usage in usage_of(client).items()
                     },
                 )
             )
