@@ -51,7 +51,7 @@ def test_it_becomes_a_service_that_crashed(tmp_path: Path, monkeypatch: pytest.M
         while len(standing_by()) < 2:  # the next one does
             time.sleep(0.05)
         assert supervisor.process_number("control") == number
-        with Client(control) as client:
+        with Client(control, deadline_s=60.0) as client:
             assert client.status().sessions == []
     finally:
         supervisor.stop()
