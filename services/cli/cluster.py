@@ -38,7 +38,9 @@ def cluster(
         from services.cli.ray_workers import RayWorkers
     except ModuleNotFoundError:
         command = install_command("kouxing[cluster]")
-        raise UserError(f"Ray is missing; on every host, too: {command}") from None
+        raise UserError(
+            f"Ray is missing: {command}; the same on every host of the cluster"
+        ) from None
     with RayWorkers(address) as workers:
         for name, number in (("recognizer", recognizers), ("synthesizer", synthesizers)):
             if number is not None:

@@ -51,7 +51,7 @@ from shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
 STATUS_LOST_S = 3.0  # after which it is asked again
-MISSING_S = 3.0  # after which a service that control does not know is told: it may be new itself
+MISSING_S = 3.0  # after which a service that control does not know is told: control may be new
 CONTROL_MISSING_S = 8.0  # the same of control, which may start again unnoticed
 
 
@@ -263,10 +263,7 @@ class GatewayService(Service):
         running = {state.service for state in report.services if state.state == "ready"}
         needed = ("recognizer", "synthesizer")
         missing = tuple(service for service in needed if service not in running)
-        if not missing:
-            self._incomplete_s = math.inf
-        else:
-            self._incomplete_s = min(self._incomplete_s, self._report_s)
+        self._incomplete_s = min(self._incomplete_s, self._report_s) if missing else math.inf
         if not missing or self._report_s > self._incomplete_s + MISSING_S:
             self._viewers.set_missing(missing)
 

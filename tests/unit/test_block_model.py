@@ -201,7 +201,7 @@ def scores_of_encoder(model: BlockModel, frames: np.ndarray) -> np.ndarray:
     kept = []
     for start in range(0, len(frames), 8):
         stream.accept(frames[start : start + 8])
-        kept.append(stream.past.cache.rings.copy())
+        kept.append(stream.cache.rings.copy())
     return np.stack(kept)
 
 

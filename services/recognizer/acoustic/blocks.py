@@ -51,7 +51,6 @@ from numpy.typing import NDArray
 
 from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
 from services.recognizer.acoustic.caches import (
-    Cache,
     CacheMemory,
     CacheSizes,
     Halves,
@@ -122,7 +121,7 @@ class BlockModel:
         for stream, (_, frames) in zip(streams, work, strict=True):
             stream.take_frames(frames)
         while ready := [stream for stream in streams if stream.is_due]:
-            for numbers, rings in self.caches.runs([stream.past.cache for stream in ready]):
+            for numbers, rings in self.caches.runs([stream.cache for stream in ready]):
                 self._run([ready[number] for number in numbers], rings)
         return [stream.take_settled() for stream in streams]
 
@@ -166,9 +165,8 @@ class BlockSizes:
 
 @dataclass(slots=True)
 class Past:
-    """What a session's network has computed before a block."""
+    """What a session's network has computed before a block, beside its cache."""
 
-    cache: Cache  # rings: keys of all layers, then values (2 layers, heads, PAST, size)
     state: Floats  # of the recurrent layer, (width,)
     num_cached: int = 0  # positions in the cache
 
@@ -253,8 +251,7 @@ class BlockStream:
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
         self._nothing = no_scores(model.topology.num_states)
-        state = np.zeros(self._sizes.state, np.float32)
-        self.past = Past(model.caches.open(), state)
+        self.cache = model.caches.open()  # what lies beyond the past's positions is masked
         self.reset()
 
     def accept(self, frames: Floats) -> Floats:
@@ -280,7 +277,7 @@ class BlockStream:
         """Go to the first row of the table of positions, with nothing before it."""
         self._row = 0  # of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
-        self.past.num_cached, self.past.state = 0, np.zeros_like(self.past.state)
+        self.past = Past(np.zeros(self._sizes.state, np.float32))
 
     def take_frames(self, frames: Floats | None) -> None:
         """Take frames, (n, 80), or the segment's end, at which its last frame is repeated."""
@@ -329,7 +326,7 @@ class BlockStream:
             return
         if num_settled:
             slot = self._row % sizes.past
-            block.past.cache.rings[:, :, slot : slot + sizes.block] = new
+            self.cache.rings[:, :, slot : slot + sizes.block] = new
             block.past.num_cached = min(block.past.num_cached + sizes.block, sizes.past)
             block.past.state = state
             self._row += num_settled
@@ -398,10 +395,9 @@ def blocks_from(archive: Archive) -> BlockModel:
     )
     sizes = model.session.sizes
     frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
-    past = model.stream().past
-    outputs = model.session.run(
-        [Block(frames, 0, sizes.length, past)], past.cache.rings[:, np.newaxis]
-    )
+    stream = model.stream()
+    block = Block(frames, 0, sizes.length, stream.past)
+    outputs = model.session.run([block], stream.cache.rings[:, np.newaxis])
     new = (1, 2 * sizes.layers, sizes.heads, sizes.block, sizes.head_size)
     expected = [(1, 2 * sizes.length, topology.num_states), (1, sizes.state), new]
     if [array.shape for array in outputs] != expected:
