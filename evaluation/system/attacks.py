@@ -176,8 +176,9 @@ def _damage(
     with _attacker(attack, target, endpoints.get(target, "")):
         p95_ms = _p95_ms(control, sound, rate_hz)
     growth_mb = max(memory.growth_mb for memory in memories)
+    end_s = time.monotonic() + RETURN_S
     for memory in memories:
-        memory.wait_until_kept(LITTLE_MB, RETURN_S)
+        memory.wait_until_kept(LITTLE_MB, end_s - time.monotonic())
     kept_mb = max(memory.kept_mb for memory in memories)
     return Damage(keys, attack, target, growth_mb, kept_mb, *p95_ms)
 
