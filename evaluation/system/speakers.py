@@ -52,7 +52,7 @@ class Spoken:
     begin_s: float = 0.0  # when the first sample was due, by ``time.perf_counter``
     num_sent: int = 0  # chunks
     num_full: int = 0  # of them, those that the queue did not take
-    num_rest: int = 0  # frames that lead to rest, as if the speaker were silent
+    num_rest: int = 0  # frames that lead to rest, as if the speaker had fallen silent
     arrived_s: dict[int, float] = field(default_factory=dict)  # by media time, first arrival
 
     @property
@@ -71,10 +71,10 @@ class Spoken:
 
     def take(self, frame: FapFrame) -> None:
         """Note that a frame came."""
-        if frame.media_time in self.arrived_s:
-            self.num_rest += 1
-        else:
+        if frame.media_time not in self.arrived_s:
             self.arrived_s[frame.media_time] = time.perf_counter()
+        elif frame.media_time > 0:  # before that the speaker has not begun
+            self.num_rest += 1
 
     def delays_s(self, delay_s: float, from_s: float, until_s: float) -> Iterator[float]:
         """Yield how long after their sound frames came, beyond the delay they are made with.

@@ -52,6 +52,14 @@ def test_a_frame_of_rest_is_no_arrival() -> None:
     assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
 
 
+def test_rest_before_a_speaker_begins_is_not_counted() -> None:
+    spoken = _spoken({})
+    frame = FapFrame(media_time=0, values=bytes(272), mask=bytes(9))
+    for _ in range(3):
+        spoken.take(frame)
+    assert spoken.num_rest == 0
+
+
 def test_every_speaker_has_a_voice_and_a_place_of_its_own() -> None:
     text = np.sin(np.cumsum(np.linspace(0.01, 1.0, 16_000))).astype(np.float32)
     sounds = [voiced(text, number) for number in range(12)]
