@@ -220,6 +220,7 @@ class Client:
         | StatusRequest,
     ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
+        is_refused = False  # at last; one whose address is shut out for a while is let in again
         while time.monotonic() < deadline_s:
             self._commands.send(message)
             retry_s = min(deadline_s, time.monotonic() + RETRY_S)
@@ -239,11 +240,12 @@ class Client:
                         raise Refused(answer.code, answer.text, answer.retry_after_s)
                     if isinstance(answer, Message):
                         return answer
-            if self.bus.is_refused(self._control):
-                raise UserError(refusal(self._control, CLIENT, ("client",)))
+            is_refused = self.bus.is_refused(self._control)
             if not self._commands.can_send:  # something else was at its address
                 self.bus.drop(self._commands)
                 self._commands = self.bus.connect_dealer(self._control)
+        if is_refused:
+            raise UserError(refusal(self._control, CLIENT, ("client",)))
         address = self._control.partition(" ")[0]
         raise UserError(
             f"control at {address} does not answer; is it running? to start it: kouxing run"

@@ -121,9 +121,15 @@ def control_endpoint(address: str, *, insecure: bool) -> str:
 
 
 def refusal(control: str, name: str, roles: Collection[str]) -> str:
-    """Return what to say when control does not accept a key of this machine."""
+    """Return what to say when control refuses a process of this machine, with its key or none."""
+    address, _, server_key = control.partition(" ")
+    if not server_key:
+        return (
+            f"control at {address} refuses this machine: insecure = true is set here, but not"
+            " there, or its log says why"
+        )
     return (
-        f"control at {control.partition(' ')[0]} does not accept {key_folder() / name}.key; if it"
+        f"control at {address} does not accept {key_folder() / name}.key; if it"
         f" runs on this machine, start it again, else make a key there: {how_to_add(roles)}"
     )
 

@@ -77,7 +77,8 @@ class LiveFace(threading.Thread):
         super().__init__()
         self._control = control
         self._begins, self._ends = threading.Event(), threading.Event()
-        self._num_missing = -1  # frames
+        self._num_missing = 0  # frames
+        self._error: Exception | None = None
 
     def __enter__(self) -> Self:
         self.start()
@@ -87,9 +88,18 @@ class LiveFace(threading.Thread):
     def __exit__(self, *exc: object) -> None:
         self._ends.set()
         self.join(30.0)
-        assert 0 <= self._num_missing < 50 + SynthesizerConfig().delay_ms / 20
+        assert not self.is_alive()
+        if self._error is not None:
+            raise self._error
+        assert self._num_missing < 50 + SynthesizerConfig().delay_ms / 20
 
     def run(self) -> None:
+        try:
+            self._speak()
+        except Exception as error:  # for the test's own thread
+            self._error = error
+
+    def _speak(self) -> None:
         with Client(self._control) as client:
             session = client.open_session()
             output = session.subscribe(FapFrame)

@@ -9,6 +9,7 @@ import socket
 import stat
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ import pytest
 from evaluation.system.attackers import connected, frame
 from shared import connection, connections, kernel_sockets
 from shared.bus import COMMANDS, MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
+from shared.client import Client
 from shared.connection import CREDIT, MIB, Connection
 from shared.connections import MAX_SUBSCRIBED, MAX_SUBSCRIPTION
 from shared.keys import NOBODY, Peer
@@ -23,7 +25,7 @@ from shared.wire.audio import AudioChunk
 from shared.wire.codec import encode
 from shared.wire.face import FapFrame
 from shared.wire.message import MAX_AUDIO_BYTES, Message
-from shared.wire.session import Error
+from shared.wire.session import CloseSession, Done, Error
 from shared.wire.speech import Progress
 
 pytestmark = pytest.mark.unit
@@ -405,6 +407,19 @@ def test_an_address_that_floods_once_is_shut_out_for_a_while(
         assert received[-1].message == chunk(sequence, 10)
     monkeypatch.setattr(connections, "FAULTS_S", 50)
     collect(bus, audio, lambda all_: late.send(chunk(3, 10)) and bool(all_))
+
+
+def test_a_client_whose_address_is_shut_out_for_a_while_gets_its_answer(bus: Bus) -> None:
+    commands = bus.bind_router(LOCAL, "commands", COMMANDS)
+    with connected(port_of(commands)) as hostile:
+        hostile.sendall(frame(b"", more=True) * 2 * MAX_DROPPED + frame(b""))
+        assert is_cut(hostile, commands)
+    with Client(commands.endpoint) as client, ThreadPoolExecutor(1) as pool:
+        closing = pool.submit(client.close_session, "s", "t")
+        (request, *_) = collect(bus, commands, bool)
+        assert isinstance(request.message, CloseSession)
+        commands.send(Done(session="s", request=request.message.request), to=request.sender)
+        closing.result()
 
 
 @pytest.mark.parametrize(

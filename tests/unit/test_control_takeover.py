@@ -32,6 +32,14 @@ def served(endpoints: dict[str, str] = PLACED, **fields: object) -> StartSession
     )  # fmt: skip
 
 
+def beat(kind: str, endpoints: dict[str, str], **fields: object) -> Heartbeat:
+    """Return what a service of some kind says at that time."""
+    return Heartbeat(
+        service=kind, instance=kind, role="worker", state="ready", sent_ns=0, endpoints=endpoints,
+        **fields,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
 def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
     """Return the next messages that control sends to a socket."""
     received: list[Message] = []
@@ -113,17 +121,14 @@ def test_a_session_whose_synthesizer_is_gone_gets_another_at_the_end(
 def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
     recognizer, _ = stage.services
     answers(stage, recognizer)
-    beat = Heartbeat(
-        service="recognizer", instance="recognizer", role="worker", state="ready", sent_ns=0,
-        endpoints={name: PLACED[name] for name in ("audio", "phones")},
-        sessions={"mine": SessionInput()},
-    )  # fmt: skip
-    recognizer.send(beat)
+    endpoints = {name: PLACED[name] for name in ("audio", "phones")}
+    serving = beat("recognizer", endpoints, sessions={"mine": SessionInput()})
+    recognizer.send(serving)
     (seen,) = answers(stage, recognizer)
     assert not isinstance(seen, StopSession)
     stage.control._takeover_end_s = 0.0
     stage.control.step(0.02)
-    recognizer.send(beat)
+    recognizer.send(serving)
     assert StopSession(session="mine") in answers(stage, recognizer, 2)
 
 
@@ -141,13 +146,10 @@ def test_a_client_is_told_again_that_its_session_moved(
     for media_time in (2840, 5000):  # said again, as one does that goes on
         speech = Speech(session="mine", epoch=1, sequence=1, media_time=media_time, active=True)
         recognizer.send(speech)
+    recognizer.send(beat("recognizer", {name: PLACED[name] for name in ("audio", "phones")}))
+    answers(stage, recognizer)  # the synthesizer's, over another connection, might overtake speech
     again = {"phone_input": "tcp://127.0.0.1:9", "faps": "tcp://127.0.0.1:9"}
-    synthesizer.send(
-        Heartbeat(
-            service="synthesizer", instance="synthesizer", role="worker", state="ready", sent_ns=0,
-            endpoints=again,
-        )
-    )  # fmt: skip
+    synthesizer.send(beat("synthesizer", again))
     for service in reversed(stage.services):  # the recognizer last
         starts: list[StartSession] = []
         while not starts:

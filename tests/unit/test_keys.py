@@ -20,6 +20,7 @@ from shared.keys import (
     may_follow,
     own_key,
     read_guests,
+    refusal,
     revoke_guest,
     save_guests,
     user_key,
@@ -115,6 +116,16 @@ def test_an_added_key_works_on_another_machine(
         own_key("lamp", ("service:lamp",))
     save_guests({public: Guest("laptop", ("client",))})
     assert read_guests() == {public: Guest("laptop", ("client",))}
+
+
+@pytest.mark.parametrize(
+    ("control", "said"),
+    [("tcp://host:5550 key", "driver.key"), ("tcp://host:5550", "insecure = true is set here")],
+)
+def test_a_refusal_names_control_and_what_it_may_lack(control: str, said: str) -> None:
+    text = refusal(control, "driver", ("service:driver",))
+    assert "control at tcp://host:5550 " in text
+    assert said in text
 
 
 def test_a_credential_counts_instead_of_an_own_key(
