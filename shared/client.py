@@ -220,7 +220,8 @@ class Client:
         | StatusRequest,
     ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
-        is_refused = False  # at last; one whose address is shut out for a while is let in again
+        # Only the last try counts: an address that is shut out for a while is let in again.
+        is_refused = False
         while time.monotonic() < deadline_s:
             self._commands.send(message)
             retry_s = min(deadline_s, time.monotonic() + RETRY_S)

@@ -22,6 +22,14 @@ LOCAL = "tcp://127.0.0.1:*"
 PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 
 
+def beat(kind: str, address: str = "tcp://127.0.0.1:1", **fields: object) -> Heartbeat:
+    """Return what a service of some kind, with all its sockets at an address, says at that time."""
+    return Heartbeat(
+        service=kind, instance=kind, role="worker", state="ready", sent_ns=0,
+        endpoints=dict.fromkeys(PROVIDED[kind], address), **fields,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
 class Stage:
     """Control, and two services that start whatever it says."""
 
@@ -33,16 +41,10 @@ class Stage:
         )
         self.buses = []
         self.services = []
-        for kind, provided in PROVIDED.items():
+        for kind in PROVIDED:
             bus = Bus(None if insecure else own_key(kind, (f"service:{kind}",)))
             service = bus.connect_dealer(self.control.endpoints["commands"])
-            endpoints = dict.fromkeys(provided, "tcp://127.0.0.1:1")
-            service.send(
-                Heartbeat(
-                    service=kind, instance=kind, role="worker", state="ready", sent_ns=0,
-                    endpoints=endpoints,
-                )
-            )  # fmt: skip
+            service.send(beat(kind))
             self.buses.append(bus)
             self.services.append(service)
         self.strangers: list[zmq.Socket[bytes]] = []

@@ -8,6 +8,7 @@ import resource
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Self
 
@@ -70,36 +71,26 @@ def client(system: System) -> Iterator[Client]:
         yield made
 
 
-class LiveFace(threading.Thread):
+class LiveFace:
     """A live session of which at most a second may be missing when something has gone on."""
 
     def __init__(self, control: str) -> None:
-        super().__init__()
         self._control = control
         self._begins, self._ends = threading.Event(), threading.Event()
-        self._num_missing = 0  # frames
-        self._error: Exception | None = None
+        self._pool = ThreadPoolExecutor(1)
+        self._num_missing: Future[int]  # frames
 
     def __enter__(self) -> Self:
-        self.start()
+        self._num_missing = self._pool.submit(self._speak)
         assert self._begins.wait(30.0)
         return self
 
     def __exit__(self, *exc: object) -> None:
         self._ends.set()
-        self.join(30.0)
-        assert not self.is_alive()
-        if self._error is not None:
-            raise self._error
-        assert self._num_missing < 50 + SynthesizerConfig().delay_ms / 20
+        self._pool.shutdown(wait=False)
+        assert self._num_missing.result(30.0) < 50 + SynthesizerConfig().delay_ms / 20
 
-    def run(self) -> None:
-        try:
-            self._speak()
-        except Exception as error:  # for the test's own thread
-            self._error = error
-
-    def _speak(self) -> None:
+    def _speak(self) -> int:
         with Client(self._control) as client:
             session = client.open_session()
             output = session.subscribe(FapFrame)
@@ -115,7 +106,7 @@ class LiveFace(threading.Thread):
                 if num_frames:
                     self._begins.set()
             session.close()
-        self._num_missing = max(0, num_sent - num_frames)
+        return max(0, num_sent - num_frames)
 
 
 @pytest.mark.parametrize("attack", attackers.FLOODS)

@@ -201,10 +201,10 @@ def test_garbage_on_every_port_harms_nobody(system: System, witness: Session) ->
 
 
 def garbage_socket(context: zmq.Context[zmq.Socket[bytes]], kind: int) -> zmq.Socket[bytes]:
-    """Return a socket whose garbage is all sent before it is closed, or its connection is cut.
+    """Return a socket that has time to send its garbage, and does not connect again.
 
-    It does not connect again: libzmq aborts if a connection ends in the midst of a message just
-    when the time that a closed socket has for it is over.
+    libzmq aborts if a connection ends in the midst of a message just when the time that a closed
+    socket has for it is over.
     """
     raw = context.socket(kind)
     raw.setsockopt(zmq.RECONNECT_IVL, -1)

@@ -8,11 +8,11 @@ import pytest
 
 from services.control import service as control_service
 from shared.bus import Bus, Socket
-from shared.wire.control import Heartbeat, SessionInput, StartSession, StopSession
+from shared.wire.control import SessionInput, StartSession, StopSession
 from shared.wire.message import Message
 from shared.wire.session import CloseSession, Done, Error, OpenSession, SessionMoved, SessionOpened
 from shared.wire.speech import Speech
-from tests.control_stage import Stage
+from tests.control_stage import Stage, beat
 
 pytestmark = pytest.mark.unit
 PLACED = {
@@ -28,14 +28,6 @@ def served(endpoints: dict[str, str] = PLACED, **fields: object) -> StartSession
     return StartSession(
         session="mine", epoch=4, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
         num_channels=1, record=False, paced=True, language="mandarin", endpoints=endpoints,
-        **fields,  # type: ignore[arg-type]
-    )  # fmt: skip
-
-
-def beat(kind: str, endpoints: dict[str, str], **fields: object) -> Heartbeat:
-    """Return what a service of some kind says at that time."""
-    return Heartbeat(
-        service=kind, instance=kind, role="worker", state="ready", sent_ns=0, endpoints=endpoints,
         **fields,  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -121,8 +113,7 @@ def test_a_session_whose_synthesizer_is_gone_gets_another_at_the_end(
 def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
     recognizer, _ = stage.services
     answers(stage, recognizer)
-    endpoints = {name: PLACED[name] for name in ("audio", "phones")}
-    serving = beat("recognizer", endpoints, sessions={"mine": SessionInput()})
+    serving = beat("recognizer", sessions={"mine": SessionInput()})
     recognizer.send(serving)
     (seen,) = answers(stage, recognizer)
     assert not isinstance(seen, StopSession)
@@ -146,10 +137,9 @@ def test_a_client_is_told_again_that_its_session_moved(
     for media_time in (2840, 5000):  # said again, as one does that goes on
         speech = Speech(session="mine", epoch=1, sequence=1, media_time=media_time, active=True)
         recognizer.send(speech)
-    recognizer.send(beat("recognizer", {name: PLACED[name] for name in ("audio", "phones")}))
+    recognizer.send(beat("recognizer"))
     answers(stage, recognizer)  # the synthesizer's, over another connection, might overtake speech
-    again = {"phone_input": "tcp://127.0.0.1:9", "faps": "tcp://127.0.0.1:9"}
-    synthesizer.send(beat("synthesizer", again))
+    synthesizer.send(beat("synthesizer", "tcp://127.0.0.1:9"))
     for service in reversed(stage.services):  # the recognizer last
         starts: list[StartSession] = []
         while not starts:
@@ -159,5 +149,5 @@ def test_a_client_is_told_again_that_its_session_moved(
         service.send(Done(session="mine", request=starts[0].request))
     first, *others = answers(stage, client, 3)
     assert isinstance(first, SessionMoved)
-    assert (first.epoch, first.faps) == (2, again["faps"])
+    assert (first.epoch, first.faps) == (2, "tcp://127.0.0.1:9")
     assert others == [first, first]
