@@ -42,6 +42,7 @@ class Watched:
 
     def __exit__(self, *_: object) -> None:
         self.supervisor.stop()
+        print(self.shown.getvalue())  # shown with a test that failed
 
     def instance(self, client: Client, service: str) -> str:
         for state in client.status().services:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 from shared.phones.events import Phone
 from shared.phones.inventory import PhoneInventory
@@ -60,10 +61,9 @@ class SyllableTrack:
             self._syllables.pop(oldest[0].index, None)
             for each in oldest:
                 del self._phones[each.index]
-        after: list[list[Phone]] = [*groups[1:], []]
         syllables = {
             group[0].index: self._syllable(group, place, following)
-            for group, place, following in zip(groups, places, after, strict=True)
+            for place, (group, following) in zip(places, pairwise([*groups, []]), strict=True)
         }
         withdrawn = [
             Syllable(index=index, text=old.text, onset_s=old.onset_s, duration_s=0.0, final=True)

@@ -195,6 +195,14 @@ def test_live_audio_far_ahead_of_the_clock_is_refused(service: Watched) -> None:
     assert "paced false" in service.warnings_given[0][1]
 
 
+def test_live_audio_that_waited_for_another_recognizer_is_taken(service: Watched) -> None:
+    service.start_session(replace(start_of(), paced=True, epoch=2))
+    for number in range(1, 6):  # of 4 s
+        pcm = bytes(8 * RATE_HZ)
+        service.take(AudioChunk(session="s", token="t", epoch=2, sequence=number, pcm=pcm))
+    assert service.warnings_given == []
+
+
 def test_the_clock_counts_from_where_live_audio_last_waited(service: Watched) -> None:
     service.start_session(replace(start_of(), paced=True))
     session = service._sessions["s"]

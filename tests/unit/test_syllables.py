@@ -137,3 +137,11 @@ def test_what_is_not_in_the_text_is_spelled() -> None:
     for index, symbol in enumerate(("n", "i", "h", "ao")):
         texts |= {each.index: each.text for each in track.accept(phone(index, symbol))}
     assert texts == {0: "ni", 2: "好"}
+
+
+def test_a_phone_that_nobody_knows_is_withdrawn_without_a_trace() -> None:
+    track = SyllableTrack(MANDARIN)
+    assert track.accept(phone(3, "sil", duration_s=0.0)) == []
+    track.accept(phone(0, "sh"))
+    (withdrawn,) = track.accept(phone(0, "sh", duration_s=0.0))
+    assert withdrawn.duration_s == 0.0
