@@ -50,7 +50,7 @@ class SessionFollower:
     """Receives chosen kinds of messages of one session, through its moves, to its end.
 
     After a move it stays subscribed where it was until the new subscriptions are in effect, and
-    where the session stays ``KEPT_S`` longer. It takes once what comes both ways, and a frame that
+    ``KEPT_S`` longer if one of its publishers stays. It takes once what comes both ways, and a frame that
     is made again in a new epoch. Where a publisher does not confirm, it subscribes again: if
     another program was at its address before, libzmq never connects that socket again.
 
@@ -110,7 +110,7 @@ class SessionFollower:
         self._again_s = math.inf  # when the new one is given up unless it is complete
         self._addresses: set[str] = set()
         self._frame_addresses: set[str] = set()  # those of them with live frames
-        self._stays = False  # it subscribed again at the same addresses
+        self._stays = False  # it subscribed again at one of the same addresses
         self._confirmed: set[str] = set()
         self._first_epoch = 0  # that of the first start
         self._epochs: dict[str, int] = {}  # of the newest message, by publisher
@@ -144,11 +144,15 @@ class SessionFollower:
         addresses = {endpoints[name] for name in names}
         frames = {endpoints["faps"]} & addresses if self._live and "faps" in names else set()
         socket = self._connect(addresses, frames)
-        self._leave_socket_before()
-        self._socket_before = self._socket
-        self._newest_before, self._taken = dict(self._newest), set()
+        stays = bool(addresses & self._addresses)
+        if self._socket is not None and self._socket_before is not None and not self.is_complete:
+            self._loop.unregister(self._socket)  # the one before is all there is so far
+            self._stays = self._stays and stays
+        else:
+            self._leave_socket_before()
+            self._socket_before, self._stays = self._socket, stays
+            self._newest_before, self._taken = dict(self._newest), set()
         self._leave_s = math.inf
-        self._stays = addresses == self._addresses
         self._addresses, self._frame_addresses = addresses, frames
         self._first_epoch = self._first_epoch or epoch
         self.epoch = self.epoch or epoch

@@ -42,8 +42,17 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests that start services, which take longest."""
-    items.sort(key=lambda item: Path(item.nodeid).parts[1] not in STARTS_SERVICES)
+    """Begin with the tests that start services, which take longest; run one that fails once more.
+
+    They run in real time: where the machine stands still for a moment, live frames are left out.
+    """
+    items.sort(key=lambda item: not _starts_services(item))
+    for item in filter(_starts_services, items):
+        item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def _starts_services(item: pytest.Item) -> bool:
+    return Path(item.nodeid).parts[1] in STARTS_SERVICES
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> FileScheduling:

@@ -147,11 +147,13 @@ def test_a_session_that_moved_is_followed_to_its_new_publisher(studio: Studio) -
     studio.complete()
     assert studio.num_completed == 2
     studio.received.clear()
-    studio.faps.send(frame(7))  # where it was published before
     studio.other_faps.send(frame(1, epoch=2))
-    studio.other_faps.send(frame(2, epoch=1))  # left over from before the restart
     studio.step_until(lambda: bool(studio.received))
-    assert studio.received == [frame(1, epoch=2)]
+    studio.other_faps.send(frame(2, epoch=1))  # left over from before the restart
+    studio.faps.send(frame(7))  # where it was published before
+    studio.other_faps.send(frame(2, epoch=2))
+    studio.step_until(lambda: len(studio.received) > 1)
+    assert studio.received == [frame(1, epoch=2), frame(2, epoch=2)]
     assert studio.epochs == [2]
     assert not studio.follower.has_ended
     assert studio.follower.num_missed == 0
@@ -201,6 +203,27 @@ def test_what_the_connection_before_still_brings_is_taken_once(studio: Studio) -
     studio.phones.send(dataclasses.replace(sounds[0], sequence=4))
     studio.step_until(lambda: len(studio.received) == 4)
     assert studio.follower._socket_before is None
+
+
+def test_what_works_is_kept_until_the_other_does(studio: Studio) -> None:
+    studio.start(1)
+    studio.complete()
+    for _ in range(2):  # it connects again, and once more before that is in effect
+        studio.start(1)
+    sound = Sound(session="one", epoch=1, sequence=1, pcm=b"\0\0")
+    studio.phones.send(sound)  # nobody else has subscribed yet
+    studio.complete()
+    studio.step_until(lambda: bool(studio.received))
+    assert studio.received == [sound]
+
+
+def test_what_the_publisher_that_stays_sent_before_a_move_still_comes(studio: Studio) -> None:
+    studio.start(1)
+    studio.complete()
+    studio.start(2, studio.other_faps)
+    studio.complete()
+    assert studio.follower._socket_before is not None
+    assert studio.follower._leave_s > time.monotonic() + follower.KEPT_S / 2
 
 
 def test_what_waited_while_the_process_was_stopped_is_left_but_for_the_newest(
