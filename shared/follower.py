@@ -50,9 +50,9 @@ class SessionFollower:
     """Receives chosen kinds of messages of one session, through its moves, to its end.
 
     After a move it stays subscribed where it was until the new subscriptions are in effect, and
-    ``KEPT_S`` longer if one of its publishers stays. It takes once what comes both ways, and a frame that
-    is made again in a new epoch. Where a publisher does not confirm, it subscribes again: if
-    another program was at its address before, libzmq never connects that socket again.
+    ``KEPT_S`` longer if one of its publishers stays. It takes once what comes both ways, and a
+    frame that is made again in a new epoch. Where a publisher does not confirm, it subscribes
+    again: if another program was at its address before, libzmq never connects that socket again.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ class _Session:
         self.finished = False  # all audio up to the end is processed
         self.num_gaps = 0  # of the stream's, counted
         self.late_since_s: float | None = None  # since when the synthesizer owes too much
-        # Before the clock, and when. Where another was lost, what came meanwhile waits at the client.
+        # Before the clock, and when. Where another was lost, the client kept what came meanwhile.
         self._lead_s, self._lead_at_s = -MAX_LEAD_S if start.epoch > 1 else 0.0, time.monotonic()
         self._end_s: float | None = None  # media time of the end of the newest sound taken
 
