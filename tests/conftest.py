@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from bisect import bisect
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from tests.system import System
 from tests.videos import write_video
 
 STARTS_SERVICES = {"bench", "e2e", "process"}  # folders whose tests start services
-PARTS = ("e2e/test_co", "e2e/test_o")  # where the second and the third third of them begin
+SECOND_HALF = "e2e/test_f"  # where that of them begins
 
 settings.register_profile(
     "kouxing", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -25,19 +24,19 @@ settings.load_profile("kouxing")
 
 
 class FileScheduling(LoadScopeScheduling):  # type: ignore[misc] # untyped
-    """Each file's tests run in one process, and all that start services in three."""
+    """Each file's tests run in one process, and all that start services in two."""
 
     def _split_scope(self, nodeid: str) -> str:
         file = nodeid.partition("::")[0]
         _, folder, *_, name = Path(file).parts
         if folder not in STARTS_SERVICES:
             return file
-        return f"services {bisect(PARTS, f'{folder}/{name}')}"
+        return f"services {int(f'{folder}/{name}' >= SECOND_HALF)}"
 
 
 def pytest_configure() -> None:
-    """Let services and those who wait for them come first where a fourth process tests the rest."""
-    if os.environ.get("PYTEST_XDIST_WORKER") == "gw3":
+    """Let services and those who wait for them come first where a third process tests the rest."""
+    if os.environ.get("PYTEST_XDIST_WORKER") == "gw2":
         os.nice(10)
 
 
