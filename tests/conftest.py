@@ -10,12 +10,13 @@ import pytest
 from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
+from xdist.workermanage import WorkerController
 
 from tests.system import System
 from tests.videos import write_video
 
 STARTS_SERVICES = {"bench", "e2e", "process"}  # folders whose tests start services
-SECOND_HALF = "e2e/test_f"  # where that of them begins
+THIRD = "gw2"  # of the processes
 
 settings.register_profile(
     "kouxing", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -24,19 +25,20 @@ settings.load_profile("kouxing")
 
 
 class FileScheduling(LoadScopeScheduling):  # type: ignore[misc] # untyped
-    """Each file's tests run in one process, and all that start services in two."""
+    """Each file's tests run in one process; the third begins with those that start no services."""
 
     def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.partition("::")[0]
-        _, folder, *_, name = Path(file).parts
-        if folder not in STARTS_SERVICES:
-            return file
-        return f"services {int(f'{folder}/{name}' >= SECOND_HALF)}"
+        return nodeid.partition("::")[0]
+
+    def _assign_work_unit(self, node: WorkerController) -> None:
+        if node.gateway.id == THIRD:
+            self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
+        super()._assign_work_unit(node)
 
 
 def pytest_configure() -> None:
     """Let services and those who wait for them come first where a third process tests the rest."""
-    if os.environ.get("PYTEST_XDIST_WORKER") == "gw2":
+    if os.environ.get("PYTEST_XDIST_WORKER") == THIRD:
         os.nice(10)
 
 
