@@ -37,7 +37,7 @@ class FileScheduling(LoadScopeScheduling):  # type: ignore[misc] # untyped
 
 
 def pytest_configure() -> None:
-    """Let services and those who wait for them come first where a third process tests the rest."""
+    """Let services and the tests that wait for them come before what the third process does."""
     if os.environ.get("PYTEST_XDIST_WORKER") == THIRD:
         os.nice(10)
 
@@ -45,7 +45,7 @@ def pytest_configure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the tests that start services, which take longest; run one that fails once more.
 
-    They run in real time: where the machine stands still for a moment, live frames are left out.
+    They run in real time: when the machine stands still for a moment, live frames are left out.
     """
     items.sort(key=lambda item: not _starts_services(item))
     for item in filter(_starts_services, items):

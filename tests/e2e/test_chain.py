@@ -68,7 +68,7 @@ def test_the_sound_is_the_audio_that_was_sent(collected: Collected) -> None:
     np.testing.assert_allclose(sound / 32768, sent, atol=1e-4)
 
 
-@pytest.mark.parametrize("chunk", [97, 8000])
+@pytest.mark.parametrize("chunk", [97, 1600, 8000])
 def test_frames_do_not_depend_on_the_chunks(
     system: System, collected: Collected, chunk: int
 ) -> None:

@@ -79,7 +79,7 @@ def test_a_client_that_asks_again_for_its_session_gets_it(stage: Stage) -> None:
         _, start = answers(stage, stage.services[0], 2)
         assert isinstance(start, StartSession)
         stage.services[0].send(served(client=start.client, client_request="2"))
-        answers(stage, stage.services[0])  # taken over: over another connection might come earlier
+        answers(stage, stage.services[0])  # it is taken over, before the client asks
         client.send(OpenSession(session="mine", request="2"))
         (opened,) = answers(stage, client)
     assert isinstance(opened, SessionOpened)
