@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from kouxing.services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
 track_app = typer.Typer(add_completion=False)
 adapt_app = typer.Typer(add_completion=False)
@@ -26,8 +26,8 @@ def adapt(
     json_file: JsonFile = None,
 ) -> None:
     """Learn a speaker's own mouth from tracked lips; --voice uses it."""
-    from corpora import voices
-    from services.recognizer.lip_tracks import MEASURES
+    from kouxing.corpora import voices
+    from kouxing.services.recognizer.lip_tracks import MEASURES
 
     check_output(output, json_file)
     voice = voices.adapt(sources)
@@ -51,7 +51,7 @@ def track(
     ],
 ) -> None:
     """Track the lips in a video: a clip for kouxing adapt."""
-    from corpora.lip_tracking import track_video
+    from kouxing.corpora.lip_tracking import track_video
 
     check_output(*(output.with_suffix(suffix) for suffix in (".flac", ".csv", ".json")))
     with CONSOLE.status(f"tracking {video}"):

@@ -28,8 +28,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
 
 Array = NDArray[np.float64]
 

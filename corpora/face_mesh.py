@@ -2,7 +2,7 @@
 
 Sources: Bazarevsky et al. 2019, "BlazeFace: sub-millisecond neural face detection on mobile GPUs";
 Kartynnik et al. 2019, "Real-time facial surface geometry from monocular video on mobile GPUs". The
-two networks are MediaPipe's (Apache-2.0), converted by ``python -m training.face_mesh``.
+two networks are MediaPipe's (Apache-2.0), converted by ``python -m kouxing.training.face_mesh``.
 
 The detector looks at the whole picture, and again where the face was lost. The mesh looks at a
 square around the face, turned so that the eyes are level: where the detector, or the landmarks of
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from services.recognizer.onnx_session import open_network
+from kouxing.services.recognizer.onnx_session import open_network
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]

@@ -18,9 +18,9 @@ import soundfile
 from numpy.typing import NDArray
 from rich.progress import track
 
-from corpora.speech_corpus import RowErrors, Utterance
-from services.recognizer.front_end.features import NUM_BANDS, LogMel
-from services.recognizer.front_end.resample import to_16_khz
+from kouxing.corpora.speech_corpus import RowErrors, Utterance
+from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
+from kouxing.services.recognizer.front_end.resample import to_16_khz
 
 _FORMAT = "3"  # raise when the front end's log-mel stage changes
 _FULL_SCALE = 32768.0  # samples are kept as 16-bit sound files keep them

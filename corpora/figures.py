@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from shared.errors import UserError, install_command
+from kouxing.shared.errors import UserError, install_command
 
 _DOTS_PER_INCH = 80
 

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.face_landmarks import LANDMARKS, mouth_faps
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
-from services.recognizer.front_end.resample import to_16_khz
-from shared.errors import UserError
+from kouxing.corpora.face_landmarks import LANDMARKS, mouth_faps
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.errors import UserError
 
 SUFFIX = ".landmarks"
 MAX_BYTES = 64 * 1024 * 1024

@@ -22,16 +22,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.feature_cache import read_audio
-from corpora.speech_corpus import may_ship
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.alignment import align_text
-from services.recognizer.front_end.pcm import level_db
-from services.recognizer.offline import recognize
-from services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, columns
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.alignment import align_text
+from kouxing.services.recognizer.front_end.pcm import level_db
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, columns
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 

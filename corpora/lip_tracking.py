@@ -10,13 +10,13 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from corpora.face_landmarks import LANDMARKS, mouth_faps
-from corpora.face_mesh import FaceMesh
-from corpora.landmark_file import MIN_FRAMES
-from corpora.lip_clips import SAMPLE_RATE_HZ, level_track
-from corpora.video_file import read_video
-from shared.errors import UserError
-from shared.face.faps import FAPS, MOUTH_FAPS
+from kouxing.corpora.face_landmarks import LANDMARKS, mouth_faps
+from kouxing.corpora.face_mesh import FaceMesh
+from kouxing.corpora.landmark_file import MIN_FRAMES
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, level_track
+from kouxing.corpora.video_file import read_video
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 
 
 def track_video(video: Path, clip: Path) -> tuple[int, int]:

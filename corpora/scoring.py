@@ -8,8 +8,8 @@ from itertools import zip_longest
 
 import numpy as np
 
-from services.recognizer.recognizer import Emission
-from shared.phones.events import Phone
+from kouxing.services.recognizer.recognizer import Emission
+from kouxing.shared.phones.events import Phone
 
 
 @dataclass(slots=True, kw_only=True)

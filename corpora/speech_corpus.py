@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory, Syllable
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
 # Licences that allow a model trained on the data to be given away.
 _FREE_LICENCE = re.compile(

@@ -9,8 +9,8 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import SAMPLE_RATE_HZ
-from shared.errors import UserError
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
+from kouxing.shared.errors import UserError
 
 MAX_DURATION_S = 1200.0
 MAX_SIDE_PX = 960  # larger pictures are made smaller

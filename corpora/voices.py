@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.landmark_file import SUFFIX, read_landmark_file
-from corpora.lip_clips import LipClip, read_clip
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_positions import POSITION_S
-from services.recognizer.lip_tracks import MEASURES, lip_tracks
-from services.recognizer.lips import LIPS_PATH, LipPredictor, lips_for
-from services.recognizer.voice_learning import (
+from kouxing.corpora.landmark_file import SUFFIX, read_landmark_file
+from kouxing.corpora.lip_clips import LipClip, read_clip
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_positions import POSITION_S
+from kouxing.services.recognizer.lip_tracks import MEASURES, lip_tracks
+from kouxing.services.recognizer.lips import LIPS_PATH, LipPredictor, lips_for
+from kouxing.services.recognizer.voice_learning import (
     FilmedSpeech,
     Material,
     VoiceGain,
@@ -24,7 +24,7 @@ from services.recognizer.voice_learning import (
     material_of,
     measure_gain,
 )
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,11 +12,11 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
-from shared.face.lip_models import LipModelName
+from kouxing.services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from kouxing.shared.face.lip_models import LipModelName
 
 if TYPE_CHECKING:
-    from services.recognizer.acoustic.acoustic_model import AcousticModel
+    from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 
 
 class BenchGroup(TyperGroup):
@@ -74,10 +74,10 @@ def recognizer(
     json_file: JsonFile = None,
 ) -> None:
     """Measure phone and viseme errors, delays and cost of acoustic models, side by side."""
-    from evaluation.recognizer.confusions import draw_confusions
-    from evaluation.recognizer.delay_curve import draw_delay_curve
-    from evaluation.recognizer.error_rates import evaluate_recognizer
-    from evaluation.recognizer.report import print_figures
+    from kouxing.evaluation.recognizer.confusions import draw_confusions
+    from kouxing.evaluation.recognizer.delay_curve import draw_delay_curve
+    from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
+    from kouxing.evaluation.recognizer.report import print_figures
 
     check_output(confusions, curve, json_file)
     results = {
@@ -108,7 +108,7 @@ def robustness(
     json_file: JsonFile = None,
 ) -> None:
     """Measure errors in disturbed speech, and phones recognised in sounds without speech."""
-    from evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+    from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
 
     check_output(json_file)
     results = {
@@ -128,8 +128,8 @@ def _models(
 
     Yields title, name, model, and the output rule that suits it.
     """
-    from services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
-    from services.recognizer.config import RecognizerConfig
+    from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
+    from kouxing.services.recognizer.config import RecognizerConfig
 
     for name in names or [DEFAULT_MODEL]:
         suited = RecognizerConfig(acoustic=name)
@@ -154,8 +154,8 @@ def lips(
 
     The file has all figures by language, source and speaker, too.
     """
-    from evaluation.lips.report import print_scores
-    from evaluation.lips.scores import main
+    from kouxing.evaluation.lips.report import print_scores
+    from kouxing.evaluation.lips.scores import main
 
     check_output(json_file)
     scores = main(clips, parameters, source or ())
@@ -197,12 +197,12 @@ def schemes(
     Without a corpus or clips the sentences are the samples that come with kouxing, without
     --acoustic the recognizers blocks and gmm.
     """
-    from evaluation.lips import sentences
-    from evaluation.lips.four_schemes import film_all, hear_all, listeners_of
-    from evaluation.lips.scheme_report import print_outcome
-    from evaluation.lips.scheme_scores import evaluate
-    from services.recognizer.acoustic.load import load_live_model
-    from shared.errors import UserError
+    from kouxing.evaluation.lips import sentences
+    from kouxing.evaluation.lips.four_schemes import film_all, hear_all, listeners_of
+    from kouxing.evaluation.lips.scheme_report import print_outcome
+    from kouxing.evaluation.lips.scheme_scores import evaluate
+    from kouxing.services.recognizer.acoustic.load import load_live_model
+    from kouxing.shared.errors import UserError
 
     check_output(json_file)
     if manifest and clips:
@@ -246,9 +246,9 @@ def rivals(
 
     These run in Node; 'npm ci' in evaluation/lips/rivals installs them.
     """
-    from corpora.figures import save_figure
-    from evaluation.lips.report import print_comparison
-    from evaluation.lips.rivals.comparison import figure, main
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.lips.report import print_comparison
+    from kouxing.evaluation.lips.rivals.comparison import figure, main
 
     check_output(picture, json_file)
     scores = main(clips)
@@ -268,8 +268,8 @@ def ferguson(
     json_file: JsonFile = None,
 ) -> None:
     """Compare lips with real ones at several speaking rates, as Zhang et al. 2021 do."""
-    from corpora.figures import save_figure
-    from evaluation.lips.contour_accuracy import print_rates, rates_figure, score_rates
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.lips.contour_accuracy import print_rates, rates_figure, score_rates
 
     check_output(picture, json_file)
     scores = score_rates(clips, part)
@@ -289,8 +289,8 @@ def contour(
     """Check the shapes of the Ferguson lips: gap, outline, bends and dents at every opening."""
     import numpy as np
 
-    from corpora.figures import save_figure
-    from evaluation.lips.contour_shapes import check_shapes, print_shapes, shapes_figure
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.lips.contour_shapes import check_shapes, print_shapes, shapes_figure
 
     check_output(picture, json_file)
     figures = check_shapes(np.linspace(0.0, 5.0, 501))
@@ -306,7 +306,7 @@ def closures(
     json_file: JsonFile = None,
 ) -> None:
     """Compare how the learnt lips may weigh evidence of closures, on clips for choices."""
-    from evaluation.lips.closure_fit import main, print_scores
+    from kouxing.evaluation.lips.closure_fit import main, print_scores
 
     check_output(json_file)
     scores = main(clips)
@@ -328,8 +328,8 @@ def voices(
     json_file: JsonFile = None,
 ) -> None:
     """Show what some seconds of a speaker's own lips bring, on clips held out."""
-    from evaluation.lips.voices import print_scores, score_voices
-    from services.recognizer.lips import LIPS_PATH
+    from kouxing.evaluation.lips.voices import print_scores, score_voices
+    from kouxing.services.recognizer.lips import LIPS_PATH
 
     check_output(json_file)
     scores = score_voices(clips, lips or LIPS_PATH, speaker or ())
@@ -347,7 +347,7 @@ def visemes(
     json_file: JsonFile = None,
 ) -> None:
     """Show how the visemes fit lips they were not trained on, and what training changed."""
-    from evaluation.lips.viseme_fit import main
+    from kouxing.evaluation.lips.viseme_fit import main
 
     check_output(picture, json_file)
     write_json(json_file, main(clips, parameters, picture))
@@ -367,9 +367,9 @@ def endpoints(
     json_file: JsonFile = None,
 ) -> None:
     """Compare syllables found by energy and zero crossings with forced alignment."""
-    from corpora.figures import save_figure
-    from evaluation.lips.segmentation import figure, print_score, score_segmentation
-    from shared.errors import UserError
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.lips.segmentation import figure, print_score, score_segmentation
+    from kouxing.shared.errors import UserError
 
     check_output(picture, json_file)
     score, recordings = score_segmentation(manifest, split, audio)
@@ -391,7 +391,7 @@ def attacks(
     json_file: JsonFile = None,
 ) -> None:
     """Measure what hostile peers cost: memory of the services, and delay of others' faces."""
-    from evaluation.system.attacks import measure, show
+    from kouxing.evaluation.system.attacks import measure, show
 
     check_output(json_file)
     damages = measure(audio, attack or (), CONSOLE)
@@ -416,7 +416,7 @@ def faults(
     "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut off for 2 s", "hosts,
     recognizer gone for good, one more", "hosts, synthesizer gone for good, one more".
     """
-    from evaluation.system.faults import TIMING, measure, show
+    from kouxing.evaluation.system.faults import TIMING, measure, show
 
     check_output(json_file)
     outcomes = list(measure(audio, fault or (), logs, CONSOLE, TIMING))
@@ -431,7 +431,7 @@ def senders(
     json_file: JsonFile = None,
 ) -> None:
     """Measure how many frames arrive at other programs that show the face, and how evenly."""
-    from evaluation.system.sending import measure, show
+    from kouxing.evaluation.system.sending import measure, show
 
     check_output(json_file)
     arrivals = measure(audio, seconds, CONSOLE)
@@ -452,7 +452,7 @@ def control(
     The workers are played: each sends its heartbeats and starts what it is told. A tenth and a
     hundredth of them are measured, too.
     """
-    from evaluation.system.control_scale import measure, show
+    from kouxing.evaluation.system.control_scale import measure, show
 
     check_output(json_file)
     costs = [
@@ -475,8 +475,8 @@ def soak(
 
     The file is written after each round, so an interrupted run keeps its figures.
     """
-    from corpora.figures import save_figure
-    from evaluation.system.soak import Round, draw, measure, show, summary
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.system.soak import Round, draw, measure, show, summary
 
     def keep(rounds: list[Round]) -> None:
         figures = [asdict(each) for each in rounds]
@@ -500,7 +500,7 @@ def chain(
 
     The page is measured where Chromium is installed, and how far its sound is from its picture.
     """
-    from evaluation.system import chromium, latency, page, rendering, sessions
+    from kouxing.evaluation.system import chromium, latency, page, rendering, sessions
 
     delays = latency.measure(audio, repeats, CONSOLE)
     costs = sessions.measure(audio)
@@ -538,8 +538,8 @@ def load(
 
     One process speaks into all of them, each with a voice of its own.
     """
-    from corpora.figures import save_figure
-    from evaluation.system.load import draw, measure, show
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.system.load import draw, measure, show
 
     check_output(picture, json_file)
     figures = measure(audio or sorted(SENTENCE.parent.glob("*.wav")), sessions, seconds, CONSOLE)
@@ -561,7 +561,7 @@ def plot_visemes(
     parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
 ) -> None:
     """Draw the visemes' faces, their dominance curves, and the FAP curves of a sentence."""
-    from evaluation.lips.viseme_plots import plot_visemes as draw
+    from kouxing.evaluation.lips.viseme_plots import plot_visemes as draw
 
     for path in draw(folder, audio, parameters):
         print_message(f"wrote {path}")
@@ -572,8 +572,8 @@ def plot_lip_line(
     output: Annotated[Path, typer.Argument(help="Picture to write (.png).")],
 ) -> None:
     """Draw the head's lips beside lips that plain zones of influence move; print their bumps."""
-    from corpora.figures import save_figure
-    from evaluation.lips.lip_line import lip_line_figure, print_lip_lines
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.lips.lip_line import lip_line_figure, print_lip_lines
 
     check_output(output)
     print_lip_lines(Console())
@@ -586,7 +586,7 @@ def plot_mouths(
     folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/mouths"),
 ) -> None:
     """Draw visemes and expressions on every head, and mouths with more or less expressiveness."""
-    from evaluation.lips.mouth_sheets import draw_mouth_sheets
+    from kouxing.evaluation.lips.mouth_sheets import draw_mouth_sheets
 
     for path in draw_mouth_sheets(folder):
         print_message(f"wrote {path}")
@@ -600,7 +600,7 @@ def plot_heads(
     ] = None,
 ) -> None:
     """Draw every head, and the faces of every viseme, from the front and from 40 degrees."""
-    from evaluation.system.head_pictures import draw_choices, draw_sheets
+    from kouxing.evaluation.system.head_pictures import draw_choices, draw_sheets
 
     for path in draw_sheets(folder) + (draw_choices(choices) if choices else []):
         print_message(f"wrote {path}")
@@ -613,7 +613,7 @@ def plot_clip(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
 ) -> None:
     """Make a video of every lip model beside the tracked lips of a clip."""
-    from evaluation.lips.clip_video import film_clip
+    from kouxing.evaluation.lips.clip_video import film_clip
 
     film_clip(clips, name, output)
     print_message(f"wrote {output}")

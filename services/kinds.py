@@ -10,9 +10,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from shared.config import COMMON, Bound, ServiceConfig, Settings, bound_keys, variable
-from shared.endpoints import WILDCARDS
-from shared.errors import UserError
+from kouxing.shared.config import COMMON, Bound, ServiceConfig, Settings, bound_keys, variable
+from kouxing.shared.endpoints import WILDCARDS
+from kouxing.shared.errors import UserError
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,32 +36,32 @@ KINDS = {
     for kind in (  # in the order in which they start
         ServiceKind(
             "control",
-            "services.control.config:ControlConfig",
-            "services.control.service:ControlService",
+            "kouxing.services.control.config:ControlConfig",
+            "kouxing.services.control.service:ControlService",
             "Run control: it opens sessions and places them on the other services.",
         ),
         ServiceKind(
             "recognizer",
-            "services.recognizer.config:RecognizerConfig",
-            "services.recognizer.service:RecognizerService",
+            "kouxing.services.recognizer.config:RecognizerConfig",
+            "kouxing.services.recognizer.service:RecognizerService",
             "Run a recognizer: audio in, phones with times out.",
         ),
         ServiceKind(
             "synthesizer",
-            "services.synthesizer.config:SynthesizerConfig",
-            "services.synthesizer.service:SynthesizerService",
+            "kouxing.services.synthesizer.config:SynthesizerConfig",
+            "kouxing.services.synthesizer.service:SynthesizerService",
             "Run a synthesizer: phones in, FAP frames out.",
         ),
         ServiceKind(
             "driver",
-            "services.driver.config:DriverConfig",
-            "services.driver.service:DriverService",
+            "kouxing.services.driver.config:DriverConfig",
+            "kouxing.services.driver.service:DriverService",
             "Run a driver: FAP frames in, a window and videos out.",
         ),
         ServiceKind(
             "gateway",
-            "services.gateway.config:GatewayConfig",
-            "services.gateway.service:GatewayService",
+            "kouxing.services.gateway.config:GatewayConfig",
+            "kouxing.services.gateway.service:GatewayService",
             "Run the gateway: the face and a microphone in a browser.",
         ),
     )
@@ -78,7 +78,7 @@ def read_settings(
     Raises
     ------
     UserError
-        As ``shared.config.Settings``.
+        As ``kouxing.shared.config.Settings``.
     """
     types = {kind.name: kind.config_type for kind in KINDS.values()}
     return Settings(types, file=file, assignments=assignments)

@@ -9,16 +9,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.lip_source import LipsFromSound
-from services.recognizer.lips import lips_for
-from services.recognizer.stream import SpeechStream, StreamOutput, Waveform
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.lip_model import LipModel
-from shared.clock import MEDIA_RATE_HZ
-from shared.phones.events import SoundEvent
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.lip_source import LipsFromSound
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.stream import SpeechStream, StreamOutput, Waveform
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.phones.events import SoundEvent
 
 
 def sound_events(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from shared.service import Service
+    from kouxing.shared.service import Service
 
 
 def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
@@ -23,7 +23,7 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
     Parameters
     ----------
     name
-        One of ``services.kinds.KINDS``.
+        One of ``kouxing.services.kinds.KINDS``.
     file
         A TOML file, if there is one.
     assignments
@@ -35,9 +35,9 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
         If the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while it starts is no error
-    from services.kinds import KINDS, read_settings
-    from shared.config import parse_assignments
-    from shared.service import run_service
+    from kouxing.services.kinds import KINDS, read_settings
+    from kouxing.shared.config import parse_assignments
+    from kouxing.shared.service import run_service
 
     kind = KINDS[name]
     config = read_settings(file).load(kind.config_type, parse_assignments(assignments))
@@ -53,11 +53,11 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
 def run_module(name: str) -> None:
     """Run ``python -m services.<name>``: a service without the command line's other commands."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from services.kinds import KINDS
-    from shared.errors import UserError
+    from kouxing.services.kinds import KINDS
+    from kouxing.shared.errors import UserError
 
     parser = argparse.ArgumentParser(
-        prog=f"python -m services.{name}", description=KINDS[name].summary
+        prog=f"python -m kouxing.services.{name}", description=KINDS[name].summary
     )
     parser.add_argument("--config", type=Path, metavar="FILE", help="TOML file.")
     parser.add_argument(

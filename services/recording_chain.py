@@ -17,18 +17,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.front_end.pcm import progress_of
-from services.recognizer.lip_source import LipsFromSound
-from services.recognizer.offline import decode_offline
-from services.recognizer.speech_scores import SpeechEnd, SpeechStart, frame_time_s, score_recording
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import MAX_DELAY_S, REST_S, Face, Frame
-from services.synthesizer.lips.learnt.closures import ClosureRule
-from services.synthesizer.lips.learnt.model import LearntLips
-from services.synthesizer.lips.lip_model import LipModel
-from shared.clock import MEDIA_RATE_HZ
-from shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.lip_source import LipsFromSound
+from kouxing.services.recognizer.offline import decode_offline
+from kouxing.services.recognizer.speech_scores import (
+    SpeechEnd,
+    SpeechStart,
+    frame_time_s,
+    score_recording,
+)
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face import MAX_DELAY_S, REST_S, Face, Frame
+from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
+from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent, SpeechChange
 
 # Chosen on clips for choices, as those of the live chain. Where the sound tells one closure and the
 # phones two, the vowel between them counts; no clip has such a place.

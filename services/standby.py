@@ -1,6 +1,6 @@
 """A process that has imported what takes long, and becomes a service when it is told which.
 
-``python -m services.standby`` reads one line of JSON from standard input:
+``python -m kouxing.services.standby`` reads one line of JSON from standard input:
 ``{"service": NAME, "arguments": [...], "environment": {...}}``. So a service that crashed is back
 without the time that Python takes for its libraries.
 """
@@ -13,8 +13,8 @@ import pkgutil
 import signal
 import sys
 
-from services.kinds import KINDS
-from services.process import run_module
+from kouxing.services.kinds import KINDS
+from kouxing.services.process import run_module
 
 
 def main() -> None:

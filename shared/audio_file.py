@@ -13,11 +13,11 @@ import soundfile
 import soxr
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.wav_header import read_wav_header
+from kouxing.shared.errors import UserError
+from kouxing.shared.wav_header import read_wav_header
 
 if TYPE_CHECKING:
-    from shared.media_file import MediaSound
+    from kouxing.shared.media_file import MediaSound
 
 LOWEST_RATE_HZ = 8_000
 HIGHEST_RATE_HZ = 48_000  # what the wire carries; files above are resampled to it
@@ -94,7 +94,7 @@ def _check_rate(path: Path, rate_hz: int) -> None:
 
 def _open_media(path: Path, block_s: float) -> AudioSource:
     """Open what libsndfile does not read."""
-    from shared.media_file import open_media  # noqa: PLC0415 - 0.1 s; few files need it
+    from kouxing.shared.media_file import open_media  # noqa: PLC0415 - 0.1 s; few files need it
 
     sound = open_media(path, HIGHEST_RATE_HZ, 2)
     remarks: list[str] = []

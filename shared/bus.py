@@ -19,20 +19,20 @@ from typing import Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from shared.connection import BAN_FAULTS, KIB, Bounds, Connection
-from shared.connections import Guard, Guarded
-from shared.endpoints import split_endpoint
-from shared.errors import UserError
-from shared.keys import NOBODY, Guest, Key, Peer, may_follow
-from shared.wire.codec import BadMessage, decode, encode, topic
-from shared.wire.message import (
+from kouxing.shared.connection import BAN_FAULTS, KIB, Bounds, Connection
+from kouxing.shared.connections import Guard, Guarded
+from kouxing.shared.endpoints import split_endpoint
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import NOBODY, Guest, Key, Peer, may_follow
+from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
+from kouxing.shared.wire.message import (
     MAX_AUDIO_BYTES,
     MAX_COMMAND_BYTES,
     MAX_MESSAGE_BYTES,
     Message,
 )
-from shared.wire.session import Error, Joined
-from shared.zap import Zap, answer_handshakes
+from kouxing.shared.wire.session import Error, Joined
+from kouxing.shared.zap import Zap, answer_handshakes
 
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames of a recording for a subscriber that pauses
 LIVE_BUFFER = 65_536  # bytes of the kernel: some seconds of FAP frames, over any distance

@@ -12,17 +12,17 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.bus import AUDIO_QUEUE_LENGTH, CONNECT_MS, Bus, Received
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.face.expressions import DEFAULT_HOLD_S
-from shared.follower import PollingLoop, SessionFollower
-from shared.keys import CLIENT, Key, refusal, user_key
-from shared.wire.audio import AudioChunk, EndOfAudio
-from shared.wire.codec import BadMessage
-from shared.wire.control import StatusReport, StatusRequest
-from shared.wire.message import MAX_AUDIO_BYTES, Message
-from shared.wire.session import (
+from kouxing.shared.bus import AUDIO_QUEUE_LENGTH, CONNECT_MS, Bus, Received
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S
+from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.keys import CLIENT, Key, refusal, user_key
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.codec import BadMessage
+from kouxing.shared.wire.control import StatusReport, StatusRequest
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
+from kouxing.shared.wire.session import (
     AddShapes,
     ChooseExpressiveness,
     ChooseLips,
@@ -35,7 +35,7 @@ from shared.wire.session import (
     SessionMoved,
     SessionOpened,
 )
-from shared.wire.speech import Acknowledge
+from kouxing.shared.wire.speech import Acknowledge
 
 RETRY_S = 1.0
 RESEND_S = 10.0  # audio kept for a recognizer that takes the place of a lost one

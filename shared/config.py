@@ -25,8 +25,8 @@ from annotated_types import Ge, Le, MultipleOf
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
-from shared.endpoints import WILDCARDS, is_loopback, own_address, split_endpoint, with_host
-from shared.errors import UserError
+from kouxing.shared.endpoints import WILDCARDS, is_loopback, own_address, split_endpoint, with_host
+from kouxing.shared.errors import UserError
 
 PREFIX = "KOUXING_"
 COMMON = "common"  # table of the keys that every service has

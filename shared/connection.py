@@ -11,8 +11,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-from shared.kernel_sockets import SEES_BYTES, borrowed, bytes_read, bytes_taken, inode_of
-from shared.logs import LOG, RateLimit
+from kouxing.shared.kernel_sockets import SEES_BYTES, borrowed, bytes_read, bytes_taken, inode_of
+from kouxing.shared.logs import LOG, RateLimit
 
 KIB, MIB = 1024, 1024 * 1024
 STOPPED_S = 1.0  # without taking anything of what waits for it, and a subscriber stands still
@@ -70,7 +70,7 @@ class Credit:
 
 
 class BoundSocket(Protocol):
-    """The socket to which a connection is, as ``shared.connections.Guarded``."""
+    """The socket to which a connection is, as ``kouxing.shared.connections.Guarded``."""
 
     bounds: Bounds
     turns: int  # times that every connection's next complete message was delivered

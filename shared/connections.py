@@ -21,7 +21,7 @@ from collections.abc import Collection, Iterable, Iterator
 
 import zmq
 
-from shared.connection import (
+from kouxing.shared.connection import (
     BAN_FAULTS,
     CREDIT,
     FAULTS_S,
@@ -35,8 +35,8 @@ from shared.connection import (
     Connection,
     Credit,
 )
-from shared.kernel_sockets import SEES_BYTES, address_of, inode_of, network_of, port_of
-from shared.metrics import give_back_memory
+from kouxing.shared.kernel_sockets import SEES_BYTES, address_of, inode_of, network_of, port_of
+from kouxing.shared.metrics import give_back_memory
 
 RECEIVE_BUFFER = 256 * KIB  # of the kernel; a few segments of loopback, or it stalls
 LOOK_S = 0.02  # between looks while bytes arrive

@@ -7,7 +7,7 @@ import ipaddress
 import re
 import socket
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - named to be recognised, not bound
 _ENDPOINT = re.compile(

@@ -12,16 +12,16 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from shared.bus import Bus, Socket
-from shared.clock import was_stopped
-from shared.errors import UserError
-from shared.keys import Peer
-from shared.metrics import Metrics
-from shared.wire.codec import BadMessage
-from shared.wire.face import EndOfFaps, FapFrame, Shapes
-from shared.wire.kinds import PUBLISHER_OF
-from shared.wire.message import Message
-from shared.wire.session import Joined
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.clock import was_stopped
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Peer
+from kouxing.shared.metrics import Metrics
+from kouxing.shared.wire.codec import BadMessage
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.kinds import PUBLISHER_OF
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Joined
 
 UNCONFIRMED_S = 3.0  # until a subscription that is not in effect is made anew
 KEPT_S = 3.0  # a connection that may be dead, for what TCP still brings

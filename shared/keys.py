@@ -25,8 +25,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from shared.endpoints import with_key
-from shared.errors import UserError
+from kouxing.shared.endpoints import with_key
+from kouxing.shared.errors import UserError
 
 CONTROL = "control"
 CLIENT = "client"

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 _MAX_STREAMS = 64
 # What a file itself may hold, and nothing that it names elsewhere: no network, no playlist's files.

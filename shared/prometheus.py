@@ -23,8 +23,8 @@ from prometheus_client.core import (
 )
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 
-from shared.errors import UserError
-from shared.metrics import BUCKETS, Distribution, Metrics
+from kouxing.shared.errors import UserError
+from kouxing.shared.metrics import BUCKETS, Distribution, Metrics
 
 REQUEST_LIMIT_S = 5.0  # for a peer to send its request and take the answer
 MAX_REQUESTS = 16  # answered at the same time; further connections are closed

@@ -10,10 +10,10 @@ import dataclasses
 from collections import deque
 from collections.abc import Callable
 
-from shared.bus import Socket
-from shared.keys import NOBODY, Peer
-from shared.wire.message import Message
-from shared.wire.speech import Acknowledge
+from kouxing.shared.bus import Socket
+from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import Acknowledge
 
 RESEND_AFTER_S = 0.5
 ACKNOWLEDGE_EVERY = 32  # messages; each tick acknowledges the rest

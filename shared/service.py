@@ -21,18 +21,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from shared.bus import Bus, Received, Socket
-from shared.clock import ClockOffset, now_ns, was_stopped
-from shared.config import ServiceConfig
-from shared.connections import raise_file_limit
-from shared.endpoints import is_loopback, split_endpoint, with_key
-from shared.errors import UserError
-from shared.keys import Guest, Peer, own_key, refusal, save_guests
-from shared.logs import LOG, RateLimit, configure
-from shared.metrics import BusyShare, Metrics, give_back_memory, keep_one_arena, memory_mb
-from shared.prometheus import MetricsServer
-from shared.wire.codec import BadMessage
-from shared.wire.control import (
+from kouxing.shared.bus import Bus, Received, Socket
+from kouxing.shared.clock import ClockOffset, now_ns, was_stopped
+from kouxing.shared.config import ServiceConfig
+from kouxing.shared.connections import raise_file_limit
+from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Guest, Peer, own_key, refusal, save_guests
+from kouxing.shared.logs import LOG, RateLimit, configure
+from kouxing.shared.metrics import BusyShare, Metrics, give_back_memory, keep_one_arena, memory_mb
+from kouxing.shared.prometheus import MetricsServer
+from kouxing.shared.wire.codec import BadMessage
+from kouxing.shared.wire.control import (
     AllowedKeys,
     FlushNow,
     Heartbeat,
@@ -43,8 +43,15 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.message import Message
-from shared.wire.session import AddShapes, ChooseExpressiveness, Done, Error, ErrorCode, Express
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
+    AddShapes,
+    ChooseExpressiveness,
+    Done,
+    Error,
+    ErrorCode,
+    Express,
+)
 
 HEARTBEAT_S = 0.25
 SESSIONS_A_BEAT = 16  # of a worker, in turn: a heartbeat costs the same however many it serves

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from shared.audio_file import AudioSource, Samples, raw_audio
-from shared.errors import UserError
+from kouxing.shared.audio_file import AudioSource, Samples, raw_audio
+from kouxing.shared.errors import UserError
 
 _RATE_HZ = 16_000
 _LATENCY_MS = 20  # of what is recorded of other programs

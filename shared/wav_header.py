@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 _CHUNK = struct.Struct("<4sI")
 _FORMAT = struct.Struct("<HHI6xH")  # tag, channels, Hz, bits

@@ -8,9 +8,9 @@ from collections.abc import Callable, Collection
 import zmq
 from zmq.utils import z85
 
-from shared.errors import UserError
-from shared.keys import Guests, guests_file, read_guests
-from shared.logs import LOG
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Guests, guests_file, read_guests
+from kouxing.shared.logs import LOG
 
 # Who may connect to a socket, by its setting; to the others every key that is allowed at all.
 ROLES_AT = {

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from evaluation.system.chromium import Chromium, wait_until
+from kouxing.evaluation.system.chromium import Chromium, wait_until
 
 SIZE_PX = (640, 480)
 

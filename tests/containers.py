@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from evaluation.system.network import Network
+from kouxing.evaluation.system.network import Network
 from tests.system import ROOT
 
 USER = 10001
@@ -102,7 +102,7 @@ class Containers:
             folder.mkdir()
         for name, path in secrets.items():
             (folder / name).write_bytes(path.read_bytes())
-        program = [sys.executable, "-m", "services", *arguments]
+        program = [sys.executable, "-m", "kouxing", *arguments]
         enter = ["unshare", "--mount", "sh", "-ec", ENTER]
         if not self._has_root:
             self._folder.chmod(0o755)

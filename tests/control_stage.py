@@ -7,16 +7,16 @@ from collections.abc import Callable
 
 import zmq
 
-from evaluation.system.attackers import connect
-from services.control.config import ControlConfig
-from services.control.service import ControlService
-from shared.bus import Bus, Socket
-from shared.endpoints import key_of, with_key
-from shared.keys import Key, own_key
-from shared.wire.codec import decode, encode
-from shared.wire.control import Heartbeat, StartSession
-from shared.wire.message import Message
-from shared.wire.session import Done, OpenSession
+from kouxing.evaluation.system.attackers import connect
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.service import ControlService
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.endpoints import key_of, with_key
+from kouxing.shared.keys import Key, own_key
+from kouxing.shared.wire.codec import decode, encode
+from kouxing.shared.wire.control import Heartbeat, StartSession
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Done, OpenSession
 
 LOCAL = "tcp://127.0.0.1:*"
 PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}

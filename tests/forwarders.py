@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
-from evaluation.system.systems import PORTS
-from shared.keys import CLIENT
+from kouxing.evaluation.system.systems import PORTS
+from kouxing.shared.keys import CLIENT
 
 ALL_PORTS = sorted(port for ports in PORTS.values() for port in ports.values())
 BETWEEN_SERVICES = PORTS["synthesizer"]["phone_input"]

@@ -7,8 +7,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head.head import ASSETS, Detail, Head, neutral_faps
-from shared.face.faps import FAPS, NUM_FAPS, Fap
+from kouxing.services.driver.head.head import ASSETS, Detail, Head, neutral_faps
+from kouxing.shared.face.faps import FAPS, NUM_FAPS, Fap
 
 NAMES = sorted(path.stem for path in ASSETS.glob("*.npz"))
 AXES = {

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.search.phone_lm import Graph, PhoneLanguageModel
-from shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.services.recognizer.search.phone_lm import Graph, PhoneLanguageModel
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
 MANDARIN = load_inventory("mandarin")
 NUM_PHONES = len(MANDARIN)

@@ -5,18 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LipClip
-from services.synthesizer.config import DELAYS_MS
-from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes, VisemeArticulation
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from services.synthesizer.lips.lip_model import Articulation
-from services.synthesizer.modifiers.modifier import Moment
-from shared.face.faps import MOUTH_FAPS
-from shared.face.lip_models import LipModelName
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import load_inventory
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.synthesizer.config import DELAYS_MS
+from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
+    DynamicVisemes,
+    VisemeArticulation,
+)
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from kouxing.services.synthesizer.lips.lip_model import Articulation
+from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import load_inventory
 
 INVENTORY = load_inventory()
 LIPS = DynamicVisemes(load_parameters(), INVENTORY)

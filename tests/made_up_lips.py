@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import LipFrame
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import LipFrame
 
 JAW = MOUTH_FAPS.index(3)
 

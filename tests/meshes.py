@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head.head import Head
+from kouxing.services.driver.head.head import Head
 from tests.glb_writer import Mesh
 
 STIFF = ("hair_tips", "lashes")  # parts that need transparency, which the meshes here do without

@@ -7,7 +7,7 @@ import socket
 import time
 from random import Random
 
-from evaluation.system import attackers
+from kouxing.evaluation.system import attackers
 
 
 def pour(port: int, seconds: float) -> None:

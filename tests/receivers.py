@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pythonosc.osc_bundle import OscBundle
 
-from services.senders import live_link, osc, vmc
-from services.senders.face import Face
-from services.senders.target import Target, parse_target
-from services.senders.vtube_studio import Dialogue, parameters
+from kouxing.services.senders import live_link, osc, vmc
+from kouxing.services.senders.face import Face
+from kouxing.services.senders.target import Target, parse_target
+from kouxing.services.senders.vtube_studio import Dialogue, parameters
 
 # what can be sent, each to a program that reads it otherwise
 SENT = (

@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.control.config import ControlConfig
-from services.control.service import ControlService
-from services.recognizer.config import RecognizerConfig
-from services.synthesizer.config import SynthesizerConfig
-from shared.config import variable
-from shared.face.faps import FAP_NUMBER, MASK_BYTES
-from shared.keys import Peer
-from shared.service import Service
-from shared.wire.audio import AudioChunk, EndOfAudio, Sound
-from shared.wire.control import StartSession
-from shared.wire.face import FapFrame
-from shared.wire.session import ChooseExpressiveness, Express
-from shared.wire.speech import Phone
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.service import ControlService
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.config import variable
+from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
+from kouxing.shared.keys import Peer
+from kouxing.shared.service import Service
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.session import ChooseExpressiveness, Express
+from kouxing.shared.wire.speech import Phone
 from tests.system import ROOT
 
 FRAME = 320  # samples; 20 ms
@@ -207,7 +207,7 @@ class Gateway:
         scheme = "https" if "certificate" in settings else "http"
         self.page = f"{scheme}://127.0.0.1:{port}/"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "services.gateway"],
+            [sys.executable, "-m", "kouxing.services.gateway"],
             cwd=ROOT,
             env={
                 **os.environ,

@@ -14,12 +14,12 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Self
 
-from services.kinds import KINDS, free_addresses
-from shared.client import Client
-from shared.config import variable
-from shared.errors import UserError
-from shared.keys import control_endpoint
-from shared.wire.control import StatusReport
+from kouxing.services.kinds import KINDS, free_addresses
+from kouxing.shared.client import Client
+from kouxing.shared.config import variable
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import control_endpoint
+from kouxing.shared.wire.control import StatusReport
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
@@ -95,7 +95,7 @@ def kouxing(
     if control:
         environment["KOUXING_CONTROL"] = control.partition(" ")[0]
     result = subprocess.run(
-        [sys.executable, "-m", "services", *map(str, arguments)],
+        [sys.executable, "-m", "kouxing", *map(str, arguments)],
         env=environment,
         cwd=ROOT,
         capture_output=True,
@@ -164,7 +164,7 @@ class System:
         name = name or service
         with (self.folder / f"{name}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", f"services.{service}"],
+                [sys.executable, "-m", f"kouxing.services.{service}"],
                 env={**self.environment, **settings},
                 cwd=ROOT,
                 stderr=log,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from training.neural.batches import Recording, Targets
+from kouxing.training.neural.batches import Recording, Targets
 
 
 def burst(start_s: float, end_s: float, whole_s: float, tone_hz: float = 1000.0) -> np.ndarray:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from services.driver.video.writer import VideoWriter
-from shared.clock import MEDIA_RATE_HZ
+from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.shared.clock import MEDIA_RATE_HZ
 
 DURATION_S = 0.25
 _RATE_HZ = 20.0

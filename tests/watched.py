@@ -11,10 +11,10 @@ from typing import Self
 
 from rich.console import Console
 
-from services.cli.supervisor import Supervisor
-from services.kinds import more_workers, read_settings
-from shared.client import Client
-from shared.keys import control_endpoint
+from kouxing.services.cli.supervisor import Supervisor
+from kouxing.services.kinds import more_workers, read_settings
+from kouxing.shared.client import Client
+from kouxing.shared.keys import control_endpoint
 from tests.system import own_environment
 
 

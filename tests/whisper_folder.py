@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
 
 def encoder_arrays(num_layers: int = 3, width: int = 32, inner: int = 48) -> dict[str, np.ndarray]:

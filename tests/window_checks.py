@@ -10,11 +10,11 @@ import time
 import glfw
 import numpy as np
 
-from services.driver.config import DriverConfig
-from services.driver.head.head import Head, neutral_faps
-from services.driver.render.renderer import Renderer
-from services.driver.render.window import Window
-from services.driver.service import DriverService
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.window import Window
+from kouxing.services.driver.service import DriverService
 from tests.system import free_port
 
 

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
-from services.cli.terminal import check_output, print_message
-from shared.errors import UserError, install_command
-from shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
-from training import SYNTHETIC_WEIGHT
+from kouxing.services.cli.terminal import check_output, print_message
+from kouxing.shared.errors import UserError, install_command
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
+from kouxing.training import SYNTHETIC_WEIGHT
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")
 
@@ -90,8 +90,8 @@ def phone_lm(
     seed: Seed = 0,
 ) -> None:
     """Train a phone language model on texts, for the recognizers' search."""
-    from training.phone_lm.open_gram import draw_phones
-    from training.phone_lm.recipe import train_phone_lm
+    from kouxing.training.phone_lm.open_gram import draw_phones
+    from kouxing.training.phone_lm.recipe import train_phone_lm
 
     check_output(output)
     if (ngrams is None) != (dictionary is None):
@@ -123,7 +123,7 @@ def gmm(
     any_licence: AnyLicence = False,
 ) -> None:
     """Train the Gaussian mixture recognizer; a model card is written beside it."""
-    from training.gmm.recipe import train_gmm
+    from kouxing.training.gmm.recipe import train_gmm
 
     check_output(output)
     train_gmm(
@@ -175,7 +175,7 @@ def neural(
     """Train the neural recognizer; a model card and the training curves are written beside it."""
     check_output(output)
     with _neural_training():
-        from training.neural.recipe import train_neural
+        from kouxing.training.neural.recipe import train_neural
 
     train_neural(
         corpus,
@@ -212,7 +212,7 @@ def blocks(
     """
     check_output(output)
     with _neural_training():
-        from training.blocks.recipe import train_blocks
+        from kouxing.training.blocks.recipe import train_blocks
 
     train_blocks(
         corpus,
@@ -234,7 +234,7 @@ def visemes(
     any_licence: AnyLicence = False,
 ) -> None:
     """Train the dynamic visemes' parameters on tracked lips."""
-    from training.visemes.recipe import train_visemes
+    from kouxing.training.visemes.recipe import train_visemes
 
     check_output(output)
     train_visemes(clips, output, any_licence=any_licence)
@@ -262,7 +262,7 @@ def lips(
     """Train lips from sound on tracked lips; a model card is written beside it."""
     check_output(output)
     with _neural_training():
-        from training.lips.recipe import train_lips
+        from kouxing.training.lips.recipe import train_lips
 
     train_lips(
         clips,
@@ -282,7 +282,7 @@ def ferguson(
     any_licence: AnyLicence = False,
 ) -> None:
     """Learn the table of the ferguson lips: openings, usual lengths, influence factors."""
-    from training.ferguson.recipe import train_ferguson
+    from kouxing.training.ferguson.recipe import train_ferguson
 
     check_output(output)
     train_ferguson(clips, corpus, output, print_message, any_licence=any_licence)

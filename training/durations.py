@@ -21,10 +21,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST, NUM_POSITIONS
-from services.recognizer.front_end.features import HOP_S
-from services.recognizer.search.decoder import Segment
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST, NUM_POSITIONS
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.shared.phones.inventory import PhoneInventory
 
 _PRIOR_COUNT = 10.0  # n0
 _MIN_CONNECTED_PHONES = 8  # a recording with fewer phones is no connected speech

@@ -6,9 +6,9 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from corpora.speech_corpus import RowErrors
-from training.search_weights import SearchWeights
-from training.training_set import FRAMES_PER_MINUTE, Example
+from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.training.search_weights import SearchWeights
+from kouxing.training.training_set import FRAMES_PER_MINUTE, Example
 
 
 def write_card(

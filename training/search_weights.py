@@ -10,18 +10,18 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.feature_cache import as_floats
-from corpora.scoring import ErrorCounts, count_errors
-from corpora.speech_corpus import RowErrors
-from services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
-from services.recognizer.acoustic.gmm import GmmModel
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.vtln import without_pitch
-from services.recognizer.search.decoder import Decoder
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
-from training.progress import Report
-from training.training_set import Example, load_examples
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.corpora.scoring import ErrorCounts, count_errors
+from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.gmm import GmmModel
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.vtln import without_pitch
+from kouxing.services.recognizer.search.decoder import Decoder
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.progress import Report
+from kouxing.training.training_set import Example, load_examples
 
 M = TypeVar("M", GmmModel, NeuralModel)
 # Error rate of recordings, from their scaled scores of shape (frames, states) each.
@@ -79,7 +79,7 @@ def choose_search_weights(
     model
         A model whose own acoustic scale is 1.
     corpora
-        Folders that :func:`corpora.speech_corpus.read_corpus` reads.
+        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads.
     scales
         Acoustic scales to try.
     shipping

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.feature_cache import log_mel_of, samples_of
-from corpora.kept_back import is_kept_back
-from corpora.speech_corpus import (
+from kouxing.corpora.feature_cache import log_mel_of, samples_of
+from kouxing.corpora.kept_back import is_kept_back
+from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
     audio_files,
@@ -26,9 +26,9 @@ from corpora.speech_corpus import (
     may_ship,
     read_corpus,
 )
-from services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
-from shared.phones.inventory import PhoneInventory
-from training import SYNTHETIC_WEIGHT
+from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training import SYNTHETIC_WEIGHT
 
 MAX_WORD_PHONES = 8  # a recording with no more phones is a word, not connected speech
 FRAMES_PER_MINUTE = 6000
@@ -73,7 +73,7 @@ def load_examples(
     Parameters
     ----------
     corpora
-        Folders that :func:`corpora.speech_corpus.read_corpus` reads.
+        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads.
     errors
         Receives a message for every row that cannot be used.
     inventory

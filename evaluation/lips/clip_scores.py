@@ -9,8 +9,8 @@ from itertools import zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LipClip
-from evaluation.lips.measures import (
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.evaluation.lips.measures import (
     NEITHER_SHUT_NOR_OPEN,
     PAIRING_WINDOW_S,
     Hits,
@@ -32,7 +32,7 @@ from evaluation.lips.measures import (
     turns,
     without_drift,
 )
-from evaluation.lips.schemes import (
+from kouxing.evaluation.lips.schemes import (
     FRAME_RATE_HZ,
     HeardClip,
     Scheme,
@@ -41,7 +41,7 @@ from evaluation.lips.schemes import (
     phones_shaped,
     quietest_moments,
 )
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 Array = NDArray[np.float64]
 

@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LipClip, read_clips
-from evaluation.lips.schemes import FRAME_RATE_HZ, live_frames
-from services.driver.config import Framing
-from services.driver.render import scene
-from services.driver.render.renderer import Renderer
-from services.driver.render.side_by_side import SideBySide
-from services.driver.video import film
-from services.driver.video.writer import check_name
-from services.live_chain import sound_events
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.lips import lips_for
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.load import load_lip_model
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.face.lip_models import LipModelName
+from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_frames
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.side_by_side import SideBySide
+from kouxing.services.driver.video import film
+from kouxing.services.driver.video.writer import check_name
+from kouxing.services.live_chain import sound_events
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.lip_models import LipModelName
 
 _FACE_PX = (480, 360)
 _IMAGES_PER_S = 25.0

@@ -17,17 +17,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import track
 
-from corpora.lip_clips import read_clips
-from evaluation.lips.clip_scores import score_clip
-from evaluation.lips.schemes import DEFAULT_DELAY_S, HeardClip, hear, live_scheme
-from evaluation.lips.scores import pool
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.lips import lips_for
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.learnt.closures import ClosureRule
-from services.synthesizer.lips.learnt.model import LearntLips
-from shared.errors import UserError
+from kouxing.corpora.lip_clips import read_clips
+from kouxing.evaluation.lips.clip_scores import score_clip
+from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, HeardClip, hear, live_scheme
+from kouxing.evaluation.lips.scores import pool
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
+from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.shared.errors import UserError
 
 TRIED = {
     "sound": (1.0, 1.5, 2.0, 2.5),

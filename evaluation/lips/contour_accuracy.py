@@ -31,28 +31,28 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from corpora.figures import new_figure
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
-from evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
-from evaluation.recognizer.disturbances import faster
-from services.cli.mouth_drawing import syllables_of
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.alignment import align_phones, spoken
-from services.recognizer.front_end.pcm import progress_of
-from services.recognizer.lips import lips_for
-from services.recognizer.offline import recognize
-from services.synthesizer.config import DELAYS_MS
-from services.synthesizer.lips.ferguson.contour import faps_of
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING, KeyFrames
-from services.synthesizer.lips.ferguson.openings import key_frames_of
-from services.synthesizer.lips.ferguson.table import load_table
-from services.synthesizer.lips.ferguson.timing import time_text
-from services.synthesizer.lips.load import LIP_MODELS, load_lip_model
-from shared.errors import UserError
-from shared.face.faps import FAPS, MOUTH_FAPS
-from shared.phones.events import Phone
-from shared.phones.inventory import Syllable
+from kouxing.corpora.figures import new_figure
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
+from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
+from kouxing.evaluation.recognizer.disturbances import faster
+from kouxing.services.cli.mouth_drawing import syllables_of
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.synthesizer.config import DELAYS_MS
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING, KeyFrames
+from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.timing import time_text
+from kouxing.services.synthesizer.lips.load import LIP_MODELS, load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import Syllable
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.float32]

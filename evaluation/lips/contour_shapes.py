@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from rich.console import Console
 from rich.table import Table
 
-from corpora.figures import new_figure
-from services.synthesizer.lips.ferguson.contour import LINES, lip_lines, lip_points
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from kouxing.corpora.figures import new_figure
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, lip_lines, lip_points
+from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
 
 Array = NDArray[np.float64]
 

@@ -22,28 +22,28 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from corpora.lip_clips import LipClip
-from evaluation.lips.clip_video import tracked_frames
-from evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted, paper_config
-from evaluation.lips.schemes import animate_live, live_events, once_the_next_begins
-from evaluation.lips.sentences import Sentence
-from services.driver.config import Framing
-from services.driver.render import scene
-from services.driver.render.renderer import Renderer
-from services.driver.video import film
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.lip_source import LipsFromSound
-from services.recognizer.lips import lips_for
-from services.recording_chain import HeardRecording, animate, hear_recording
-from services.synthesizer.config import DELAYS_MS, SynthesizerConfig
-from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.load import load_lip_model
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.face.lip_models import LipModelName
-from shared.phones.events import SoundEvent
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.evaluation.lips.clip_video import tracked_frames
+from kouxing.evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted, paper_config
+from kouxing.evaluation.lips.schemes import animate_live, live_events, once_the_next_begins
+from kouxing.evaluation.lips.sentences import Sentence
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video import film
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.lip_source import LipsFromSound
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recording_chain import HeardRecording, animate, hear_recording
+from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
+from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import SoundEvent
 
 SCHEMES = (1, 2, 3, 4)
 BOUND, RECOGNISED, NEXT_PHONE = 1, 2, 4

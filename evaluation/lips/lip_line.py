@@ -23,17 +23,17 @@ from rich.table import Table
 from scipy import sparse
 from scipy.interpolate import CubicSpline
 
-from corpora.figures import new_figure
-from services.driver.head.head import Head
-from services.driver.head.import_fields import FaceFields
-from services.driver.head.surface import Float, Index
-from services.driver.render.camera import Camera
-from services.driver.render.renderer import Renderer
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEMES
-from services.synthesizer.lips.ferguson.contour import LINES, faps_of
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.corpora.figures import new_figure
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.head.import_fields import FaceFields
+from kouxing.services.driver.head.surface import Float, Index
+from kouxing.services.driver.render.camera import Camera
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEMES
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, faps_of
+from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 _NEAR_M = 2e-3  # a vertex so near to a line at rest lies on it
 _WIDTH_PX, _HEIGHT_PX = 420, 300

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from evaluation.system.head_pictures import head_names
-from services.driver.config import Framing
-from services.driver.head.head import DEFAULT_HEAD, Head
-from services.driver.render.renderer import Renderer
-from services.driver.render.scene import camera
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
-from services.synthesizer.modifiers.expressiveness import Expressiveness
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.evaluation.system.head_pictures import head_names
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.head.head import DEFAULT_HEAD, Head
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.scene import camera
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
+from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import zip_longest
 
-from corpora.scoring import is_emitted
-from services.recognizer.config import RecognizerConfig
-from shared.phones.events import Phone, SoundEvent, SpeechChange
+from kouxing.corpora.scoring import is_emitted
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
 
 
 def paper_config(acoustic: str) -> RecognizerConfig:

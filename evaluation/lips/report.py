@@ -9,9 +9,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.lips.clip_scores import MEASURES
-from evaluation.lips.schemes import DEFAULT_DELAY_S
-from evaluation.lips.scores import CurveScore, HitScore, LipScore
+from kouxing.evaluation.lips.clip_scores import MEASURES
+from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S
+from kouxing.evaluation.lips.scores import CurveScore, HitScore, LipScore
 
 Cell = Callable[[LipScore], str]
 

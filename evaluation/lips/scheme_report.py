@@ -9,9 +9,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.lips.report import Cell, of_curves, of_opening, shown
-from evaluation.lips.scheme_scores import ConditionScore, Order, Outcome
-from evaluation.lips.scores import LipScore
+from kouxing.evaluation.lips.report import Cell, of_curves, of_opening, shown
+from kouxing.evaluation.lips.scheme_scores import ConditionScore, Order, Outcome
+from kouxing.evaluation.lips.scores import LipScore
 
 # Table 2: mean opinion scores of sync and realism, and the least delay in theory, ms.
 PAPER = {1: (4.34, 4.01, 0), 2: (3.98, 3.81, 0), 3: (3.42, 3.50, 45), 4: (3.21, 3.16, 110)}

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from corpora.lip_clips import LipClip, level_track
-from corpora.scoring import matched_pairs
-from evaluation.lips.clip_scores import MEASURES, ClipScore, score_clip
-from evaluation.lips.four_schemes import (
+from kouxing.corpora.lip_clips import LipClip, level_track
+from kouxing.corpora.scoring import matched_pairs
+from kouxing.evaluation.lips.clip_scores import MEASURES, ClipScore, score_clip
+from kouxing.evaluation.lips.four_schemes import (
     BOUND,
     RECOGNISED,
     SCHEMES,
@@ -36,16 +36,16 @@ from evaluation.lips.four_schemes import (
     events_told,
     face_of,
 )
-from evaluation.lips.measures import rms_jerk
-from evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme
-from evaluation.lips.scores import LipScore, pool
-from services.recognizer.alignment import spoken
-from services.synthesizer.config import DELAYS_MS, SynthesizerConfig
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.face.lip_models import LipModelName
-from shared.phones.events import Phone, Progress, SoundEvent
-from shared.phones.inventory import PhoneInventory
+from kouxing.evaluation.lips.measures import rms_jerk
+from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme
+from kouxing.evaluation.lips.scores import LipScore, pool
+from kouxing.services.recognizer.alignment import spoken
+from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 Scores = Mapping[Condition, Mapping[int, ClipScore]]  # by condition and number of the sentence

@@ -22,22 +22,28 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LEVEL_STEP_S, SAMPLE_RATE_HZ, LipClip, aligned_phones, level_track
-from corpora.scoring import is_emitted
-from evaluation.lips.measures import is_near
-from services.live_chain import sound_events
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.lip_source import LipFrameStream, LipsFromSound, delay_for
-from services.recognizer.offline import recognize
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.lip_model import LipModel
-from services.synthesizer.offline import synthesize
-from shared.face.faps import NUM_FAPS
-from shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
-from shared.phones.inventory import PhoneInventory
+from kouxing.corpora.lip_clips import (
+    LEVEL_STEP_S,
+    SAMPLE_RATE_HZ,
+    LipClip,
+    aligned_phones,
+    level_track,
+)
+from kouxing.corpora.scoring import is_emitted
+from kouxing.evaluation.lips.measures import is_near
+from kouxing.services.live_chain import sound_events
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.lip_source import LipFrameStream, LipsFromSound, delay_for
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

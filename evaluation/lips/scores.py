@@ -43,8 +43,8 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from corpora.lip_clips import LipClip, read_clips
-from evaluation.lips.clip_scores import (
+from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.evaluation.lips.clip_scores import (
     LAGS_S,
     MEASURES,
     ClipScore,
@@ -54,14 +54,14 @@ from evaluation.lips.clip_scores import (
     is_measured,
     score_clip,
 )
-from evaluation.lips.measures import Hits, best_lag
-from evaluation.lips.schemes import all_schemes, hear
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.lips import lips_for
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
-from services.synthesizer.lips.load import LIP_MODELS
-from shared.errors import UserError
+from kouxing.evaluation.lips.measures import Hits, best_lag
+from kouxing.evaluation.lips.schemes import all_schemes, hear
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
+from kouxing.services.synthesizer.lips.load import LIP_MODELS
+from kouxing.shared.errors import UserError
 
 
 @dataclass(slots=True, kw_only=True)

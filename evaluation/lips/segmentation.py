@@ -19,21 +19,21 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from corpora.feature_cache import read_audio
-from corpora.figures import new_figure
-from corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
-from evaluation.recognizer.disturbances import SPEECH_CONDITIONS
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.alignment import align_phones, spoken
-from services.recognizer.front_end.pcm import progress_of
-from services.synthesizer.lips.ferguson.endpoints import Piece, pieces_of
-from services.synthesizer.lips.ferguson.table import PhoneTable, load_table
-from services.synthesizer.lips.ferguson.timing import time_text
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import Syllable
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.figures import new_figure
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
+from kouxing.evaluation.recognizer.disturbances import SPEECH_CONDITIONS
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.synthesizer.lips.ferguson.endpoints import Piece, pieces_of
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable, load_table
+from kouxing.services.synthesizer.lips.ferguson.timing import time_text
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import Syllable
 
 Array = NDArray[np.float64]
 

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from corpora.feature_cache import read_audio
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
-from corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
-from evaluation.lips.scores import clips_to_score
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.alignment import align_phones
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
+from kouxing.evaluation.lips.scores import clips_to_score
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.alignment import align_phones
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
 
 NUM_SENTENCES = 20  # of Li et al. 2011, two of each speaker
 _USUAL_S = 4.0  # their mean length

@@ -21,22 +21,25 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from corpora.figures import new_figure, save_figure
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
-from evaluation.lips.clip_scores import MEASURES, real_faps
-from evaluation.lips.schemes import FRAME_RATE_HZ
-from evaluation.lips.scores import clips_to_score
-from evaluation.lips.viseme_plots import draw_sound
-from services.recognizer.acoustic.load import load_model
-from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters, load_parameters
-from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
-from services.synthesizer.offline import synthesize
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
+from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
+from kouxing.evaluation.lips.clip_scores import MEASURES, real_faps
+from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
+from kouxing.evaluation.lips.scores import clips_to_score
+from kouxing.evaluation.lips.viseme_plots import draw_sound
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
+    VisemeParameters,
+    load_parameters,
+)
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

@@ -14,33 +14,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.figures import new_figure, save_figure
-from corpora.lip_clips import SAMPLE_RATE_HZ, level_track
-from evaluation.lips.schemes import DEFAULT_DELAY_S, FRAME_RATE_HZ, live_frames
-from services.cli.sound_file import read_mono_16k
-from services.driver.head.head import Head
-from services.driver.render.camera import Camera
-from services.driver.render.renderer import Renderer
-from services.live_chain import sound_events
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.offline import recognize
-from services.recognizer.stream import SILENT_DB
-from services.synthesizer.lips.dynamic_visemes.blending import (
+from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, level_track
+from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, FRAME_RATE_HZ, live_frames
+from kouxing.services.cli.sound_file import read_mono_16k
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.camera import Camera
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.live_chain import sound_events
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.stream import SILENT_DB
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
     blend,
     log_weights,
     softmax,
 )
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
-from services.synthesizer.offline import synthesize
-from shared.errors import UserError
-from shared.face.faps import FAPS, MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import EndOfSound, Phone, Progress, SoundEvent
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import EndOfSound, Phone, Progress, SoundEvent
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

@@ -16,20 +16,20 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from corpora.lip_clips import LipClip, read_clips
-from corpora.speech_corpus import may_ship
-from corpora.voices import clip_material, load_models
-from services.recognizer.lip_positions import POSITION_S
-from services.recognizer.lip_source import delay_for
-from services.recognizer.lip_tracks import MEASURES
-from services.recognizer.voice_learning import (
+from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.corpora.voices import clip_material, load_models
+from kouxing.services.recognizer.lip_positions import POSITION_S
+from kouxing.services.recognizer.lip_source import delay_for
+from kouxing.services.recognizer.lip_tracks import MEASURES
+from kouxing.services.recognizer.voice_learning import (
     FACE_DELAY_S,
     Material,
     correlations,
     learn_voice,
     with_voice,
 )
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
 

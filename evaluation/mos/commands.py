@@ -9,8 +9,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from services.cli.services import Assignments, ConfigFile
-from services.cli.terminal import JsonFile, check_output, print_message, write_json, write_output
+from kouxing.services.cli.services import Assignments, ConfigFile
+from kouxing.services.cli.terminal import (
+    JsonFile,
+    check_output,
+    print_message,
+    write_json,
+    write_output,
+)
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Let people judge videos.")
 
@@ -31,7 +37,7 @@ def new(
     ] = None,
 ) -> None:
     """Make a study of videos named CONDITION/SENTENCE.mp4 or SENTENCE_CONDITION.mp4."""
-    from evaluation.mos.study import LANGUAGES, new_study
+    from kouxing.evaluation.mos.study import LANGUAGES, new_study
 
     study = new_study(
         folder,
@@ -57,12 +63,12 @@ def serve(
     """Serve a study's page until Ctrl-C, where and for whom the gateway.* settings say."""
     import asyncio
 
-    from evaluation.mos import server
-    from evaluation.mos.store import Store
-    from evaluation.mos.study import load_study
-    from services.gateway.config import GatewayConfig
-    from services.kinds import read_settings
-    from shared.config import parse_assignments
+    from kouxing.evaluation.mos import server
+    from kouxing.evaluation.mos.store import Store
+    from kouxing.evaluation.mos.study import load_study
+    from kouxing.services.gateway.config import GatewayConfig
+    from kouxing.services.kinds import read_settings
+    from kouxing.shared.config import parse_assignments
 
     overrides = {} if port is None else {"port": str(port)}
     settings = read_settings(config, parse_assignments(assignments or []))
@@ -84,10 +90,10 @@ def report(
     json_file: JsonFile = None,
 ) -> None:
     """Print mean opinion scores without outliers, and which conditions differ."""
-    from corpora.figures import save_figure
-    from evaluation.mos.report import draw_boxes, make_report, print_report
-    from evaluation.mos.store import read_answers
-    from evaluation.mos.study import load_study
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.mos.report import draw_boxes, make_report, print_report
+    from kouxing.evaluation.mos.store import read_answers
+    from kouxing.evaluation.mos.study import load_study
 
     check_output(picture, json_file)
     study = load_study(folder)
@@ -107,9 +113,9 @@ def export(
     ] = None,
 ) -> None:
     """Write every score as a line of CSV."""
-    from evaluation.mos.report import to_csv
-    from evaluation.mos.store import read_answers
-    from evaluation.mos.study import load_study
+    from kouxing.evaluation.mos.report import to_csv
+    from kouxing.evaluation.mos.store import read_answers
+    from kouxing.evaluation.mos.study import load_study
 
     check_output(output)
     study = load_study(folder)

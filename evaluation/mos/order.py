@@ -18,7 +18,7 @@ import random
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.mos.study import Study
+from kouxing.evaluation.mos.study import Study
 
 NUM_PRACTICE = 2
 

@@ -11,8 +11,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from corpora.figures import new_figure
-from evaluation.mos.statistics import (
+from kouxing.corpora.figures import new_figure
+from kouxing.evaluation.mos.statistics import (
     WHISKERS,
     Comparison,
     Mean,
@@ -21,9 +21,9 @@ from evaluation.mos.statistics import (
     group_scores,
     opinion_of,
 )
-from evaluation.mos.store import Answer
-from evaluation.mos.study import SCALES, Study
-from shared.errors import UserError
+from kouxing.evaluation.mos.store import Answer
+from kouxing.evaluation.mos.study import SCALES, Study
+from kouxing.shared.errors import UserError
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,16 +31,16 @@ from typing import Any
 
 from aiohttp import web
 
-from evaluation.mos.beeps import make_beeps
-from evaluation.mos.order import places_of_judge
-from evaluation.mos.store import Answer, Judge, Store
-from evaluation.mos.study import LANGUAGES, SCALES, Study
-from services.gateway import http
-from services.gateway.access import Access
-from services.gateway.config import GatewayConfig
-from services.gateway.entrance import make_entrance
-from services.gateway.listener import Listener, bind
-from shared.logs import LOG
+from kouxing.evaluation.mos.beeps import make_beeps
+from kouxing.evaluation.mos.order import places_of_judge
+from kouxing.evaluation.mos.store import Answer, Judge, Store
+from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study
+from kouxing.services.gateway import http
+from kouxing.services.gateway.access import Access
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.gateway.entrance import make_entrance
+from kouxing.services.gateway.listener import Listener, bind
+from kouxing.shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
 FILES = {

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from evaluation.mos.store import Answer
+from kouxing.evaluation.mos.store import Answer
 
 WHISKERS = 1.5  # interquartile ranges beyond the quartiles within which a score is no outlier
 CONFIDENCE = 0.95

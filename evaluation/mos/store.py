@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 FILE_NAME = "answers.sqlite"
 MAX_JUDGES = 10_000  # nobody fills the disk

@@ -9,8 +9,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from shared.errors import UserError
-from shared.media_file import check_video
+from kouxing.shared.errors import UserError
+from kouxing.shared.media_file import check_video
 
 FILE_NAME = "study.json"
 SUFFIXES = {".mp4", ".webm", ".mov"}

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.figures import new_figure, save_figure
-from corpora.scoring import matched_pairs
-from shared.phones.inventory import PhoneInventory
+from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.corpora.scoring import matched_pairs
+from kouxing.shared.phones.inventory import PhoneInventory
 
 # Visemes of consonants made at the lips (b p m, f), and of those that sound alike but are made with
 # the tongue (d t n, g k h).

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from services.recognizer.front_end.resample import Resampler
-from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
-from services.recognizer.search.decoder import Decoder
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from kouxing.services.recognizer.search.decoder import Decoder
 
 CHUNK_SAMPLES = 160  # 10 ms, as sound arrives live
 

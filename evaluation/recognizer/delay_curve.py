@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from corpora.figures import new_figure, save_figure
+from kouxing.corpora.figures import new_figure, save_figure
 
 _STYLES = {"": ("o-", "first"), "final_": ("s--", "final")}  # by prefix of the rates' names
 

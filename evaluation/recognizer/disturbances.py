@@ -30,7 +30,7 @@ import soundfile
 from numpy.typing import NDArray
 from scipy.signal import butter, fftconvolve, sosfilt, sosfiltfilt
 
-from services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 
 Samples = NDArray[np.float32]  # (n,), 16 kHz, in [-1, 1]
 _TWELFTH = 2 ** (1 / 12)

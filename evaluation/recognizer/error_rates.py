@@ -28,26 +28,26 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from corpora.feature_cache import read_audio
-from corpora.scoring import (
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.scoring import (
     ErrorCounts,
     count_errors,
     final_hypothesis,
     first_hypothesis,
     matched_pairs,
 )
-from corpora.speech_corpus import RowErrors, Utterance, read_corpus
-from evaluation.recognizer.confusions import Confusions
-from evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage
-from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.alignment import align_phones, spoken
-from services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from services.recognizer.offline import decode_offline
-from services.recognizer.recognizer import DEFAULT_RULE, Recognizer
-from services.recognizer.speech_scores import ScoreEvent, SpeechScores
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus
+from kouxing.evaluation.recognizer.confusions import Confusions
+from kouxing.evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.offline import decode_offline
+from kouxing.services.recognizer.recognizer import DEFAULT_RULE, Recognizer
+from kouxing.services.recognizer.speech_scores import ScoreEvent, SpeechScores
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Rule = tuple[int, float]  # N, and the confidence that a frame needs
 # The paper's rule, and confident frames only.
@@ -137,7 +137,7 @@ def evaluate_recognizer(
         The acoustic model.
     corpus, audio
         A corpus folder, or a manifest and the folder of its recordings, in the model's language,
-        as :func:`corpora.speech_corpus.read_corpus` reads them.
+        as :func:`kouxing.corpora.speech_corpus.read_corpus` reads them.
     split
         Its split, such as ``dev`` or ``test``.
     rules

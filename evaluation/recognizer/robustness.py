@@ -1,6 +1,6 @@
 """Robustness: errors in disturbed speech, and phones recognised in sounds without speech.
 
-Both come from :mod:`evaluation.recognizer.disturbances`.
+Both come from :mod:`kouxing.evaluation.recognizer.disturbances`.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from corpora.feature_cache import read_audio
-from corpora.scoring import ErrorCounts, count_errors, final_hypothesis, first_hypothesis
-from corpora.speech_corpus import RowErrors, audio_files, read_corpus
-from evaluation.recognizer.confusions import Confusions
-from evaluation.recognizer.disturbances import (
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.scoring import ErrorCounts, count_errors, final_hypothesis, first_hypothesis
+from kouxing.corpora.speech_corpus import RowErrors, audio_files, read_corpus
+from kouxing.evaluation.recognizer.confusions import Confusions
+from kouxing.evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
     Samples,
     babble,
     with_sound,
 )
-from evaluation.recognizer.error_rates import Rule, mouth_shapes, recognizer_with
-from evaluation.recognizer.report import percent
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.alignment import spoken
-from services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from services.recognizer.offline import decode_offline
-from services.recognizer.recognizer import DEFAULT_RULE
-from services.recognizer.speech_scores import score_recording
-from shared.phones.inventory import PhoneInventory
+from kouxing.evaluation.recognizer.error_rates import Rule, mouth_shapes, recognizer_with
+from kouxing.evaluation.recognizer.report import percent
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.alignment import spoken
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.offline import decode_offline
+from kouxing.services.recognizer.recognizer import DEFAULT_RULE
+from kouxing.services.recognizer.speech_scores import score_recording
+from kouxing.shared.phones.inventory import PhoneInventory
 
 _SOUND_S = 60.0
 _OTHER_RECORDINGS = 40  # of another language
@@ -62,7 +62,7 @@ def evaluate_robustness(
         The acoustic model.
     corpus, audio
         A corpus folder, or a manifest and the folder of its recordings, in the model's language,
-        as :func:`corpora.speech_corpus.read_corpus` reads them.
+        as :func:`kouxing.corpora.speech_corpus.read_corpus` reads them.
     split
         Its split, such as ``dev`` or ``test``.
     own_rule

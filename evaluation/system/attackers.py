@@ -15,9 +15,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import zmq
 
-from shared.client import Client
-from shared.clock import MEDIA_RATE_HZ
-from shared.keys import Key, user_key
+from kouxing.shared.client import Client
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.keys import Key, user_key
 
 MORE, LONG, COMMAND = 1, 2, 4  # flags of a frame
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.attackers import (
+from kouxing.evaluation.system.attackers import (
     ALLOWED,
     FLOODS,
     PAGE,
@@ -35,15 +35,15 @@ from evaluation.system.attackers import (
     Attack,
     hold_connections,
 )
-from evaluation.system.latency import percentiles, stream
-from evaluation.system.memory import Memory
-from evaluation.system.systems import LocalSystem
-from services.kinds import KINDS
-from services.synthesizer.config import SynthesizerConfig
-from shared.audio_file import read_audio
-from shared.client import Client
-from shared.connection import BAN_S, KIB
-from shared.errors import UserError
+from kouxing.evaluation.system.latency import percentiles, stream
+from kouxing.evaluation.system.memory import Memory
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.kinds import KINDS
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client
+from kouxing.shared.connection import BAN_S, KIB
+from kouxing.shared.errors import UserError
 
 PHASE_S = 3.0
 SLACK_S = 0.5  # in which a session opens

@@ -13,7 +13,7 @@ from typing import Any
 
 import aiohttp
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 _PATIENCE_S = 60.0
 

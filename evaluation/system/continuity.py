@@ -8,10 +8,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.scoring import count_errors
-from evaluation.system.live import Seen
-from shared.clock import MEDIA_RATE_HZ
-from shared.face.faps import FAPS
+from kouxing.corpora.scoring import count_errors
+from kouxing.evaluation.system.live import Seen
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.face.faps import FAPS
 
 UNSEEN = 1.0  # FAP units; a smaller step is none
 LATE_S = 0.06  # after the sound that a frame needs; one that comes later is not in time

@@ -22,17 +22,23 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from services.kinds import free_addresses
-from shared.bus import Bus, Socket
-from shared.clock import now_ns
-from shared.connections import raise_file_limit
-from shared.errors import UserError
-from shared.keys import control_endpoint, own_key, user_key
-from shared.service import HEARTBEAT_S, SESSIONS_A_BEAT
-from shared.wire.codec import BadMessage
-from shared.wire.control import Heartbeat, HeartbeatSeen, SessionInput, StartSession, StopSession
-from shared.wire.message import Message
-from shared.wire.session import CloseSession, Done, Error, OpenSession, SessionOpened
+from kouxing.services.kinds import free_addresses
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.clock import now_ns
+from kouxing.shared.connections import raise_file_limit
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import control_endpoint, own_key, user_key
+from kouxing.shared.service import HEARTBEAT_S, SESSIONS_A_BEAT
+from kouxing.shared.wire.codec import BadMessage
+from kouxing.shared.wire.control import (
+    Heartbeat,
+    HeartbeatSeen,
+    SessionInput,
+    StartSession,
+    StopSession,
+)
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import CloseSession, Done, Error, OpenSession, SessionOpened
 
 PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
 SETTLE_S, MEASURE_S = 5.0, 20.0
@@ -245,7 +251,7 @@ def _control(max_sessions: int) -> Iterator[tuple[str, int, Path]]:
         log = Path(folder) / "log"
         with log.open("wb") as stream:
             process = subprocess.Popen(
-                [sys.executable, "-m", "services.control"], env=environment, stderr=stream
+                [sys.executable, "-m", "kouxing.services.control"], env=environment, stderr=stream
             )
         try:
             yield control_endpoint(environment["KOUXING_CONTROL"], insecure=False), process.pid, log

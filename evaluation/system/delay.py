@@ -1,6 +1,6 @@
 """Returns each packet that is led to a TUN device some time later, in order.
 
-usage: python -m evaluation.system.delay DEVICE DELAY_MS JITTER_MS
+usage: python -m kouxing.evaluation.system.delay DEVICE DELAY_MS JITTER_MS
 """
 
 from __future__ import annotations

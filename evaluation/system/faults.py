@@ -28,19 +28,19 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.continuity import Continuity, compare, staleness, worst
-from evaluation.system.live import Seen, Wire, speak, speak_undisturbed
-from evaluation.system.network import Link, Network
-from evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
-from services.recognizer.front_end.resample import to_16_khz
-from services.synthesizer.config import SynthesizerConfig
-from shared.audio_file import read_audio
-from shared.client import Client, Refused, Session
-from shared.clock import MEDIA_RATE_HZ, to_samples
-from shared.config import COMMON, variable
-from shared.errors import UserError
-from shared.keys import CLIENT
-from shared.phones.inventory import load_inventory
+from kouxing.evaluation.system.continuity import Continuity, compare, staleness, worst
+from kouxing.evaluation.system.live import Seen, Wire, speak, speak_undisturbed
+from kouxing.evaluation.system.network import Link, Network
+from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client, Refused, Session
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
+from kouxing.shared.config import COMMON, variable
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import CLIENT
+from kouxing.shared.phones.inventory import load_inventory
 
 NUM_SESSIONS = 16
 SPIN = """
@@ -431,7 +431,7 @@ class Listener:
     def __init__(self, control: str, session: str) -> None:
         environment = {**os.environ, variable(COMMON, "control"): control.partition(" ")[0]}
         self._process = subprocess.Popen(  # noqa: S603 - our own module
-            [sys.executable, "-m", "services", "listen", session],
+            [sys.executable, "-m", "kouxing", "listen", session],
             env=environment,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

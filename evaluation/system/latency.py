@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.systems import LocalSystem
-from services.synthesizer.config import SynthesizerConfig
-from shared.audio_file import read_audio
-from shared.client import Client
-from shared.errors import UserError
-from shared.wire.face import EndOfFaps, FapFrame
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client
+from kouxing.shared.errors import UserError
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
 
 CHUNK_S = 0.02
 END_LIMIT_S = 30.0  # the last frame must come within this time

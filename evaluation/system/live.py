@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.bus import Bus, Socket
-from shared.client import Client, Session
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.keys import Key
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.speech import Phone, Speech
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.client import Client, Session
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Key
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.speech import Phone, Speech
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 END_LIMIT_S = 15.0  # after the last sample the last frame must come within this time

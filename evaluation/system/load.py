@@ -20,14 +20,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from corpora.figures import new_figure
-from evaluation.system.latency import percentiles
-from evaluation.system.speakers import Crowd, read_text
-from evaluation.system.systems import LocalSystem
-from services.kinds import read_settings
-from services.synthesizer.config import SynthesizerConfig
-from shared.client import Client
-from shared.errors import UserError
+from kouxing.corpora.figures import new_figure
+from kouxing.evaluation.system.latency import percentiles
+from kouxing.evaluation.system.speakers import Crowd, read_text
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.kinds import read_settings
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.client import Client
+from kouxing.shared.errors import UserError
 
 LIMIT_MS = 60.0  # that 95 % of the frames must come within
 SERVING = ("control", "recognizer", "synthesizer")  # who watches is no part of the load

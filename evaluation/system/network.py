@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 TOOLS = ("ip", "nft", "nsenter")
 DELAY_DEVICE = "delay"
@@ -142,7 +142,7 @@ class Network:
 
     def _delay(self) -> None:
         """Lead what comes from hosts through a process that returns it later."""
-        module = [sys.executable, "-m", "evaluation.system.delay", DELAY_DEVICE]
+        module = [sys.executable, "-m", "kouxing.evaluation.system.delay", DELAY_DEVICE]
         delay_ms = str(self._link.delay_ms), str(self._link.jitter_ms)
         self._delaying = subprocess.Popen(  # noqa: S603 - our own module
             _command(self._router, *module, *delay_ms)

@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system import sync
-from evaluation.system.chromium import Chromium
-from evaluation.system.live import NUM_TRIES, speak
-from evaluation.system.systems import LocalSystem
-from services.recognizer.front_end.resample import to_16_khz
-from shared.audio_file import read_audio
-from shared.client import Client
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
+from kouxing.evaluation.system import sync
+from kouxing.evaluation.system.chromium import Chromium
+from kouxing.evaluation.system.live import NUM_TRIES, speak
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
 
 SIZE_PX = (1100, 800)
 SETTLE_S = 12.0  # until the page has found how finely it can draw, and for how long to wait

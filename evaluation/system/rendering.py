@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
-from services.driver.render.renderer import Renderer
-from services.driver.video.writer import VideoWriter
-from shared.face.high_level import VISEMES
+from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.shared.face.high_level import VISEMES
 
 NUM_IMAGES = 60
 # name, detail, size, anti-aliasing samples per pixel, whether the images are encoded (H.264)

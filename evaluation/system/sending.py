@@ -28,15 +28,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.latency import percentiles, stream
-from evaluation.system.vtube_studio import VTubeStudioStub
-from services.cli.supervisor import Supervisor
-from services.gateway.wire import SHAPES_TYPE
-from services.kinds import free_addresses
-from services.synthesizer.config import SynthesizerConfig
-from shared.audio_file import read_audio
-from shared.client import Client
-from shared.keys import control_endpoint, key_folder
+from kouxing.evaluation.system.latency import percentiles, stream
+from kouxing.evaluation.system.vtube_studio import VTubeStudioStub
+from kouxing.services.cli.supervisor import Supervisor
+from kouxing.services.gateway.wire import SHAPES_TYPE
+from kouxing.services.kinds import free_addresses
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client
+from kouxing.shared.keys import control_endpoint, key_folder
 
 # what is sent, and the bytes by which a frame's last datagram (or only one) is known
 TARGETS = {
@@ -176,7 +176,7 @@ def _sending(urls: list[str], environment: dict[str, str], state_folder: str) ->
     """Run ``kouxing send``; the token that it gets is kept in a folder of the measurement."""
     shutil.copytree(key_folder(), Path(state_folder) / "state" / "kouxing")
     sender = subprocess.Popen(  # noqa: S603 - our own module
-        [sys.executable, "-m", "services", "send", *urls],
+        [sys.executable, "-m", "kouxing", "send", *urls],
         env={**os.environ, **environment, "XDG_STATE_HOME": str(Path(state_folder) / "state")},
         stderr=subprocess.DEVNULL,
     )

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.live import CHUNK
-from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.front_end.resample import to_16_khz
-from services.recognizer.lips import LipPredictor, lips_for
-from services.recognizer.recognizer import warm_up
-from services.recognizer.stream import SpeechStream
-from shared.audio_file import read_audio
-from shared.clock import MEDIA_RATE_HZ
+from kouxing.evaluation.system.live import CHUNK
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.lips import LipPredictor, lips_for
+from kouxing.services.recognizer.recognizer import warm_up
+from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.clock import MEDIA_RATE_HZ
 
 MODELS = ("neural", "blocks")
 NUM_SESSIONS = (1, 16)

@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from corpora.figures import new_figure
-from evaluation.system.load import SERVING, usage_of
-from evaluation.system.speakers import read_text, voiced
-from evaluation.system.systems import LocalSystem
-from shared.client import Client, Session
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.wire.face import FapFrame
-from shared.wire.speech import Phone
+from kouxing.corpora.figures import new_figure
+from kouxing.evaluation.system.load import SERVING, usage_of
+from kouxing.evaluation.system.speakers import read_text, voiced
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.shared.client import Client, Session
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.speech import Phone
 
 RATE_HZ = 44_100
 CHUNK = RATE_HZ // 25  # samples: 40 ms

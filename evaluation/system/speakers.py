@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluation.system.live import CHUNK
-from services.recognizer.front_end.resample import to_16_khz
-from shared.audio_file import read_audio
-from shared.client import Client, Refused, Session
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.follower import PollingLoop, SessionFollower
-from shared.wire.face import FapFrame
+from kouxing.evaluation.system.live import CHUNK
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client, Refused, Session
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.wire.face import FapFrame
 
 CHUNK_S = CHUNK / MEDIA_RATE_HZ
 VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, times those of the recording

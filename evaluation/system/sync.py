@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.system.chromium import Chromium
+from kouxing.evaluation.system.chromium import Chromium
 
 APART_MS = 200.0  # between a click and its picture at most, and between two clicks at least
 AROUND_MS = (500.0, 250.0)  # of a click: the time before it and after it for which it counts

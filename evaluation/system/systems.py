@@ -13,13 +13,13 @@ from typing import Protocol, Self
 
 from rich.console import Console
 
-from services.cli.supervisor import Supervisor
-from services.kinds import KINDS, free_addresses, more_workers, read_settings
-from shared.client import Client
-from shared.config import variable
-from shared.errors import UserError
-from shared.keys import CLIENT, Key, control_endpoint, read_key, user_key
-from shared.wire.control import StatusReport
+from kouxing.services.cli.supervisor import Supervisor
+from kouxing.services.kinds import KINDS, free_addresses, more_workers, read_settings
+from kouxing.shared.client import Client
+from kouxing.shared.config import variable
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import CLIENT, Key, control_endpoint, read_key, user_key
+from kouxing.shared.wire.control import StatusReport
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 60.0
@@ -209,7 +209,7 @@ class HostsSystem:
     def _bring_key(self, host: str, name: str, role: str) -> None:
         """Make a key on control's host and copy it to another."""
         subprocess.run(  # noqa: S603 - our own module
-            [sys.executable, "-m", "services", "keys", "add", host, "--role", role],
+            [sys.executable, "-m", "kouxing", "keys", "add", host, "--role", role],
             env={**os.environ, "XDG_STATE_HOME": str(self._state("control"))},
             cwd=self._states,
             stderr=subprocess.DEVNULL,
@@ -239,7 +239,7 @@ def start(
     """
     with (folder / f"{instance}.log").open("wb") as log:
         return subprocess.Popen(  # noqa: S603 - our own module
-            [*command, sys.executable, "-m", f"services.{service}"],
+            [*command, sys.executable, "-m", f"kouxing.services.{service}"],
             env={**os.environ, **environment, variable(service, "instance"): instance},
             stderr=log,
             start_new_session=True,

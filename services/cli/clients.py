@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from services.cli.running_system import find_control
-from services.cli.terminal import (
+from kouxing.services.cli.running_system import find_control
+from kouxing.services.cli.terminal import (
     CONSOLE,
     CurveForm,
     JsonFile,
@@ -24,11 +24,11 @@ from services.cli.terminal import (
     print_message,
     write_json,
 )
-from services.kinds import read_settings
-from shared.config import ServiceConfig
-from shared.errors import UserError
-from shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
-from shared.keys import control_endpoint
+from kouxing.services.kinds import read_settings
+from kouxing.shared.config import ServiceConfig
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
+from kouxing.shared.keys import control_endpoint
 
 SHOWN_FIGURES = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
@@ -64,10 +64,10 @@ def speak(
     control: Control = "",
 ) -> None:
     """Stream a file, standard input, a microphone or what is played to a running system."""
-    from services.cli.streaming import stream
-    from services.recognizer.voice import read_profile
-    from shared.audio_file import open_audio, raw_audio
-    from shared.sound_devices import microphone, monitor
+    from kouxing.services.cli.streaming import stream
+    from kouxing.services.recognizer.voice import read_profile
+    from kouxing.shared.audio_file import open_audio, raw_audio
+    from kouxing.shared.sound_devices import microphone, monitor
 
     profile = b"" if voice is None else read_profile(voice)
     if device and source not in ("mic", "monitor"):
@@ -98,7 +98,7 @@ def speak(
 
 def devices() -> None:
     """List what 'kouxing speak mic' and 'kouxing speak monitor' can name with --device."""
-    from shared.sound_devices import sound_devices
+    from kouxing.shared.sound_devices import sound_devices
 
     table = Table("kind", "name", "speak it", box=box.SIMPLE)
     for device in sound_devices():
@@ -127,7 +127,7 @@ def listen(
     control: Control = "",
 ) -> None:
     """Print or record what a session shows, until it ends."""
-    from services.cli.follow import follow
+    from kouxing.services.cli.follow import follow
 
     follow(_session_name(session), output, show, form, control_address(control))
 
@@ -143,8 +143,8 @@ def send(
     control: Control = "",
 ) -> None:
     """Send the face to avatars in other programs: VMC, Live Link Face, OSC, VTube Studio."""
-    from services.cli.send import send_to
-    from services.senders.target import parse_target
+    from kouxing.services.cli.send import send_to
+    from kouxing.services.senders.target import parse_target
 
     config = read_settings().load(ServiceConfig)
     send_to(
@@ -170,7 +170,7 @@ def express(
     control: Control = "",
 ) -> None:
     """Let the face of a session show expressions for a while; none ends those before."""
-    from shared.client import Client
+    from kouxing.shared.client import Client
 
     strengths = dict(map(_strength, expressions or ()))
     check_expressions(strengths, hold)
@@ -188,7 +188,7 @@ def _strength(text: str) -> tuple[str, float]:
 
 def status(control: Control = "", json_file: JsonFile = None) -> None:
     """Show services, sessions, rates and latencies."""
-    from shared.client import Client
+    from kouxing.shared.client import Client
 
     with Client(control_address(control), deadline_s=3.0) as client:
         report = client.status()

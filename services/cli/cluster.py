@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from services.cli.services import ConfigFile
-from services.kinds import KINDS, read_settings
-from shared.config import parse_assignments
-from shared.errors import UserError, install_command
+from kouxing.services.cli.services import ConfigFile
+from kouxing.services.kinds import KINDS, read_settings
+from kouxing.shared.config import parse_assignments
+from kouxing.shared.errors import UserError, install_command
 
 Number = Annotated[int | None, typer.Option(min=0, max=1000, help="How many are to run.")]
 
@@ -35,7 +35,7 @@ def cluster(
     """Run so many recognizers and synthesizers on a Ray cluster; without numbers, list them."""
     settings = read_settings(config, parse_assignments(assignments or []))
     try:
-        from services.cli.ray_workers import RayWorkers
+        from kouxing.services.cli.ray_workers import RayWorkers
     except ModuleNotFoundError:
         command = install_command("kouxing[cluster]")
         raise UserError(

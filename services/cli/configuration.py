@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
-from services.cli.services import Assignments, ConfigFile
-from services.kinds import KINDS, read_settings
-from shared.config import COMMON, ServiceConfig, Setting, Settings, parse_assignments
-from shared.errors import UserError
+from kouxing.services.cli.services import Assignments, ConfigFile
+from kouxing.services.kinds import KINDS, read_settings
+from kouxing.shared.config import COMMON, ServiceConfig, Setting, Settings, parse_assignments
+from kouxing.shared.errors import UserError
 
 TABLES: dict[str, type[ServiceConfig]] = {
     COMMON: ServiceConfig,

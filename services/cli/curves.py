@@ -11,14 +11,14 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.cli.terminal import CurveForm
-from shared.errors import UserError
-from shared.face.fap_file import FapAnimation, write_fap
-from shared.face.faps import FAPS
-from shared.face.shapes import SHAPE_SETS
+from kouxing.services.cli.terminal import CurveForm
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import FapAnimation, write_fap
+from kouxing.shared.face.faps import FAPS
+from kouxing.shared.face.shapes import SHAPE_SETS
 
 if TYPE_CHECKING:
-    from services.cli.motion import Motion
+    from kouxing.services.cli.motion import Motion
 
 Values = NDArray[np.float32]
 CURVE_SUFFIXES = (".fap", ".csv", ".jsonl", ".glb")
@@ -75,8 +75,8 @@ def write_curves(motion: Motion, output: Path, form: CurveForm, head: str) -> No
         write_fap(output, FapAnimation(output.stem, motion.frame_rate_hz, faps))
         return
     if suffix == ".glb":
-        from services.driver.head.glb_export import export_glb  # noqa: PLC0415 - it draws
-        from services.driver.render.scene import load_head  # noqa: PLC0415
+        from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - it draws
+        from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
 
         export_glb(load_head(head), output, motion.frames, as_arkit=form is CurveForm.ARKIT)
         return

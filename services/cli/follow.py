@@ -12,23 +12,23 @@ from typing import IO, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from services.cli.curves import check_curves, row_writer
-from services.cli.terminal import CONSOLE, CurveForm, Shown, check_output, print_message
-from shared.client import Client, Refused
-from shared.clock import to_seconds
-from shared.errors import UserError
-from shared.face.fap_file import FapAnimation, write_fap
-from shared.face.faps import FAPS, NUM_FAPS
-from shared.follower import PollingLoop, SessionFollower
-from shared.phones import events
-from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
-from shared.phones.syllables import SyllableTrack
-from shared.wire.control import SessionState
-from shared.wire.events import phone_of
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.message import Message
-from shared.wire.session import ErrorCode
-from shared.wire.speech import Phone
+from kouxing.services.cli.curves import check_curves, row_writer
+from kouxing.services.cli.terminal import CONSOLE, CurveForm, Shown, check_output, print_message
+from kouxing.shared.client import Client, Refused
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import FapAnimation, write_fap
+from kouxing.shared.face.faps import FAPS, NUM_FAPS
+from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.phones import events
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
+from kouxing.shared.phones.syllables import SyllableTrack
+from kouxing.shared.wire.control import SessionState
+from kouxing.shared.wire.events import phone_of
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.speech import Phone
 
 OPEN_POLL_S = 0.2
 SILENT_S = 2.0  # without messages, control is asked where the session is

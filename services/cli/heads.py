@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from services.cli.terminal import print_message
-from services.driver.config import DriverConfig
+from kouxing.services.cli.terminal import print_message
+from kouxing.services.driver.config import DriverConfig
 
 DEFAULT_HEAD = DriverConfig().head
 HeadName = Annotated[
@@ -30,8 +30,8 @@ def export_head(
     head: HeadName = DEFAULT_HEAD,
 ) -> None:
     """Write a head for an engine: a GLB of FAPs and ARKit shapes, or a VRM 1.0 avatar."""
-    from services.driver.head.glb_export import export_glb
-    from services.driver.render.scene import load_head
+    from kouxing.services.driver.head.glb_export import export_glb
+    from kouxing.services.driver.render.scene import load_head
 
     export_glb(load_head(head), glb)
     print_message(f"wrote {glb} ({glb.stat().st_size / 1e6:.1f} MB)")
@@ -50,7 +50,7 @@ def import_mesh(
     output: Annotated[Path, typer.Option("--output", "-o", help="Head to write (.npz).")],
 ) -> None:
     """Turn a mesh into a head that FAPs move; use it with --head."""
-    from services.driver.head.import_head import import_head
+    from kouxing.services.driver.head.import_head import import_head
 
     for remark in import_head(mesh, points, output):
         print_message(remark)

@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from services.cli.terminal import print_message
-from services.kinds import KINDS
-from shared.keys import (
+from kouxing.services.cli.terminal import print_message
+from kouxing.services.kinds import KINDS
+from kouxing.shared.keys import (
     CLIENT,
     add_guest,
     key_folder,

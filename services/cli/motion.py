@@ -10,24 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from services.cli.sound_file import read_mono_16k
-from services.cli.spoken_text import does_not_fit, read_text
-from services.cli.terminal import print_message
-from services.driver.video import film
-from services.live_chain import LiveChain
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.alignment import align_syllables
-from services.recognizer.lips import LipPredictor, lips_for
-from services.recognizer.voice import read_profile
-from services.recording_chain import animate, hear_recording
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.load import load_lip_model
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.face.fap_file import read_fap
-from shared.face.lip_models import LipModelName
-from shared.phones.events import Phone, SoundEvent
+from kouxing.services.cli.sound_file import read_mono_16k
+from kouxing.services.cli.spoken_text import does_not_fit, read_text
+from kouxing.services.cli.terminal import print_message
+from kouxing.services.driver.video import film
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.alignment import align_syllables
+from kouxing.services.recognizer.lips import LipPredictor, lips_for
+from kouxing.services.recognizer.voice import read_profile
+from kouxing.services.recording_chain import animate, hear_recording
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import read_fap
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import Phone, SoundEvent
 
 _IMAGE_RATE_HZ = 25.0  # of a video of a sound
 MAX_IMAGE_RATE_HZ = 240.0

@@ -13,26 +13,26 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from services.cli.sound_file import read_mono_16k
-from services.cli.spoken_text import does_not_fit, read_text
-from services.cli.terminal import CONSOLE, Timing, check_output, print_message, write_text
-from services.driver.video.writer import VideoWriter, write_picture
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.alignment import align_syllables, spoken, timed_syllables
-from services.recognizer.front_end.pcm import progress_of
-from services.recognizer.offline import recognize
-from services.recognizer.transcriber import SherpaTranscriber
-from services.synthesizer.lips.ferguson import drawing
-from services.synthesizer.lips.ferguson.contour import LINES, contour
-from services.synthesizer.lips.ferguson.motion import KeyFrames
-from services.synthesizer.lips.ferguson.openings import anchors_of, key_frames_of
-from services.synthesizer.lips.ferguson.table import load_table
-from services.synthesizer.lips.ferguson.timing import time_text
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory, load_inventory
-from shared.phones.transcript import TimedSyllable, Transcript
+from kouxing.services.cli.sound_file import read_mono_16k
+from kouxing.services.cli.spoken_text import does_not_fit, read_text
+from kouxing.services.cli.terminal import CONSOLE, Timing, check_output, print_message, write_text
+from kouxing.services.driver.video.writer import VideoWriter, write_picture
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables
+from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.transcriber import SherpaTranscriber
+from kouxing.services.synthesizer.lips.ferguson import drawing
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
+from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
+from kouxing.services.synthesizer.lips.ferguson.openings import anchors_of, key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.timing import time_text
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
 Span = tuple[float, float, str]  # from, to (seconds): what is said
 

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from services.cli.heads import DEFAULT_HEAD, HeadName
-from services.cli.terminal import (
+from kouxing.services.cli.heads import DEFAULT_HEAD, HeadName
+from kouxing.services.cli.terminal import (
     CONSOLE,
     CurveForm,
     Timing,
@@ -17,9 +17,9 @@ from services.cli.terminal import (
     print_message,
     write_output,
 )
-from services.driver.config import Framing
-from shared.errors import UserError
-from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.services.driver.config import Framing
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file.")]
 Acoustic = Annotated[str, typer.Option(help="Model: neural, blocks, gmm, or a file.")]
@@ -99,9 +99,9 @@ def render(
     """Make a video, pictures or curves of an audio or FAP file."""
     from rich.progress import Progress
 
-    from services.cli import curves
-    from services.cli.motion import is_fap, motion_of_sound, read_motion
-    from services.cli.rendering import Shot, check_pictures, draw, make_renderer
+    from kouxing.services.cli import curves
+    from kouxing.services.cli.motion import is_fap, motion_of_sound, read_motion
+    from kouxing.services.cli.rendering import Shot, check_pictures, draw, make_renderer
 
     faces = lips or [DEFAULT_LIP_MODEL]
     _check_source(
@@ -156,7 +156,7 @@ def _number(count: int, noun: str) -> str:
 
 def _check_source(source: Path, *, sound: bool, **of_sounds: bool) -> None:
     """Refuse options that do not fit a source."""
-    from services.cli.motion import is_fap
+    from kouxing.services.cli.motion import is_fap
 
     if of_sounds["live"] and of_sounds["text"]:
         raise UserError("--live knows no text beforehand; leave --live or --text out")
@@ -173,11 +173,11 @@ def phones(
     audio: Audio, acoustic: Acoustic = "blocks", form: Form = None, output: Output = None
 ) -> None:
     """Recognise an audio file: phones with their times."""
-    from services.cli.sound_file import read_mono_16k
-    from services.recognizer.acoustic.load import load_model, model_path
-    from services.recognizer.offline import recognize
-    from shared.clock import MEDIA_RATE_HZ
-    from shared.phones.phone_files import format_phones
+    from kouxing.services.cli.sound_file import read_mono_16k
+    from kouxing.services.recognizer.acoustic.load import load_model, model_path
+    from kouxing.services.recognizer.offline import recognize
+    from kouxing.shared.clock import MEDIA_RATE_HZ
+    from kouxing.shared.phones.phone_files import format_phones
 
     style = _form(form, output)
     samples = read_mono_16k(audio)
@@ -199,12 +199,12 @@ def align(
     output: Output = None,
 ) -> None:
     """Find the times of the phones of a known text; status 1 if it does not fit the sound."""
-    from services.cli.sound_file import read_mono_16k
-    from services.cli.spoken_text import does_not_fit, read_text
-    from services.recognizer.acoustic.load import load_model, model_path
-    from services.recognizer.alignment import align_syllables, timed_syllables
-    from shared.clock import MEDIA_RATE_HZ
-    from shared.phones.phone_files import format_phones
+    from kouxing.services.cli.sound_file import read_mono_16k
+    from kouxing.services.cli.spoken_text import does_not_fit, read_text
+    from kouxing.services.recognizer.acoustic.load import load_model, model_path
+    from kouxing.services.recognizer.alignment import align_syllables, timed_syllables
+    from kouxing.shared.clock import MEDIA_RATE_HZ
+    from kouxing.shared.phones.phone_files import format_phones
 
     style = _form(form, output)
     samples = read_mono_16k(audio)
@@ -245,7 +245,7 @@ def lips(
     ] = None,
 ) -> None:
     """Draw the mouth alone, in two dimensions: for cartoons, teaching and papers."""
-    from services.cli.mouth_drawing import draw_mouth
+    from kouxing.services.cli.mouth_drawing import draw_mouth
 
     *text, output = text_and_output
     if len(text) > 1:

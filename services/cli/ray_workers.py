@@ -19,13 +19,13 @@ from typing import Self
 
 import ray
 
-from services.cli.service_process import LOOK_S, WORKED_S, ServiceProcess
-from services.cli.supervisor import ONE_THREAD
-from services.kinds import KINDS, ServiceKind
-from shared.config import Bound, Settings, bound_keys, variable
-from shared.errors import UserError
-from shared.keys import key_text, own_key
-from shared.service import DRAIN_LIMIT_S
+from kouxing.services.cli.service_process import LOOK_S, WORKED_S, ServiceProcess
+from kouxing.services.cli.supervisor import ONE_THREAD
+from kouxing.services.kinds import KINDS, ServiceKind
+from kouxing.shared.config import Bound, Settings, bound_keys, variable
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import key_text, own_key
+from kouxing.shared.service import DRAIN_LIMIT_S
 
 NAMESPACE = "kouxing"  # of the actors' names
 PLACED_WITHIN_S = 5.0  # otherwise there is no room
@@ -39,7 +39,7 @@ class Worker:
     Parameters
     ----------
     kind
-        One of ``services.kinds.KINDS``.
+        One of ``kouxing.services.kinds.KINDS``.
     environment
         The worker's settings.
     key

@@ -8,15 +8,15 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from services.cli.curves import CURVE_SUFFIXES
-from services.cli.motion import Motion
-from services.driver.config import Framing
-from services.driver.render import scene
-from services.driver.render.renderer import Renderer
-from services.driver.render.side_by_side import SideBySide
-from services.driver.video import film
-from services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_sequence
-from shared.errors import UserError
+from kouxing.services.cli.curves import CURVE_SUFFIXES
+from kouxing.services.cli.motion import Motion
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.side_by_side import SideBySide
+from kouxing.services.driver.video import film
+from kouxing.services.driver.video.writer import VIDEO_SUFFIXES, check_name, is_sequence
+from kouxing.shared.errors import UserError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,20 +12,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.cli.heads import HeadName
-from services.cli.running_system import announce, find_control
-from services.cli.services import ConfigFile
-from services.cli.terminal import CONSOLE, command_name, print_message
-from services.control.config import ControlConfig
-from services.driver.config import DriverConfig
-from services.kinds import KINDS, available_addresses, more_workers, read_settings
-from shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
-from shared.endpoints import WILDCARDS, split_endpoint
-from shared.errors import UserError
-from shared.keys import control_endpoint
+from kouxing.services.cli.heads import HeadName
+from kouxing.services.cli.running_system import announce, find_control
+from kouxing.services.cli.services import ConfigFile
+from kouxing.services.cli.terminal import CONSOLE, command_name, print_message
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.kinds import KINDS, available_addresses, more_workers, read_settings
+from kouxing.shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
+from kouxing.shared.endpoints import WILDCARDS, split_endpoint
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import control_endpoint
 
 if TYPE_CHECKING:
-    from shared.audio_file import AudioSource
+    from kouxing.shared.audio_file import AudioSource
 
 
 def run(
@@ -57,8 +57,8 @@ def run(
     ] = None,
 ) -> None:
     """Run all services on this machine and restart those that crash."""
-    from services.cli.supervisor import Supervisor
-    from shared.audio_file import open_audio
+    from kouxing.services.cli.supervisor import Supervisor
+    from kouxing.shared.audio_file import open_audio
 
     given = parse_assignments(assignments or [])
     if port is not None:
@@ -130,8 +130,8 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
     environment = {"KOUXING_DRIVER_HEAD": name}
     if name == DriverConfig().head:
         return environment
-    from services.driver.head.glb_export import export_glb
-    from services.driver.render.scene import load_head
+    from kouxing.services.driver.head.glb_export import export_glb
+    from kouxing.services.driver.render.scene import load_head
 
     page_head = (out / "head.glb").absolute()
     try:
@@ -181,7 +181,7 @@ def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str
 
 
 def _play_sample(sample: AudioSource, control: str) -> None:
-    from services.cli.streaming import stream
+    from kouxing.services.cli.streaming import stream
 
     summary = stream(sample, control, CONSOLE, session="demo", record=True)
     print_message(f"spoke {sample.name}: {summary.num_phones} phones in {summary.duration_s:.1f} s")

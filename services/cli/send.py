@@ -9,16 +9,16 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from services.cli.follow import OPEN_POLL_S, find_session
-from services.cli.terminal import print_message
-from services.senders.senders import Senders
-from services.senders.target import Target
-from shared.client import Client
-from shared.clock import to_seconds
-from shared.errors import UserError
-from shared.follower import PollingLoop, SessionFollower
-from shared.wire.control import SessionState
-from shared.wire.face import FapFrame
+from kouxing.services.cli.follow import OPEN_POLL_S, find_session
+from kouxing.services.cli.terminal import print_message
+from kouxing.services.senders.senders import Senders
+from kouxing.services.senders.target import Target
+from kouxing.shared.client import Client
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.errors import UserError
+from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.wire.control import SessionState
+from kouxing.shared.wire.face import FapFrame
 
 STEP_S = 0.05
 SEARCH_LIMIT_S = 1.0

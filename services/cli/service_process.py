@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from shared.service import PARENT_VARIABLE, PULSE_VARIABLE
+from kouxing.shared.service import PARENT_VARIABLE, PULSE_VARIABLE
 
 LOOK_S = 0.2  # between looks at a process
 SILENT_S = 0.7  # at least, without a heartbeat
@@ -28,7 +28,7 @@ _STATE, _USER, _KERNEL = 0, 11, 12  # fields of Linux' file stat, after the prog
 
 
 class ServiceProcess(subprocess.Popen[bytes]):
-    """Runs ``python -m services.<module>``; it ends when this process does.
+    """Runs ``python -m kouxing.services.<module>``; it ends when this process does.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class ServiceProcess(subprocess.Popen[bytes]):
         own = {PARENT_VARIABLE: str(os.getpid()), PULSE_VARIABLE: str(written)}
         try:
             super().__init__(
-                [sys.executable, "-m", f"services.{module}", *arguments],
+                [sys.executable, "-m", f"kouxing.services.{module}", *arguments],
                 env={**environment, **own},
                 pass_fds=(written,),
                 **options,

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from services.kinds import ServiceKind
+from kouxing.services.kinds import ServiceKind
 
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML file with one table per service.")
@@ -24,7 +24,7 @@ def service_command(kind: ServiceKind) -> Callable[..., None]:
     """Return the command that runs a service of this kind."""
 
     def command(config: ConfigFile = None, assignments: Assignments = None) -> None:
-        from services.process import serve
+        from kouxing.services.process import serve
 
         sys.exit(serve(kind.name, config, assignments or []))
 

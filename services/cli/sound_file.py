@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.cli.terminal import print_message
-from services.recognizer.front_end.resample import Resampler
-from shared.audio_file import clipping_remarks, num_clipped, open_audio
+from kouxing.services.cli.terminal import print_message
+from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
 
 
 def read_mono_16k(path: Path) -> NDArray[np.float32]:
@@ -20,7 +20,7 @@ def read_mono_16k(path: Path) -> NDArray[np.float32]:
     Raises
     ------
     UserError
-        As ``shared.audio_file.open_audio``.
+        As ``kouxing.shared.audio_file.open_audio``.
     """
     source = open_audio(path, block_s=1.0)
     resampler = Resampler(source.sample_rate_hz, source.num_channels)

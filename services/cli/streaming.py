@@ -12,15 +12,15 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from shared.audio_file import AudioSource, clipping_remarks, num_clipped
-from shared.bus import Socket
-from shared.client import Client, Session, Subscription
-from shared.clock import to_seconds
-from shared.errors import UserError
-from shared.phones.inventory import load_inventory
-from shared.wire.control import Event
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.speech import Phone
+from kouxing.shared.audio_file import AudioSource, clipping_remarks, num_clipped
+from kouxing.shared.bus import Socket
+from kouxing.shared.client import Client, Session, Subscription
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.wire.control import Event
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.speech import Phone
 
 QUEUE_WAIT_S = 0.005
 END_LIMIT_S = 30.0  # for the last frames after the last sample

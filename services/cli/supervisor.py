@@ -16,11 +16,11 @@ from typing import IO
 
 from rich.console import Console
 
-from services.cli.service_process import BLOCKED_S, LOOK_S, WORKED_S, ServiceProcess
-from services.kinds import KINDS, WORKERS, kind_of
-from shared.client import Client
-from shared.errors import UserError
-from shared.service import DRAIN_LIMIT_S
+from kouxing.services.cli.service_process import BLOCKED_S, LOOK_S, WORKED_S, ServiceProcess
+from kouxing.services.kinds import KINDS, WORKERS, kind_of
+from kouxing.shared.client import Client
+from kouxing.shared.errors import UserError
+from kouxing.shared.service import DRAIN_LIMIT_S
 
 BACKOFF_S = (0.2, 5.0)  # least and longest wait before a service that crashed twice starts again
 STEADY_S = 30.0  # after which a crash counts as the first one again
@@ -44,7 +44,7 @@ class Supervisor:
         Which to run.
     more
         Additions to the environment for more workers of their kinds, by name, as
-        ``services.kinds.more_workers`` returns them.
+        ``kouxing.services.kinds.more_workers`` returns them.
     """
 
     def __init__(

@@ -12,8 +12,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from shared.errors import UserError
-from shared.face.shape_names import ShapeSetName
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.shape_names import ShapeSetName
 
 CONSOLE = Console(stderr=True)
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the figures here.")]

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from shared.config import BoundEndpoint, ServiceConfig
-from shared.endpoints import is_loopback, own_address, split_endpoint
+from kouxing.shared.config import BoundEndpoint, ServiceConfig
+from kouxing.shared.endpoints import is_loopback, own_address, split_endpoint
 
 
 class ControlConfig(ServiceConfig):

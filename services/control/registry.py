@@ -11,11 +11,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from operator import itemgetter
 
-from services.control.load import RETRY_AFTER_S, SAME_LOAD, WorkerLoad
-from shared.endpoints import with_key
-from shared.keys import NOBODY, Peer
-from shared.wire.control import Heartbeat
-from shared.wire.session import ErrorCode
+from kouxing.services.control.load import RETRY_AFTER_S, SAME_LOAD, WorkerLoad
+from kouxing.shared.endpoints import with_key
+from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.wire.control import Heartbeat
+from kouxing.shared.wire.session import ErrorCode
 
 CLIENT_NEEDS = ("audio", "phones", "faps")  # the endpoints that a client is told
 UNPACED_AUDIO = "unpaced_audio"  # instead of "audio", where a recognizer has it

@@ -23,18 +23,18 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
-from services.control.config import ControlConfig
-from services.control.registry import PROVIDERS, Refusal, Registry, ServiceRecord
-from services.control.sessions import SessionRecord, Sessions
-from shared.bus import COMMANDS
-from shared.clock import now_ns
-from shared.endpoints import split_endpoint, with_key
-from shared.errors import UserError
-from shared.keys import NOBODY, Peer
-from shared.logs import LOG
-from shared.service import Handler, Service
-from shared.wire.codec import encoded_size
-from shared.wire.control import (
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.registry import PROVIDERS, Refusal, Registry, ServiceRecord
+from kouxing.services.control.sessions import SessionRecord, Sessions
+from kouxing.shared.bus import COMMANDS
+from kouxing.shared.clock import now_ns
+from kouxing.shared.endpoints import split_endpoint, with_key
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.logs import LOG
+from kouxing.shared.service import Handler, Service
+from kouxing.shared.wire.codec import encoded_size
+from kouxing.shared.wire.control import (
     AllowedKey,
     AllowedKeys,
     Event,
@@ -51,8 +51,8 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.message import Message
-from shared.wire.session import (
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
     AddShapes,
     ChooseExpressiveness,
     ChooseLips,
@@ -65,8 +65,8 @@ from shared.wire.session import (
     OpenSession,
     SessionMoved,
 )
-from shared.wire.speech import Speech
-from shared.zap import Zap
+from kouxing.shared.wire.speech import Speech
+from kouxing.shared.zap import Zap
 
 STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from itertools import count
 from operator import attrgetter
 
-from services.control.registry import UNPACED_AUDIO, Refusal, Registry
-from shared.face.shapes import SHAPE_SETS
-from shared.keys import Peer
-from shared.wire.control import Heartbeat, SessionState, StartSession
-from shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
+from kouxing.services.control.registry import UNPACED_AUDIO, Refusal, Registry
+from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.control import Heartbeat, SessionState, StartSession
+from kouxing.shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
 
 KEY_SHARE = 0.75  # of the sessions that one key may have open
 

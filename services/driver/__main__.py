@@ -1,6 +1,6 @@
 """Runs a driver as a process of its own."""
 
-from services.process import run_module
+from kouxing.services.process import run_module
 
 if __name__ == "__main__":
     run_module("driver")

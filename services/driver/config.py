@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from shared.config import Form, ServiceConfig, Switch
+from kouxing.shared.config import Form, ServiceConfig, Switch
 
 
 class Framing(StrEnum):

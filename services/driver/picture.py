@@ -9,7 +9,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 UInt8 = NDArray[np.uint8]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import NUM_FAPS
-from shared.face.idle_motion import RestingFace
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.idle_motion import RestingFace
 
 NEWEST = "newest"
 STALL_S = 1.0  # a face goes to rest after so long without frames

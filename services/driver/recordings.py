@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.video.recording import Recording
-from shared.errors import UserError
+from kouxing.services.driver.video.recording import Recording
+from kouxing.shared.errors import UserError
 
 Float32 = NDArray[np.float32]
 

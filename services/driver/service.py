@@ -15,20 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from services.driver.config import DriverConfig
-from services.driver.poses import STALL_S, Poses
-from services.driver.recordings import Recordings
-from services.driver.video.recording import Recording
-from services.driver.view import View
-from shared.clock import to_seconds
-from shared.follower import SessionFollower
-from shared.logs import LOG
-from shared.service import Service
-from shared.wire.audio import Sound
-from shared.wire.control import Recorded, SessionInput, StartSession
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.message import Message
-from shared.wire.session import Error, ErrorCode
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.poses import STALL_S, Poses
+from kouxing.services.driver.recordings import Recordings
+from kouxing.services.driver.video.recording import Recording
+from kouxing.services.driver.view import View
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.follower import SessionFollower
+from kouxing.shared.logs import LOG
+from kouxing.shared.service import Service
+from kouxing.shared.wire.audio import Sound
+from kouxing.shared.wire.control import Recorded, SessionInput, StartSession
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Error, ErrorCode
 
 DRAW_BUDGET_S = 0.2  # for videos in one turn of the loop, so that heartbeats go on
 LAST_FRAME_LIMIT_S = 10.0  # for a closed session's last frames to arrive

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.config import DriverConfig
-from services.driver.render.renderer import Renderer
-from services.driver.render.scene import background, camera, load_head
-from services.driver.video.virtual_camera import VirtualCamera
-from shared.errors import UserError
-from shared.logs import LOG
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.scene import background, camera, load_head
+from kouxing.services.driver.video.virtual_camera import VirtualCamera
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 
 if TYPE_CHECKING:
-    from services.driver.render.window import Window
+    from kouxing.services.driver.render.window import Window
 
 
 class View:
@@ -92,7 +92,7 @@ class View:
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if config.view == "none" or (config.view == "auto" and not has_display):
             return None
-        from services.driver.render.window import Window  # noqa: PLC0415 - glfw starts processes
+        from kouxing.services.driver.render.window import Window  # noqa: PLC0415 - glfw starts processes
 
         head = load_head(config.head, "coarse")  # live, smooth motion is worth more than outlines
         try:

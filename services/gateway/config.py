@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field
 
-from services.gateway.places import ADDRESS_SHARE
-from services.senders.target import parse_target
-from shared.config import BoundHost, BoundPort, Form, ServiceConfig, Switch
-from shared.errors import UserError
+from kouxing.services.gateway.places import ADDRESS_SHARE
+from kouxing.services.senders.target import parse_target
+from kouxing.shared.config import BoundHost, BoundPort, Form, ServiceConfig, Switch
+from kouxing.shared.errors import UserError
 
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
 

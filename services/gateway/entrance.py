@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from services.gateway.access import Access
-from services.gateway.config import GatewayConfig
-from services.gateway.https import own_names, tls_context
-from shared.endpoints import WILDCARDS, is_address, is_loopback, own_address
+from kouxing.services.gateway.access import Access
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.gateway.https import own_names, tls_context
+from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, own_address
 
 
 @dataclass(frozen=True, slots=True)

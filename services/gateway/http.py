@@ -13,13 +13,15 @@ from pathlib import Path
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler
 
-import shared.face
-from services.gateway.access import Access
-from services.gateway.places import Places
-from shared.logs import LOG
+import kouxing.shared.face
+from kouxing.services.gateway.access import Access
+from kouxing.services.gateway.places import Places
+from kouxing.shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
-LIGHT = Path(shared.face.__file__).with_name("light.glsl")  # the page and the driver share it
+LIGHT = Path(kouxing.shared.face.__file__).with_name(
+    "light.glsl"
+)  # the page and the driver share it
 THREE = PAGE / "node_modules" / "three"
 FACE_MESH = PAGE / "node_modules" / "@mediapipe" / "face_mesh"
 # The files that are served: of the page, and of the module that finds a face in a picture.

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 _DAYS = 397  # browsers take no longer ones
 

@@ -19,14 +19,14 @@ from pathlib import Path
 
 from aiohttp import web
 
-from services.gateway.http import MAX_UPLOAD_BYTES
-from shared.errors import UserError
-from shared.logs import LOG
+from kouxing.services.gateway.http import MAX_UPLOAD_BYTES
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 
 UPLOAD_LIMIT_S = 60.0
 LEARNING_LIMIT_S = 180.0
 PRESENCE_CHECK_S = 0.5  # a browser that has left is noticed within this
-ADAPT = (sys.executable, "-m", "services", "adapt")
+ADAPT = (sys.executable, "-m", "kouxing", "adapt")
 _NICENESS = 19  # live sessions come first
 _USERS_MISTAKE = 2  # exit status
 

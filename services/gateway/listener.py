@@ -17,9 +17,9 @@ from aiohttp import web
 from aiohttp.http import HttpProcessingError
 from aiohttp.typedefs import Handler
 
-from services.gateway.places import ADDRESS_SHARE, Places
-from shared.errors import UserError
-from shared.logs import LOG
+from kouxing.services.gateway.places import ADDRESS_SHARE, Places
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 
 MAX_CONNECTIONS = 256
 IDLE_LIMIT_S = 10.0  # for a request to arrive, and for the next one

@@ -10,16 +10,16 @@ from pathlib import Path
 
 from aiohttp import WSMsgType, web
 
-from services.gateway import wire
-from services.gateway.http import WebSockets
-from services.gateway.own_sessions import OwnSession, OwnSessions, error_text
-from services.gateway.places import Places
-from services.gateway.sound_input import SoundInput
-from shared.audio_file import open_audio
-from shared.errors import UserError
-from shared.logs import LOG
+from kouxing.services.gateway import wire
+from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway.own_sessions import OwnSession, OwnSessions, error_text
+from kouxing.services.gateway.places import Places
+from kouxing.services.gateway.sound_input import SoundInput
+from kouxing.shared.audio_file import open_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 
-SAMPLE = Path(str(resources.files("shared") / "demo" / "hello-female.wav"))
+SAMPLE = Path(str(resources.files("kouxing.shared") / "demo" / "hello-female.wav"))
 SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
 MAX_MICROPHONES = 16
 HELLO_LIMIT_S = 10.0

@@ -10,10 +10,10 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Iterator
 
-from services.gateway import wire
-from shared.client import Client, Refused, Session
-from shared.errors import UserError
-from shared.keys import Key
+from kouxing.services.gateway import wire
+from kouxing.shared.client import Client, Refused, Session
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Key
 
 LAST_FRAME_LIMIT_S = 1.5  # for the last frames, when the sound ends
 LAST_PHONES_S = 0.2  # for the last phones after the last frame: they take another way

@@ -12,12 +12,12 @@ from dataclasses import asdict
 import numpy as np
 from aiohttp import web
 
-from services.gateway import wire
-from services.senders.senders import Senders
-from services.senders.target import Target, parse_delay_s, parse_target
-from shared.clock import to_seconds
-from shared.errors import UserError
-from shared.logs import LOG
+from kouxing.services.gateway import wire
+from kouxing.services.senders.senders import Senders
+from kouxing.services.senders.target import Target, parse_delay_s, parse_target
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 
 
 class Sending:

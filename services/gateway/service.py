@@ -20,34 +20,34 @@ from dataclasses import dataclass, replace
 
 from aiohttp import web
 
-from services.gateway import http, wire
-from services.gateway.config import GatewayConfig
-from services.gateway.entrance import make_entrance
-from services.gateway.learn_mouth import MouthLearner
-from services.gateway.listener import Listener, bind
-from services.gateway.microphone import SAMPLE_TEXT, Microphones, Sample
-from services.gateway.outbox import Kind
-from services.gateway.own_sessions import OwnSessions, error_text
-from services.gateway.sending import Sending
-from services.gateway.viewers import Viewers
-from services.gateway.vosk import VoskClients
-from services.gateway.whip import WhipClients
-from shared.bus import Socket
-from shared.clock import to_samples
-from shared.errors import UserError
-from shared.face.idle_motion import REST_RATE_HZ, RestingFace
-from shared.follower import SessionFollower
-from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
-from shared.phones.known_text import Characters, characters_of
-from shared.phones.syllables import SyllableTrack
-from shared.service import Handler, Service
-from shared.wire.audio import Sound
-from shared.wire.control import SessionInput, StartSession, StatusReport, StatusRequest
-from shared.wire.events import phone_of
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.message import Message
-from shared.wire.session import ChooseExpressiveness, Express
-from shared.wire.speech import Phone, Speech
+from kouxing.services.gateway import http, wire
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.gateway.entrance import make_entrance
+from kouxing.services.gateway.learn_mouth import MouthLearner
+from kouxing.services.gateway.listener import Listener, bind
+from kouxing.services.gateway.microphone import SAMPLE_TEXT, Microphones, Sample
+from kouxing.services.gateway.outbox import Kind
+from kouxing.services.gateway.own_sessions import OwnSessions, error_text
+from kouxing.services.gateway.sending import Sending
+from kouxing.services.gateway.viewers import Viewers
+from kouxing.services.gateway.vosk import VoskClients
+from kouxing.services.gateway.whip import WhipClients
+from kouxing.shared.bus import Socket
+from kouxing.shared.clock import to_samples
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.idle_motion import REST_RATE_HZ, RestingFace
+from kouxing.shared.follower import SessionFollower
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
+from kouxing.shared.phones.known_text import Characters, characters_of
+from kouxing.shared.phones.syllables import SyllableTrack
+from kouxing.shared.service import Handler, Service
+from kouxing.shared.wire.audio import Sound
+from kouxing.shared.wire.control import SessionInput, StartSession, StatusReport, StatusRequest
+from kouxing.shared.wire.events import phone_of
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import ChooseExpressiveness, Express
+from kouxing.shared.wire.speech import Phone, Speech
 
 STATUS_S = 1.0
 STATUS_LOST_S = 3.0  # after which it is asked again

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import msgpack
 import numpy as np
 
-from services.gateway import wire
-from shared.errors import UserError
-from shared.face.shapes import SHAPE_SETS
+from kouxing.services.gateway import wire
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.shapes import SHAPE_SETS
 
 FORMATS = ("binary", "json", "msgpack")
 _TYPES = {"weights": wire.SHAPES_TYPE, "rest": wire.REST_SHAPES_TYPE}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 RATES_HZ = (8000, 48000)

@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator
 
 from aiohttp import WSMessage, WSMsgType, web
 
-from services.gateway.own_sessions import OwnSession
-from services.gateway.pace import COMMAND_S, Pace
-from services.gateway.sound_format import SoundFormat
+from kouxing.services.gateway.own_sessions import OwnSession
+from kouxing.services.gateway.pace import COMMAND_S, Pace
+from kouxing.services.gateway.sound_format import SoundFormat
 
 MAX_AHEAD_S = 30.0  # that may wait; who sends more waits itself
 PIECE_S = 0.04  # in which it goes on

@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 
 from aiohttp import WSMsgType, web
 
-from services.gateway import wire
-from services.gateway.http import WebSockets
-from services.gateway.outbox import Kind, Outbox
-from services.gateway.pace import COMMAND_S, Pace
-from services.gateway.places import Places
-from services.gateway.shape_view import ShapeView, parse_shape_view
-from shared.errors import UserError
-from shared.metrics import Metrics
+from kouxing.services.gateway import wire
+from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway.outbox import Kind, Outbox
+from kouxing.services.gateway.pace import COMMAND_S, Pace
+from kouxing.services.gateway.places import Places
+from kouxing.services.gateway.shape_view import ShapeView, parse_shape_view
+from kouxing.shared.errors import UserError
+from kouxing.shared.metrics import Metrics
 
 MAX_VIEWERS = 64
 SEND_BUFFER_BYTES = 64 * 1024  # what the kernel may hold for a slow viewer, about a second

@@ -16,16 +16,16 @@ from typing import Any
 
 from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
-from services.gateway import wire
-from services.gateway.http import WebSockets
-from services.gateway.own_sessions import OwnSessions
-from services.gateway.places import Places
-from services.gateway.sound_format import SoundFormat, check_text
-from services.gateway.sound_input import SoundInput
-from shared.errors import UserError
-from shared.logs import LOG
-from shared.phones.events import Phone
-from shared.wav_header import read_wav_header
+from kouxing.services.gateway import wire
+from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway.own_sessions import OwnSessions
+from kouxing.services.gateway.places import Places
+from kouxing.services.gateway.sound_format import SoundFormat, check_text
+from kouxing.services.gateway.sound_input import SoundInput
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.wav_header import read_wav_header
 
 MAX_CLIENTS = 16
 DEFAULT_RATE_HZ = 8000  # as vosk-server's own

@@ -19,7 +19,7 @@ from aiortc import (
 from aiortc.mediastreams import MediaStreamError
 from av import AudioFrame
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 CONNECT_LIMIT_S = 20.0  # from the answer to the first sound
 CONCEALED = 14_400  # samples at most: what was lost is replaced, so that speech goes on

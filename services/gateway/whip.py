@@ -17,20 +17,20 @@ from typing import TYPE_CHECKING
 
 from aiohttp import web
 
-from services.gateway import wire
-from services.gateway.outbox import Kind
-from services.gateway.own_sessions import OwnSession, OwnSessions, error_text, retry_after_s
-from services.gateway.pace import COMMAND_S, Pace
-from services.gateway.places import Places
-from services.gateway.shape_view import ShapeView, parse_shape_view
-from services.gateway.viewers import Viewers
-from shared.errors import UserError
-from shared.logs import LOG
+from kouxing.services.gateway import wire
+from kouxing.services.gateway.outbox import Kind
+from kouxing.services.gateway.own_sessions import OwnSession, OwnSessions, error_text, retry_after_s
+from kouxing.services.gateway.pace import COMMAND_S, Pace
+from kouxing.services.gateway.places import Places
+from kouxing.services.gateway.shape_view import ShapeView, parse_shape_view
+from kouxing.services.gateway.viewers import Viewers
+from kouxing.shared.errors import UserError
+from kouxing.shared.logs import LOG
 
 if TYPE_CHECKING:
     from aiortc import RTCDataChannel
 
-    from services.gateway.webrtc import Peer
+    from kouxing.services.gateway.webrtc import Peer
 
 MAX_CLIENTS = 16
 SDP = "application/sdp"
@@ -146,7 +146,9 @@ class WhipClients:
 
     async def _make_peer(self, client: _Client) -> Peer:
         try:
-            webrtc = await asyncio.to_thread(importlib.import_module, "services.gateway.webrtc")
+            webrtc = await asyncio.to_thread(
+                importlib.import_module, "kouxing.services.gateway.webrtc"
+            )
         except ModuleNotFoundError:
             raise web.HTTPNotImplemented(text=MISSING) from None
         if self._addresses:

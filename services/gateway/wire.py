@@ -11,10 +11,10 @@ import json
 import struct
 from dataclasses import dataclass
 
-from services.gateway.sound_format import RATES_HZ, SoundFormat, check_text
-from shared.errors import UserError
-from shared.face.expressions import DEFAULT_HOLD_S, check_expressions, check_expressiveness
-from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from kouxing.services.gateway.sound_format import RATES_HZ, SoundFormat, check_text
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions, check_expressiveness
+from kouxing.shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units

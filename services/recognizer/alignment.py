@@ -16,20 +16,20 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.front_end.features import HOP_S
-from services.recognizer.front_end.resample import to_16_khz
-from services.recognizer.search.forced_path import (
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.search.forced_path import (
     UtteranceGraph,
     segments_of_path,
     utterance_graph,
     viterbi_path,
 )
-from services.recognizer.speech_scores import frame_time_s
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory, Syllable
-from shared.phones.transcript import TimedSyllable, Transcript
+from kouxing.services.recognizer.speech_scores import frame_time_s
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory, Syllable
+from kouxing.shared.phones.transcript import TimedSyllable, Transcript
 
 # Calibrated with the block model on the corpus' dev sentences and conversation: see
 # docs/recognition.md.

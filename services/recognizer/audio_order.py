@@ -6,7 +6,7 @@ that again; what has come meanwhile is held until then, for a while.
 
 from __future__ import annotations
 
-from shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
 
 WAIT_S = 1.0  # for messages that are missing
 MAX_HELD = 2**20  # bytes held meanwhile

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from shared.config import BoundEndpoint, ServiceConfig
+from kouxing.shared.config import BoundEndpoint, ServiceConfig
 
 # Settings that suit an acoustic model and differ from the defaults below. Who chooses the model
 # has them, unless others are given.

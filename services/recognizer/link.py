@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections import deque
 
-from shared.bus import Socket
-from shared.clock import to_samples
-from shared.reliable import ReliableSender
-from shared.wire.message import Message
-from shared.wire.speech import Acknowledge, ResumeFace, Speech
+from kouxing.shared.bus import Socket
+from kouxing.shared.clock import to_samples
+from kouxing.shared.reliable import ReliableSender
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import Acknowledge, ResumeFace, Speech
 
 KEPT = to_samples(3.0)  # samples of media time whose messages a new synthesizer is told
 

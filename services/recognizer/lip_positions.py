@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.features import HOP_S
-from services.recognizer.lips import features_at
-from services.recognizer.speech_scores import SpeechScores
-from shared.clock import MEDIA_RATE_HZ
-from shared.phones.events import LipFrame
+from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.lips import features_at
+from kouxing.services.recognizer.speech_scores import SpeechScores
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.phones.events import LipFrame
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

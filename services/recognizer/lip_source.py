@@ -12,7 +12,7 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.phones.events import LipFrame
+from kouxing.shared.phones.events import LipFrame
 
 # Frames of the face are due every 20 ms of sound, and the network's positions end this long before:
 # a window of 25 ms in steps of 20 ms can come no closer.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.lips import LIP_FAPS, OTHER_SIDE
-from shared.face.faps import MOUTH_FAPS
+from kouxing.services.recognizer.lips import LIP_FAPS, OTHER_SIDE
+from kouxing.shared.face.faps import MOUTH_FAPS
 
 Array = NDArray[np.float64]
 

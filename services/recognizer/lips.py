@@ -43,16 +43,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
-from services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.acoustic.two_networks import TwoNetworks
-from services.recognizer.front_end.whisper_mel import NUM_MELS
-from services.recognizer.voice import Voice, parse_profile
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import LipFrame
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.voice import Voice, parse_profile
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import LipFrame
 
 Floats = NDArray[np.float32]
 

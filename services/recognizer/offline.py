@@ -10,16 +10,16 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.search.decoder import Decoder
-from services.recognizer.speech_scores import (
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.search.decoder import Decoder
+from kouxing.services.recognizer.speech_scores import (
     ScoreEvent,
     SpeechEnd,
     SpeechStart,
     frame_time_s,
     score_recording,
 )
-from shared.phones.events import LipFrame, Phone
+from kouxing.shared.phones.events import LipFrame, Phone
 
 
 def recognize(

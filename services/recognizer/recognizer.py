@@ -21,7 +21,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import (
+from kouxing.services.recognizer.acoustic.acoustic_model import (
     FIRST,
     INSIDE,
     AcousticModel,
@@ -29,12 +29,12 @@ from services.recognizer.acoustic.acoustic_model import (
     no_scores,
     run_scoring_tasks,
 )
-from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
-from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
-from services.recognizer.lip_source import LipFrameStream
-from services.recognizer.search.decoder import Decoder, Segment, segments_after
-from services.recognizer.search.output_rule import OutputRule
-from services.recognizer.speech_scores import (
+from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from kouxing.services.recognizer.lip_source import LipFrameStream
+from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
+from kouxing.services.recognizer.search.output_rule import OutputRule
+from kouxing.services.recognizer.speech_scores import (
     FrameScores,
     ScoreEvent,
     SpeechEnd,
@@ -42,7 +42,7 @@ from services.recognizer.speech_scores import (
     SpeechStart,
     frame_time_s,
 )
-from shared.phones.events import LipFrame, Phone, SpeechChange
+from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange
 
 DEFAULT_RULE = (1, 0.9)  # N (the paper's is 3) and the confidence that each frame needs
 FINALIZE_AFTER_S = 0.2  # after a phone's end; waiting longer corrects nothing more

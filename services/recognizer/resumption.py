@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from services.recognizer.stream import Chunk, StreamOutput, Waveform
-from shared.clock import MEDIA_RATE_HZ, to_samples
-from shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from kouxing.services.recognizer.stream import Chunk, StreamOutput, Waveform
+from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
 
 WARM_UP_S = 2.8  # of sound before that time; docs/recognition.md tells how it was chosen
 # Sound begins at a multiple of this: of the voice detector's blocks, the networks' positions and

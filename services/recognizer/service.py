@@ -17,32 +17,32 @@ from collections import deque
 from collections.abc import Sequence
 from functools import partial
 
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.audio_order import AudioMessage, AudioOrder
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
-from services.recognizer.link import SynthesizerLink
-from services.recognizer.lip_source import LipsFromSound
-from services.recognizer.lips import lips_for
-from services.recognizer.recognizer import warm_up
-from services.recognizer.resumption import WARM_UP_S, Resumption
-from services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Waveform
-from shared.bus import Socket
-from shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
-from shared.errors import UserError
-from shared.keys import NOBODY, Peer
-from shared.logs import LOG
-from shared.metrics import give_back_memory
-from shared.phones.events import LipFrame, Phone, SpeechChange
-from shared.phones.final_time import FinalTime
-from shared.service import Service
-from shared.wire.audio import AudioChunk, EndOfAudio, Sound
-from shared.wire.control import SessionInput, StartSession
-from shared.wire.events import SpeechMessage, event_of, message_of
-from shared.wire.message import Message
-from shared.wire.session import Error, ErrorCode
-from shared.wire.speech import Acknowledge, EndOfPhones, Stalled
+from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.audio_order import AudioMessage, AudioOrder
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
+from kouxing.services.recognizer.link import SynthesizerLink
+from kouxing.services.recognizer.lip_source import LipsFromSound
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.recognizer import warm_up
+from kouxing.services.recognizer.resumption import WARM_UP_S, Resumption
+from kouxing.services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Waveform
+from kouxing.shared.bus import Socket
+from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.logs import LOG
+from kouxing.shared.metrics import give_back_memory
+from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange
+from kouxing.shared.phones.final_time import FinalTime
+from kouxing.shared.service import Service
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.control import SessionInput, StartSession
+from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Error, ErrorCode
+from kouxing.shared.wire.speech import Acknowledge, EndOfPhones, Stalled
 
 MAX_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 MAX_BACKLOG = 2000  # messages the synthesizer may owe acknowledgement for before audio waits

@@ -17,18 +17,18 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import (
+from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     PositionStream,
     ScoringTask,
     run_scoring_tasks,
 )
-from services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
-from services.recognizer.front_end.resample import Resampler
-from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
-from services.recognizer.lip_source import LipFrameStream
-from shared.phones.events import LipFrame
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
+from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector
+from kouxing.services.recognizer.lip_source import LipFrameStream
+from kouxing.shared.phones.events import LipFrame
 
 PRE_ROLL_S = 0.20  # sound before the detector's decision that counts as speech: weak consonants
 _FIRST_NEWEST_FRAME = 2  # the last one that the network's first position has seen

@@ -15,19 +15,26 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import (
+from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticModel,
     ScoringTask,
     run_scoring_tasks,
 )
-from services.recognizer.front_end.pcm import SLICE, progress_at, slices
-from services.recognizer.front_end.pitch import Pitch
-from services.recognizer.front_end.resample import Resampler
-from services.recognizer.lip_source import LipsFromSound, delay_for
-from services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
-from services.recognizer.speech_scores import frame_at
-from shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
-from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.services.recognizer.front_end.pcm import SLICE, progress_at, slices
+from kouxing.services.recognizer.front_end.pitch import Pitch
+from kouxing.services.recognizer.front_end.resample import Resampler
+from kouxing.services.recognizer.lip_source import LipsFromSound, delay_for
+from kouxing.services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
+from kouxing.services.recognizer.speech_scores import frame_at
+from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
+from kouxing.shared.phones.events import (
+    EndOfSound,
+    LipFrame,
+    Phone,
+    Progress,
+    SoundEvent,
+    SpeechChange,
+)
 
 MAX_JITTER = MEDIA_RATE_HZ // 10  # media time that jumps further ahead leaves a gap; samples
 SILENT_DB = -120.0  # the level after the last sample

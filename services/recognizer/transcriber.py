@@ -12,8 +12,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError, install_command
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError, install_command
 
 
 class Transcriber(Protocol):

@@ -29,8 +29,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.face.lip_models import MAX_VOICE_BYTES
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import MAX_VOICE_BYTES
 
 Floats = NDArray[np.float32]
 

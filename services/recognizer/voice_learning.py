@@ -30,13 +30,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_positions import POSITION_S, lip_positions
-from services.recognizer.lip_source import delay_for
-from services.recognizer.lip_tracks import measures_of, values_at
-from services.recognizer.lips import LIP_FAPS, LipPredictor
-from services.recognizer.voice import Voice
-from shared.errors import UserError
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_positions import POSITION_S, lip_positions
+from kouxing.services.recognizer.lip_source import delay_for
+from kouxing.services.recognizer.lip_tracks import measures_of, values_at
+from kouxing.services.recognizer.lips import LIP_FAPS, LipPredictor
+from kouxing.services.recognizer.voice import Voice
+from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import aiohttp
 
-from services.senders import live_link, osc, vmc
-from services.senders.face import Face
-from services.senders.target import Target
-from services.senders.vtube_studio import Denied, Dialogue
-from shared.errors import UserError
-from shared.keys import key_folder
-from shared.logs import LOG
+from kouxing.services.senders import live_link, osc, vmc
+from kouxing.services.senders.face import Face
+from kouxing.services.senders.target import Target
+from kouxing.services.senders.vtube_studio import Denied, Dialogue
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import key_folder
+from kouxing.shared.logs import LOG
 
 RETRY_S = 1.0
 ANSWER_S = 5.0  # for a connection, and for a frame to leave

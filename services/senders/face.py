@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
-from shared.face.shapes import SHAPE_SETS
+from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.shapes import SHAPE_SETS
 
 _HEAD = [FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw", "roll")]
 _EYES = [

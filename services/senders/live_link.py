@@ -15,8 +15,8 @@ import math
 import struct
 import uuid
 
-from services.senders.face import Face
-from services.senders.target import Target
+from kouxing.services.senders.face import Face
+from kouxing.services.senders.target import Target
 
 VERSION = 6
 FRAME_RATE_HZ = 50  # of the time code

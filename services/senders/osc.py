@@ -21,8 +21,8 @@ from functools import lru_cache
 
 from pythonosc.osc_message_builder import build_msg
 
-from services.senders.face import Face
-from services.senders.target import Target
+from kouxing.services.senders.face import Face
+from kouxing.services.senders.target import Target
 
 MAX_BYTES = 1500 - 28  # of a datagram: an Ethernet frame without the headers of IP and UDP
 _HEADER = b"#bundle\0" + struct.pack(">Q", 1)  # to be shown at once

@@ -13,13 +13,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from services.senders.connections import Connection, connect
-from services.senders.face import Face
-from services.senders.playout import Playout
-from services.senders.target import Target
-from shared.errors import UserError
-from shared.face.faps import NUM_FAPS
-from shared.face.idle_motion import REST_RATE_HZ, RestingFace
+from kouxing.services.senders.connections import Connection, connect
+from kouxing.services.senders.face import Face
+from kouxing.services.senders.playout import Playout
+from kouxing.services.senders.target import Target
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.idle_motion import REST_RATE_HZ, RestingFace
 
 MAX_SENDERS = 16
 STALL_S = 1.0  # a face goes to rest after so long without frames

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from urllib.parse import parse_qsl, urlsplit
 
-from shared.endpoints import is_loopback
-from shared.errors import UserError
+from kouxing.shared.endpoints import is_loopback
+from kouxing.shared.errors import UserError
 
 LOOPBACK = "127.0.0.1"
 MAX_DELAY_MS = 10_000.0
@@ -54,7 +54,7 @@ class Target:
     is_mouth_only: bool = False
     """Whether eyes, brows and head are left to another program."""
     shapes: str = "arkit"
-    """Set of shapes, of ``shared.face.shapes.SHAPE_SETS``."""
+    """Set of shapes, of ``kouxing.shared.face.shapes.SHAPE_SETS``."""
     has_head: bool = False
     """Whether the head's turn is sent as a bone's."""
     name: str = "kouxing"

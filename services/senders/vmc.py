@@ -17,9 +17,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from services.senders.face import Angles, Face
-from services.senders.osc import bundles, message
-from services.senders.target import Target
+from kouxing.services.senders.face import Angles, Face
+from kouxing.services.senders.osc import bundles, message
+from kouxing.services.senders.target import Target
 
 _VRM_0 = {
     "aa": "A",

@@ -13,8 +13,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from services.senders.face import Face
-from shared.errors import UserError
+from kouxing.services.senders.face import Face
+from kouxing.shared.errors import UserError
 
 PLUGIN = {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
 _ACCESS_OFF, _UNAUTHENTICATED, _DENIED, _ASKING, _IN_USE = 1, 8, 50, 51, 454  # numbers of errors

@@ -6,8 +6,8 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from shared.config import BoundEndpoint, ServiceConfig
-from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.config import BoundEndpoint, ServiceConfig
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 
 # Default delay of each lip model.
 DELAYS_MS: dict[str, float] = {

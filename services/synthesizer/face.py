@@ -21,18 +21,18 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.trajectory import Motion, Transition
-from services.synthesizer.lips.lip_model import LipModel, MouthFrame
-from services.synthesizer.modifiers.amplitude import Amplitude
-from services.synthesizer.modifiers.expression import Expression, mix
-from services.synthesizer.modifiers.expressiveness import JAW, Expressiveness
-from services.synthesizer.modifiers.life import Life
-from services.synthesizer.modifiers.modifier import Modifier, Moment
-from services.synthesizer.phone_numbers import PhoneNumbers
-from shared.clock import MAX_GAP_S
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import Motion, Transition
+from kouxing.services.synthesizer.lips.lip_model import LipModel, MouthFrame
+from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
+from kouxing.services.synthesizer.modifiers.expression import Expression, mix
+from kouxing.services.synthesizer.modifiers.expressiveness import JAW, Expressiveness
+from kouxing.services.synthesizer.modifiers.life import Life
+from kouxing.services.synthesizer.modifiers.modifier import Modifier, Moment
+from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
+from kouxing.shared.clock import MAX_GAP_S
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, SpeechChange
 
 Faps: TypeAlias = NDArray[np.float64]  # (68,)
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)

@@ -12,13 +12,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.blending import blend
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes, VisemeArticulation
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
-from services.synthesizer.modifiers.amplitude import Amplitude
-from services.synthesizer.modifiers.modifier import Moment
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import Phone
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
+    DynamicVisemes,
+    VisemeArticulation,
+)
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
+from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
+from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import Phone
 
 _BLOCK_S = 2.0
 # Further away a viseme weighs less than a face can show, whatever its parameters.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from shared.phones.events import Phone
+from kouxing.shared.phones.events import Phone
 
 _SAME_S = 0.05  # between the onsets of a phone that two recognizers tell
 

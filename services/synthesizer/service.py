@@ -21,26 +21,26 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import REST_S, Face, Frame
-from services.synthesizer.lips.load import load_lip_model
-from shared.bus import PHONES, Socket
-from shared.clock import to_samples, to_seconds
-from shared.endpoints import key_of
-from shared.face.faps import MASK_BYTES, NUM_FAPS
-from shared.face.shapes import SHAPE_SETS
-from shared.keys import Peer
-from shared.logs import LOG
-from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent
-from shared.phones.final_time import FinalTime
-from shared.phones.inventory import load_inventory
-from shared.reliable import ReliableReceiver
-from shared.service import Service
-from shared.wire.control import SessionInput, StartSession
-from shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
-from shared.wire.face import EndOfFaps, FapFrame, Shapes
-from shared.wire.session import AddShapes, ChooseExpressiveness, Express
-from shared.wire.speech import Acknowledge, ResumeFace, Stalled
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face import REST_S, Face, Frame
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.bus import PHONES, Socket
+from kouxing.shared.clock import to_samples, to_seconds
+from kouxing.shared.endpoints import key_of
+from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
+from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.keys import Peer
+from kouxing.shared.logs import LOG
+from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent
+from kouxing.shared.phones.final_time import FinalTime
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.reliable import ReliableReceiver
+from kouxing.shared.service import Service
+from kouxing.shared.wire.control import SessionInput, StartSession
+from kouxing.shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.session import AddShapes, ChooseExpressiveness, Express
+from kouxing.shared.wire.speech import Acknowledge, ResumeFace, Stalled
 
 LOST_S = 20.0  # without a word from a recognizer, which would tell that its client is silent
 AGAIN_S = 3.0  # for which followers of a session that has moved here may still be on their way

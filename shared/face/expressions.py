@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import StrEnum
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS = 0.5, 2.0  # 1: as the lip model moves the mouth
 MAX_HOLD_S = 3600.0

@@ -22,8 +22,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.face.faps import NUM_FAPS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import NUM_FAPS
 
 _VERSION = "2.1"
 MAX_BYTES = 256 * 1024 * 1024  # hours

@@ -29,7 +29,7 @@ class Fap:
 
 
 def _read_table() -> tuple[Fap, ...]:
-    text = resources.files("shared.face").joinpath("faps.tsv").read_text(encoding="utf-8")
+    text = resources.files("kouxing.shared.face").joinpath("faps.tsv").read_text(encoding="utf-8")
     return tuple(
         Fap(
             number=int(row["fap"]),

@@ -17,8 +17,8 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.face.faps import NUM_FAPS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import NUM_FAPS
 
 Float32 = NDArray[np.float32]
 
@@ -27,7 +27,7 @@ FULL = 63  # highest viseme_blend and expression_intensity
 
 def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
     """Read a table beside this module: its rows, and their columns ``fapN`` as FAPs (rows, 68)."""
-    text = resources.files("shared.face").joinpath(name).read_text("utf-8")
+    text = resources.files("kouxing.shared.face").joinpath(name).read_text("utf-8")
     rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
     values = np.zeros((len(rows), NUM_FAPS), np.float32)
     for row, target in zip(rows, values, strict=True):

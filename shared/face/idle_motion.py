@@ -19,7 +19,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 
 _DEGREE = math.pi / 180.0 / 1e-5  # in the FAPs' angle unit, 1e-5 rad
 

@@ -41,9 +41,9 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from shared.face.high_level import VISEMES, fap_table
-from shared.face.shape_names import ShapeSetName
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.high_level import VISEMES, fap_table
+from kouxing.shared.face.shape_names import ShapeSetName
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 
 QUIET_S = 0.5  # speech that begins is told sooner after its first phone's onset
 

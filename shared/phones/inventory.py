@@ -35,10 +35,10 @@ from functools import cached_property, lru_cache
 from importlib import resources
 from importlib.metadata import entry_points
 
-from shared.errors import UserError
-from shared.phones.transcript import SpokenSyllable, Transcript
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
-BUILT_IN = {"mandarin": "shared.phones.mandarin"}
+BUILT_IN = {"mandarin": "kouxing.shared.phones.mandarin"}
 DEFAULT_LANGUAGE = "mandarin"
 ENTRY_POINTS = "kouxing.languages"
 KINDS = ("initial", "vowel", "silence")

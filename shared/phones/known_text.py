@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory, Syllable
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
 Characters = Sequence[tuple[str, Syllable]]  # what is written, and its phones
 GAP = 0.7  # cost of a syllable that was missed, or one too many; a wrong one costs 1

@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import TypeAlias
 
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.transcript import TimedSyllable
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.transcript import TimedSyllable
 
 _COLUMNS = ("index", "phone", "onset_s", "duration_s", "confidence")
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
-from shared.phones.known_text import Characters, place_in_text
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.known_text import Characters, place_in_text
 
 MAX_PHONES = 40  # that may still be revised; older ones are taken for granted
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from shared.wire.message import MAX_AUDIO_BYTES, Message, Name
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message, Name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

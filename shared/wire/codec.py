@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import msgspec
 
-from shared.wire.kinds import MESSAGES
-from shared.wire.message import DOCUMENT, VERSION, Message, Version
+from kouxing.shared.wire.kinds import MESSAGES
+from kouxing.shared.wire.message import DOCUMENT, VERSION, Message, Version
 
 MAX_TOPIC_BYTES = 96
 

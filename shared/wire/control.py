@@ -8,8 +8,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from shared.keys import MAX_KEYS, MAX_ROLES
-from shared.wire.message import (
+from kouxing.shared.keys import MAX_KEYS, MAX_ROLES
+from kouxing.shared.wire.message import (
     Address,
     ChosenLips,
     Count,

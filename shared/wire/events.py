@@ -6,10 +6,18 @@ from typing import TypeAlias, get_args
 
 import numpy as np
 
-from shared.clock import duration_to_samples, to_samples, to_seconds
-from shared.phones import events
-from shared.wire.message import Message
-from shared.wire.speech import EndOfPhones, Lips, Phone, Progress, ResumeFace, Speech, Stalled
+from kouxing.shared.clock import duration_to_samples, to_samples, to_seconds
+from kouxing.shared.phones import events
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import (
+    EndOfPhones,
+    Lips,
+    Phone,
+    Progress,
+    ResumeFace,
+    Speech,
+    Stalled,
+)
 
 SpeechMessage: TypeAlias = Phone | Lips | Speech | Progress | EndOfPhones
 LinkMessage: TypeAlias = SpeechMessage | Stalled | ResumeFace  # from recognizer to synthesizer

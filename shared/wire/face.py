@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from shared.wire.message import FapMask, FapValues, Message, Name, ShapeWeights
+from kouxing.shared.wire.message import FapMask, FapValues, Message, Name, ShapeWeights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from shared.wire.audio import AudioChunk, EndOfAudio, Sound
-from shared.wire.control import (
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.control import (
     AllowedKeys,
     Event,
     FlushNow,
@@ -16,9 +16,9 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.face import EndOfFaps, FapFrame, Shapes
-from shared.wire.message import Message
-from shared.wire.session import (
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
     AddShapes,
     ChooseExpressiveness,
     ChooseLips,
@@ -32,7 +32,7 @@ from shared.wire.session import (
     SessionMoved,
     SessionOpened,
 )
-from shared.wire.speech import (
+from kouxing.shared.wire.speech import (
     Acknowledge,
     EndOfPhones,
     Lips,

@@ -14,15 +14,15 @@ from typing import Annotated, ClassVar
 
 from msgspec import Meta
 
-from shared.face.expressions import (
+from kouxing.shared.face.expressions import (
     MAX_EXPRESSIVENESS,
     MAX_HOLD_S,
     MIN_EXPRESSIVENESS,
     ExpressionName,
 )
-from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
-from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
-from shared.face.shape_names import MAX_SHAPES, ShapeSetName
+from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from kouxing.shared.face.shape_names import MAX_SHAPES, ShapeSetName
 
 VERSION = 2
 DOCUMENT = "proto/PROTOCOL.md"

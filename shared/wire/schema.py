@@ -1,6 +1,6 @@
 """The JSON schema of every message, made from the message classes.
 
-``python -m shared.wire.schema > proto/schema.json`` rewrites it.
+``python -m kouxing.shared.wire.schema > proto/schema.json`` rewrites it.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import sys
 
 import msgspec
 
-from shared.wire.kinds import MESSAGES
-from shared.wire.message import VERSION
+from kouxing.shared.wire.kinds import MESSAGES
+from kouxing.shared.wire.message import VERSION
 
 
 def schema() -> dict[str, object]:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from shared.face.expressions import DEFAULT_HOLD_S
-from shared.wire.message import (
+from kouxing.shared.face.expressions import DEFAULT_HOLD_S
+from kouxing.shared.wire.message import (
     ChosenLips,
     Count,
     Encoding,

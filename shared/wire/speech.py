@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from shared.wire.message import (
+from kouxing.shared.wire.message import (
     Count,
     FapValues,
     FapValuesOrNone,

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import app
-from evaluation.system import control_scale
+from kouxing.evaluation.commands import app
+from kouxing.evaluation.system import control_scale
 
 pytestmark = pytest.mark.bench
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import app
-from evaluation.system.faults import Timing
+from kouxing.evaluation.commands import app
+from kouxing.evaluation.system.faults import Timing
 from tests.system import DEMO
 
 pytestmark = pytest.mark.bench
@@ -20,8 +20,10 @@ def test_a_crash_loses_nothing_and_the_command_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, service: str
 ) -> None:
     timing = Timing(length_s=6.0, fault_at_s=3.2, also_at_s=())
-    monkeypatch.setattr("evaluation.system.faults.TIMING", timing)
-    monkeypatch.setattr("evaluation.system.live.END_LIMIT_S", 60.0)  # a busy machine starts slowly
+    monkeypatch.setattr("kouxing.evaluation.system.faults.TIMING", timing)
+    monkeypatch.setattr(
+        "kouxing.evaluation.system.live.END_LIMIT_S", 60.0
+    )  # a busy machine starts slowly
     fault, figures, logs = f"{service} killed", tmp_path / "faults.json", tmp_path / "logs"
     arguments = [str(DEMO / "hello-female.wav"), "--fault", fault]
     result = CliRunner().invoke(

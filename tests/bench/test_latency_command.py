@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import bench_app
+from kouxing.evaluation.commands import bench_app
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.bench
@@ -17,10 +17,10 @@ pytestmark = pytest.mark.bench
 def test_it_prints_a_table_and_writes_the_same_figures(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evaluation.system.rendering.NUM_IMAGES", 10)
-    monkeypatch.setattr("evaluation.system.sessions.NUM_SESSIONS", (1, 2))
-    monkeypatch.setattr("evaluation.system.page.SETTLE_S", 0.5)
-    monkeypatch.setattr("evaluation.system.page.MEASURE_S", 2.0)
+    monkeypatch.setattr("kouxing.evaluation.system.rendering.NUM_IMAGES", 10)
+    monkeypatch.setattr("kouxing.evaluation.system.sessions.NUM_SESSIONS", (1, 2))
+    monkeypatch.setattr("kouxing.evaluation.system.page.SETTLE_S", 0.5)
+    monkeypatch.setattr("kouxing.evaluation.system.page.MEASURE_S", 2.0)
     figures = tmp_path / "latency.json"
     arguments = [str(VOWELS_FILE), "--repeats", "1", "--json", str(figures)]
     result = CliRunner().invoke(bench_app, arguments)

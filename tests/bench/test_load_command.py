@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import bench_app
+from kouxing.evaluation.commands import bench_app
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.bench
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.bench
 def test_it_prints_a_table_writes_the_same_figures_and_draws_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evaluation.system.load.SETTLE_S", 1.0)
+    monkeypatch.setattr("kouxing.evaluation.system.load.SETTLE_S", 1.0)
     figures, picture = tmp_path / "load.json", tmp_path / "load.png"
     arguments = ["load", str(VOWELS_FILE), "--sessions", "3", "--seconds", "1"]
     result = CliRunner().invoke(

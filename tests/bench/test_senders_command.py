@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import app
-from evaluation.system.sending import TARGETS, VIEWER
+from kouxing.evaluation.commands import app
+from kouxing.evaluation.system.sending import TARGETS, VIEWER
 from tests.system import VOWELS_FILE
 
 pytestmark = [pytest.mark.bench, pytest.mark.alone]

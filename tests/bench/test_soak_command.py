@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import app
-from evaluation.system import soak
+from kouxing.evaluation.commands import app
+from kouxing.evaluation.system import soak
 from tests.system import DEMO
 
 pytestmark = [pytest.mark.bench, pytest.mark.slow, pytest.mark.timeout(400)]

@@ -11,19 +11,25 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from services.control.registry import CLIENT_NEEDS
-from services.control.service import Request
-from services.synthesizer.service import LOW_LEVEL_FAPS
-from shared.face.faps import FAPS, MOUTH_FAPS
-from shared.face.shapes import SHAPE_SETS
-from shared.phones.inventory import load_inventory
-from shared.wire.audio import AudioChunk, EndOfAudio
-from shared.wire.control import AllowedKey, EventName, ServiceState, SessionInput, SessionState
-from shared.wire.events import LINK_MESSAGES
-from shared.wire.kinds import MESSAGES, PUBLISHER_OF
-from shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
-from shared.wire.schema import schema
-from shared.wire.session import ErrorCode, SessionMoved, SessionOpened
+from kouxing.services.control.registry import CLIENT_NEEDS
+from kouxing.services.control.service import Request
+from kouxing.services.synthesizer.service import LOW_LEVEL_FAPS
+from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
+from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.control import (
+    AllowedKey,
+    EventName,
+    ServiceState,
+    SessionInput,
+    SessionState,
+)
+from kouxing.shared.wire.events import LINK_MESSAGES
+from kouxing.shared.wire.kinds import MESSAGES, PUBLISHER_OF
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
+from kouxing.shared.wire.schema import schema
+from kouxing.shared.wire.session import ErrorCode, SessionMoved, SessionOpened
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.contract

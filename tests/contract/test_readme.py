@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from services.cli.main import app
+from kouxing.services.cli.main import app
 
 ROOT = Path(__file__).parents[2]
 ENGLISH, CHINESE = (

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared.client import Client, Session
-from shared.wire.face import FapFrame
+from kouxing.shared.client import Client, Session
+from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.audio_file import read_audio
-from shared.bus import Received
-from shared.client import Client, Session, Subscription
-from shared.wire.audio import Sound
-from shared.wire.face import EndOfFaps, FapFrame, Shapes
-from shared.wire.message import Message
-from shared.wire.speech import Lips, Phone, Speech
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.bus import Received
+from kouxing.shared.client import Client, Session, Subscription
+from kouxing.shared.wire.audio import Sound
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import Lips, Phone, Speech
 
 KINDS: tuple[type[Message], ...] = (FapFrame, EndOfFaps, Phone, Lips, Speech, Sound)
 

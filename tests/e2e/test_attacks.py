@@ -15,12 +15,12 @@ from typing import Self
 import numpy as np
 import pytest
 
-from evaluation.system import attackers
-from evaluation.system.memory import Memory
-from services.synthesizer.config import SynthesizerConfig
-from shared.client import Client, Session
-from shared.connections import MAX_CONNECTIONS
-from shared.wire.face import FapFrame
+from kouxing.evaluation.system import attackers
+from kouxing.evaluation.system.memory import Memory
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.client import Client, Session
+from kouxing.shared.connections import MAX_CONNECTIONS
+from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import stream
 from tests.raw_bytes import pour
 from tests.system import System

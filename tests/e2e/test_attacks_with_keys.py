@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from evaluation.system import attackers
-from evaluation.system.attacks import wait_until_let_in
-from evaluation.system.memory import Memory
-from shared.client import Client, Session
+from kouxing.evaluation.system import attackers
+from kouxing.evaluation.system.attacks import wait_until_let_in
+from kouxing.evaluation.system.memory import Memory
+from kouxing.shared.client import Client, Session
 from tests.raw_bytes import pour
 from tests.system import System
 

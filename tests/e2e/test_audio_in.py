@@ -25,10 +25,10 @@ from aiortc import RTCConfiguration, RTCPeerConnection, RTCSessionDescription
 from aiortc.contrib.media import MediaPlayer
 from aiortc.rtcdtlstransport import RTCDtlsTransport
 
-from evaluation.system.chromium import wait_until
-from services.gateway.wire import FAP_TYPE, SHAPES_TYPE
-from shared.face.shapes import ARKIT
-from shared.phones.inventory import load_inventory
+from kouxing.evaluation.system.chromium import wait_until
+from kouxing.services.gateway.wire import FAP_TYPE, SHAPES_TYPE
+from kouxing.shared.face.shapes import ARKIT
+from kouxing.shared.phones.inventory import load_inventory
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file, stream
 from tests.raw_bytes import pour

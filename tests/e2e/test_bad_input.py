@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 import zmq
 
-from evaluation.system.attackers import connect
-from shared.bus import Bus, Socket
-from shared.client import Client, Refused, Session
-from shared.keys import own_key, user_key
-from shared.wire.audio import AudioChunk, EndOfAudio, Sound
-from shared.wire.control import Heartbeat, SessionInput
-from shared.wire.face import FapFrame
-from shared.wire.message import Message
-from shared.wire.session import Error, OpenSession
-from shared.wire.speech import Acknowledge, Phone, Progress
+from kouxing.evaluation.system.attackers import connect
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.client import Client, Refused, Session
+from kouxing.shared.keys import own_key, user_key
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.control import Heartbeat, SessionInput
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Error, OpenSession
+from kouxing.shared.wire.speech import Acknowledge, Phone, Progress
 from tests.e2e.following import stream
 from tests.system import System
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from shared.client import Client
-from shared.wire.codec import encode
-from shared.wire.control import Heartbeat
+from kouxing.shared.client import Client
+from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.control import Heartbeat
 from tests.browser import Browser
 from tests.system import DEMO, System
 

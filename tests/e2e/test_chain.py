@@ -10,10 +10,10 @@ import av
 import numpy as np
 import pytest
 
-from services.synthesizer.config import SynthesizerConfig
-from shared.client import Client, Subscription
-from shared.phones.inventory import load_inventory
-from shared.wire.face import FapFrame
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.client import Client, Subscription
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.system import DEMO, VOWELS_FILE, System
 

@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evaluation.system import sync
-from shared.client import Client
-from shared.face.shapes import SHAPE_SETS
+from kouxing.evaluation.system import sync
+from kouxing.shared.client import Client
+from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.browser import Browser
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from ray.cluster_utils import Cluster
 
-from shared.client import Client
-from shared.wire.control import StatusReport
+from kouxing.shared.client import Client
+from kouxing.shared.wire.control import StatusReport
 from tests.e2e.following import samples_of_file, stream
 from tests.system import VOWELS_FILE, System, kouxing
 

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import soundfile
 
-from shared.client import Client, Refused, Subscription
-from shared.face.fap_file import read_fap
-from shared.face.faps import FAP_NUMBER
-from shared.face.shapes import ARKIT
-from shared.wire.face import FapFrame
+from kouxing.shared.client import Client, Refused, Subscription
+from kouxing.shared.face.fap_file import read_fap
+from kouxing.shared.face.faps import FAP_NUMBER
+from kouxing.shared.face.shapes import ARKIT
+from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file, stream_into
 from tests.system import ROOT, VOWELS_FILE, System, free_port, kouxing
 
@@ -137,7 +137,7 @@ def test_a_driver_that_was_silent_for_a_while_still_writes_its_video(tmp_path: P
     services = ("control", "recognizer", "synthesizer", "driver")
     with System(services, tmp_path, settings={"KOUXING_CONTROL_LOST_AFTER_S": "2"}) as own:
         driver = own.processes["driver"]
-        command = [sys.executable, "-m", "services", "speak", str(SENTENCE), "--record", "--fast"]
+        command = [sys.executable, "-m", "kouxing", "speak", str(SENTENCE), "--record", "--fast"]
         speaker = subprocess.Popen(
             command, env=own.environment, cwd=ROOT, stderr=subprocess.PIPE, text=True
         )
@@ -218,7 +218,7 @@ def test_render_into_a_missing_folder_is_named(tmp_path: Path) -> None:
 def listening(control: str, *arguments: object, says: str) -> subprocess.Popen[str]:
     """Start ``kouxing listen`` and return once it says what is expected first."""
     listener = subprocess.Popen(
-        [sys.executable, "-m", "services", "listen", *map(str, arguments)],
+        [sys.executable, "-m", "kouxing", "listen", *map(str, arguments)],
         env={**os.environ, "KOUXING_CONTROL": control.partition(" ")[0]},
         cwd=ROOT,
         stdout=subprocess.PIPE,
@@ -356,7 +356,7 @@ def test_lines_reach_a_log_file_at_once() -> None:
     """Killed in the middle, a command has written all the lines it printed."""
     code = """
 import os, signal
-from services.cli import main as command_line
+from kouxing.services.cli import main as command_line
 command_line.app = lambda **_: (print("step 1"), os.kill(os.getpid(), signal.SIGKILL))
 command_line.main()
 """

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import yaml
 
-from evaluation.system.network import Link, Network
-from shared.client import Client
-from shared.errors import UserError
-from shared.keys import control_endpoint, read_key
+from kouxing.evaluation.system.network import Link, Network
+from kouxing.shared.client import Client
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import control_endpoint, read_key
 from tests.containers import READ, USER, Containers
 from tests.system import ROOT, VOWELS_FILE
 

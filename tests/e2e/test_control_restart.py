@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.client import Client
-from shared.face.shapes import ARKIT, VRM
-from shared.wire.face import Shapes
+from kouxing.shared.client import Client
+from kouxing.shared.face.shapes import ARKIT, VRM
+from kouxing.shared.wire.face import Shapes
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send
 from tests.system import DEMO, System
 

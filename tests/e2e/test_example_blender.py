@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from services.driver.head.glb_export import export_glb
-from shared.face.shapes import ARKIT
+from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.shared.face.shapes import ARKIT
 from tests import heads
 from tests.system import ROOT, free_port
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.client import Client
+from kouxing.shared.client import Client
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream_into
 from tests.scripted_system import Gateway
 from tests.system import ROOT, VOWELS_FILE, System, free_port

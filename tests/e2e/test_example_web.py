@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.system.chromium import wait_until
-from services.driver.head.glb_export import export_glb
-from shared.client import Client
-from shared.face.shapes import ARKIT
+from kouxing.evaluation.system.chromium import wait_until
+from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.shared.client import Client
+from kouxing.shared.face.shapes import ARKIT
 from tests import heads
 from tests.browser import Browser
 from tests.scripted_system import Gateway, System

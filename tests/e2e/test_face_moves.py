@@ -12,9 +12,9 @@ import pytest
 import zmq
 from numpy.typing import NDArray
 
-from evaluation.system.attackers import connect
-from shared.client import Client
-from shared.keys import user_key
+from kouxing.evaluation.system.attackers import connect
+from kouxing.shared.client import Client
+from kouxing.shared.keys import user_key
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream
 from tests.system import DEMO, System
 

@@ -11,16 +11,16 @@ from typing import TypeVar
 
 import pytest
 
-from services.control.registry import MAX_SERVICES_OF_KEY
-from shared.bus import Bus, Socket
-from shared.client import Client, Refused, Session
-from shared.errors import UserError
-from shared.keys import add_guest, key_folder, own_key, revoke_guest, user_key
-from shared.wire.control import Event, Heartbeat, Recorded, SessionInput
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.message import Message
-from shared.wire.session import Error
-from shared.wire.speech import EndOfPhones, Phone, Progress, Speech
+from kouxing.services.control.registry import MAX_SERVICES_OF_KEY
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.client import Client, Refused, Session
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import add_guest, key_folder, own_key, revoke_guest, user_key
+from kouxing.shared.wire.control import Event, Heartbeat, Recorded, SessionInput
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Error
+from kouxing.shared.wire.speech import EndOfPhones, Phone, Progress, Speech
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System
 

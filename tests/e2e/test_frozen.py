@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from evaluation.system.faults import SPIN
-from evaluation.system.systems import LocalSystem
-from shared.client import Client
-from shared.wire.face import FapFrame
-from shared.wire.message import Message
-from shared.wire.speech import Phone
+from kouxing.evaluation.system.faults import SPIN
+from kouxing.evaluation.system.systems import LocalSystem
+from kouxing.shared.client import Client
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import Phone
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream
 from tests.system import ANY_LOAD, DEMO, System
 

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import zmq
 
-from evaluation.system.attackers import connect
-from shared.keys import Key, key_folder, own_key, user_key
+from kouxing.evaluation.system.attackers import connect
+from kouxing.shared.keys import Key, key_folder, own_key, user_key
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System

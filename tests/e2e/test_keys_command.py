@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.kinds import KINDS
-from shared.keys import key_folder, read_guests
+from kouxing.services.kinds import KINDS
+from kouxing.shared.keys import key_folder, read_guests
 from tests.e2e.following import stream
 from tests.system import System, kouxing, own_addresses
 

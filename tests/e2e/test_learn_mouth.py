@@ -16,12 +16,12 @@ import pytest
 import soundfile
 from PIL import Image
 
-from corpora.face_landmarks import LANDMARKS
-from corpora.landmark_file import landmark_file
-from evaluation.system.chromium import wait_until
-from services.driver.head.head import neutral_faps
-from services.driver.render.renderer import Renderer
-from shared.client import Client
+from kouxing.corpora.face_landmarks import LANDMARKS
+from kouxing.corpora.landmark_file import landmark_file
+from kouxing.evaluation.system.chromium import wait_until
+from kouxing.services.driver.head.head import neutral_faps
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.shared.client import Client
 from tests import heads
 from tests.browser import Browser
 from tests.scripted_system import Gateway, System

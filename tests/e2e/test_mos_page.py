@@ -16,11 +16,11 @@ from urllib.parse import urlsplit
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.mos.commands import app
-from evaluation.mos.order import places_of_judge
-from evaluation.mos.store import Store, read_answers
-from evaluation.mos.study import load_study, new_study
-from evaluation.system.chromium import Chromium
+from kouxing.evaluation.mos.commands import app
+from kouxing.evaluation.mos.order import places_of_judge
+from kouxing.evaluation.mos.store import Store, read_answers
+from kouxing.evaluation.mos.study import load_study, new_study
+from kouxing.evaluation.system.chromium import Chromium
 from tests.system import ROOT, free_port
 
 pytestmark = pytest.mark.e2e
@@ -39,7 +39,7 @@ class Served:
         self.start()
 
     def start(self) -> None:
-        code = "from evaluation.mos.commands import app; app()"
+        code = "from kouxing.evaluation.mos.commands import app; app()"
         command = [sys.executable, "-c", code, "serve", str(self.folder), "--port", str(self.port)]
         self._process = subprocess.Popen(
             [*command, *self._options],

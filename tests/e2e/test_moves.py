@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.client import Client
-from shared.wire.speech import Phone, Speech
+from kouxing.shared.client import Client
+from kouxing.shared.wire.speech import Phone, Speech
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream
 from tests.system import DEMO, System
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.system.live import Seen, speak, speak_undisturbed
-from evaluation.system.network import Link, Network
-from evaluation.system.systems import ON_HOSTS, SPARE, Hosts, HostsSystem
-from shared.client import Client
-from shared.errors import UserError
-from shared.keys import CLIENT
+from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
+from kouxing.evaluation.system.network import Link, Network
+from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, Hosts, HostsSystem
+from kouxing.shared.client import Client
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import CLIENT
 from tests.e2e.following import samples_of_file
 from tests.forwarders import Forwarders
 from tests.system import DEMO

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
-from services.live_chain import LiveChain
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.lip_source import delay_for
-from services.recognizer.service import RecognizerService
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.load import load_lip_model
-from shared.client import Client, Refused
-from shared.clock import to_samples
-from shared.face.faps import MOUTH_FAPS
-from shared.face.lip_models import LipModelName
-from shared.phones.events import LipFrame, Phone
-from shared.wire.events import message_of
-from shared.wire.speech import Lips
+from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.lip_source import delay_for
+from kouxing.services.recognizer.service import RecognizerService
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.client import Client, Refused
+from kouxing.shared.clock import to_samples
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import LipFrame, Phone
+from kouxing.shared.wire.events import message_of
+from kouxing.shared.wire.speech import Lips
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.lips import LIPS, clip_of
 from tests.made_up_lips import JAW, LoudLips

@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evaluation.system import sync
-from evaluation.system.chromium import wait_until
-from shared.client import Client, Session
-from shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.evaluation.system import sync
+from kouxing.evaluation.system.chromium import wait_until
+from kouxing.shared.client import Client, Session
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from tests.browser import SIZE_PX, Browser
 from tests.scripted_system import LOOK_AHEAD_MS, Gateway, System
 from tests.system import ROOT, free_port
@@ -78,7 +78,7 @@ def system() -> Iterator[System]:
 def gateway(system: System) -> Iterator[Gateway]:
     for name, file in HEADS.items():
         if not file.is_file():
-            command = [sys.executable, "-m", "services", "head", "export", "--head", name]
+            command = [sys.executable, "-m", "kouxing", "head", "export", "--head", name]
             subprocess.run([*command, str(file)], cwd=ROOT, check=True)
     gateway = Gateway(system.address, free_port())
     yield gateway

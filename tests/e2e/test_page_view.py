@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from evaluation.system.chromium import wait_until
+from kouxing.evaluation.system.chromium import wait_until
 from tests.browser import Browser
 from tests.scripted_system import Gateway, System
 from tests.system import DEMO, free_port

@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from services.cli.supervisor import Supervisor
-from shared.client import Client, Session
-from shared.errors import UserError
-from shared.wire.face import FapFrame
+from kouxing.services.cli.supervisor import Supervisor
+from kouxing.shared.client import Client, Session
+from kouxing.shared.errors import UserError
+from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO
 from tests.watched import Watched

@@ -16,24 +16,24 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.cli.heads import import_mesh
-from services.cli.offline import render
-from services.cli.run import head_environment
-from services.cli.terminal import CurveForm
-from services.driver.config import DriverConfig, Framing
-from services.driver.head.glb_export import export_glb
-from services.driver.head.head import Head
-from services.driver.video.film import frames_of
-from services.live_chain import LiveChain
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.lips import load_lips
-from services.recognizer.voice import Voice
-from services.synthesizer.lips.load import load_lip_model
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.face.fap_file import FapAnimation, read_fap, write_fap
-from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
-from shared.face.shapes import VRM
+from kouxing.services.cli.heads import import_mesh
+from kouxing.services.cli.offline import render
+from kouxing.services.cli.run import head_environment
+from kouxing.services.cli.terminal import CurveForm
+from kouxing.services.driver.config import DriverConfig, Framing
+from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.video.film import frames_of
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lips import load_lips
+from kouxing.services.recognizer.voice import Voice
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.face.shapes import VRM
 from tests.glb_writer import write_glb
 from tests.meshes import meshes
 from tests.system import ROOT, VOWELS_FILE, free_port, kouxing
@@ -239,7 +239,7 @@ def test_the_page_gets_the_head_that_is_chosen(tmp_path: Path) -> None:
     port = free_port()
     environment = {**os.environ, **chosen, "KOUXING_GATEWAY_PORT": str(port)}
     gateway = subprocess.Popen(
-        [sys.executable, "-m", "services", "gateway"],
+        [sys.executable, "-m", "kouxing", "gateway"],
         env=environment,
         cwd=ROOT,
         stderr=subprocess.DEVNULL,

@@ -34,7 +34,7 @@ def test_the_demo_leaves_a_video_and_ends(tmp_path: Path) -> None:
 
 def test_it_runs_until_it_is_interrupted_and_is_found_whatever_its_ports(tmp_path: Path) -> None:
     environment = {**os.environ, **ONE_THREAD, "XDG_RUNTIME_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "services", "run"]
+    command = [sys.executable, "-m", "kouxing", "run"]
     for setting in ("driver.view=none", f"driver.out={tmp_path}"):
         command += ["--set", setting]
     with contextlib.ExitStack() as stack:

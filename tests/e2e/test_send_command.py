@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from shared.client import Client
+from kouxing.shared.client import Client
 from tests.e2e.following import samples_of_file, stream_into
 from tests.receivers import read_osc
 from tests.system import ROOT, VOWELS_FILE, System, kouxing
@@ -25,7 +25,7 @@ def test_each_session_of_a_name_moves_the_avatar(system: System) -> None:
         program.settimeout(60)
         url = f"osc://127.0.0.1:{program.getsockname()[1]}"
         sender = subprocess.Popen(
-            [sys.executable, "-m", "services", "send", url, "--session", "sent"],
+            [sys.executable, "-m", "kouxing", "send", url, "--session", "sent"],
             env={**os.environ, "KOUXING_CONTROL": system.control.partition(" ")[0]},
             cwd=ROOT,
             stderr=subprocess.PIPE,

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from shared.client import Client
-from shared.wire.control import Event
-from shared.wire.session import Error
+from kouxing.shared.client import Client
+from kouxing.shared.wire.control import Event
+from kouxing.shared.wire.session import Error
 from tests.e2e.following import samples_of_file, stream
 from tests.system import VOWELS_FILE, System
 
@@ -47,7 +47,7 @@ def test_without_gestures_the_mouth_alone_moves(tuned: System) -> None:
 def test_a_session_without_audio_is_closed_and_its_client_told(
     tuned: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shared.client.MOVE_LIMIT_S", 0.2)
+    monkeypatch.setattr("kouxing.shared.client.MOVE_LIMIT_S", 0.2)
     with Client(tuned.control) as client:
         session = client.open_session(encoding="f32le")
         events = client.bus.connect_subscriber(session.opened.events)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared.client import Client
+from kouxing.shared.client import Client
 from tests.e2e.following import KINDS, Collected, samples_of_file, send
 from tests.system import DEMO, System
 

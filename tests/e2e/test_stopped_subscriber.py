@@ -16,8 +16,8 @@ from typing import IO
 import numpy as np
 import pytest
 
-from shared.client import Client, Session, Subscription
-from shared.wire.face import FapFrame
+from kouxing.shared.client import Client, Session, Subscription
+from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System
 
@@ -27,10 +27,10 @@ MAX_OLD = 10  # frames
 RATE_HZ = 50
 FOLLOWER = """
 import sys
-from shared.bus import Bus
-from shared.follower import PollingLoop, SessionFollower
-from shared.keys import user_key
-from shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.bus import Bus
+from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.keys import user_key
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
 
 session, endpoint, is_live = sys.argv[1:]
 with Bus(user_key()) as bus:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from services.driver.head.head import neutral_faps
-from services.driver.render.renderer import Renderer
+from kouxing.services.driver.head.head import neutral_faps
+from kouxing.services.driver.render.renderer import Renderer
 from tests import heads
 
 pytestmark = pytest.mark.golden

@@ -9,8 +9,8 @@ from pathlib import Path
 import msgpack
 import pytest
 
-from shared.wire.codec import BadMessage, decode, encode
-from shared.wire.message import VERSION, Message
+from kouxing.shared.wire.codec import BadMessage, decode, encode
+from kouxing.shared.wire.message import VERSION, Message
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.golden

@@ -27,15 +27,15 @@ import pytest
 from numpy.typing import NDArray
 from pythonosc.osc_bundle import OscBundle
 
-from services.gateway.microphone import SAMPLE, SAMPLE_TEXT
-from services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
-from shared.bus import AUDIO_QUEUE_LENGTH, Bus
-from shared.clock import now_ns
-from shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
-from shared.face.shapes import VRM
-from shared.keys import Peer
-from shared.wire.audio import AudioChunk, EndOfAudio, Sound
-from shared.wire.control import (
+from kouxing.services.gateway.microphone import SAMPLE, SAMPLE_TEXT
+from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
+from kouxing.shared.bus import AUDIO_QUEUE_LENGTH, Bus
+from kouxing.shared.clock import now_ns
+from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.face.shapes import VRM
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.control import (
     Heartbeat,
     HeartbeatSeen,
     ServiceState,
@@ -45,9 +45,9 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.message import Message
-from shared.wire.session import (
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
     ChooseExpressiveness,
     ChooseLips,
     CloseSession,
@@ -58,7 +58,7 @@ from shared.wire.session import (
     OpenSession,
     SessionOpened,
 )
-from shared.wire.speech import Phone, Speech
+from kouxing.shared.wire.speech import Phone, Speech
 from tests.system import DEMO, free_port
 
 pytestmark = pytest.mark.process
@@ -68,8 +68,8 @@ LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls so
 EPOCH = 3
 PATIENT = """
-from services.gateway import own_sessions
-from services.process import run_module
+from kouxing.services.gateway import own_sessions
+from kouxing.services.process import run_module
 own_sessions.LAST_FRAME_LIMIT_S = 600
 run_module("gateway")
 """
@@ -275,7 +275,7 @@ class GatewayProcess:
 
 def spawn(*program: str, **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, *(program or ("-m", "services.gateway"))],
+        [sys.executable, *(program or ("-m", "kouxing.services.gateway"))],
         cwd=ROOT,
         env={**os.environ, "KOUXING_INSECURE": "1", "KOUXING_GATEWAY_PORT": "0", **environment},
         stderr=subprocess.PIPE,

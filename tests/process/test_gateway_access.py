@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from evaluation.system.chromium import wait_until
+from kouxing.evaluation.system.chromium import wait_until
 from tests.scripted_system import Gateway
 from tests.system import ROOT, free_port
 
@@ -173,7 +173,7 @@ def test_the_made_certificate_is_for_its_owner_alone(gateway: Gateway, certifica
 
 def test_plain_http_to_a_proxy_needs_a_token_too_which_is_made_and_shown() -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "services.gateway"],
+        [sys.executable, "-m", "kouxing.services.gateway"],
         cwd=ROOT,
         env={
             **os.environ,
@@ -212,7 +212,7 @@ def test_plain_http_to_a_proxy_needs_a_token_too_which_is_made_and_shown() -> No
 )
 def test_what_is_wrong_is_named(settings: dict[str, str], named: str) -> None:
     result = subprocess.run(
-        [sys.executable, "-m", "services.gateway"],
+        [sys.executable, "-m", "kouxing.services.gateway"],
         cwd=ROOT,
         env={
             **os.environ,

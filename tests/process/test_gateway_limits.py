@@ -16,15 +16,15 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from aiohttp.typedefs import Handler
 
-from services.gateway import listener, microphone, viewers, vosk, whip
-from services.gateway.http import WebSockets
-from services.gateway.listener import Listener
-from services.gateway.microphone import Microphones
-from services.gateway.pace import Pace
-from services.gateway.viewers import Viewers
-from services.gateway.vosk import VoskClients
-from services.gateway.whip import WhipClients
-from shared.metrics import Metrics
+from kouxing.services.gateway import listener, microphone, viewers, vosk, whip
+from kouxing.services.gateway.http import WebSockets
+from kouxing.services.gateway.listener import Listener
+from kouxing.services.gateway.microphone import Microphones
+from kouxing.services.gateway.pace import Pace
+from kouxing.services.gateway.viewers import Viewers
+from kouxing.services.gateway.vosk import VoskClients
+from kouxing.services.gateway.whip import WhipClients
+from kouxing.shared.metrics import Metrics
 
 pytestmark = pytest.mark.process
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.service_process import LOOK_S, SILENT_S, WORKED_S, ServiceProcess
-from shared.client import Client
-from shared.keys import control_endpoint
+from kouxing.services.cli.service_process import LOOK_S, SILENT_S, WORKED_S, ServiceProcess
+from kouxing.shared.client import Client
+from kouxing.shared.keys import control_endpoint
 from tests.system import PATIENT, own_addresses
 
 pytestmark = pytest.mark.process

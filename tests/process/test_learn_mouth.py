@@ -16,9 +16,9 @@ import aiohttp
 import pytest
 from aiohttp import web
 
-from services.gateway import learn_mouth
-from services.gateway.http import MAX_UPLOAD_BYTES, make_application
-from services.gateway.learn_mouth import MouthLearner
+from kouxing.services.gateway import learn_mouth
+from kouxing.services.gateway.http import MAX_UPLOAD_BYTES, make_application
+from kouxing.services.gateway.learn_mouth import MouthLearner
 
 pytestmark = pytest.mark.process
 

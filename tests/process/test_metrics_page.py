@@ -15,10 +15,10 @@ import pytest
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
-from shared.audio_file import read_audio
-from shared.client import Client
-from shared.config import variable
-from shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.client import Client
+from kouxing.shared.config import variable
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from tests.raw_bytes import pour
 from tests.system import ROOT, VOWELS_FILE, System, free_port
 

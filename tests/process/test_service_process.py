@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from services.kinds import KINDS
-from shared.client import Client
-from shared.config import variable
+from kouxing.services.kinds import KINDS
+from kouxing.shared.client import Client
+from kouxing.shared.config import variable
 from tests.system import ROOT, System, own_addresses
 
 pytestmark = pytest.mark.process
@@ -48,7 +48,7 @@ def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
     addresses = own_addresses(["recognizer"])
     port = int(addresses[variable("recognizer", "audio")].rpartition(":")[2])
     process = subprocess.Popen(
-        [sys.executable, "-m", "services.recognizer"],
+        [sys.executable, "-m", "kouxing.services.recognizer"],
         env={**os.environ, **addresses},
         cwd=ROOT,
         stderr=subprocess.PIPE,
@@ -66,7 +66,7 @@ def test_ctrl_c_while_a_service_starts_is_no_error() -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "slow_import"), [("services.recognizer", "pydantic"), ("services", "typer")]
+    ("module", "slow_import"), [("kouxing.services.recognizer", "pydantic"), ("kouxing", "typer")]
 )
 def test_ctrl_c_amid_the_imports_is_no_error(tmp_path: Path, module: str, slow_import: str) -> None:
     ctrl_c = "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n"
@@ -85,7 +85,7 @@ def test_a_port_in_use_is_named(service: str, key: str) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         setting = {variable(service, key): f"tcp://127.0.0.1:{taken.getsockname()[1]}"}
-        result = ended(f"services.{service}", **setting)
+        result = ended(f"kouxing.services.{service}", **setting)
     assert result.returncode == 2
     assert f"{service}.{key}" in result.stderr
     assert "Traceback" not in result.stderr
@@ -93,7 +93,7 @@ def test_a_port_in_use_is_named(service: str, key: str) -> None:
 
 @pytest.mark.parametrize("service", KINDS)
 def test_a_wrong_setting_is_named_before_anything_is_opened(service: str) -> None:
-    result = ended(f"services.{service}", "--set", "log_level=loud")
+    result = ended(f"kouxing.services.{service}", "--set", "log_level=loud")
     assert result.returncode == 2
     assert f"{service}.log_level" in result.stderr
     assert "Traceback" not in result.stderr

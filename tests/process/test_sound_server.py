@@ -9,8 +9,8 @@ from collections.abc import Generator, Iterator
 import numpy as np
 import pytest
 
-from evaluation.system.chromium import wait_until
-from shared.sound_devices import monitor, sound_devices
+from kouxing.evaluation.system.chromium import wait_until
+from kouxing.shared.sound_devices import monitor, sound_devices
 
 pytestmark = pytest.mark.process
 RATE_HZ, TONE_HZ = 16_000, 1000

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from services.cli import supervisor as supervisors
-from services.cli.supervisor import Supervisor
-from shared.client import Client
-from shared.keys import control_endpoint
+from kouxing.services.cli import supervisor as supervisors
+from kouxing.services.cli.supervisor import Supervisor
+from kouxing.shared.client import Client
+from kouxing.shared.keys import control_endpoint
 from tests.system import own_addresses
 
 pytestmark = pytest.mark.process

@@ -7,8 +7,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, rule
 
-from shared.wire.codec import BadMessage, decode, encode
-from shared.wire.message import Message
+from kouxing.shared.wire.codec import BadMessage, decode, encode
+from kouxing.shared.wire.message import Message
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.property

@@ -5,13 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.clock import to_seconds
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent, SpeechChange
-from shared.wire.audio import AudioChunk
-from shared.wire.codec import BadMessage, decode, encode
-from shared.wire.events import event_of, message_of
-from shared.wire.message import VERSION, Message
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import (
+    EndOfSound,
+    LipFrame,
+    Phone,
+    Progress,
+    SoundEvent,
+    SpeechChange,
+)
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.codec import BadMessage, decode, encode
+from kouxing.shared.wire.events import event_of, message_of
+from kouxing.shared.wire.message import VERSION, Message
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.property

@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.lips import lips_for
-from services.recognizer.stream import SpeechStream, Waveform
-from services.synthesizer.config import DELAYS_MS
-from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.load import load_lip_model
-from shared.audio_file import read_audio
-from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.stream import SpeechStream, Waveform
+from kouxing.services.synthesizer.config import DELAYS_MS
+from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.system import DEMO
 
 pytestmark = pytest.mark.property

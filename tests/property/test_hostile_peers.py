@@ -15,19 +15,25 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from services.control.config import ControlConfig
-from services.control.service import ControlService
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.service import RecognizerService
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.service import SynthesizerService
-from shared.bus import Bus, Socket
-from shared.errors import UserError
-from shared.service import Service
-from shared.wire.codec import encode
-from shared.wire.control import Heartbeat, SessionInput, StartSession, StatusReport, StatusRequest
-from shared.wire.message import MAX_AUDIO_BYTES, Message
-from shared.wire.session import Done, Error, OpenSession
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.service import ControlService
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.service import RecognizerService
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.service import SynthesizerService
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.errors import UserError
+from kouxing.shared.service import Service
+from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.control import (
+    Heartbeat,
+    SessionInput,
+    StartSession,
+    StatusReport,
+    StatusRequest,
+)
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
+from kouxing.shared.wire.session import Done, Error, OpenSession
 from tests.samples import SAMPLES
 from tests.system import free_port
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from evaluation.lips.contour_shapes import check_shapes
-from services.synthesizer.lips.ferguson.contour import contour
-from services.synthesizer.lips.ferguson.motion import KeyFrames
+from kouxing.evaluation.lips.contour_shapes import check_shapes
+from kouxing.services.synthesizer.lips.ferguson.contour import contour
+from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
 
 pytestmark = pytest.mark.property
 

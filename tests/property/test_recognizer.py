@@ -9,18 +9,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from corpora.scoring import count_errors
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.front_end.features import Differences, LogMel, cepstra, with_differences
-from services.recognizer.front_end.resample import Resampler, to_16_khz
-from services.recognizer.offline import recognize
-from services.recognizer.recognizer import Emission, Recognizer
-from services.recognizer.search.decoder import Decoder
-from services.recognizer.search.output_rule import OutputRule
-from services.recognizer.speech_scores import FrameScores, SpeechEnd, SpeechStart, score_recording
-from shared.audio_file import read_audio
-from shared.phones.events import Phone
+from kouxing.corpora.scoring import count_errors
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.front_end.features import (
+    Differences,
+    LogMel,
+    cepstra,
+    with_differences,
+)
+from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.recognizer import Emission, Recognizer
+from kouxing.services.recognizer.search.decoder import Decoder
+from kouxing.services.recognizer.search.output_rule import OutputRule
+from kouxing.services.recognizer.speech_scores import (
+    FrameScores,
+    SpeechEnd,
+    SpeechStart,
+    score_recording,
+)
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.phones.events import Phone
 
 pytestmark = pytest.mark.property
 

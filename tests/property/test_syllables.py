@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shared.phones.events import Phone
-from shared.phones.inventory import load_inventory
-from shared.phones.known_text import characters_of
-from shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.known_text import characters_of
+from kouxing.shared.phones.syllables import MAX_PHONES, Syllable, SyllableTrack
 
 pytestmark = pytest.mark.property
 MANDARIN = load_inventory("mandarin")

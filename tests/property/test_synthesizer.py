@@ -12,18 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.synthesizer.face import Face
-from services.synthesizer.lips.dynamic_visemes.blending import blend, log_weights, softmax
-from services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import (
+from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend, log_weights, softmax
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     VISEME_INDEX,
 )
-from services.synthesizer.lips.learnt.model import LearntLips
-from services.synthesizer.offline import synthesize
-from shared.face.fap_file import FapAnimation, read_fap, write_fap
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import INVENTORY, LIPS, advance, make_face
 
 pytestmark = pytest.mark.property

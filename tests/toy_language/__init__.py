@@ -5,7 +5,7 @@ The tests install it as a distribution would be (see ``tests.languages.install_l
 
 import re
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 
 def pronounce(text: str) -> list[tuple[str, ...]]:

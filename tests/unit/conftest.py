@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared.bus import Bus, Socket
+from kouxing.shared.bus import Bus, Socket
 from tests.control_stage import Stage
 
 

@@ -8,14 +8,19 @@ import numpy as np
 import pytest
 import typer
 
-from services.cli.offline import PhoneFormat, align
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.alignment import align_syllables, align_text, spoken, timed_syllables
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import load_inventory
-from shared.phones.phone_files import format_phones
+from kouxing.services.cli.offline import PhoneFormat, align
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.alignment import (
+    align_syllables,
+    align_text,
+    spoken,
+    timed_syllables,
+)
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.phone_files import format_phones
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit

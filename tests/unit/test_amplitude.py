@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
-from services.synthesizer.modifiers.amplitude import Amplitude
-from services.synthesizer.offline import synthesize
-from shared.phones.events import Phone
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import VisemeArticulation
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
+from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.phones.events import Phone
 from tests.lips import LIPS, articulation_of, moment
 
 pytestmark = pytest.mark.unit

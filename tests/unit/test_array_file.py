@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.driver.head.head import Head
-from services.recognizer.acoustic.load import load_model
-from shared.array_file import read_arrays
-from shared.errors import UserError
+from kouxing.services.driver.head.head import Head
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.array_file import read_arrays
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from shared.audio_file import open_audio, raw_audio, read_audio
-from shared.errors import UserError
+from kouxing.shared.audio_file import open_audio, raw_audio, read_audio
+from kouxing.shared.errors import UserError
 from tests.system import DEMO
 
 pytestmark = pytest.mark.unit

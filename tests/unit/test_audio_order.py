@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from services.recognizer.audio_order import MAX_HELD, WAIT_S, AudioOrder
-from shared.wire.audio import AudioChunk
+from kouxing.services.recognizer.audio_order import MAX_HELD, WAIT_S, AudioOrder
+from kouxing.shared.wire.audio import AudioChunk
 
 pytestmark = pytest.mark.unit
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.features import LOG_FLOOR
-from training.gmm.augmentation import Augmentation
+from kouxing.services.recognizer.front_end.features import LOG_FLOOR
+from kouxing.training.gmm.augmentation import Augmentation
 
 pytestmark = pytest.mark.unit
 

@@ -8,29 +8,29 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.blending import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import (
     active_visemes,
     blend,
     log_weights,
     softmax,
 )
-from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     VisemeParameters,
     load_parameters,
     save_parameters,
 )
-from services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEME_INDEX,
     static_targets,
 )
-from services.synthesizer.offline import synthesize
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
-from shared.phones.inventory import load_inventory
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import load_inventory
 
 pytestmark = pytest.mark.unit
 

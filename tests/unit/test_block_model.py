@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 import torch
 
-from services.recognizer.acoustic import blocks as blocks_module
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.blocks import BlockModel
-from services.recognizer.acoustic.load import MODELS, load_model
-from services.recognizer.acoustic.model_file import read_archive, write_archive
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.whisper_mel import WhisperMel
-from services.recognizer.recognizer import Recognizer
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from training.blocks.export import onnx_of
-from training.blocks.network import BlockEncoder, BlockReadout, layout
-from training.neural.network import Shape
+from kouxing.services.recognizer.acoustic import blocks as blocks_module
+from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import MODELS, load_model
+from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.training.blocks.export import onnx_of
+from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.neural.network import Shape
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 

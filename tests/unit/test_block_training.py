@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from corpora.feature_cache import as_floats
-from services.recognizer.acoustic.blocks import BlockModel
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, WhisperMel
-from shared.errors import UserError
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, WhisperMel
+from kouxing.shared.errors import UserError
+from kouxing.training.blocks import batches, readout, trainer
+from kouxing.training.blocks.batches import block_batch
+from kouxing.training.blocks.labels import load_labels, save_labels
+from kouxing.training.blocks.network import RIGHT_CONTEXT, BlockEncoder, BlockReadout, layout
+from kouxing.training.blocks.readout import Readout, train_readout
+from kouxing.training.blocks.recipe import train_blocks
+from kouxing.training.blocks.trainer import BlockNetwork, train_network
+from kouxing.training.blocks.window_features import encode_by
+from kouxing.training.neural import teacher
+from kouxing.training.neural.batches import Recording, Targets
+from kouxing.training.neural.teacher import WholeEncoder
 from tests.tones import tones
 from tests.unit.test_block_model import HELLO, SMALL
 from tests.unit.test_neural_training import write_corpus
 from tests.whisper_folder import encoder_arrays, write_whisper
-from training.blocks import batches, readout, trainer
-from training.blocks.batches import block_batch
-from training.blocks.labels import load_labels, save_labels
-from training.blocks.network import RIGHT_CONTEXT, BlockEncoder, BlockReadout, layout
-from training.blocks.readout import Readout, train_readout
-from training.blocks.recipe import train_blocks
-from training.blocks.trainer import BlockNetwork, train_network
-from training.blocks.window_features import encode_by
-from training.neural import teacher
-from training.neural.batches import Recording, Targets
-from training.neural.teacher import WholeEncoder
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
 
@@ -231,7 +231,7 @@ def test_the_encoder_learns_and_goes_on_where_it_stopped(
 @pytest.mark.usefixtures("quick")
 def test_the_recipe_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("training.neural.initial_network.Shape", SMALL)
+    monkeypatch.setattr("kouxing.training.neural.initial_network.Shape", SMALL)
     monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
     corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO, "d": HELLO})
     whisper = write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6))

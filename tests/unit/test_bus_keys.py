@@ -13,20 +13,20 @@ from pathlib import Path
 import pytest
 import zmq
 
-from evaluation.system.attackers import connect
-from shared import connections, kernel_sockets
-from shared.bus import Bus, Socket
-from shared.client import Client
-from shared.config import ServiceConfig
-from shared.endpoints import split_endpoint, with_key
-from shared.errors import UserError
-from shared.keys import NOBODY, Guest, Key, add_guest, key_folder, own_key, revoke_guest
-from shared.service import Service
-from shared.wire.codec import encode
-from shared.wire.control import AllowedKey, AllowedKeys, StatusRequest
-from shared.wire.face import FapFrame
-from shared.wire.message import Message
-from shared.wire.session import Joined
+from kouxing.evaluation.system.attackers import connect
+from kouxing.shared import connections, kernel_sockets
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.client import Client
+from kouxing.shared.config import ServiceConfig
+from kouxing.shared.endpoints import split_endpoint, with_key
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import NOBODY, Guest, Key, add_guest, key_folder, own_key, revoke_guest
+from kouxing.shared.service import Service
+from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.control import AllowedKey, AllowedKeys, StatusRequest
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Joined
 from tests.system import ROOT
 
 pytestmark = pytest.mark.unit

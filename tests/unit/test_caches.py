@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.recognizer.acoustic.caches import NUM_PLACES, Cache, CacheMemory, CacheSizes
-from shared.metrics import memory_mb
+from kouxing.services.recognizer.acoustic.caches import NUM_PLACES, Cache, CacheMemory, CacheSizes
+from kouxing.shared.metrics import memory_mb
 
 pytestmark = pytest.mark.unit
 

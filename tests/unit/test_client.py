@@ -12,13 +12,13 @@ from typing import TypeVar
 import numpy as np
 import pytest
 
-from shared import client as client_module
-from shared.bus import Bus, Socket
-from shared.client import NEAREST_MS, RESEND_S, Client, Session
-from shared.keys import Peer
-from shared.wire.audio import AudioChunk, EndOfAudio
-from shared.wire.message import Message
-from shared.wire.session import (
+from kouxing.shared import client as client_module
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.client import NEAREST_MS, RESEND_S, Client, Session
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
     CloseSession,
     Done,
     Error,
@@ -28,7 +28,7 @@ from shared.wire.session import (
     SessionMoved,
     SessionOpened,
 )
-from shared.wire.speech import Acknowledge, Phone
+from kouxing.shared.wire.speech import Acknowledge, Phone
 from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit

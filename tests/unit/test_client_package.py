@@ -32,14 +32,14 @@ from kouxing_client import (
 )
 from kouxing_client.audio import to_pcm
 
-from shared.bus import Bus, Socket
-from shared.face.shapes import SHAPE_SETS
-from shared.keys import Peer, user_key
-from shared.wire import face, speech
-from shared.wire.audio import AudioChunk, EndOfAudio
-from shared.wire.control import Event
-from shared.wire.message import Message
-from shared.wire.session import (
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.keys import Peer, user_key
+from kouxing.shared.wire import face, speech
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.control import Event
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
     AddShapes,
     CloseSession,
     Done,

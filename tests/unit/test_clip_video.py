@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from evaluation.lips.clip_video import film_clip, tracked_frames
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
+from kouxing.evaluation.lips.clip_video import film_clip, tracked_frames
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.lips import JAW, WIDTH, clip_of
 
 pytestmark = pytest.mark.unit

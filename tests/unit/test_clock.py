@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from shared.clock import ClockOffset, duration_to_samples, to_samples, to_seconds
+from kouxing.shared.clock import ClockOffset, duration_to_samples, to_samples, to_seconds
 
 pytestmark = pytest.mark.unit
 

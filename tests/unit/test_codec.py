@@ -3,11 +3,11 @@ from __future__ import annotations
 import msgpack
 import pytest
 
-from shared.wire.audio import AudioChunk
-from shared.wire.codec import BadMessage, decode, encode, topic
-from shared.wire.face import FapFrame
-from shared.wire.session import Done, OpenSession
-from shared.wire.speech import Phone
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.session import Done, OpenSession
+from kouxing.shared.wire.speech import Phone
 
 pytestmark = pytest.mark.unit
 

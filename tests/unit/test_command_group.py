@@ -10,9 +10,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from services.cli import main as command_line
-from services.kinds import KINDS
-from shared.errors import UserError
+from kouxing.services.cli import main as command_line
+from kouxing.services.kinds import KINDS
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 
@@ -72,8 +72,9 @@ def test_the_version_is_told() -> None:
 
 def test_the_command_line_imports_neither_training_nor_evaluation_nor_services() -> None:
     code = (
-        "import sys, services.cli.main\n"
-        "heavy = ('training', 'evaluation', 'numpy', 'zmq', 'services.recognizer.service')\n"
+        "import sys, kouxing.services.cli.main\n"
+        "heavy = ('kouxing.training', 'kouxing.evaluation', 'numpy', 'zmq',"
+        " 'kouxing.services.recognizer.service')\n"
         "print([name for name in heavy if name in sys.modules])\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -82,7 +83,7 @@ def test_the_command_line_imports_neither_training_nor_evaluation_nor_services()
 
 def test_without_ray_the_command_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "services.cli.ray_workers", raising=False)
+    monkeypatch.delitem(sys.modules, "kouxing.services.cli.ray_workers", raising=False)
     ended = CliRunner().invoke(command_line.app, ["cluster"])
     assert isinstance(ended.exception, UserError)
     assert "pip install 'kouxing[cluster]'" in str(ended.exception)

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from services.control.config import ControlConfig
-from services.driver.config import DriverConfig, Framing
-from services.gateway.config import GatewayConfig
-from services.kinds import KINDS, free_addresses
-from services.recognizer.config import RecognizerConfig
-from services.synthesizer.config import SynthesizerConfig
-from shared.config import ServiceConfig, Settings
-from shared.errors import UserError
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.driver.config import DriverConfig, Framing
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.kinds import KINDS, free_addresses
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.shared.config import ServiceConfig, Settings
+from kouxing.shared.errors import UserError
 from tests.documents import code_blocks
 
 pytestmark = pytest.mark.unit

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.configuration import TABLES, config, markdown_page
-from services.kinds import read_settings
-from shared.errors import UserError
+from kouxing.services.cli.configuration import TABLES, config, markdown_page
+from kouxing.services.kinds import read_settings
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

@@ -14,19 +14,19 @@ from pathlib import Path
 
 import pytest
 
-from evaluation.system.attackers import connected, frame
-from shared import connection, connections, kernel_sockets
-from shared.bus import COMMANDS, MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
-from shared.client import Client
-from shared.connection import CREDIT, MIB, Connection
-from shared.connections import MAX_SUBSCRIBED, MAX_SUBSCRIPTION
-from shared.keys import NOBODY, Peer
-from shared.wire.audio import AudioChunk
-from shared.wire.codec import encode
-from shared.wire.face import FapFrame
-from shared.wire.message import MAX_AUDIO_BYTES, Message
-from shared.wire.session import CloseSession, Done, Error
-from shared.wire.speech import Progress
+from kouxing.evaluation.system.attackers import connected, frame
+from kouxing.shared import connection, connections, kernel_sockets
+from kouxing.shared.bus import COMMANDS, MAX_DROPPED, REFUSAL_COST, Bus, Received, Socket
+from kouxing.shared.client import Client
+from kouxing.shared.connection import CREDIT, MIB, Connection
+from kouxing.shared.connections import MAX_SUBSCRIBED, MAX_SUBSCRIPTION
+from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
+from kouxing.shared.wire.session import CloseSession, Done, Error
+from kouxing.shared.wire.speech import Progress
 
 pytestmark = pytest.mark.unit
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.system.continuity import compare, staleness, worst
-from evaluation.system.live import Seen
-from shared.wire.face import FapFrame
-from shared.wire.speech import Phone, Speech
+from kouxing.evaluation.system.continuity import compare, staleness, worst
+from kouxing.evaluation.system.live import Seen
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.speech import Phone, Speech
 
 pytestmark = pytest.mark.unit
 MASK = bytes([252] + [255] * 7 + [15])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.lips.contour_accuracy import (
+from kouxing.evaluation.lips.contour_accuracy import (
     BEST_OPENING,
     STILL,
     accuracy_of,
@@ -13,9 +13,9 @@ from evaluation.lips.contour_accuracy import (
     mean_mouths,
     scaled,
 )
-from evaluation.lips.contour_shapes import check_shapes
-from services.synthesizer.lips.ferguson.contour import faps_of
-from shared.face.faps import MOUTH_FAPS
+from kouxing.evaluation.lips.contour_shapes import check_shapes
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.shared.face.faps import MOUTH_FAPS
 
 pytestmark = pytest.mark.unit
 

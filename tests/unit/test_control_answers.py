@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import zmq
 
-from shared.keys import user_key
-from shared.wire.codec import encode
-from shared.wire.control import SessionInput
-from shared.wire.session import OpenSession, SessionOpened
+from kouxing.shared.keys import user_key
+from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.control import SessionInput
+from kouxing.shared.wire.session import OpenSession, SessionOpened
 from tests.control_stage import Stage
 from tests.forwarders import Link
 

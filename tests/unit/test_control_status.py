@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from services.control import service as control_service
-from shared.bus import Bus, Socket
-from shared.endpoints import key_of
-from shared.keys import own_key
-from shared.wire.control import Heartbeat, StatusReport, StatusRequest
-from shared.wire.session import Error
+from kouxing.services.control import service as control_service
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.endpoints import key_of
+from kouxing.shared.keys import own_key
+from kouxing.shared.wire.control import Heartbeat, StatusReport, StatusRequest
+from kouxing.shared.wire.session import Error
 from tests.control_stage import Stage
 
 pytestmark = pytest.mark.unit

@@ -6,12 +6,19 @@ import time
 
 import pytest
 
-from services.control import service as control_service
-from shared.bus import Bus, Socket
-from shared.wire.control import SessionInput, StartSession, StopSession
-from shared.wire.message import Message
-from shared.wire.session import CloseSession, Done, Error, OpenSession, SessionMoved, SessionOpened
-from shared.wire.speech import Speech
+from kouxing.services.control import service as control_service
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.wire.control import SessionInput, StartSession, StopSession
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
+    CloseSession,
+    Done,
+    Error,
+    OpenSession,
+    SessionMoved,
+    SessionOpened,
+)
+from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage, beat
 
 pytestmark = pytest.mark.unit

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.search import decoder as search
-from services.recognizer.search.decoder import Decoder, Segment, segments_after
-from services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from kouxing.services.recognizer.search import decoder as search
+from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from tests.languages import MANDARIN, NUM_PHONES, SIL, Gram, Table, flat_language
 
 pytestmark = pytest.mark.unit

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from services.synthesizer.lips.dynamic_visemes.dominance import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
     log_closure,
     log_dominance,
     log_left_silence,

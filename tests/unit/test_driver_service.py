@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.driver.config import DriverConfig
-from services.driver.service import DriverService
-from shared.bus import Bus
-from shared.face.faps import MASK_BYTES, NUM_FAPS
-from shared.keys import Peer
-from shared.wire.control import Heartbeat, Recorded, SessionInput, StartSession, StopSession
-from shared.wire.face import EndOfFaps, FapFrame
-from shared.wire.session import Done, Error
+from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.service import DriverService
+from kouxing.shared.bus import Bus
+from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.control import Heartbeat, Recorded, SessionInput, StartSession, StopSession
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.session import Done, Error
 
 pytestmark = pytest.mark.unit
 

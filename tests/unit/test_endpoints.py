@@ -44,7 +44,7 @@ def test_what_is_bound_to_every_address_is_advertised_by_the_one_on_the_way_to_c
     control: str, bound: str, told: str
 ) -> None:
     program = (
-        "from services.synthesizer.config import SynthesizerConfig;"
+        "from kouxing.services.synthesizer.config import SynthesizerConfig;"
         f"print(SynthesizerConfig(control={control!r}).reachable({bound!r}))"
     )
     command = ["sh", "-ec", INTERFACES, "sh", sys.executable, "-c", program]
@@ -52,5 +52,5 @@ def test_what_is_bound_to_every_address_is_advertised_by_the_one_on_the_way_to_c
 
 
 def test_a_host_without_network_reaches_itself() -> None:
-    program = "from shared.endpoints import own_address; print(own_address('10.77.0.1'))"
+    program = "from kouxing.shared.endpoints import own_address; print(own_address('10.77.0.1'))"
     assert with_own_network([sys.executable, "-c", program]) == "127.0.0.1"

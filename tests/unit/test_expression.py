@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.synthesizer.face import Face
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
-from shared.errors import UserError
-from shared.face.expressions import ExpressionName, check_expressions
-from shared.face.faps import FAP_NUMBER, MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import Phone, SpeechChange
+from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.expressions import ExpressionName, check_expressions
+from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.lips import LIPS, advance, make_face
 
 pytestmark = pytest.mark.unit

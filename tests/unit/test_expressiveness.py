@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from services.synthesizer.modifiers.expressiveness import Expressiveness
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from tests.lips import LIPS
 
 pytestmark = pytest.mark.unit

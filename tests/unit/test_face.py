@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.face import REST_S, Face, Frame
-from services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
-from services.synthesizer.lips.dynamic_visemes.visemes import LIP_HEIGHT_FAPS
-from services.synthesizer.offline import synthesize
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.face.idle_motion import IdleMotion, State
-from shared.phones.events import EndOfSound, Progress, SpeechChange
+from kouxing.services.synthesizer.face import REST_S, Face, Frame
+from kouxing.services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import LIP_HEIGHT_FAPS
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.idle_motion import IdleMotion, State
+from kouxing.shared.phones.events import EndOfSound, Progress, SpeechChange
 from tests.lips import DELAY_S, INVENTORY, LIPS, advance, make_face, phone
 
 pytestmark = pytest.mark.unit

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from corpora.face_landmarks import _STEADY, LANDMARKS, mouth_faps
-from corpora.landmark_file import landmark_file, read_landmark_file
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
+from kouxing.corpora.face_landmarks import _STEADY, LANDMARKS, mouth_faps
+from kouxing.corpora.landmark_file import landmark_file, read_landmark_file
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
 
 pytestmark = pytest.mark.unit
 NUM_FRAMES = 60

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from corpora.face_mesh import FaceMesh
+from kouxing.corpora.face_mesh import FaceMesh
 
 pytestmark = pytest.mark.unit
 PICTURES = Path(__file__).parents[1] / "golden"

@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from shared.errors import UserError
-from shared.face.fap_file import FapAnimation, read_fap, write_fap
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap
 
 pytestmark = pytest.mark.unit
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.features import (
+from kouxing.services.recognizer.front_end.features import (
     LOG_FLOOR,
     NUM_BANDS,
     NUM_FEATURES,

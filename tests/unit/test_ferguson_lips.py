@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.live_chain import LiveChain
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.front_end.resample import to_16_khz
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import Face
-from services.synthesizer.lips.ferguson.contour import faps_of
-from services.synthesizer.lips.ferguson.table import load_table
-from services.synthesizer.lips.load import load_lip_model
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.face.lip_models import LipModelName
-from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
-from shared.phones.inventory import load_inventory
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.inventory import load_inventory
 from tests.lips import phone
 from tests.system import DEMO
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.front_end.pcm import progress_of, zero_crossing_rate
-from services.recognizer.stream import SpeechStream
-from services.synthesizer.lips.ferguson.endpoints import SyllableCutter, pieces_of
-from services.synthesizer.lips.ferguson.motion import KeyFrames
-from services.synthesizer.lips.ferguson.openings import key_frames_of
-from services.synthesizer.lips.ferguson.table import format_table, load_table, parse_table
-from services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import load_inventory
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.front_end.pcm import progress_of, zero_crossing_rate
+from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableCutter, pieces_of
+from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
+from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.table import format_table, load_table, parse_table
+from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import load_inventory
 from tests.system import DEMO
 
 pytestmark = pytest.mark.unit

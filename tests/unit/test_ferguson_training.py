@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluation.lips.segmentation import SegmentedRecording, figure, pair, score
-from services.recognizer.alignment import spoken
-from services.synthesizer.lips.ferguson.contour import faps_of
-from services.synthesizer.lips.ferguson.endpoints import pieces_of
-from services.synthesizer.lips.ferguson.openings import key_frames_of
-from services.synthesizer.lips.ferguson.table import load_table
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import load_inventory
+from kouxing.evaluation.lips.segmentation import SegmentedRecording, figure, pair, score
+from kouxing.services.recognizer.alignment import spoken
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.endpoints import pieces_of
+from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.training.ferguson.lengths import AlignedSpeech, influence_levels, usual_times
+from kouxing.training.ferguson.openings import fit_openings, relative_openings, travel_of
+from kouxing.training.ferguson.recipe import train_ferguson
 from tests.lips import clip_of, utterance
-from training.ferguson.lengths import AlignedSpeech, influence_levels, usual_times
-from training.ferguson.openings import fit_openings, relative_openings, travel_of
-from training.ferguson.recipe import train_ferguson
 
 pytestmark = pytest.mark.unit
 

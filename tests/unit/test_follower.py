@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from shared import follower
-from shared.bus import Bus, Socket
-from shared.errors import UserError
-from shared.face.faps import MASK_BYTES, NUM_FAPS
-from shared.follower import PollingLoop, SessionFollower
-from shared.wire.audio import Sound
-from shared.wire.face import EndOfFaps, FapFrame, Shapes
-from shared.wire.message import Message
+from kouxing.shared import follower
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
+from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.wire.audio import Sound
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.message import Message
 from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit

@@ -10,24 +10,24 @@ import pytest
 import soundfile
 from typer.testing import CliRunner
 
-from corpora.speech_corpus import Utterance
-from evaluation.commands import app
-from evaluation.lips.four_schemes import Condition, Hearing, events_told, listeners_of
-from evaluation.lips.measures import rms_jerk
-from evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted
-from evaluation.lips.scheme_report import sentence
-from evaluation.lips.scheme_scores import Order, falls, first_told
-from evaluation.lips.schemes import once_the_next_begins
-from evaluation.lips.sentences import choose
-from evaluation.mos.commands import app as mos
-from services.driver.video import film
-from services.recording_chain import HeardRecording
-from services.synthesizer.config import DELAYS_MS
-from services.synthesizer.face import Frame
-from shared.face.faps import MOUTH_FAPS
-from shared.face.lip_models import LipModelName
-from shared.media_file import check_video
-from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.corpora.speech_corpus import Utterance
+from kouxing.evaluation.commands import app
+from kouxing.evaluation.lips.four_schemes import Condition, Hearing, events_told, listeners_of
+from kouxing.evaluation.lips.measures import rms_jerk
+from kouxing.evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted
+from kouxing.evaluation.lips.scheme_report import sentence
+from kouxing.evaluation.lips.scheme_scores import Order, falls, first_told
+from kouxing.evaluation.lips.schemes import once_the_next_begins
+from kouxing.evaluation.lips.sentences import choose
+from kouxing.evaluation.mos.commands import app as mos
+from kouxing.services.driver.video import film
+from kouxing.services.recording_chain import HeardRecording
+from kouxing.services.synthesizer.config import DELAYS_MS
+from kouxing.services.synthesizer.face import Frame
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.media_file import check_video
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
 from tests.videos import write_video
 

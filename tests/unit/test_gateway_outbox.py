@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from services.gateway.outbox import MAX_WAITING, NUM_FRAMES_KEPT, Kind, Outbox
+from kouxing.services.gateway.outbox import MAX_WAITING, NUM_FRAMES_KEPT, Kind, Outbox
 
 pytestmark = pytest.mark.unit
 

@@ -7,10 +7,10 @@ import struct
 
 import pytest
 
-from services.gateway import wire
-from services.gateway.sound_format import SoundFormat
-from shared.errors import UserError
-from shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from kouxing.services.gateway import wire
+from kouxing.services.gateway.sound_format import SoundFormat
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
 
 pytestmark = pytest.mark.unit
 

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.driver.head.glb_export import export_glb
-from services.driver.head.glb_head import read_glb
-from services.driver.head.head import Head, neutral_faps
-from services.driver.render.renderer import Renderer
-from services.driver.render.scene import camera, load_head
-from shared.errors import UserError
-from shared.face.faps import NUM_FAPS
-from shared.face.shapes import ARKIT, OCULUS
+from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.services.driver.head.glb_head import read_glb
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.scene import camera, load_head
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.shapes import ARKIT, OCULUS
 from tests.glb_writer import Mesh, write_glb
 from tests.meshes import meshes
 

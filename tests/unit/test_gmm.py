@@ -5,13 +5,18 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.acoustic.gmm import FORMAT, GaussianMixtures, GmmModel, mixture_scores
-from services.recognizer.acoustic.load import NEURAL_PATH, load_model
-from services.recognizer.acoustic.model_file import read_archive
-from services.recognizer.front_end.features import NUM_BANDS, NUM_FEATURES, NUM_STATIC
-from services.recognizer.front_end.vtln import VocalTractNormalizer, without_pitch
-from shared.errors import UserError
+from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from kouxing.services.recognizer.acoustic.gmm import (
+    FORMAT,
+    GaussianMixtures,
+    GmmModel,
+    mixture_scores,
+)
+from kouxing.services.recognizer.acoustic.load import NEURAL_PATH, load_model
+from kouxing.services.recognizer.acoustic.model_file import read_archive
+from kouxing.services.recognizer.front_end.features import NUM_BANDS, NUM_FEATURES, NUM_STATIC
+from kouxing.services.recognizer.front_end.vtln import VocalTractNormalizer, without_pitch
+from kouxing.shared.errors import UserError
 from tests.languages import MANDARIN, NUM_PHONES, random_language
 
 pytestmark = pytest.mark.unit

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
-from shared.errors import UserError
-from shared.face.faps import FAPS, NUM_FAPS
+from kouxing.services.driver.head.head import ASSETS, DEFAULT_HEAD, Detail, Head, neutral_faps
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, NUM_FAPS
+from kouxing.training.heads.people import PEOPLE
 from tests import heads
-from training.heads.people import PEOPLE
 
 pytestmark = pytest.mark.unit
 
@@ -173,7 +173,7 @@ def test_broken_asset(tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPat
         elif damage == "texture_skin":
             del arrays[damage]
         elif damage == "huge":
-            monkeypatch.setattr("services.driver.head.head.MAX_BYTES", 100_000)
+            monkeypatch.setattr("kouxing.services.driver.head.head.MAX_BYTES", 100_000)
         elif damage in arrays:
             arrays[damage] = arrays[damage][:1]
         else:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.driver import picture
-from services.driver.head import surface
-from training.heads import hair, paint_parts, parts, people, texture, zones
+from kouxing.services.driver import picture
+from kouxing.services.driver.head import surface
+from kouxing.training.heads import hair, paint_parts, parts, people, texture, zones
 
 pytestmark = pytest.mark.unit
 

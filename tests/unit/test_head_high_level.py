@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.driver.head.head import Head
-from shared.errors import UserError
-from shared.face.high_level import (
+from kouxing.services.driver.head.head import Head
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.high_level import (
     EXPRESSION_NAMES,
     EXPRESSIONS,
     VISEME_NAMES,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.driver.head.head import Head, neutral_faps
-from shared.face import high_level
-from shared.face.faps import NUM_FAPS
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.shared.face import high_level
+from kouxing.shared.face.faps import NUM_FAPS
 from tests import heads
 
 pytestmark = pytest.mark.unit

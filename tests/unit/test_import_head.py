@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.driver.head.head import Head, neutral_faps
-from services.driver.head.import_head import import_head
-from shared.errors import UserError
-from shared.face.faps import FAPS, NUM_FAPS
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.head.import_head import import_head
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from tests.glb_writer import Mesh, write_glb
 from tests.heads import OPEN
 from tests.meshes import meshes, write_obj

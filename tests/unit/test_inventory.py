@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.errors import UserError
-from shared.phones.inventory import MAX_PHONES, PhoneInventory, load_inventory
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import MAX_PHONES, PhoneInventory, load_inventory
 from tests.languages import MANDARIN, install_language
 
 pytestmark = pytest.mark.unit

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from shared.errors import UserError
-from shared.keys import (
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import (
     MAX_KEYS,
     MAX_ROLES,
     Guest,
@@ -25,9 +25,9 @@ from shared.keys import (
     save_guests,
     user_key,
 )
-from shared.wire.codec import decode, encode
-from shared.wire.control import AllowedKey, AllowedKeys
-from shared.wire.message import MAX_MESSAGE_BYTES
+from kouxing.shared.wire.codec import decode, encode
+from kouxing.shared.wire.control import AllowedKey, AllowedKeys
+from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
 
 pytestmark = pytest.mark.unit
 
@@ -48,7 +48,7 @@ def test_the_first_use_makes_keys_that_only_their_owner_can_read() -> None:
 
 
 def test_processes_that_start_together_make_one_key() -> None:
-    program = "from shared.keys import user_key; print(user_key())"
+    program = "from kouxing.shared.keys import user_key; print(user_key())"
     started = [
         subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) for _ in range(4)
     ]

@@ -9,8 +9,8 @@ import socket
 
 import pytest
 
-from services.gateway.config import GatewayConfig
-from services.kinds import (
+from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.kinds import (
     KINDS,
     ServiceKind,
     available_addresses,
@@ -18,9 +18,9 @@ from services.kinds import (
     more_workers,
     read_settings,
 )
-from shared.config import ServiceConfig
-from shared.errors import UserError
-from shared.service import Service
+from kouxing.shared.config import ServiceConfig
+from kouxing.shared.errors import UserError
+from kouxing.shared.service import Service
 
 pytestmark = pytest.mark.unit
 
@@ -31,7 +31,7 @@ def test_an_entry_leads_to_its_classes_and_its_module(kind: ServiceKind) -> None
     assert issubclass(service, Service)
     assert service.name == kind.name
     assert issubclass(kind.config_type, ServiceConfig)
-    assert importlib.util.find_spec(f"services.{kind.name}.__main__")
+    assert importlib.util.find_spec(f"kouxing.services.{kind.name}.__main__")
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "*"])

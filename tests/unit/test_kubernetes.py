@@ -9,8 +9,8 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from services.kinds import KINDS
-from shared.config import Bound, Settings, bound_keys
+from kouxing.services.kinds import KINDS
+from kouxing.shared.config import Bound, Settings, bound_keys
 from tests.system import ROOT
 
 pytestmark = pytest.mark.unit

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.face import Face, Frame
-from services.synthesizer.lips.learnt.closures import ClosingPhones, ClosureRule, shut_share
-from services.synthesizer.lips.learnt.model import LearntLips
-from services.synthesizer.lips.learnt.track import LipTrack
-from services.synthesizer.lips.load import load_lip_model
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.lips.learnt.closures import ClosingPhones, ClosureRule, shut_share
+from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.services.synthesizer.lips.learnt.track import LipTrack
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
 from tests.lips import LIPS
 
 pytestmark = pytest.mark.unit

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.face import Face
-from shared.face.faps import FAP_NUMBER, MOUTH_FAPS
-from shared.face.idle_motion import IdleMotion, State
-from shared.phones.events import Progress, SpeechChange
+from kouxing.services.synthesizer.face import Face
+from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from kouxing.shared.face.idle_motion import IdleMotion, State
+from kouxing.shared.phones.events import Progress, SpeechChange
 from tests.lips import make_face
 
 pytestmark = pytest.mark.unit

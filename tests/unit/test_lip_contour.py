@@ -8,8 +8,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from services.synthesizer.lips.ferguson import drawing
-from services.synthesizer.lips.ferguson.contour import (
+from kouxing.services.synthesizer.lips.ferguson import drawing
+from kouxing.services.synthesizer.lips.ferguson.contour import (
     LINES,
     contour,
     faps_of,
@@ -17,8 +17,8 @@ from services.synthesizer.lips.ferguson.contour import (
     lip_points,
     parse_lip_points,
 )
-from shared.errors import UserError
-from shared.face.faps import FAPS, MOUTH_FAPS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 
 pytestmark = pytest.mark.unit
 
@@ -57,7 +57,7 @@ def test_feature_points_travel_as_measured(opening: float) -> None:
     ],
 )
 def test_a_damaged_table_of_points_is_refused(right: str, wrong: str, message: str) -> None:
-    file = resources.files("services.synthesizer.lips.ferguson") / "lip_points.tsv"
+    file = resources.files("kouxing.services.synthesizer.lips.ferguson") / "lip_points.tsv"
     text = file.read_text("utf-8")
     assert parse_lip_points(text) == lip_points()
     assert text.count(right) == 1

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evaluation.lips.lip_line import PlainZones, away_from_spline, with_fields
-from services.driver.head.head import Head
-from services.driver.head.import_fields import INNER, OUTER, FaceFields
-from services.synthesizer.lips.ferguson.contour import faps_of
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.evaluation.lips.lip_line import PlainZones, away_from_spline, with_fields
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.head.import_fields import INNER, OUTER, FaceFields
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 pytestmark = pytest.mark.unit
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evaluation.lips.measures import (
+from kouxing.evaluation.lips.measures import (
     Hits,
     Likeness,
     best_lag,

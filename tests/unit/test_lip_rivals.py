@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip, level_track
-from evaluation.lips.clip_scores import score_clip
-from evaluation.lips.report import print_comparison
-from evaluation.lips.rivals import rows as rivals_rows
-from evaluation.lips.rivals.comparison import as_it_comes, figure, mapped
-from evaluation.lips.rivals.linear_map import fit
-from evaluation.lips.rivals.rows import (
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip, level_track
+from kouxing.evaluation.lips.clip_scores import score_clip
+from kouxing.evaluation.lips.report import print_comparison
+from kouxing.evaluation.lips.rivals import rows as rivals_rows
+from kouxing.evaluation.lips.rivals.comparison import as_it_comes, figure, mapped
+from kouxing.evaluation.lips.rivals.linear_map import fit
+from kouxing.evaluation.lips.rivals.rows import (
     HEAD_AUDIO_VISEMES,
     ROW_S,
     head_audio_rows,
@@ -23,12 +23,12 @@ from evaluation.lips.rivals.rows import (
     wlipsync_profile,
     wlipsync_rows,
 )
-from evaluation.lips.schemes import DELAYS_S, HeardClip
-from evaluation.lips.scores import pool
-from services.recognizer.acoustic.load import load_model
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
+from kouxing.evaluation.lips.schemes import DELAYS_S, HeardClip
+from kouxing.evaluation.lips.scores import pool
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.lips import INVENTORY, clip_of
 from tests.system import VOWELS_FILE
 

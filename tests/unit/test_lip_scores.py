@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from corpora.figures import new_figure, save_figure
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
-from evaluation.lips.clip_scores import score_clip
-from evaluation.lips.closure_fit import TRIED, compare
-from evaluation.lips.report import print_scores
-from evaluation.lips.schemes import (
+from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
+from kouxing.evaluation.lips.clip_scores import score_clip
+from kouxing.evaluation.lips.closure_fit import TRIED, compare
+from kouxing.evaluation.lips.report import print_scores
+from kouxing.evaluation.lips.schemes import (
     DEFAULT_DELAY_S,
     DELAYS_S,
     HeardClip,
@@ -28,25 +28,25 @@ from evaluation.lips.schemes import (
     phones_shaped,
     quietest_moments,
 )
-from evaluation.lips.scores import LipScore, clips_to_score, pool
-from evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
-from evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
-from services.live_chain import sound_events
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.lips import lips_for
-from services.synthesizer.lips.dynamic_visemes.blending import blend
-from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import (
+from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool
+from kouxing.evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
+from kouxing.evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
+from kouxing.services.live_chain import sound_events
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
+from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     clips_seen,
     load_parameters,
     save_parameters,
 )
-from services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import INVENTORY, LIPS, clip_of, utterance
 from tests.system import VOWELS_FILE
 
@@ -332,7 +332,9 @@ def test_clips_that_were_learnt_from_are_not_scored(
     clips.mkdir()
     for name in ("a_one", "a_two"):
         write_clip(clips, name)
-    monkeypatch.setattr("corpora.lip_clips.read_audio", lambda _path: np.zeros(1600, np.float32))
+    monkeypatch.setattr(
+        "kouxing.corpora.lip_clips.read_audio", lambda _path: np.zeros(1600, np.float32)
+    )
     with pytest.raises(UserError, match=r"held\.txt"):
         clips_to_score(clips, parameters)
     (clips / "held.txt").write_text("a_one a_two a_three b_four")

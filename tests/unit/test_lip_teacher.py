@@ -11,19 +11,17 @@ import soundfile
 import torch
 from numpy.typing import NDArray
 
-from corpora.feature_cache import as_integers, read_audio
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_positions import POSITION_S
-from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS
-from shared.errors import UserError
-from tests.lips import clip_of
-from tests.system import VOWELS_FILE
-from training.lips import teacher
-from training.lips.positions import Speech, speech_of
-from training.lips.recipe import DELAYS_S
-from training.lips.recurrent import UNITS, Example, LipNetwork
-from training.lips.teacher import (
+from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_positions import POSITION_S
+from kouxing.services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS
+from kouxing.shared.errors import UserError
+from kouxing.training.lips import teacher
+from kouxing.training.lips.positions import Speech, speech_of
+from kouxing.training.lips.recipe import DELAYS_S
+from kouxing.training.lips.recurrent import UNITS, Example, LipNetwork
+from kouxing.training.lips.teacher import (
     TAUGHT_DELAY_S,
     Projection,
     Teacher,
@@ -31,8 +29,10 @@ from training.lips.teacher import (
     label_recordings,
     train_teacher,
 )
-from training.neural.network import Shape
-from training.neural.teacher import WholeEncoder
+from kouxing.training.neural.network import Shape
+from kouxing.training.neural.teacher import WholeEncoder
+from tests.lips import clip_of
+from tests.system import VOWELS_FILE
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.model_file import write_archive
-from services.recognizer.lips import (
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.model_file import write_archive
+from kouxing.services.recognizer.lips import (
     CLOSURE,
     FORMAT,
     LIP_FAPS,
@@ -20,10 +20,10 @@ from services.recognizer.lips import (
     load_lips,
     mouth_faps,
 )
-from services.recognizer.stream import SpeechStream
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import LipFrame
+from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import LipFrame
 from tests.e2e.following import samples_of_file
 from tests.lip_predictors import DELAYS_S, HISTORY, NUM_FEATURES, UNITS, made_up_model
 from tests.system import VOWELS_FILE

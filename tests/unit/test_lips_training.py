@@ -12,18 +12,15 @@ import pytest
 import soundfile
 import torch
 
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, part_of
-from services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS, load_lips
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
-from tests.e2e.following import samples_of_file
-from tests.lips import clip_of
-from tests.system import VOWELS_FILE
-from training.lips import recipe, recurrent
-from training.lips.card import lips_of
-from training.lips.positions import Speech
-from training.lips.recipe import (
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, part_of
+from kouxing.services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS, load_lips
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.training.lips import recipe, recurrent
+from kouxing.training.lips.card import lips_of
+from kouxing.training.lips.positions import Speech
+from kouxing.training.lips.recipe import (
     DELAYS_S,
     Units,
     basis_of,
@@ -32,12 +29,15 @@ from training.lips.recipe import (
     joined,
     train_lips,
 )
-from training.lips.recurrent import Example, LipNetwork, train_network
-from training.lips.ridge import HISTORY, Products, fit_ridge, history_of
-from training.lips.scores import Stretch, correlations, count_closures
-from training.lips.targets import Touch, targets_at, touches
-from training.neural.network import Shape
-from training.neural.teacher import WholeEncoder
+from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.lips.ridge import HISTORY, Products, fit_ridge, history_of
+from kouxing.training.lips.scores import Stretch, correlations, count_closures
+from kouxing.training.lips.targets import Touch, targets_at, touches
+from kouxing.training.neural.network import Shape
+from kouxing.training.neural.teacher import WholeEncoder
+from tests.e2e.following import samples_of_file
+from tests.lips import clip_of
+from tests.system import VOWELS_FILE
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from evaluation.commands import bench_app
-from evaluation.system import latency
-from evaluation.system.load import Load, Step, step_sizes
-from evaluation.system.speakers import Spoken, voiced
-from shared.client import Session
-from shared.wire.face import FapFrame
-from shared.wire.session import SessionOpened
+from kouxing.evaluation.commands import bench_app
+from kouxing.evaluation.system import latency
+from kouxing.evaluation.system.load import Load, Step, step_sizes
+from kouxing.evaluation.system.speakers import Spoken, voiced
+from kouxing.shared.client import Session
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.session import SessionOpened
 
 pytestmark = pytest.mark.unit
 

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from shared.bus import Bus
-from shared.config import ServiceConfig
-from shared.keys import Peer
-from shared.logs import LOG
-from shared.service import Service, run_service
-from shared.wire.control import Heartbeat
-from shared.wire.speech import Progress, Speech
+from kouxing.shared.bus import Bus
+from kouxing.shared.config import ServiceConfig
+from kouxing.shared.keys import Peer
+from kouxing.shared.logs import LOG
+from kouxing.shared.service import Service, run_service
+from kouxing.shared.wire.control import Heartbeat
+from kouxing.shared.wire.speech import Progress, Speech
 
 pytestmark = pytest.mark.unit
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from shared.metrics import WINDOW, BusyShare, Metrics
+from kouxing.shared.metrics import WINDOW, BusyShare, Metrics
 
 pytestmark = pytest.mark.unit
 

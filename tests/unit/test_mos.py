@@ -16,11 +16,11 @@ from rich.console import Console
 from scipy import stats
 from typer.testing import CliRunner
 
-from evaluation.mos.beeps import make_beeps
-from evaluation.mos.commands import app
-from evaluation.mos.order import order_of_judge, places_of_judge, williams_design
-from evaluation.mos.report import draw_boxes, make_report, print_report, to_csv
-from evaluation.mos.statistics import (
+from kouxing.evaluation.mos.beeps import make_beeps
+from kouxing.evaluation.mos.commands import app
+from kouxing.evaluation.mos.order import order_of_judge, places_of_judge, williams_design
+from kouxing.evaluation.mos.report import draw_boxes, make_report, print_report, to_csv
+from kouxing.evaluation.mos.statistics import (
     compare_all,
     differential_scores,
     holm,
@@ -28,9 +28,9 @@ from evaluation.mos.statistics import (
     mean_of,
     opinion_of,
 )
-from evaluation.mos.store import FORGOTTEN_AFTER_S, Answer, Judge, Store, read_answers
-from evaluation.mos.study import FILE_NAME, Study, load_study, new_study
-from shared.errors import UserError
+from kouxing.evaluation.mos.store import FORGOTTEN_AFTER_S, Answer, Judge, Store, read_answers
+from kouxing.evaluation.mos.study import FILE_NAME, Study, load_study, new_study
+from kouxing.shared.errors import UserError
 from tests.videos import write_video
 
 pytestmark = pytest.mark.unit
@@ -241,7 +241,7 @@ def test_who_scores_nothing_is_forgotten_and_their_row_is_free(
     store.add(answers_of(practised, -1, ("a", "live"), sync=1, realism=1))
     store.add(answers_of(scored, 0, ("a", "live"), sync=4, realism=2))
     later_s = time.time() + FORGOTTEN_AFTER_S + 60.0
-    monkeypatch.setattr("evaluation.mos.store.time.time", lambda: later_s)
+    monkeypatch.setattr("kouxing.evaluation.mos.store.time.time", lambda: later_s)
     assert judge_in(store).number == 0
     assert store.find_judge(scored.token) == scored
     assert [store.find_judge(each.token) for each in (began, left, practised)] == [None] * 3
@@ -253,7 +253,7 @@ def test_who_scores_nothing_is_forgotten_and_their_row_is_free(
 def test_many_who_only_begin_do_not_shut_the_study(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evaluation.mos.store.MAX_JUDGES", 3)
+    monkeypatch.setattr("kouxing.evaluation.mos.store.MAX_JUDGES", 3)
     store = Store(tmp_path)
     scored, hearing = judge_in(store), judge_in(store)
     store.add(answers_of(scored, 0, ("a", "live"), sync=4, realism=2))
@@ -271,7 +271,7 @@ def test_many_who_only_begin_do_not_shut_the_study(
 def test_a_study_is_full_of_those_who_scored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("evaluation.mos.store.MAX_JUDGES", 2)
+    monkeypatch.setattr("kouxing.evaluation.mos.store.MAX_JUDGES", 2)
     store = Store(tmp_path)
     for _ in range(2):
         store.add(answers_of(judge_in(store), 0, ("a", "live"), sync=4, realism=2))

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from matplotlib.font_manager import findfont
 
-from services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
-from services.cli.offline import lips
-from services.cli.terminal import Timing
-from services.driver import picture
-from services.synthesizer.lips.ferguson import drawing
-from services.synthesizer.lips.ferguson.contour import LINES, contour
-from shared.errors import UserError
+from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
+from kouxing.services.cli.offline import lips
+from kouxing.services.cli.terminal import Timing
+from kouxing.services.driver import picture
+from kouxing.services.synthesizer.lips.ferguson import drawing
+from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
+from kouxing.shared.errors import UserError
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit

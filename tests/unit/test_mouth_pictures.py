@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.driver.config import Framing
-from services.driver.head.head import Head
-from services.driver.render.camera import Camera
-from services.driver.render.renderer import Renderer
-from services.driver.render.scene import camera
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from services.synthesizer.modifiers.expressiveness import Expressiveness
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.camera import Camera
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.scene import camera
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.services.synthesizer.modifiers.expressiveness import Expressiveness
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from tests import heads
 from tests.lips import LIPS
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.acoustic.network import NUM_INPUTS
-from services.recognizer.acoustic.neural import NeuralModel
-from training.neural.export import network_of, onnx_of
-from training.neural.network import Network, Shape
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.network import NUM_INPUTS
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.training.neural.export import network_of, onnx_of
+from kouxing.training.neural.network import Network, Shape
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 

@@ -8,16 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.recognizer.acoustic import neural as neural_module
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.acoustic.model_file import read_archive
-from services.recognizer.acoustic.network import MAX_POSITIONS, NUM_INPUTS, WINDOW, position_table
-from services.recognizer.acoustic.neural import FORMAT, NeuralModel
-from services.recognizer.front_end.whisper_mel import WhisperMel
-from services.recognizer.recognizer import Recognizer
-from shared.audio_file import read_audio
-from shared.errors import UserError
+from kouxing.services.recognizer.acoustic import neural as neural_module
+from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.model_file import read_archive
+from kouxing.services.recognizer.acoustic.network import (
+    MAX_POSITIONS,
+    NUM_INPUTS,
+    WINDOW,
+    position_table,
+)
+from kouxing.services.recognizer.acoustic.neural import FORMAT, NeuralModel
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 

@@ -10,35 +10,35 @@ import pytest
 import soundfile
 import torch
 
-from corpora.feature_cache import as_floats, samples_of
-from corpora.speech_corpus import RowErrors, read_corpus
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.acoustic.model_file import PHONE_LM_PATH, shipped_phone_lm
-from services.recognizer.acoustic.network import WINDOW
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.features import LogMel
-from services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from tests.languages import MANDARIN, SIL
-from tests.tones import burst, tones
-from tests.whisper_folder import encoder_arrays, write_whisper
-from training.neural import augmentation, batches, teacher, trainer
-from training.neural.augmentation import (
+from kouxing.corpora.feature_cache import as_floats, samples_of
+from kouxing.corpora.speech_corpus import RowErrors, read_corpus
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.model_file import PHONE_LM_PATH, shipped_phone_lm
+from kouxing.services.recognizer.acoustic.network import WINDOW
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.features import LogMel
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.training.neural import augmentation, batches, teacher, trainer
+from kouxing.training.neural.augmentation import (
     augment_samples,
     change_tempo,
     mask,
     scale_level,
     source_frames,
 )
-from training.neural.batches import Recording, Targets, augment, batches_of
-from training.neural.export import network_of, onnx_of
-from training.neural.network import Network, Shape, output_frames
-from training.neural.recipe import train_neural
-from training.neural.scoring import first_hypothesis_error_rate, log_posteriors_of
-from training.neural.trainer import Trainer, cross_entropy, shift_targets
-from training.neural.whisper_weights import load_whisper
-from training.training_set import load_examples, load_untranscribed
+from kouxing.training.neural.batches import Recording, Targets, augment, batches_of
+from kouxing.training.neural.export import network_of, onnx_of
+from kouxing.training.neural.network import Network, Shape, output_frames
+from kouxing.training.neural.recipe import train_neural
+from kouxing.training.neural.scoring import first_hypothesis_error_rate, log_posteriors_of
+from kouxing.training.neural.trainer import Trainer, cross_entropy, shift_targets
+from kouxing.training.neural.whisper_weights import load_whisper
+from kouxing.training.training_set import load_examples, load_untranscribed
+from tests.languages import MANDARIN, SIL
+from tests.tones import burst, tones
+from tests.whisper_folder import encoder_arrays, write_whisper
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
@@ -308,7 +308,9 @@ def test_samples_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     rows = read_corpus(corpus, RowErrors(), MANDARIN)
     (corpus / "b.wav").write_bytes(b"no sound")
     first = samples_of(rows)
-    monkeypatch.setattr("corpora.feature_cache.read_audio", lambda _: pytest.fail("computed again"))
+    monkeypatch.setattr(
+        "kouxing.corpora.feature_cache.read_audio", lambda _: pytest.fail("computed again")
+    )
     for found in (first, samples_of(rows)):
         np.testing.assert_allclose(as_floats(found[0]), HELLO, atol=2**-16)
         assert len(found[1]) == 0
@@ -547,7 +549,7 @@ def test_long_recordings_are_cropped_and_start_at_any_position(
 def corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Two recordings of a sentence, one of them for dev; networks and batches are small."""
     quick(monkeypatch)
-    monkeypatch.setattr("training.neural.initial_network.Shape", SMALL)
+    monkeypatch.setattr("kouxing.training.neural.initial_network.Shape", SMALL)
     return write_corpus(tmp_path / "corpus", {"a": HELLO, "d": HELLO})
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from services.recognizer.search.output_rule import OutputRule
+from kouxing.services.recognizer.search.output_rule import OutputRule
 
 pytestmark = pytest.mark.unit
 

@@ -11,22 +11,22 @@ from numpy.typing import NDArray
 from PIL import Image
 from typer.testing import CliRunner
 
-from corpora.commands import adapt_app, track_app
-from corpora.face_landmarks import LANDMARKS
-from corpora.landmark_file import landmark_file
-from corpora.lip_clips import read_clip
-from services.driver.render.renderer import Renderer
-from services.driver.video.film import render_video
-from services.driver.video.writer import VideoWriter
-from services.live_chain import LiveChain
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
-from services.recognizer.lips import load_lips
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.load import load_lip_model
-from shared.errors import UserError
-from shared.face.faps import FAP_NUMBER, MOUTH_FAPS
-from shared.face.lip_models import LipModelName
+from kouxing.corpora.commands import adapt_app, track_app
+from kouxing.corpora.face_landmarks import LANDMARKS
+from kouxing.corpora.landmark_file import landmark_file
+from kouxing.corpora.lip_clips import read_clip
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video.film import render_video
+from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
+from kouxing.services.recognizer.lips import load_lips
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
+from kouxing.shared.face.lip_models import LipModelName
 from tests.e2e.following import samples_of_file
 from tests.heads import load
 from tests.system import DEMO

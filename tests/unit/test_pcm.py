@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.pcm import (
+from kouxing.services.recognizer.front_end.pcm import (
     SLICE,
     BadAudio,
     level_db,

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.load import load_lip_model
-from services.synthesizer.offline import synthesize
-from shared.face.lip_models import LipModelName
-from shared.face.shapes import SHAPE_SETS
-from shared.phones.events import Phone
-from shared.phones.inventory import load_inventory
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import load_inventory
 from tests import heads
 from tests.receivers import SENT, received
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.model_file import Archive, phone_lm_arrays, phone_lm_from
-from services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
+from kouxing.services.recognizer.acoustic.model_file import Archive, phone_lm_arrays, phone_lm_from
+from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
 from tests.languages import NUM_PHONES, SIL, START, Gram, Table, flat_language, step
 
 pytestmark = pytest.mark.unit

@@ -11,18 +11,29 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from services.recognizer.acoustic.gmm import GmmModel
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.acoustic.model_file import (
+from kouxing.services.recognizer.acoustic.gmm import GmmModel
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.acoustic.model_file import (
     PHONE_LM_PATH,
     read_archive,
     shipped_phone_lm,
     write_archive,
 )
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from shared.errors import UserError
-from shared.phones.inventory import load_inventory
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.training.commands import app
+from kouxing.training.phone_lm import open_gram
+from kouxing.training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
+from kouxing.training.phone_lm.open_gram import draw_phones
+from kouxing.training.phone_lm.recipe import (
+    load_phone_lm,
+    phone_lm_of,
+    phones_of_text,
+    train_phone_lm,
+)
+from kouxing.training.training_set import Example
 from tests.languages import (
     MANDARIN,
     NUM_PHONES,
@@ -33,12 +44,6 @@ from tests.languages import (
     install_language,
     step,
 )
-from training.commands import app
-from training.phone_lm import open_gram
-from training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
-from training.phone_lm.open_gram import draw_phones
-from training.phone_lm.recipe import load_phone_lm, phone_lm_of, phones_of_text, train_phone_lm
-from training.training_set import Example
 
 pytestmark = pytest.mark.unit
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from services.synthesizer.phone_numbers import PhoneNumbers
+from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
 from tests.lips import phone
 
 pytestmark = pytest.mark.unit

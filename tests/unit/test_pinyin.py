@@ -1,7 +1,7 @@
 import pytest
 
-from shared.errors import UserError
-from shared.phones.mandarin.pinyin import phones_of_syllable, transcribe
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.mandarin.pinyin import phones_of_syllable, transcribe
 from tests.languages import MANDARIN
 
 pytestmark = pytest.mark.unit

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from corpora.scoring import first_hypothesis, is_emitted
-from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.offline import recognize
-from services.recognizer.recognizer import Emission, Recognizer, warm_up
-from services.recognizer.search import decoder
-from services.recognizer.search.decoder import Segment
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.phones.events import Phone, SpeechChange
+from kouxing.corpora.scoring import first_hypothesis, is_emitted
+from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.recognizer import Emission, Recognizer, warm_up
+from kouxing.services.recognizer.search import decoder
+from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.languages import MANDARIN
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]

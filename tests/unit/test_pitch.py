@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.front_end.pitch import Pitch
+from kouxing.services.recognizer.front_end.pitch import Pitch
 
 pytestmark = pytest.mark.unit
 

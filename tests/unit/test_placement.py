@@ -6,10 +6,10 @@ import dataclasses
 
 import pytest
 
-from services.control.load import MEASURED_S, NUM_SURE, RETRY_AFTER_S, WorkerLoad
-from services.control.registry import Refusal
-from shared.keys import Peer
-from shared.wire.session import OpenSession
+from kouxing.services.control.load import MEASURED_S, NUM_SURE, RETRY_AFTER_S, WorkerLoad
+from kouxing.services.control.registry import Refusal
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.session import OpenSession
 from tests.unit.test_sessions import Made, worker
 
 pytestmark = pytest.mark.unit

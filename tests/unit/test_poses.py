@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.driver.poses import FADE_S, Poses
-from shared.face.faps import NUM_FAPS
-from shared.face.idle_motion import IdleMotion
+from kouxing.services.driver.poses import FADE_S, Poses
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.idle_motion import IdleMotion
 
 pytestmark = pytest.mark.unit
 

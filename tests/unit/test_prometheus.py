@@ -11,9 +11,9 @@ from contextlib import closing
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from shared.errors import UserError
-from shared.metrics import Metrics
-from shared.prometheus import MAX_REQUESTS, MetricsServer
+from kouxing.shared.errors import UserError
+from kouxing.shared.metrics import Metrics
+from kouxing.shared.prometheus import MAX_REQUESTS, MetricsServer
 
 pytestmark = pytest.mark.unit
 

@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from corpora.scoring import ErrorCounts, count_errors, first_hypothesis, matched_pairs
-from evaluation.recognizer.confusions import Confusions, draw_confusions
-from evaluation.recognizer.delay_curve import draw_delay_curve
-from evaluation.recognizer.error_rates import (
+from kouxing.corpora.scoring import ErrorCounts, count_errors, first_hypothesis, matched_pairs
+from kouxing.evaluation.recognizer.confusions import Confusions, draw_confusions
+from kouxing.evaluation.recognizer.delay_curve import draw_delay_curve
+from kouxing.evaluation.recognizer.error_rates import (
     bootstrap_interval,
     evaluate_recognizer,
     mouth_shapes,
 )
-from evaluation.recognizer.report import print_figures
-from services.recognizer.acoustic.load import load_model
-from shared.errors import UserError
-from shared.phones.events import Phone, SpeechChange
+from kouxing.evaluation.recognizer.report import print_figures
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.languages import MANDARIN
 from tests.system import VOWELS_FILE
 

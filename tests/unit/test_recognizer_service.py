@@ -11,26 +11,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.recognizer.acoustic.load import load_model, model_path
-from services.recognizer.audio_order import AudioMessage
-from services.recognizer.config import RecognizerConfig
-from services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
-from services.recognizer.service import (
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
+from kouxing.services.recognizer.audio_order import AudioMessage
+from kouxing.services.recognizer.config import RecognizerConfig
+from kouxing.services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
+from kouxing.services.recognizer.service import (
     MAX_LEAD_S,
     MAX_QUEUED_S,
     MAX_UNPACED_S,
     RecognizerService,
 )
-from services.recognizer.stream import SpeechStream
-from services.recognizer.voice import Voice
-from shared.bus import Bus
-from shared.keys import Peer
-from shared.phones.events import LipFrame
-from shared.reliable import ReliableSender
-from shared.wire.audio import AudioChunk, EndOfAudio
-from shared.wire.control import StartSession
-from shared.wire.message import MAX_AUDIO_BYTES, Message
-from shared.wire.speech import Stalled
+from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.recognizer.voice import Voice
+from kouxing.shared.bus import Bus
+from kouxing.shared.keys import Peer
+from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.reliable import ReliableSender
+from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
+from kouxing.shared.wire.speech import Stalled
 from tests.e2e.following import samples_of_file
 from tests.system import VOWELS_FILE, free_port
 

@@ -6,10 +6,10 @@ import av
 import numpy as np
 import pytest
 
-from services.driver.head.head import Head
-from services.driver.render.renderer import Renderer
-from services.driver.video.recording import Recording
-from shared.face.faps import NUM_FAPS
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video.recording import Recording
+from kouxing.shared.face.faps import NUM_FAPS
 
 pytestmark = pytest.mark.unit
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from corpora.lip_clips import level_track
-from services.recognizer.acoustic.load import load_live_model, load_model
-from services.recognizer.alignment import align_text
-from services.recognizer.lips import lips_for
-from services.recording_chain import HeardRecording, animate, hear_recording
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.load import load_lip_model
-from services.synthesizer.offline import synthesize
-from shared.audio_file import read_audio
-from shared.phones.events import Phone, SpeechChange
+from kouxing.corpora.lip_clips import level_track
+from kouxing.services.recognizer.acoustic.load import load_live_model, load_model
+from kouxing.services.recognizer.alignment import align_text
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recording_chain import HeardRecording, animate, hear_recording
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit

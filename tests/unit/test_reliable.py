@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import pytest
 
-from shared.bus import Bus, Socket
-from shared.keys import Peer
-from shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
-from shared.wire.message import Message
-from shared.wire.speech import Acknowledge, Progress
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.keys import Peer
+from kouxing.shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import Acknowledge, Progress
 
 pytestmark = pytest.mark.unit
 

@@ -8,11 +8,11 @@ import moderngl
 import numpy as np
 import pytest
 
-from services.driver.head.head import Head, neutral_faps
-from services.driver.render import renderer as render
-from services.driver.render.renderer import Renderer
-from services.driver.render.window import Window
-from shared.errors import UserError
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.render import renderer as render
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.window import Window
+from kouxing.shared.errors import UserError
 from tests.heads import OPEN
 
 pytestmark = pytest.mark.unit

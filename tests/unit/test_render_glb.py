@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from services.driver.head.glb_export import export_glb
-from shared.errors import UserError
-from shared.face.faps import FAPS
-from shared.face.shapes import ARKIT
+from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS
+from kouxing.shared.face.shapes import ARKIT
 from tests import heads
 
 pytestmark = pytest.mark.unit

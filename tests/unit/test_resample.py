@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.resample import Resampler, to_16_khz
-from shared.errors import UserError
+from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

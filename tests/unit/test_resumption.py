@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.resumption import GRID_S, WARM_UP_S, Resumption
-from services.recognizer.stream import SpeechStream, StreamOutput, Waveform
-from shared.clock import to_samples
-from shared.phones.events import LipFrame, Phone, Progress, SpeechChange
-from shared.phones.final_time import QUIET_S, FinalTime
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.resumption import GRID_S, WARM_UP_S, Resumption
+from kouxing.services.recognizer.stream import SpeechStream, StreamOutput, Waveform
+from kouxing.shared.clock import to_samples
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from kouxing.shared.phones.final_time import QUIET_S, FinalTime
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from evaluation.recognizer import robustness
-from evaluation.recognizer.disturbances import (
+from kouxing.evaluation.recognizer import robustness
+from kouxing.evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
     babble,
@@ -21,9 +21,9 @@ from evaluation.recognizer.disturbances import (
     with_noise,
     with_sound,
 )
-from evaluation.recognizer.robustness import evaluate_robustness, print_robustness
-from services.recognizer.acoustic.load import load_model
-from shared.errors import UserError
+from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.clients import control_address
-from services.cli.running_system import announce, find_control
-from shared.keys import user_key
+from kouxing.services.cli.clients import control_address
+from kouxing.services.cli.running_system import announce, find_control
+from kouxing.shared.keys import user_key
 from tests.system import ROOT
 
 pytestmark = pytest.mark.unit
 ANNOUNCE = """
 import sys
-from services.cli.running_system import announce
+from kouxing.services.cli.running_system import announce
 with announce(sys.argv[1]):
     print("announced", flush=True)
     sys.stdin.read()

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.driver.config import Framing
-from services.driver.head.head import Head, neutral_faps
-from services.driver.render.camera import Camera
-from services.driver.render.renderer import BACKGROUND, Renderer
-from services.driver.render.scene import background, camera, load_head
-from shared.errors import UserError
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.render.camera import Camera
+from kouxing.services.driver.render.renderer import BACKGROUND, Renderer
+from kouxing.services.driver.render.scene import background, camera, load_head
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from services.senders import live_link, osc, vmc, vtube_studio
-from services.senders.face import Face
-from services.senders.target import parse_target
-from shared.errors import UserError
-from shared.face.faps import FAP_NUMBER, NUM_FAPS
-from shared.face.shapes import SHAPE_SETS
+from kouxing.services.senders import live_link, osc, vmc, vtube_studio
+from kouxing.services.senders.face import Face
+from kouxing.services.senders.target import parse_target
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.shapes import SHAPE_SETS
 from tests.receivers import LIVE_LINK_ORDER, read_live_link, read_osc
 
 pytestmark = pytest.mark.unit

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from services.control.config import ControlConfig
-from services.control.service import ControlService
-from shared.bus import Bus
-from shared.config import ServiceConfig
-from shared.keys import NOBODY, Peer
-from shared.service import SESSIONS_A_BEAT, STOOD_STILL_S, Service
-from shared.wire.control import (
+from kouxing.services.control.config import ControlConfig
+from kouxing.services.control.service import ControlService
+from kouxing.shared.bus import Bus
+from kouxing.shared.config import ServiceConfig
+from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.service import SESSIONS_A_BEAT, STOOD_STILL_S, Service
+from kouxing.shared.wire.control import (
     Heartbeat,
     HeartbeatSeen,
     SessionInput,
@@ -25,8 +25,8 @@ from shared.wire.control import (
     StopSession,
     UseLips,
 )
-from shared.wire.session import AddShapes, ChooseExpressiveness, Done, Express
-from shared.wire.speech import Progress, Speech
+from kouxing.shared.wire.session import AddShapes, ChooseExpressiveness, Done, Express
+from kouxing.shared.wire.speech import Progress, Speech
 from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit
@@ -295,7 +295,7 @@ def test_a_new_control_is_told_the_sessions_with_what_was_chosen(
 def test_it_registers_where_something_else_answered_before(
     monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
 ) -> None:
-    monkeypatch.setattr("shared.service.UNANSWERED_S", 0.3)
+    monkeypatch.setattr("kouxing.shared.service.UNANSWERED_S", 0.3)
     monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
     listener = socket.create_server(("127.0.0.1", 0))
     commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
@@ -316,7 +316,7 @@ def test_it_registers_where_something_else_answered_before(
 def test_where_control_hangs_what_is_meant_for_it_waits(
     monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
 ) -> None:
-    monkeypatch.setattr("shared.service.UNANSWERED_S", 0.0)
+    monkeypatch.setattr("kouxing.shared.service.UNANSWERED_S", 0.0)
     monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
     connected = worker.control
     for _ in range(3):
@@ -357,13 +357,13 @@ def test_a_process_ends_when_it_is_asked_for_its_health_and_its_loop_hangs(
     slow: Slow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[int] = []
-    monkeypatch.setattr("shared.service.os._exit", ends.append)
+    monkeypatch.setattr("kouxing.shared.service.os._exit", ends.append)
     slow.step(0.0)
     assert slow.check_health()
-    monkeypatch.setattr("shared.service.ALIVE_S", 0.0)
+    monkeypatch.setattr("kouxing.shared.service.ALIVE_S", 0.0)
     time.sleep(0.02)
     assert not slow.check_health()
     assert ends == []
-    monkeypatch.setattr("shared.service.ENDS_S", 0.0)
+    monkeypatch.setattr("kouxing.shared.service.ENDS_S", 0.0)
     slow.check_health()
     assert ends == [1]

@@ -7,13 +7,13 @@ import gc
 import numpy as np
 import pytest
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.front_end.resample import to_16_khz
-from services.recognizer.lips import lips_for
-from services.recognizer.stream import SpeechStream
-from shared.audio_file import read_audio
-from shared.metrics import give_back_memory, memory_mb
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.metrics import give_back_memory, memory_mb
 from tests.system import DEMO
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]

@@ -6,12 +6,12 @@ import dataclasses
 
 import pytest
 
-from services.control.registry import UNPACED_AUDIO, Refusal, Registry
-from services.control.sessions import SessionRecord, Sessions
-from shared.face.shapes import ARKIT, VRM
-from shared.keys import Peer
-from shared.wire.control import Heartbeat, SessionInput
-from shared.wire.session import OpenSession
+from kouxing.services.control.registry import UNPACED_AUDIO, Refusal, Registry
+from kouxing.services.control.sessions import SessionRecord, Sessions
+from kouxing.shared.face.shapes import ARKIT, VRM
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.control import Heartbeat, SessionInput
+from kouxing.shared.wire.session import OpenSession
 
 pytestmark = pytest.mark.unit
 

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from services.control.config import ControlConfig
+from kouxing.services.control.config import ControlConfig
 from tests.system import ROOT
 
 pytestmark = pytest.mark.unit

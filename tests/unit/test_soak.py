@@ -8,14 +8,14 @@ from typing import cast
 import numpy as np
 import pytest
 
-from evaluation.system.soak import RATE_HZ, Listener, Round, lost_phones, sound_of, summary
-from shared.bus import Received
-from shared.client import Session
-from shared.clock import MEDIA_RATE_HZ
-from shared.wire.face import FapFrame
-from shared.wire.message import Message
-from shared.wire.session import SessionOpened
-from shared.wire.speech import Phone
+from kouxing.evaluation.system.soak import RATE_HZ, Listener, Round, lost_phones, sound_of, summary
+from kouxing.shared.bus import Received
+from kouxing.shared.client import Session
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import SessionOpened
+from kouxing.shared.wire.speech import Phone
 
 pytestmark = pytest.mark.unit
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shared.errors import UserError
-from shared.sound_devices import monitor, sound_devices
+from kouxing.shared.errors import UserError
+from kouxing.shared.sound_devices import monitor, sound_devices
 
 pytestmark = pytest.mark.unit
 

@@ -8,9 +8,9 @@ import json
 import numpy as np
 import pytest
 
-from services.gateway.sound_format import SoundFormat, check_text
-from services.gateway.sound_input import SoundInput
-from shared.errors import UserError
+from kouxing.services.gateway.sound_format import SoundFormat, check_text
+from kouxing.services.gateway.sound_input import SoundInput
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 
@@ -114,7 +114,7 @@ def test_an_interruption_drops_what_waits_and_the_stream_goes_on() -> None:
 
 
 def test_a_stream_that_pauses_stays_open(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("services.gateway.sound_input.KEEP_ALIVE_S", 0.02)
+    monkeypatch.setattr("kouxing.services.gateway.sound_input.KEEP_ALIVE_S", 0.02)
 
     async def speak() -> Recorded:
         recorded = Recorded()

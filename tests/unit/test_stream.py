@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import run_scoring_tasks
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.front_end.resample import to_16_khz
-from services.recognizer.lip_source import delay_for
-from services.recognizer.stream import (
+from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.lip_source import delay_for
+from kouxing.services.recognizer.stream import (
     MAX_JITTER,
     SILENT_DB,
     Chunk,
@@ -21,9 +21,16 @@ from services.recognizer.stream import (
     StreamOutput,
     Waveform,
 )
-from shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent, SpeechChange
-from shared.wire.events import message_of
-from shared.wire.message import Message
+from kouxing.shared.phones.events import (
+    EndOfSound,
+    LipFrame,
+    Phone,
+    Progress,
+    SoundEvent,
+    SpeechChange,
+)
+from kouxing.shared.wire.events import message_of
+from kouxing.shared.wire.message import Message
 from tests.e2e.following import samples_of_file
 from tests.made_up_lips import JAW, LoudLips
 from tests.system import VOWELS_FILE

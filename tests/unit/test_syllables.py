@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import load_inventory
-from shared.phones.known_text import characters_of, place_in_text
-from shared.phones.mandarin.pinyin import phones_of_syllable, spell
-from shared.phones.syllables import MAX_PHONES, SyllableTrack
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.known_text import characters_of, place_in_text
+from kouxing.shared.phones.mandarin.pinyin import phones_of_syllable, spell
+from kouxing.shared.phones.syllables import MAX_PHONES, SyllableTrack
 
 pytestmark = pytest.mark.unit
 MANDARIN = load_inventory("mandarin")

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from services.recognizer.link import KEPT, SynthesizerLink
-from shared.bus import Bus, Socket
-from shared.clock import to_samples
-from shared.face.faps import NUM_FAPS
-from shared.wire.message import Message
-from shared.wire.speech import Acknowledge, Progress, ResumeFace, Speech
+from kouxing.services.recognizer.link import KEPT, SynthesizerLink
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.clock import to_samples
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.speech import Acknowledge, Progress, ResumeFace, Speech
 
 pytestmark = pytest.mark.unit
 FAPS = bytes(range(4)) * NUM_FAPS

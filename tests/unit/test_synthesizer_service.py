@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.service import MAX_AT_ONCE_S, MAX_WAITING, SynthesizerService
-from shared.clock import to_samples
-from shared.keys import Peer
-from shared.wire.control import StartSession
-from shared.wire.face import EndOfFaps, FapFrame, Shapes
-from shared.wire.speech import EndOfPhones, Progress
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.service import MAX_AT_ONCE_S, MAX_WAITING, SynthesizerService
+from kouxing.shared.clock import to_samples
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.speech import EndOfPhones, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port
 

@@ -9,13 +9,19 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import erf, softmax
 
-from services.recognizer.acoustic.network import position_table
-from services.recognizer.front_end.features import frames_in
-from services.recognizer.front_end.whisper_mel import NUM_MELS, mel_bands
+from kouxing.services.recognizer.acoustic.network import position_table
+from kouxing.services.recognizer.front_end.features import frames_in
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, mel_bands
+from kouxing.training.neural import teacher
+from kouxing.training.neural.network import Shape
+from kouxing.training.neural.teacher import (
+    Teacher,
+    WholeEncoder,
+    centred_mel,
+    process_all,
+    train_teacher,
+)
 from tests.tones import tones
-from training.neural import teacher
-from training.neural.network import Shape
-from training.neural.teacher import Teacher, WholeEncoder, centred_mel, process_all, train_teacher
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from services.cli.terminal import check_output, write_text
-from shared.errors import UserError
+from kouxing.services.cli.terminal import check_output, write_text
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

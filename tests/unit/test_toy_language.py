@@ -12,31 +12,35 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.live_chain import LiveChain
-from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, AcousticModel, Topology
-from services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.model_file import read_archive
-from services.recognizer.alignment import align_text, spoken
-from services.recognizer.front_end.features import (
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    NUM_POSITIONS,
+    AcousticModel,
+    Topology,
+)
+from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, GmmModel
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.model_file import read_archive
+from kouxing.services.recognizer.alignment import align_text, spoken
+from kouxing.services.recognizer.front_end.features import (
     HOP_S,
     NUM_FEATURES,
     LiveMean,
     cepstra,
     with_differences,
 )
-from services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
-from services.recognizer.offline import recognize
-from services.recognizer.recognizer import Recognizer
-from services.recognizer.speech_scores import frame_time_s
-from services.synthesizer.config import SynthesizerConfig
-from services.synthesizer.face import Face
-from services.synthesizer.lips.load import load_lip_model
-from shared.audio_file import read_audio
-from shared.errors import UserError
-from shared.face.lip_models import LipModelName
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
+from kouxing.services.recognizer.offline import recognize
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.speech_scores import frame_time_s
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.audio_file import read_audio
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import flat_language, install_language
 from tests.system import VOWELS_FILE
 

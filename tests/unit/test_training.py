@@ -9,24 +9,28 @@ import numpy as np
 import pytest
 import soundfile
 
-from corpora import feature_cache
-from corpora.kept_back import CONVERSATION, is_kept_back
-from corpora.speech_corpus import RowErrors, may_ship, read_corpus
-from services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.alignment import align_text
-from services.recognizer.front_end.features import NUM_BANDS
-from services.recognizer.search.decoder import Segment
-from services.recognizer.search.forced_path import segments_of_path, utterance_graph, viterbi_path
-from shared.errors import UserError
+from kouxing.corpora import feature_cache
+from kouxing.corpora.kept_back import CONVERSATION, is_kept_back
+from kouxing.corpora.speech_corpus import RowErrors, may_ship, read_corpus
+from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.alignment import align_text
+from kouxing.services.recognizer.front_end.features import NUM_BANDS
+from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.forced_path import (
+    segments_of_path,
+    utterance_graph,
+    viterbi_path,
+)
+from kouxing.shared.errors import UserError
+from kouxing.training.durations import PhoneDurations, positions_of
+from kouxing.training.gmm.decorrelation import decorrelate
+from kouxing.training.gmm.estimation import estimate, first_estimate, split
+from kouxing.training.gmm.frames import Copy, FrameSet, flat_path
+from kouxing.training.gmm.recipe import train_gmm
+from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
+from kouxing.training.training_set import Example, load_examples, speech_span
 from tests.languages import MANDARIN, SIL
-from training.durations import PhoneDurations, positions_of
-from training.gmm.decorrelation import decorrelate
-from training.gmm.estimation import estimate, first_estimate, split
-from training.gmm.frames import Copy, FrameSet, flat_path
-from training.gmm.recipe import train_gmm
-from training.phone_lm.recipe import load_phone_lm, train_phone_lm
-from training.training_set import Example, load_examples, speech_span
 
 pytestmark = pytest.mark.unit
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from services.synthesizer.lips.dynamic_visemes.trajectory import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import (
     Motion,
     Rest,
     TargetTrajectory,
     Transition,
     motionless,
 )
-from shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.lips import LIPS, articulation_of, utterance
 
 pytestmark = pytest.mark.unit

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.recognizer.transcriber import SherpaTranscriber
-from shared.errors import UserError
+from kouxing.services.recognizer.transcriber import SherpaTranscriber
+from kouxing.shared.errors import UserError
 from tests.sherpa_models import paraformer, sense_voice, transducer
 
 pytestmark = pytest.mark.unit

@@ -6,14 +6,14 @@ from typing import cast
 import numpy as np
 import pytest
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
-from services.recognizer.acoustic.load import load_model, with_early_network
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.acoustic.two_networks import TwoNetworks
-from services.recognizer.lips import lips_for
-from services.recognizer.speech_scores import FrameScores, SpeechScores
-from services.recognizer.stream import SpeechStream, StreamOutput
-from shared.phones.events import LipFrame, Phone
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.load import load_model, with_early_network
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.speech_scores import FrameScores, SpeechScores
+from kouxing.services.recognizer.stream import SpeechStream, StreamOutput
+from kouxing.shared.phones.events import LipFrame, Phone
 from tests.unit.test_block_model import FRAMES, HELLO, blocks
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]

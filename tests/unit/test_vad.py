@@ -3,8 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.vad import BLOCK_SAMPLES, VoiceActivityDetector, VoiceState
-from shared.audio_file import read_audio
+from kouxing.services.recognizer.front_end.vad import (
+    BLOCK_SAMPLES,
+    VoiceActivityDetector,
+    VoiceState,
+)
+from kouxing.shared.audio_file import read_audio
 
 pytestmark = pytest.mark.unit
 

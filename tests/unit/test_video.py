@@ -8,8 +8,8 @@ import av
 import numpy as np
 import pytest
 
-from services.driver.video.writer import VideoWriter
-from shared.errors import UserError
+from kouxing.services.driver.video.writer import VideoWriter
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

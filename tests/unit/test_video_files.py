@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from services.driver.video.writer import VideoWriter, open_writer, write_picture
-from shared.errors import UserError
+from kouxing.services.driver.video.writer import VideoWriter, open_writer, write_picture
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

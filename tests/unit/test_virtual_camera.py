@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.driver.head.head import Head, neutral_faps
-from services.driver.render.renderer import Renderer
-from services.driver.video.virtual_camera import VirtualCamera
-from shared.errors import UserError
+from kouxing.services.driver.head.head import Head, neutral_faps
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video.virtual_camera import VirtualCamera
+from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
 

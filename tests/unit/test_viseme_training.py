@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import soundfile
 
-from corpora.lip_clips import SAMPLE_RATE_HZ, part_of, read_clips
-from services.synthesizer.lips.dynamic_visemes.blending import blend
-from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.inventory import load_inventory
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, part_of, read_clips
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
+from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.inventory import load_inventory
+from kouxing.training.visemes.fit import estimate
+from kouxing.training.visemes.frames import frames_of
+from kouxing.training.visemes.recipe import closure_reach, train_visemes, usual_levels
 from tests.lips import JAW, LOWER_LIP, WIDTH, clip_of, utterance
-from training.visemes.fit import estimate
-from training.visemes.frames import frames_of
-from training.visemes.recipe import closure_reach, train_visemes, usual_levels
 
 pytestmark = pytest.mark.unit
 

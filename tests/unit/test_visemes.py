@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.dynamic_visemes.visemes import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     REST,
     VISEME_INDEX,
@@ -16,11 +16,11 @@ from services.synthesizer.lips.dynamic_visemes.visemes import (
     static_targets,
     visemes_of,
 )
-from services.synthesizer.offline import synthesize
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.services.synthesizer.offline import synthesize
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from tests import heads
 
 pytestmark = pytest.mark.unit

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from services.recognizer import voice_learning
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_tracks import measures_of
-from services.recognizer.lips import LIP_FAPS
-from services.recognizer.voice import Voice, parse_profile, read_profile
-from services.recognizer.voice_learning import (
+from kouxing.services.recognizer import voice_learning
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_tracks import measures_of
+from kouxing.services.recognizer.lips import LIP_FAPS
+from kouxing.services.recognizer.voice import Voice, parse_profile, read_profile
+from kouxing.services.recognizer.voice_learning import (
     FilmedSpeech,
     Material,
     learn_voice,
@@ -22,7 +22,7 @@ from services.recognizer.voice_learning import (
     measure_gain,
     with_voice,
 )
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 from tests.e2e.following import samples_of_file
 from tests.lip_predictors import made_up_model
 from tests.system import VOWELS_FILE

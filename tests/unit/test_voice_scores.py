@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from corpora.lip_clips import LipClip
-from evaluation.lips import voices
-from evaluation.lips.voices import score_voices
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lips import LipPredictor
-from services.recognizer.voice import Voice
-from services.recognizer.voice_learning import Material, with_voice
-from shared.errors import UserError
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.evaluation.lips import voices
+from kouxing.evaluation.lips.voices import score_voices
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lips import LipPredictor
+from kouxing.services.recognizer.voice import Voice
+from kouxing.services.recognizer.voice_learning import Material, with_voice
+from kouxing.shared.errors import UserError
 from tests.lip_predictors import made_up_model
 
 pytestmark = pytest.mark.unit

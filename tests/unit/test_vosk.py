@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from services.gateway.vosk import Utterances
-from shared.phones.events import Phone
+from kouxing.services.gateway.vosk import Utterances
+from kouxing.shared.phones.events import Phone
 
 pytestmark = pytest.mark.unit
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from services.driver.head.glb_export import export_glb
-from services.driver.head.morphs import AVATAR_MORPHS
-from shared.face.shapes import ARKIT, VRM
+from kouxing.services.driver.head.glb_export import export_glb
+from kouxing.services.driver.head.morphs import AVATAR_MORPHS
+from kouxing.shared.face.shapes import ARKIT, VRM
 from tests import heads
 
 pytestmark = pytest.mark.unit

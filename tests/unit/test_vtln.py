@@ -3,8 +3,8 @@ import itertools
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.features import NUM_BANDS, LogMel
-from services.recognizer.front_end.vtln import (
+from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
+from kouxing.services.recognizer.front_end.vtln import (
     MAX_FACTOR,
     REFERENCE_HZ,
     VOICED_STRENGTH,

@@ -8,8 +8,8 @@ import wave
 
 import pytest
 
-from shared.errors import UserError
-from shared.wav_header import WavHeader, read_wav_header
+from kouxing.shared.errors import UserError
+from kouxing.shared.wav_header import WavHeader, read_wav_header
 
 pytestmark = pytest.mark.unit
 

@@ -10,14 +10,14 @@ import aiohttp
 import pytest
 from aiohttp import web
 
-from services.gateway.whip import MISSING, WhipClients
+from kouxing.services.gateway.whip import MISSING, WhipClients
 
 pytestmark = pytest.mark.unit
 
 
 def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "aiortc", None)
-    monkeypatch.delitem(sys.modules, "services.gateway.webrtc", raising=False)
+    monkeypatch.delitem(sys.modules, "kouxing.services.gateway.webrtc", raising=False)
     nothing: Any = None
     clients = WhipClients(1.0, nothing, nothing, ["127.0.0.1"])
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel, mel_bands
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS, WhisperMel, mel_bands
 
 pytestmark = pytest.mark.unit
 

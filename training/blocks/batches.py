@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
-from corpora.feature_cache import as_floats
-from services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
-from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from training.neural.augmentation import (
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
+from kouxing.training.neural.augmentation import (
     Samples,
     change_speed,
     change_tempo,
@@ -34,7 +34,7 @@ from training.neural.augmentation import (
     scale_level,
     source_frames,
 )
-from training.neural.batches import Recording, Targets, sampling_probs
+from kouxing.training.neural.batches import Recording, Targets, sampling_probs
 
 BATCH_S = 32
 _POSITIONS_PER_S = 50

@@ -21,7 +21,7 @@ new             keys and values of the block, in the order of the  (sessions, 2 
                 inputs, 16-bit floats                              B, size)
 =============== ================================================== =============================
 
-Products are of 8-bit integers (:mod:`training.neural.onnx_graph`); norms, attention and the
+Products are of 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`); norms, attention and the
 recurrent layer are floats. A product with a single row may be summed in another order than
 one with more. The recurrent layer has a row for each session, so it gets the first session's once
 more.
@@ -33,11 +33,11 @@ import numpy as np
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
-from services.recognizer.front_end.whisper_mel import NUM_MELS
-from training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
-from training.blocks.readout import MAX_DEVIATIONS
-from training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
-from training.neural.teacher import KEPT_LAYERS
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
+from kouxing.training.blocks.readout import MAX_DEVIATIONS
+from kouxing.training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
+from kouxing.training.neural.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")
 

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.speech_corpus import RowErrors, is_synthetic
-from services.recognizer.acoustic.neural import NeuralModel
-from training.neural.alignment import align_all, aligner_scores
-from training.neural.batches import Recording, Targets
-from training.neural.scoring import samples_of
-from training.neural.teacher import WholeEncoder, process_all, train_teacher
-from training.progress import Report
-from training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
+from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.training.neural.alignment import align_all, aligner_scores
+from kouxing.training.neural.batches import Recording, Targets
+from kouxing.training.neural.scoring import samples_of
+from kouxing.training.neural.teacher import WholeEncoder, process_all, train_teacher
+from kouxing.training.progress import Report
+from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
 
 _FULL_FOLDER_MINUTES = 35  # a folder with more counts no more
 

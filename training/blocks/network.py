@@ -50,10 +50,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from services.recognizer.front_end.whisper_mel import FLOOR_BANDS
-from training.blocks.readout import Readout
-from training.neural.network import PADDING_FRAMES, Encoder, Shape
-from training.neural.teacher import KEPT_LAYERS
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
+from kouxing.training.blocks.readout import Readout
+from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Shape
+from kouxing.training.neural.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms
 PAST = 125  # positions before a block that it attends to, 2.5 s

@@ -42,9 +42,9 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax
 from torch.optim.swa_utils import AveragedModel
 
-from training.neural.batches import Batch, Recording, Targets, augment, sampling_probs
-from training.neural.trainer import cross_entropy, late_mean, take_step
-from training.progress import Report
+from kouxing.training.neural.batches import Batch, Recording, Targets, augment, sampling_probs
+from kouxing.training.neural.trainer import cross_entropy, late_mean, take_step
+from kouxing.training.progress import Report
 
 MAX_WINDOW_FRAMES = 250
 MAX_DEVIATIONS = 6.0

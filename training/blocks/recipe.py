@@ -17,23 +17,23 @@ from pathlib import Path
 
 import torch
 
-from corpora.speech_corpus import RowErrors
-from services.recognizer.acoustic.blocks import BlockModel
-from services.recognizer.acoustic.load import NEURAL_PATH, load_model
-from services.recognizer.acoustic.neural import NeuralModel
-from shared.errors import UserError
-from training.blocks.batches import BATCH_S
-from training.blocks.export import onnx_of
-from training.blocks.labels import Draw, label, load_labels, save_labels
-from training.blocks.network import BlockEncoder, BlockReadout
-from training.blocks.readout import train_readout
-from training.blocks.trainer import BlockNetwork, train_network
-from training.blocks.window_features import encode_by
-from training.model_card import write_card
-from training.neural.initial_network import init_encoder
-from training.neural.whisper_weights import load_whisper
-from training.progress import Report
-from training.training_set import FRAMES_PER_MINUTE, load_examples
+from kouxing.corpora.speech_corpus import RowErrors
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.load import NEURAL_PATH, load_model
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.shared.errors import UserError
+from kouxing.training.blocks.batches import BATCH_S
+from kouxing.training.blocks.export import onnx_of
+from kouxing.training.blocks.labels import Draw, label, load_labels, save_labels
+from kouxing.training.blocks.network import BlockEncoder, BlockReadout
+from kouxing.training.blocks.readout import train_readout
+from kouxing.training.blocks.trainer import BlockNetwork, train_network
+from kouxing.training.blocks.window_features import encode_by
+from kouxing.training.model_card import write_card
+from kouxing.training.neural.initial_network import init_encoder
+from kouxing.training.neural.whisper_weights import load_whisper
+from kouxing.training.progress import Report
+from kouxing.training.training_set import FRAMES_PER_MINUTE, load_examples
 
 NUM_READOUT_STEPS, NUM_STEPS = 450, 475
 BLOCK_LENGTH = 5  # positions, live
@@ -68,7 +68,7 @@ def train_blocks(
     output
         The ``.npz`` file to write; the card is written beside it as ``.md``.
     whisper
-        Folder with Whisper base, see :func:`training.neural.whisper_weights.load_whisper`.
+        Folder with Whisper base, see :func:`kouxing.training.neural.whisper_weights.load_whisper`.
     start
         A neural model: its HMMs, phone language model, prior and weights are taken over; it aligns.
         Without it, that is the model that ships.

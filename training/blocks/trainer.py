@@ -32,14 +32,14 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from training.blocks.batches import BlockBatch, block_batch
-from training.blocks.network import BlockEncoder, BlockReadout, layout
-from training.blocks.readout import MAX_DEVIATIONS
-from training.neural.batches import Recording
-from training.neural.network import mixed_precision
-from training.neural.teacher import WholeEncoder
-from training.neural.trainer import cross_entropy, late_mean, take_step
-from training.progress import Report
+from kouxing.training.blocks.batches import BlockBatch, block_batch
+from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.blocks.readout import MAX_DEVIATIONS
+from kouxing.training.neural.batches import Recording
+from kouxing.training.neural.network import mixed_precision
+from kouxing.training.neural.teacher import WholeEncoder
+from kouxing.training.neural.trainer import cross_entropy, late_mean, take_step
+from kouxing.training.progress import Report
 
 _RATE, _READOUT_RATE = 1e-4, 6e-4  # of the last layer, of the readout
 _RATE_BELOW = 0.85  # relative to the rate of the layer above

@@ -1,6 +1,6 @@
 """What the first readout reads: Whisper's encoder as it is, on windows, run by onnxruntime.
 
-The graph computes ``training.neural.teacher.WholeEncoder`` on a window of at most 2.5 s.
+The graph computes ``kouxing.training.neural.teacher.WholeEncoder`` on a window of at most 2.5 s.
 
 ================ ==================================================== =====================
 symbol           meaning                                              shape
@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from services.recognizer.acoustic.network import open_session, position_table
-from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
-from training.blocks.readout import MAX_WINDOW_FRAMES
-from training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats
-from training.neural.teacher import WholeEncoder
+from kouxing.services.recognizer.acoustic.network import open_session, position_table
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS
+from kouxing.training.blocks.readout import MAX_WINDOW_FRAMES
+from kouxing.training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats
+from kouxing.training.neural.teacher import WholeEncoder
 
 
 def encode_by(encoder: WholeEncoder) -> Callable[[Floats], Floats]:

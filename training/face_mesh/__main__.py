@@ -16,8 +16,8 @@ from pathlib import Path
 
 import onnx
 
-from shared.errors import UserError
-from training.face_mesh.tflite_graph import onnx_model
+from kouxing.shared.errors import UserError
+from kouxing.training.face_mesh.tflite_graph import onnx_model
 
 REQUIREMENT = "mediapipe==0.10.14"
 OUTPUT = Path(__file__).parents[2] / "corpora" / "models"
@@ -30,7 +30,7 @@ _MODELS = {
 
 def main() -> None:
     """Parse the command line, download, convert and write."""
-    parser = argparse.ArgumentParser(prog="python -m training.face_mesh")
+    parser = argparse.ArgumentParser(prog="python -m kouxing.training.face_mesh")
     parser.add_argument("--data", type=Path, help="folder that holds, or gets, the wheel")
     parser.add_argument("--output", type=Path, default=OUTPUT, help="folder to write into")
     given = parser.parse_args()

@@ -15,9 +15,9 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.ferguson.timing import Hiss
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import PhoneInventory, Syllable
+from kouxing.services.synthesizer.lips.ferguson.timing import Hiss
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
 Array = NDArray[np.float64]
 

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from corpora.lip_clips import LipClip
-from services.synthesizer.lips.dynamic_visemes.parameters import columns
-from services.synthesizer.lips.dynamic_visemes.visemes import REST
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING
-from services.synthesizer.lips.ferguson.openings import anchors_of
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
+from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from kouxing.services.synthesizer.lips.ferguson.openings import anchors_of
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

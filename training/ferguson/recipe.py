@@ -8,22 +8,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.feature_cache import read_audio
-from corpora.lip_clips import label_clip, read_clips
-from corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.alignment import align_phones, spoken
-from services.recognizer.front_end.pcm import progress_of
-from services.synthesizer.lips.ferguson.contour import lip_points
-from services.synthesizer.lips.ferguson.table import PhoneTable, format_table
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.inventory import PhoneInventory
-from training.ferguson.lengths import AlignedSpeech, usual_times
-from training.ferguson.openings import fit_openings, travel_of
-from training.progress import Report
+from kouxing.corpora.feature_cache import read_audio
+from kouxing.corpora.lip_clips import label_clip, read_clips
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, may_ship, read_corpus, syllables_of
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.alignment import align_phones, spoken
+from kouxing.services.recognizer.front_end.pcm import progress_of
+from kouxing.services.synthesizer.lips.ferguson.contour import lip_points
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable, format_table
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.ferguson.lengths import AlignedSpeech, usual_times
+from kouxing.training.ferguson.openings import fit_openings, travel_of
+from kouxing.training.progress import Report
 
 _MIN_SYLLABLES = 3  # words alone are spoken slower than speech
 _MAX_OF_SPEAKER = 60  # recordings, so that nobody counts too much

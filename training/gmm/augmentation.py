@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from services.recognizer.front_end.features import (
+from kouxing.services.recognizer.front_end.features import (
     BAND_HZ,
     BAND_MEL,
     HIGHEST_HZ,

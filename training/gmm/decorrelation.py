@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.gmm import GaussianMixtures
-from services.recognizer.front_end.features import NUM_FEATURES
-from training.gmm.estimation import variance_floor
-from training.gmm.frames import FrameSet, Hmm
+from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures
+from kouxing.services.recognizer.front_end.features import NUM_FEATURES
+from kouxing.training.gmm.estimation import variance_floor
+from kouxing.training.gmm.frames import FrameSet, Hmm
 
 
 def decorrelate(

@@ -25,13 +25,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology
-from services.recognizer.acoustic.gmm import GaussianMixtures
-from services.recognizer.front_end.features import NUM_FEATURES
-from services.recognizer.search.forced_path import segments_of_path
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from training.durations import PhoneDurations
-from training.gmm.frames import FrameSet, Hmm
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
+from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures
+from kouxing.services.recognizer.front_end.features import NUM_FEATURES
+from kouxing.services.recognizer.search.forced_path import segments_of_path
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.training.durations import PhoneDurations
+from kouxing.training.gmm.frames import FrameSet, Hmm
 
 _VARIANCE_FLOOR = 0.05  # relative to the variance of all speech
 _MIN_FRAMES = 8.0  # a component with fewer frames is dropped

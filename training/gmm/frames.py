@@ -8,17 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.gmm import GaussianMixtures, mixture_scores
-from services.recognizer.front_end.features import (
+from kouxing.services.recognizer.acoustic.gmm import GaussianMixtures, mixture_scores
+from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     LiveMean,
     cepstra_of_all,
     with_differences,
 )
-from services.recognizer.search.forced_path import UtteranceGraph, utterance_graph, viterbi_path
-from shared.phones.inventory import PhoneInventory
-from training.gmm.augmentation import Augmentation
-from training.training_set import Example
+from kouxing.services.recognizer.search.forced_path import (
+    UtteranceGraph,
+    utterance_graph,
+    viterbi_path,
+)
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.gmm.augmentation import Augmentation
+from kouxing.training.training_set import Example
 
 _LOUD_LEVEL = 0.4  # speech is louder than this, from quiet (0) to loud (1)
 

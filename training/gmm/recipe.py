@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.speech_corpus import RowErrors, is_synthetic
-from services.recognizer.acoustic.gmm import GmmModel
-from services.recognizer.front_end.features import NUM_FEATURES, cepstra_of_all
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
-from training import SYNTHETIC_WEIGHT
-from training.gmm.augmentation import Augmentation
-from training.gmm.decorrelation import decorrelate
-from training.gmm.estimation import estimate, first_estimate, split, topology_of
-from training.gmm.frames import Copy, FrameSet, Hmm
-from training.model_card import write_card
-from training.phone_lm.recipe import load_phone_lm, phone_lm_of
-from training.progress import Report
-from training.search_weights import SearchWeights, choose_search_weights
-from training.training_set import Example, load_examples
+from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
+from kouxing.services.recognizer.acoustic.gmm import GmmModel
+from kouxing.services.recognizer.front_end.features import NUM_FEATURES, cepstra_of_all
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training import SYNTHETIC_WEIGHT
+from kouxing.training.gmm.augmentation import Augmentation
+from kouxing.training.gmm.decorrelation import decorrelate
+from kouxing.training.gmm.estimation import estimate, first_estimate, split, topology_of
+from kouxing.training.gmm.frames import Copy, FrameSet, Hmm
+from kouxing.training.model_card import write_card
+from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
+from kouxing.training.progress import Report
+from kouxing.training.search_weights import SearchWeights, choose_search_weights
+from kouxing.training.training_set import Example, load_examples
 
 _STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
 _HALF_WIDTH = 2  # frames, of the differences: the textbook's

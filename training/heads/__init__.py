@@ -1,1 +1,1 @@
-"""Build the heads' assets from MakeHuman data: ``python -m training.heads``."""
+"""Build the heads' assets from MakeHuman data: ``python -m kouxing.training.heads``."""

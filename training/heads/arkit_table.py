@@ -27,9 +27,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS
-from shared.face.idle_motion import LOWER_LID, UPPER_LID
-from training.heads.assemble import Builder
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS
+from kouxing.shared.face.idle_motion import LOWER_LID, UPPER_LID
+from kouxing.training.heads.assemble import Builder
 
 Float = NDArray[np.float64]
 

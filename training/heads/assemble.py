@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate
 
-from services.driver.head import surface
-from training.heads import paint, paint_parts, parts
-from training.heads.asset import Piece, write
-from training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
-from training.heads.feature_points import FEATURE_POINTS
-from training.heads.hair import Crop, coarse_locks
-from training.heads.makehuman import PIVOT, MakeHuman
-from training.heads.measures import (
+from kouxing.services.driver.head import surface
+from kouxing.training.heads import paint, paint_parts, parts
+from kouxing.training.heads.asset import Piece, write
+from kouxing.training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
+from kouxing.training.heads.feature_points import FEATURE_POINTS
+from kouxing.training.heads.hair import Crop, coarse_locks
+from kouxing.training.heads.makehuman import PIVOT, MakeHuman
+from kouxing.training.heads.measures import (
     eye_sockets,
     head_weight,
     lip_outline,
@@ -27,10 +27,10 @@ from training.heads.measures import (
     mouth_cavity,
     neckline_height,
 )
-from training.heads.occlusion import shade
-from training.heads.people import REFERENCE, Person, Shape
-from training.heads.texture import encode
-from training.heads.zones import (
+from kouxing.training.heads.occlusion import shade
+from kouxing.training.heads.people import REFERENCE, Person, Shape
+from kouxing.training.heads.texture import encode
+from kouxing.training.heads.zones import (
     FaceFields,
     Fields,
     Skin,

@@ -1,4 +1,4 @@
-"""The file format of a head: what ``services.driver.head.head`` reads."""
+"""The file format of a head: what ``kouxing.services.driver.head.head`` reads."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head.head import FORMAT
-from training.heads import parts
-from training.heads.feature_points import FEATURE_POINTS
-from training.heads.makehuman import METRES_PER_UNIT, PIVOT
-from training.heads.zones import Fields, Skin
+from kouxing.services.driver.head.head import FORMAT
+from kouxing.training.heads import parts
+from kouxing.training.heads.feature_points import FEATURE_POINTS
+from kouxing.training.heads.makehuman import METRES_PER_UNIT, PIVOT
+from kouxing.training.heads.zones import Fields, Skin
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

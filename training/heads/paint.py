@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
-from training.heads.hair import Hair
-from training.heads.texture import Color, mix, noise
+from kouxing.training.heads.hair import Hair
+from kouxing.training.heads.texture import Color, mix, noise
 
 Float = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from training.heads.hair import NUM_BANDS
-from training.heads.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
-from training.heads.texture import Color, mix, noise
+from kouxing.training.heads.hair import NUM_BANDS
+from kouxing.training.heads.parts import EYE_RINGS, IRIS_ANGLE, PUPIL_ANGLE
+from kouxing.training.heads.texture import Color, mix, noise
 
 Float = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from training.heads.hair import Bob, Crop, Hair
-from training.heads.paint import Look
+from kouxing.training.heads.hair import Bob, Crop, Hair
+from kouxing.training.heads.paint import Look
 
 Shape = tuple[tuple[str, float], ...]
 

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from services.driver.head import surface
-from services.driver.head.import_fields import AXES, CORNER_SLOPE, INNER, OUTER
-from shared.face.faps import FAPS
-from training.heads.feature_points import FEATURE_POINTS
+from kouxing.services.driver.head import surface
+from kouxing.services.driver.head.import_fields import AXES, CORNER_SLOPE, INNER, OUTER
+from kouxing.shared.face.faps import FAPS
+from kouxing.training.heads.feature_points import FEATURE_POINTS
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]

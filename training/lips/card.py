@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from services.recognizer.lip_positions import POSITION_S
-from services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS, LipPredictor
-from training.lips.positions import Speech, components_of
-from training.lips.recurrent import Example
-from training.lips.ridge import Products, history_of
-from training.lips.scores import Made, Stretch, correlations, count_closures
-from training.lips.targets import touches
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from kouxing.services.recognizer.lip_positions import POSITION_S
+from kouxing.services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS, LipPredictor
+from kouxing.training.lips.positions import Speech, components_of
+from kouxing.training.lips.recurrent import Example
+from kouxing.training.lips.ridge import Products, history_of
+from kouxing.training.lips.scores import Made, Stretch, correlations, count_closures
+from kouxing.training.lips.targets import touches
 
 Floats = NDArray[np.float32]
 

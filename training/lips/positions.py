@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.feature_cache import cache_folder
-from corpora.lip_clips import LipClip
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_positions import lip_positions
-from training.neural.augmentation import augment_samples, scale_level
+from kouxing.corpora.feature_cache import cache_folder
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_positions import lip_positions
+from kouxing.training.neural.augmentation import augment_samples, scale_level
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

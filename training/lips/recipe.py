@@ -5,7 +5,7 @@
 
 Every clip that is not held out and whose licence allows it is trained on; no setting is chosen by
 them. Each goes in once as it is and in augmented copies, so that few voices stand for more. A
-teacher may label further speech, which nobody filmed (:mod:`training.lips.teacher`).
+teacher may label further speech, which nobody filmed (:mod:`kouxing.training.lips.teacher`).
 """
 
 from __future__ import annotations
@@ -18,26 +18,31 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from corpora.lip_clips import label_clip, read_clips
-from corpora.speech_corpus import may_ship
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.network import FRAMES_PER_POSITION
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.whisper_mel import NUM_MELS
-from services.recognizer.lips import (
+from kouxing.corpora.lip_clips import label_clip, read_clips
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.lips import (
     CLOSURE,
     LIP_FAPS,
     NUM_LAYERS,
     NUM_OUTPUTS,
     LipPredictor,
 )
-from shared.errors import UserError
-from training.lips.card import Trained, write_card
-from training.lips.positions import Speech, components_of, features_of, speech_of
-from training.lips.recurrent import Example, LipNetwork, train_network
-from training.lips.ridge import HISTORY, fit_ridge, history_of
-from training.lips.targets import Touch, targets_at, touches
-from training.lips.teacher import draw_recordings, label_recordings, load_encoder, train_teacher
+from kouxing.shared.errors import UserError
+from kouxing.training.lips.card import Trained, write_card
+from kouxing.training.lips.positions import Speech, components_of, features_of, speech_of
+from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.lips.ridge import HISTORY, fit_ridge, history_of
+from kouxing.training.lips.targets import Touch, targets_at, touches
+from kouxing.training.lips.teacher import (
+    draw_recordings,
+    label_recordings,
+    load_encoder,
+    train_teacher,
+)
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]

@@ -18,10 +18,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LipClip
-from services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
-from services.recognizer.lips import CLOSURE
-from training.lips.targets import Touch, opening
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
+from kouxing.services.recognizer.lips import CLOSURE
+from kouxing.training.lips.targets import Touch, opening
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

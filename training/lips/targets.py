@@ -22,10 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LipClip
-from services.recognizer.lip_tracks import lip_tracks, values_at
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.recognizer.lip_tracks import lip_tracks, values_at
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
 
 Array = NDArray[np.float64]
 

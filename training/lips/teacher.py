@@ -35,20 +35,20 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.special import expit
 
-from corpora.feature_cache import as_integers, read_audio
-from corpora.kept_back import is_kept_back
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from corpora.speech_corpus import audio_files, duration_s
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.lip_positions import POSITION_S
-from services.recognizer.lips import LIP_FAPS
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from training.lips.positions import Speech, speech_of
-from training.lips.recurrent import Example, LipNetwork, train_network
-from training.neural.network import Shape
-from training.neural.teacher import NUM_LAYERS, WholeEncoder
-from training.neural.whisper_weights import load_whisper
+from kouxing.corpora.feature_cache import as_integers, read_audio
+from kouxing.corpora.kept_back import is_kept_back
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from kouxing.corpora.speech_corpus import audio_files, duration_s
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_positions import POSITION_S
+from kouxing.services.recognizer.lips import LIP_FAPS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.training.lips.positions import Speech, speech_of
+from kouxing.training.lips.recurrent import Example, LipNetwork, train_network
+from kouxing.training.neural.network import Shape
+from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
+from kouxing.training.neural.whisper_weights import load_whisper
 
 Floats = NDArray[np.float32]
 Features = NDArray[np.float16]  # of Whisper's encoder
@@ -224,7 +224,7 @@ def train_teacher(
     delays_s
         Delays of the examples' targets, seconds.
     num_epochs, seed
-        As for :func:`training.lips.recurrent.train_network`.
+        As for :func:`kouxing.training.lips.recurrent.train_network`.
     """
     clips = {each.clip.name: each.clip for each in speech}
     whole = {

@@ -9,18 +9,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.search.decoder import Segment
-from services.recognizer.search.forced_path import segments_of_path, utterance_graph, viterbi_path
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from shared.errors import UserError
-from training.durations import PhoneDurations
-from training.neural.export import network_of
-from training.neural.scoring import network_scores
-from training.progress import Report, with_progress
-from training.search_weights import all_scores
-from training.training_set import Example
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Topology
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.forced_path import (
+    segments_of_path,
+    utterance_graph,
+    viterbi_path,
+)
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.errors import UserError
+from kouxing.training.durations import PhoneDurations
+from kouxing.training.neural.export import network_of
+from kouxing.training.neural.scoring import network_scores
+from kouxing.training.progress import Report, with_progress
+from kouxing.training.search_weights import all_scores
+from kouxing.training.training_set import Example
 
 STATES_PER_PHONE = 3
 _LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; layers with more are trained less

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, fftconvolve, resample_poly, sosfilt
 
-from services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
+from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ, WINDOW_S
 
 Samples = NDArray[np.float32]
 Sound = NDArray[np.floating[Any]]  # samples while they are worked on

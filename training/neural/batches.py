@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from corpora.feature_cache import as_floats
-from services.recognizer.front_end.whisper_mel import WhisperMel
-from training.neural.augmentation import (
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.training.neural.augmentation import (
     augment_samples,
     change_tempo,
     scale_level,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from corpora.figures import new_figure, save_figure
+from kouxing.corpora.figures import new_figure, save_figure
 
 _SMOOTHED_STEPS = 20
 

@@ -35,9 +35,9 @@ import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from services.recognizer.acoustic.network import NUM_INPUTS, SEEN_FRAMES, WINDOW
-from training.neural.network import Network, Shape
-from training.neural.onnx_graph import (
+from kouxing.services.recognizer.acoustic.network import NUM_INPUTS, SEEN_FRAMES, WINDOW
+from kouxing.training.neural.network import Network, Shape
+from kouxing.training.neural.onnx_graph import (
     DOMAIN,
     Floats,
     Graph,

@@ -5,16 +5,16 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.features import HOP_S
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
-from training.neural.alignment import STATES_PER_PHONE
-from training.neural.export import network_of
-from training.neural.network import Network, Shape
-from training.neural.teacher import NUM_LAYERS, WholeEncoder
-from training.neural.whisper_weights import load_whisper
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.neural.alignment import STATES_PER_PHONE
+from kouxing.training.neural.export import network_of
+from kouxing.training.neural.network import Network, Shape
+from kouxing.training.neural.teacher import NUM_LAYERS, WholeEncoder
+from kouxing.training.neural.whisper_weights import load_whisper
 
 LOOK_AHEADS_MS = (10, 30, 60, 100, 200)  # of the output layers besides the main one
 FRAME_MS = 1000 * HOP_S

@@ -4,7 +4,7 @@ Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak su
 the encoder's layers, and the weights that training starts with); Vaswani et al. 2017, "Attention is
 all you need" (sinusoidal positions). The layers and the weights are those of Whisper's encoder. To
 run live, a position attends to itself and to the ``WINDOW - 1`` positions before it instead of the
-whole recording. The teacher (:mod:`training.neural.teacher`) runs the same layers on whole
+whole recording. The teacher (:mod:`kouxing.training.neural.teacher`) runs the same layers on whole
 recordings.
 
 ======== =========================================================== ============================
@@ -28,7 +28,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax, scaled_dot_product_attention
 
-from services.recognizer.acoustic.network import NUM_INPUTS, WINDOW, position_table
+from kouxing.services.recognizer.acoustic.network import NUM_INPUTS, WINDOW, position_table
 
 PADDING_FRAMES = 2  # of zeros, before a segment's first
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 
 DOMAIN = "com.microsoft"  # of onnxruntime's own operators
 _OPERATORS = 20  # version of the ONNX operator set

@@ -5,7 +5,7 @@ learns the states of a forced alignment. The model it starts with aligns; or ano
 first, and after half of the steps the network itself. It aligns with an output layer that looks
 30 ms ahead, because the onset of a phone is clearer with some of what follows.
 
-With Whisper there is a teacher too (:mod:`training.neural.teacher`), trained on the first
+With Whisper there is a teacher too (:mod:`kouxing.training.neural.teacher`), trained on the first
 alignment, which sees whole recordings. The targets are then the average of alignment and teacher,
 and the teacher's alone in recordings without text.
 
@@ -25,15 +25,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corpora.speech_corpus import RowErrors, is_synthetic
-from services.recognizer.acoustic.acoustic_model import Topology
-from services.recognizer.acoustic.load import load_model
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.features import HOP_S
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from shared.errors import UserError
-from training.model_card import write_card
-from training.neural.alignment import (
+from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.errors import UserError
+from kouxing.training.model_card import write_card
+from kouxing.training.neural.alignment import (
     AlignedExample,
     Statistics,
     align_all,
@@ -41,22 +41,27 @@ from training.neural.alignment import (
     aligning_output,
     statistics_of,
 )
-from training.neural.batches import Recording, Targets
-from training.neural.curves import draw_curves
-from training.neural.export import onnx_of
-from training.neural.initial_network import FRAME_MS, all_look_aheads, init_encoder, init_network
-from training.neural.scoring import first_hypothesis_error_rate, network_scores, samples_of
-from training.neural.teacher import Teacher, process_all, train_teacher
-from training.neural.trainer import BATCH_S, Trainer
-from training.phone_lm.recipe import load_phone_lm, phone_lm_of
-from training.progress import Report
-from training.search_weights import (
+from kouxing.training.neural.batches import Recording, Targets
+from kouxing.training.neural.curves import draw_curves
+from kouxing.training.neural.export import onnx_of
+from kouxing.training.neural.initial_network import (
+    FRAME_MS,
+    all_look_aheads,
+    init_encoder,
+    init_network,
+)
+from kouxing.training.neural.scoring import first_hypothesis_error_rate, network_scores, samples_of
+from kouxing.training.neural.teacher import Teacher, process_all, train_teacher
+from kouxing.training.neural.trainer import BATCH_S, Trainer
+from kouxing.training.phone_lm.recipe import load_phone_lm, phone_lm_of
+from kouxing.training.progress import Report
+from kouxing.training.search_weights import (
     SearchWeights,
     choose_search_weights,
     load_dev,
     offline_error_rate,
 )
-from training.training_set import Example, load_examples, load_untranscribed
+from kouxing.training.training_set import Example, load_examples, load_untranscribed
 
 LOOK_AHEAD_MS = 10.0  # of the main output layer: a phone may be known 35 ms after its onset
 NUM_STEPS = 800

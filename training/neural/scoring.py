@@ -9,17 +9,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corpora.feature_cache import as_floats
-from corpora.scoring import ErrorCounts, count_errors, first_hypothesis
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.network import MAX_POSITIONS
-from services.recognizer.alignment import spoken
-from services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from services.recognizer.front_end.whisper_mel import WhisperMel
-from services.recognizer.recognizer import Recognizer
-from services.recognizer.speech_scores import FrameScores, SpeechEnd, SpeechStart
-from training.neural.network import Network
-from training.training_set import Example
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.corpora.scoring import ErrorCounts, count_errors, first_hypothesis
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.network import MAX_POSITIONS
+from kouxing.services.recognizer.alignment import spoken
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.speech_scores import FrameScores, SpeechEnd, SpeechStart
+from kouxing.training.neural.network import Network
+from kouxing.training.training_set import Example
 
 
 @torch.no_grad()

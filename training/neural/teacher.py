@@ -18,7 +18,7 @@ symbol     meaning                                                    shape
 ========== ========================================================== ======================
 P          power spectra of 25 ms, centred on samples 160 j           (201, frames)
 B          mel filters of                                             (80, 201)
-           :mod:`services.recognizer.front_end.whisper_mel`
+           :mod:`kouxing.services.recognizer.front_end.whisper_mel`
 m          log-mel bands; the floor is eight decades below the        (80, frames)
            recording's maximum
 h_l        positions after layer l, centred on samples 320 p          (positions, width)
@@ -50,13 +50,13 @@ from torch import Tensor, nn
 from torch.nn.functional import gelu, log_softmax
 from torch.optim.swa_utils import AveragedModel
 
-from corpora.feature_cache import as_floats
-from services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
-from services.recognizer.front_end.whisper_mel import mel_bands
-from training.neural.batches import Recording, Sample, Targets, batches_of, sampling_probs
-from training.neural.network import Encoder, Shape, mixed_precision
-from training.neural.trainer import cross_entropy, late_mean, take_step
-from training.progress import Report, with_progress
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_SAMPLES, frames_in
+from kouxing.services.recognizer.front_end.whisper_mel import mel_bands
+from kouxing.training.neural.batches import Recording, Sample, Targets, batches_of, sampling_probs
+from kouxing.training.neural.network import Encoder, Shape, mixed_precision
+from kouxing.training.neural.trainer import cross_entropy, late_mean, take_step
+from kouxing.training.progress import Report, with_progress
 
 NUM_LAYERS = 6  # of Whisper base's encoder
 _NUM_STEPS = 300  # batches of 70 s of sound
@@ -196,7 +196,7 @@ def train_teacher(
     Parameters
     ----------
     encoder
-        With Whisper's weights, see :func:`training.neural.whisper_weights.load_whisper`.
+        With Whisper's weights, see :func:`kouxing.training.neural.whisper_weights.load_whisper`.
     recordings
         With the states of an alignment as targets. Their features are held in memory, 150 KB a
         second with Whisper base.

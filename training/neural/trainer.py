@@ -41,9 +41,9 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
-from training.neural.augmentation import mask
-from training.neural.batches import Recording, Sample, augment, batches_of, sampling_probs
-from training.neural.network import Network, mixed_precision, output_frames
+from kouxing.training.neural.augmentation import mask
+from kouxing.training.neural.batches import Recording, Sample, augment, batches_of, sampling_probs
+from kouxing.training.neural.network import Network, mixed_precision, output_frames
 
 BATCH_S = 30
 _BATCH_FRAMES = 100 * BATCH_S

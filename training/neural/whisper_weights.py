@@ -38,8 +38,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from training.neural.network import Encoder
+from kouxing.shared.errors import UserError
+from kouxing.training.neural.network import Encoder
 
 _FILE_NAME = "model.bin"
 _MIN_VERSION = 4

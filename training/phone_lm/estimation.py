@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Stream = NDArray[np.uint8]  # phones of a text, with a pause before each sentence
 

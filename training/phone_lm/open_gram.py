@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
-from training.phone_lm.estimation import Stream
-from training.phone_lm.recipe import phones_of_text
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.phone_lm.estimation import Stream
+from kouxing.training.phone_lm.recipe import phones_of_text
 
 _BASE = 100_000  # of the n-grams' codes, larger than the number of words
 _NUM_CHAINS = 100_000  # drawn side by side

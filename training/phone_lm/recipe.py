@@ -8,19 +8,19 @@ from pathlib import Path
 
 from rich.progress import track
 
-from corpora.speech_corpus import RowErrors, Utterance, is_synthetic, read_corpus
-from services.recognizer.acoustic.model_file import (
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, is_synthetic, read_corpus
+from kouxing.services.recognizer.acoustic.model_file import (
     phone_lm_arrays,
     phone_lm_from,
     read_archive,
     write_archive,
 )
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
-from training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
-from training.progress import Report
-from training.training_set import MAX_WORD_PHONES, Example
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.phone_lm.estimation import Stream, estimate_phone_lm, stream_of
+from kouxing.training.progress import Report
+from kouxing.training.training_set import MAX_WORD_PHONES, Example
 
 _CORPUS_WEIGHT = 0.012  # phones of the corpora's sentences per phone of other texts
 
@@ -50,9 +50,9 @@ def train_phone_lm(
     inventory
         The language of all of them.
     drawn
-        Phones that :func:`training.phone_lm.open_gram.draw_phones` has drawn.
+        Phones that :func:`kouxing.training.phone_lm.open_gram.draw_phones` has drawn.
     order, max_ngrams
-        See :func:`training.phone_lm.estimation.estimate_phone_lm`.
+        See :func:`kouxing.training.phone_lm.estimation.estimate_phone_lm`.
     report
         Receives lines of progress.
 

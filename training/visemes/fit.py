@@ -30,31 +30,31 @@ from numpy.typing import NDArray
 from rich.progress import track
 from scipy.optimize import minimize
 
-from corpora.lip_clips import MIRROR
-from services.synthesizer.lips.dynamic_visemes.blending import softmax
-from services.synthesizer.lips.dynamic_visemes.dominance import (
+from kouxing.corpora.lip_clips import MIRROR
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import softmax
+from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
     log_left_silence,
     log_pause,
     log_right_silence,
 )
-from services.synthesizer.lips.dynamic_visemes.initial_parameters import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import (
     CONSONANTS,
     initial_parameters,
 )
-from services.synthesizer.lips.dynamic_visemes.parameters import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     NUM_MOUTH_FAPS,
     VisemeParameters,
     columns,
 )
-from services.synthesizer.lips.dynamic_visemes.visemes import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     LIP_HEIGHT_FAPS,
     REST,
     VISEME_INDEX,
     VISEMES,
 )
-from shared.face.faps import MOUTH_FAPS
-from training.visemes.frames import Array, Frames
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.training.visemes.frames import Array, Frames
 
 _RIDGE = 10.0  # weight of the initial values, frames; neighbouring frames are not independent
 _SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.04, "target": 1.0}

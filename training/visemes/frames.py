@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import LipClip
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEME_INDEX
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEME_INDEX
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

@@ -8,22 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
-from corpora.lip_clips import LEVEL_STEP_S, LipClip, label_clip, level_track, read_clips
-from services.recognizer.acoustic.load import load_model
-from services.synthesizer.lips.dynamic_visemes.blending import blend
-from services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
-from services.synthesizer.lips.dynamic_visemes.parameters import (
+from kouxing.corpora.lip_clips import LEVEL_STEP_S, LipClip, label_clip, level_track, read_clips
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
+from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     VisemeParameters,
     columns,
     save_parameters,
 )
-from services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
-from shared.errors import UserError
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
-from training.visemes.fit import estimate
-from training.visemes.frames import Array, frames_of
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, VISEMES
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
+from kouxing.training.visemes.fit import estimate
+from kouxing.training.visemes.frames import Array, frames_of
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
 _SPOKEN_DB = 25.0  # sound this far below the loudest is no speech

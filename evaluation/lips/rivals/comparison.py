@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from corpora.figures import new_figure
-from corpora.lip_clips import LipClip, read_clips
-from corpora.speech_corpus import may_ship
-from evaluation.lips.clip_scores import MEASURES, score_clip
-from evaluation.lips.rivals.linear_map import fit
-from evaluation.lips.rivals.rows import (
+from kouxing.corpora.figures import new_figure
+from kouxing.corpora.lip_clips import LipClip, read_clips
+from kouxing.corpora.speech_corpus import may_ship
+from kouxing.evaluation.lips.clip_scores import MEASURES, score_clip
+from kouxing.evaluation.lips.rivals.linear_map import fit
+from kouxing.evaluation.lips.rivals.rows import (
     HEAD_AUDIO_VISEMES,
     ROW_S,
     Rows,
@@ -32,13 +32,13 @@ from evaluation.lips.rivals.rows import (
     wlipsync_profile,
     wlipsync_rows,
 )
-from evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme, hear, live_scheme
-from evaluation.lips.scores import LipScore, clips_to_score, pool
-from services.recognizer.acoustic.load import load_live_model
-from services.recognizer.lips import lips_for
-from services.synthesizer.lips.load import LIP_MODELS
-from shared.errors import UserError
-from shared.face.high_level import VISEMES
+from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme, hear, live_scheme
+from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.synthesizer.lips.load import LIP_MODELS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.high_level import VISEMES
 
 Array = NDArray[np.float64]
 

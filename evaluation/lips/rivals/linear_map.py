@@ -28,12 +28,12 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from evaluation.lips.clip_scores import MEASURES, real_faps
-from evaluation.lips.measures import Hits, closures, real_closures, real_shut
-from evaluation.lips.rivals.rows import ROW_S
-from evaluation.lips.schemes import FRAME_RATE_HZ
-from shared.face.faps import NUM_FAPS
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
+from kouxing.evaluation.lips.clip_scores import MEASURES, real_faps
+from kouxing.evaluation.lips.measures import Hits, closures, real_closures, real_shut
+from kouxing.evaluation.lips.rivals.rows import ROW_S
+from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
+from kouxing.shared.face.faps import NUM_FAPS
 
 Array = NDArray[np.float64]
 

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import resample_poly
 
-from corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from shared.errors import UserError, install_command
-from shared.face.shapes import OCULUS
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.shared.errors import UserError, install_command
+from kouxing.shared.face.shapes import OCULUS
 
 Array = NDArray[np.float64]
 Rows = Callable[[LipClip], Array]
@@ -38,7 +38,7 @@ Rows = Callable[[LipClip], Array]
 FOLDER = Path(__file__).parent
 ROW_S = 0.01
 _NODE_RATE_HZ = 48_000
-# The order of HeadAudio's outputs, in the names that `shared.face.shapes` has for them.
+# The order of HeadAudio's outputs, in the names that `kouxing.shared.face.shapes` has for them.
 HEAD_AUDIO_VISEMES = "aa E ih oh ou PP SS TH DD FF kk nn RR CH sil".split()
 _SILENCE_AFTER_S = 0.5
 _NUM_CEPSTRA = 12

@@ -35,22 +35,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from services.driver.head import vrm
-from services.driver.head.head import ASSETS, Head, Part
-from services.driver.head.morphs import (
+from kouxing.services.driver.head import vrm
+from kouxing.services.driver.head.head import ASSETS, Head, Part
+from kouxing.services.driver.head.morphs import (
     ARKIT_MORPHS,
     AVATAR_MORPHS,
     FAP_MORPHS,
     Morph,
     units_per_weight,
 )
-from services.driver.render import shaders
-from services.driver.render.renderer import BACKGROUND
-from services.driver.render.scene import camera
-from shared.errors import UserError
-from shared.face.faps import FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
-from shared.face.shapes import ARKIT
+from kouxing.services.driver.render import shaders
+from kouxing.services.driver.render.renderer import BACKGROUND
+from kouxing.services.driver.render.scene import camera
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS, VISEME_NAMES, VISEMES
+from kouxing.shared.face.shapes import ARKIT
 
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 MAX_BYTES = 512 * 1024 * 1024
 MAX_COUNT = 2_000_000  # elements of an accessor

@@ -26,13 +26,13 @@ from pathlib import Path
 
 import numpy as np
 
-from services.driver.head.glb_file import BadGlbError, Float64, Glb
-from services.driver.head.glb_pieces import plain, read_pieces
-from services.driver.head.head import Head, assemble
-from services.driver.head.pieces import Fields, Piece, pack, part_names
-from shared.errors import UserError
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from shared.face.shapes import ARKIT, OCULUS
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
+from kouxing.services.driver.head.glb_pieces import plain, read_pieces
+from kouxing.services.driver.head.head import Head, assemble
+from kouxing.services.driver.head.pieces import Fields, Piece, pack, part_names
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.shapes import ARKIT, OCULUS
 
 EYE_DISTANCE_M = 0.055  # to which a head is scaled
 # the units of an average face, in eye distances

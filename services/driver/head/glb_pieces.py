@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from services.driver import picture
-from services.driver.head.glb_file import BadGlbError, Float64, Glb
-from services.driver.head.pieces import Piece
-from shared.errors import UserError
+from kouxing.services.driver import picture
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
+from kouxing.services.driver.head.pieces import Piece
+from kouxing.shared.errors import UserError
 
 MAX_VERTICES = 300_000
 MAX_TRIANGLES = 1_000_000

@@ -31,10 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from services.driver.head.shading import Shading
-from shared.array_file import read_arrays
-from shared.errors import UserError
-from shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.services.driver.head.shading import Shading
+from kouxing.shared.array_file import read_arrays
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"

@@ -14,9 +14,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head.pieces import Fields
-from services.driver.head.surface import Float, Geodesics, Index, smoothest
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS
+from kouxing.services.driver.head.pieces import Fields
+from kouxing.services.driver.head.surface import Float, Geodesics, Index, smoothest
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS
 
 INNER = ("2.2", "2.6", "2.4", "2.8", "2.3", "2.9", "2.5", "2.7")
 OUTER = ("8.1", "8.5", "8.3", "8.7", "8.2", "8.8", "8.4", "8.6")

@@ -17,15 +17,21 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from services.driver.head.glb_file import Float64
-from services.driver.head.glb_head import EYE_DISTANCE_M, PIVOT, fade
-from services.driver.head.import_fields import INNER, LOWER_LIP, OUTER, UPPER_LIP, FaceFields
-from services.driver.head.mesh_file import numbered_vertices, read_mesh
-from services.driver.head.pieces import Fields, Piece, pack, weld
-from services.driver.head.points_file import Points, read_points
-from services.driver.head.surface import Geodesics
-from shared.errors import UserError
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.services.driver.head.glb_file import Float64
+from kouxing.services.driver.head.glb_head import EYE_DISTANCE_M, PIVOT, fade
+from kouxing.services.driver.head.import_fields import (
+    INNER,
+    LOWER_LIP,
+    OUTER,
+    UPPER_LIP,
+    FaceFields,
+)
+from kouxing.services.driver.head.mesh_file import numbered_vertices, read_mesh
+from kouxing.services.driver.head.pieces import Fields, Piece, pack, weld
+from kouxing.services.driver.head.points_file import Points, read_points
+from kouxing.services.driver.head.surface import Geodesics
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
 
 MAX_VERTICES = 65_535  # more would need larger numbers in the GLB for the page
 NEEDED = ("2.1", *sorted(INNER), "2.10", *sorted(OUTER))

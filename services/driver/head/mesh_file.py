@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from services.driver import picture
-from services.driver.head.glb_file import BadGlbError, Float64, Glb
-from services.driver.head.glb_pieces import read_pieces
-from services.driver.head.pieces import Piece
-from shared.errors import UserError
+from kouxing.services.driver import picture
+from kouxing.services.driver.head.glb_file import BadGlbError, Float64, Glb
+from kouxing.services.driver.head.glb_pieces import read_pieces
+from kouxing.services.driver.head.pieces import Piece
+from kouxing.shared.errors import UserError
 
 MAX_MESH_BYTES = 256 * 1024 * 1024  # size of a file
 MESH_SUFFIXES = (".obj", ".glb", ".ply")

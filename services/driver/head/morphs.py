@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
-from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
-from shared.face.shapes import ARKIT, VRM
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from kouxing.shared.face.shapes import ARKIT, VRM
 
 Float32 = NDArray[np.float32]
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver import picture
-from services.driver.head.glb_file import Float64
-from services.driver.head.head import FORMAT
+from kouxing.services.driver import picture
+from kouxing.services.driver.head.glb_file import Float64
+from kouxing.services.driver.head.head import FORMAT
 
 _MIN_SHIFT_M = 2e-9  # smaller displacements by one FAP unit are left out
 _WHITE = np.full((2, 2, 3), 255, np.uint8)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
+from kouxing.shared.errors import UserError
 
 MAX_BYTES = 16 * 1024 * 1024
 # ISO/IEC 14496-2, annex C: how many points each group has

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from services.driver.head.morphs import EMOTIONS
-from shared.face.shapes import ARKIT, VRM
+from kouxing.services.driver.head.morphs import EMOTIONS
+from kouxing.shared.face.shapes import ARKIT, VRM
 
 Place = tuple[float, float, float]
 Bindings = Mapping[str, Sequence[tuple[int, int]]]  # morph: nodes, and its number in each

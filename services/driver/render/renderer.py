@@ -11,12 +11,12 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver import picture
-from services.driver.head.head import Head, Part
-from services.driver.head.mouth_light import mouth_light
-from services.driver.render import shaders
-from services.driver.render.camera import Camera
-from shared.errors import UserError
+from kouxing.services.driver import picture
+from kouxing.services.driver.head.head import Head, Part
+from kouxing.services.driver.head.mouth_light import mouth_light
+from kouxing.services.driver.render import shaders
+from kouxing.services.driver.render.camera import Camera
+from kouxing.shared.errors import UserError
 
 UInt8 = NDArray[np.uint8]
 Float32 = NDArray[np.float32]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from services.driver.config import Framing
-from services.driver.head.glb_head import read_glb
-from services.driver.head.head import DEFAULT_HEAD, Detail, Head
-from services.driver.render.camera import Camera
-from services.driver.render.renderer import BACKGROUND, Background
-from shared.errors import UserError
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.head.glb_head import read_glb
+from kouxing.services.driver.head.head import DEFAULT_HEAD, Detail, Head
+from kouxing.services.driver.render.camera import Camera
+from kouxing.services.driver.render.renderer import BACKGROUND, Background
+from kouxing.shared.errors import UserError
 
 COLOURS = {
     "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import shared.face
+import kouxing.shared.face
 
-LIGHT = Path(shared.face.__file__).with_name("light.glsl").read_text(encoding="utf-8")
+LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl").read_text(encoding="utf-8")
 
 # Light is worked out at the vertices (they lie about 1 mm apart) and interpolated: on software GL
 # that takes a third of the time of lighting every pixel. Only the eyes' small highlights need it.

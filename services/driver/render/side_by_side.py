@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from services.driver.render.renderer import Float32, Renderer, UInt8
+from kouxing.services.driver.render.renderer import Float32, Renderer, UInt8
 
 _CAPTION_SHARE = 1 / 20  # height of its letters, as a share of the picture's
 

@@ -9,10 +9,10 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.head.head import Head
-from services.driver.render.camera import Camera
-from services.driver.render.renderer import BACKGROUND, Background, Renderer
-from shared.errors import UserError
+from kouxing.services.driver.head.head import Head
+from kouxing.services.driver.render.camera import Camera
+from kouxing.services.driver.render.renderer import BACKGROUND, Background, Renderer
+from kouxing.shared.errors import UserError
 
 Float32 = NDArray[np.float32]
 TITLE = "kouxing"

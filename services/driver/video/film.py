@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.render.renderer import Renderer
-from services.driver.render.side_by_side import SideBySide
-from services.driver.video.recording import Recording, between
-from services.driver.video.writer import write_picture
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
-from shared.face.fap_file import FapAnimation
-from shared.face.high_level import expression_faps, viseme_faps
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.side_by_side import SideBySide
+from kouxing.services.driver.video.recording import Recording, between
+from kouxing.services.driver.video.writer import write_picture
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import FapAnimation
+from kouxing.shared.face.high_level import expression_faps, viseme_faps
 
 # media time in seconds; FAPs (68,), side by side (num_faces, 68)
 Frame = tuple[float, NDArray[np.float32]]
@@ -64,7 +64,7 @@ def render_video(
     frames
         At least one; the last one is held while the sound goes on.
     path
-        As ``services.driver.video.open_writer`` takes it.
+        As ``kouxing.services.driver.video.open_writer`` takes it.
     renderer
         What draws.
     frame_rate_hz

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.driver.render.renderer import Renderer
-from services.driver.render.side_by_side import SideBySide
-from services.driver.video.writer import open_writer
-from shared.clock import MEDIA_RATE_HZ
-from shared.errors import UserError
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.render.side_by_side import SideBySide
+from kouxing.services.driver.video.writer import open_writer
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
 
 MAX_SILENCE_S = 600.0  # inserted for missing sound
 Faps = NDArray[np.float32]

@@ -6,9 +6,9 @@ import importlib
 
 import numpy as np
 
-from services.driver.head.head import Float32
-from services.driver.render.renderer import Renderer
-from shared.errors import UserError, install_command
+from kouxing.services.driver.head.head import Float32
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.shared.errors import UserError, install_command
 
 
 class VirtualCamera:

@@ -32,8 +32,8 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from numpy.typing import NDArray
 
-from services.driver import picture
-from shared.errors import UserError
+from kouxing.services.driver import picture
+from kouxing.shared.errors import UserError
 
 Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]

@@ -9,8 +9,8 @@ from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.search.phone_lm import PhoneLanguageModel
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
+from kouxing.shared.phones.inventory import PhoneInventory
 
 # Position of a phone between two pauses. The last phone is lengthened; a single one counts as last.
 FIRST, INSIDE, LAST = range(3)

@@ -5,7 +5,7 @@ encoder); Shi et al. 2021, "Emformer: efficient memory transformer based acousti
 latency streaming speech recognition" (blocks with a cached past, whose right context is computed
 anew); Bourlard and Morgan 1994, "Connectionist speech recognition" (scores are posteriors divided
 by priors). HMMs, search and output rule are those of Li et al. 2011. The network is that of
-:mod:`training.blocks.network`.
+:mod:`kouxing.training.blocks.network`.
 
 ============== ====================================================== ========================
 symbol         meaning                                                unit, shape
@@ -49,28 +49,28 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
-from services.recognizer.acoustic.caches import (
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
+from kouxing.services.recognizer.acoustic.caches import (
     CacheMemory,
     CacheSizes,
     Halves,
     cache_names,
 )
-from services.recognizer.acoustic.model_file import (
+from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
     topology_from,
     write_archive,
 )
-from services.recognizer.acoustic.network import (
+from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     MAX_POSITIONS,
     Floats,
     open_session,
     position_table,
 )
-from services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, NUM_MELS, WhisperMel
+from kouxing.shared.phones.inventory import PhoneInventory
 
 FORMAT = "blocks 2"
 

@@ -33,22 +33,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
-from services.recognizer.acoustic.model_file import (
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
+from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
     topology_from,
     write_archive,
 )
-from services.recognizer.front_end.features import (
+from kouxing.services.recognizer.front_end.features import (
     NUM_FEATURES,
     NUM_STATIC,
     Differences,
     LiveMean,
     cepstra,
 )
-from services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
+from kouxing.shared.phones.inventory import PhoneInventory
 
 FORMAT = "gmm 3"
 _MAX_MIXTURES = 1024

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from services.recognizer.acoustic import blocks, gmm, neural
-from services.recognizer.acoustic.acoustic_model import AcousticModel
-from services.recognizer.acoustic.model_file import Archive, read_archive
-from services.recognizer.acoustic.two_networks import TwoNetworks
-from shared.errors import UserError
+from kouxing.services.recognizer.acoustic import blocks, gmm, neural
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive
+from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
+from kouxing.shared.errors import UserError
 
 MODELS = Path(__file__).parents[1] / "models"
 SHIPPED = ("blocks", "gmm", "neural")

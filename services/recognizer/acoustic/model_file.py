@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
-from services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
-from shared.array_file import read_arrays
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
+from kouxing.services.recognizer.search.phone_lm import MAX_ORDER, PhoneLanguageModel
+from kouxing.shared.array_file import read_arrays
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 
 # Of the models whose files have no phone language model.
 PHONE_LM_PATH = Path(__file__).parents[1] / "models" / "phone_lm.npz"

@@ -1,7 +1,7 @@
 """The neural model's network: an ONNX file that onnxruntime runs one position at a time.
 
-See :mod:`services.recognizer.acoustic.neural` for what it computes and
-:mod:`training.neural.export` for how the file is written.
+See :mod:`kouxing.services.recognizer.acoustic.neural` for what it computes and
+:mod:`kouxing.training.neural.export` for how the file is written.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.caches import CacheSizes, cache_names
-from services.recognizer.front_end.whisper_mel import NUM_MELS
-from services.recognizer.onnx_session import open_network
+from kouxing.services.recognizer.acoustic.caches import CacheSizes, cache_names
+from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
+from kouxing.services.recognizer.onnx_session import open_network
 
 NUM_INPUTS = NUM_MELS
 WINDOW = 128  # positions that one attends to, itself included

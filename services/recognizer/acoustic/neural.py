@@ -50,15 +50,20 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import OnPosition, Topology, Work, no_scores
-from services.recognizer.acoustic.caches import CacheMemory, Halves, cache_names
-from services.recognizer.acoustic.model_file import (
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    OnPosition,
+    Topology,
+    Work,
+    no_scores,
+)
+from kouxing.services.recognizer.acoustic.caches import CacheMemory, Halves, cache_names
+from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
     topology_from,
     write_archive,
 )
-from services.recognizer.acoustic.network import (
+from kouxing.services.recognizer.acoustic.network import (
     MAX_POSITIONS,
     NUM_INPUTS,
     SEEN_FRAMES,
@@ -68,10 +73,10 @@ from services.recognizer.acoustic.network import (
     past_masks,
     position_table,
 )
-from services.recognizer.front_end.features import HOP_S
-from services.recognizer.front_end.whisper_mel import WhisperMel
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
 
 FORMAT = "neural 6"
 

@@ -14,18 +14,18 @@ from typing import cast
 
 import numpy as np
 
-from services.recognizer.acoustic.acoustic_model import (
+from kouxing.services.recognizer.acoustic.acoustic_model import (
     AcousticStream,
     OnPosition,
     Topology,
     Work,
     no_scores,
 )
-from services.recognizer.acoustic.blocks import BlockModel
-from services.recognizer.acoustic.network import Floats
-from services.recognizer.acoustic.neural import NeuralModel
-from services.recognizer.front_end.whisper_mel import WhisperMel
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.recognizer.acoustic.blocks import BlockModel
+from kouxing.services.recognizer.acoustic.network import Floats
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
+from kouxing.shared.phones.inventory import PhoneInventory
 
 
 @dataclass(frozen=True)

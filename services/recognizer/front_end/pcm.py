@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.front_end.pitch import Pitch
-from shared.clock import to_seconds
-from shared.phones.events import Progress
+from kouxing.services.recognizer.front_end.pitch import Pitch
+from kouxing.shared.clock import to_seconds
+from kouxing.shared.phones.events import Progress
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 FULL_SCALE = 32768.0

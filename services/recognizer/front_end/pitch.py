@@ -13,7 +13,7 @@ import kaldi_native_fbank
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.clock import MEDIA_RATE_HZ
 
 _SLICE_MS = 20.0
 _FULL_SCALE = 32768.0  # Kaldi's samples are 16-bit integers

@@ -29,8 +29,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.front_end.features import SAMPLE_RATE_HZ
-from shared.errors import UserError
+from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.shared.errors import UserError
 
 MIN_RATE_HZ = 8_000
 MAX_RATE_HZ = 48_000

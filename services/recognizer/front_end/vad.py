@@ -10,7 +10,7 @@ beginnings and ends:
 Onset delay: a block of 32 ms is judged when it is complete. If the first block with speech is
 probable at once, speech is detected up to 32 ms after its beginning. To wait for a second block
 would keep out no noise that was tried, neither clicks nor knocks. A pre-roll restores the sound
-before (see :mod:`services.recognizer.speech_scores`).
+before (see :mod:`kouxing.services.recognizer.speech_scores`).
 
 ======== ================================================================ =============
 symbol   meaning                                                          shape
@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.onnx_session import open_network
+from kouxing.services.recognizer.onnx_session import open_network
 
 BLOCK_SAMPLES = 512  # at 16 kHz: 32 ms, fixed by the network
 _PROBABLE = 0.2  # enough to begin: lips must not miss the first syllable

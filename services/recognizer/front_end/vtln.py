@@ -49,7 +49,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.front_end.features import (
+from kouxing.services.recognizer.front_end.features import (
     BAND_HZ,
     HIGHEST_MEL,
     HOP_S,

@@ -32,8 +32,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.acoustic.acoustic_model import Topology
-from services.recognizer.search.phone_lm import MAX_ORDER
+from kouxing.services.recognizer.acoustic.acoustic_model import Topology
+from kouxing.services.recognizer.search.phone_lm import MAX_ORDER
 
 _NO_RECORD = -1
 _NO_TOKEN = -1

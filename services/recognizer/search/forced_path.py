@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from services.recognizer.search.decoder import Segment
+from kouxing.services.recognizer.search.decoder import Segment
 
 
 @dataclass(slots=True, kw_only=True)

@@ -29,7 +29,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.phones.inventory import PhoneInventory
+from kouxing.shared.phones.inventory import PhoneInventory
 
 MAX_ORDER = 16  # phones in an n-gram
 

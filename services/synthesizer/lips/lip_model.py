@@ -13,7 +13,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.phones.events import SoundEvent
+from kouxing.shared.phones.events import SoundEvent
 
 
 class Articulation(Protocol):

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
-from services.synthesizer.lips.learnt.model import LearntLips
-from services.synthesizer.lips.lip_model import LipModel
-from shared.errors import UserError
-from shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
-from shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+from kouxing.services.synthesizer.lips.lip_model import LipModel
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 
 
 def _ferguson(inventory: PhoneInventory) -> LipModel:
     # scipy.interpolate takes as long to import as all else: a synthesizer starts without it
-    from services.synthesizer.lips.ferguson.model import FergusonLips  # noqa: PLC0415
-    from services.synthesizer.lips.ferguson.table import load_table  # noqa: PLC0415
+    from kouxing.services.synthesizer.lips.ferguson.model import FergusonLips  # noqa: PLC0415
+    from kouxing.services.synthesizer.lips.ferguson.table import load_table  # noqa: PLC0415
 
     return FergusonLips(load_table(inventory), inventory)
 

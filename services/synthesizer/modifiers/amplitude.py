@@ -20,8 +20,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.lip_model import Articulation
-from services.synthesizer.modifiers.modifier import Moment
+from kouxing.services.synthesizer.lips.lip_model import Articulation
+from kouxing.services.synthesizer.modifiers.modifier import Moment
 
 _PER_DB = 0.03
 _MAX_DB = 15.0  # of a difference that counts

@@ -28,12 +28,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.modifiers.expressiveness import JAW, LOWER, OPEN, SHUT, UPPER
-from services.synthesizer.modifiers.modifier import Moment
-from shared.face.expressions import ExpressionName
-from shared.face.faps import NUM_FAPS
-from shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
-from shared.face.shapes import ARKIT
+from kouxing.services.synthesizer.modifiers.expressiveness import JAW, LOWER, OPEN, SHUT, UPPER
+from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.shared.face.expressions import ExpressionName
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.high_level import EXPRESSION_NAMES, EXPRESSIONS
+from kouxing.shared.face.shapes import ARKIT
 
 _EASE_S, _FADE_S = 0.09, 0.3  # time constants of each of two filters
 _FREE_S, _BIND_S = 0.15, 0.04  # time constant and time after which lips are free, and bound

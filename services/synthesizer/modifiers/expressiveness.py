@@ -26,7 +26,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.modifiers.modifier import Moment
+from kouxing.services.synthesizer.modifiers.modifier import Moment
 
 SHUT = 20.0  # a gap up to this is a closure, FAP units
 OPEN = 80.0  # from this gap on, the width of the lips is that of an open mouth

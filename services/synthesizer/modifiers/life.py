@@ -22,9 +22,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.modifiers.modifier import Moment
-from shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
-from shared.face.idle_motion import IdleMotion, State
+from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.idle_motion import IdleMotion, State
 
 _LEAD_S = 0.06  # levels are used this long before their frame, if known: the filters' delay
 _LEVEL_S = 0.03  # time constants: of the level,

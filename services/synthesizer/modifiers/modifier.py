@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.lip_model import Articulation
+from kouxing.services.synthesizer.lips.lip_model import Articulation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ Crystal has {ei, en, eng}; the vowels ``ii`` and ``iii`` keep the shape of the i
 
 import re
 
-from shared.phones.mandarin.pinyin import pronounce, spell, transcribe
+from kouxing.shared.phones.mandarin.pinyin import pronounce, spell, transcribe
 
 __all__ = ["CODE", "READABLE", "pronounce", "spell", "transcribe"]
 

@@ -22,8 +22,8 @@ import re
 import unicodedata
 from functools import lru_cache
 
-from shared.errors import UserError
-from shared.phones.transcript import SpokenSyllable, Transcript
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.transcript import SpokenSyllable, Transcript
 
 # Longest first, so that zh is not read as z + h.
 _INITIALS_BY_LENGTH = tuple("zh ch sh b p m f d t n l g k h j q x r z c s".split())

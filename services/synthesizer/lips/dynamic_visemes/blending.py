@@ -13,15 +13,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.dominance import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.dominance import (
     log_closure,
     log_dominance,
     log_left_silence,
     log_pause,
     log_right_silence,
 )
-from services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 
 
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:

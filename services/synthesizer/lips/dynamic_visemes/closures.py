@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 
 _MAX_LATE_S = 0.1  # a closure recognised later than this after its apex is not shown
 _CATCH_UP_S = 0.04  # a late one takes this long

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from services.synthesizer.lips.dynamic_visemes.parameters import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
     NUM_MOUTH_FAPS,
     VisemeParameters,
     columns,
 )
-from services.synthesizer.lips.dynamic_visemes.visemes import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     CLOSURE_FAPS,
     REST,
     ROUNDED_VISEMES,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
-from shared.phones.events import Phone, SpeechChange
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
+from kouxing.shared.phones.events import Phone, SpeechChange
+from kouxing.shared.phones.inventory import PhoneInventory
 
 _MIN_AGE_S = 0.02  # of a phone that ends with the speech
 

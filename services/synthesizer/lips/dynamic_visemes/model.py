@@ -26,12 +26,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.blending import active_visemes
-from services.synthesizer.lips.dynamic_visemes.closures import ClosureTracker
-from services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
-from services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, VisemeParameters
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline
-from services.synthesizer.lips.dynamic_visemes.trajectory import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import active_visemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.closures import ClosureTracker
+from kouxing.services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
+    NUM_MOUTH_FAPS,
+    VisemeParameters,
+)
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import (
     NO_TRANSITION,
     Motion,
     Rest,
@@ -39,10 +42,10 @@ from services.synthesizer.lips.dynamic_visemes.trajectory import (
     Transition,
     motionless,
 )
-from services.synthesizer.lips.dynamic_visemes.visemes import check_visemes
-from services.synthesizer.lips.lip_model import MouthFrame
-from shared.phones.events import Phone, SoundEvent, SpeechChange
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import check_visemes
+from kouxing.services.synthesizer.lips.lip_model import MouthFrame
+from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange
+from kouxing.shared.phones.inventory import PhoneInventory
 
 _REST_S = 0.3  # to rest when no sound comes
 _TRANSITION_S = 0.04  # from one target trajectory to the next

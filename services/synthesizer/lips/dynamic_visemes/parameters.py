@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.visemes import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEMES,
 )
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
 
 FORMAT = "kouxing viseme parameters 2"
 NUM_MOUTH_FAPS = len(MOUTH_FAPS)
@@ -191,7 +191,7 @@ def _clips_of(data: dict[str, Any]) -> frozenset[str]:
 def _read(path: Path | None) -> dict[str, Any]:
     if path is None:
         path = (
-            Path(str(resources.files("services.synthesizer.lips.dynamic_visemes")))
+            Path(str(resources.files("kouxing.services.synthesizer.lips.dynamic_visemes")))
             / "parameters.json"
         )
     data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -20,9 +20,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX, visemes_of
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
 
 EXPECTED = -1
 MAX_HOLD_S = 1.5  # a phone lasts up to this long beyond its estimate if nothing follows

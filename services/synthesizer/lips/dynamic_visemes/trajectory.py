@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.blending import blend
-from services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, VisemeParameters
-from services.synthesizer.lips.dynamic_visemes.timeline import Timeline
+from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
+    NUM_MOUTH_FAPS,
+    VisemeParameters,
+)
+from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.errors import UserError
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.inventory import PhoneInventory, VisemeShares
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.inventory import PhoneInventory, VisemeShares
 
 REST = "rest"
 VISEMES = (
@@ -77,7 +77,7 @@ def check_visemes(inventory: PhoneInventory) -> None:
 def static_targets() -> NDArray[np.float64]:
     """Read the static targets T, shape (num_visemes, num_mouth_faps), in FAP units."""
     text = (
-        resources.files("services.synthesizer.lips.dynamic_visemes")
+        resources.files("kouxing.services.synthesizer.lips.dynamic_visemes")
         .joinpath("targets.tsv")
         .read_text("utf-8")
     )

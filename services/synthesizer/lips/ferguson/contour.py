@@ -34,9 +34,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING
-from shared.errors import UserError
-from shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
+from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
 
 Array = NDArray[np.float64]
 

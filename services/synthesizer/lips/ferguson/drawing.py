@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from services.synthesizer.lips.ferguson.contour import contour
+from kouxing.services.synthesizer.lips.ferguson.contour import contour
 
 Array = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]

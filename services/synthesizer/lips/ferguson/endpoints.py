@@ -29,7 +29,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from shared.phones.events import Progress
+from kouxing.shared.phones.events import Progress
 
 SLICE_S = 0.02
 

@@ -22,23 +22,23 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
-from services.synthesizer.lips.dynamic_visemes.trajectory import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
+from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import (
     NO_TRANSITION,
     Motion,
     Rest,
     Transition,
     motionless,
 )
-from services.synthesizer.lips.ferguson.contour import faps_of
-from services.synthesizer.lips.ferguson.endpoints import Piece, SyllableCutter
-from services.synthesizer.lips.ferguson.motion import KeyFrames
-from services.synthesizer.lips.ferguson.openings import PAUSE_S, SETTING_OUT_S, anchors_of
-from services.synthesizer.lips.ferguson.table import PhoneTable
-from services.synthesizer.lips.lip_model import MouthFrame
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
+from kouxing.services.synthesizer.lips.ferguson.endpoints import Piece, SyllableCutter
+from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
+from kouxing.services.synthesizer.lips.ferguson.openings import PAUSE_S, SETTING_OUT_S, anchors_of
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
+from kouxing.services.synthesizer.lips.lip_model import MouthFrame
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

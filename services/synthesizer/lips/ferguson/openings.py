@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from services.synthesizer.lips.ferguson.motion import KeyFrames
-from services.synthesizer.lips.ferguson.table import PhoneTable
-from shared.phones.events import Phone
+from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
+from kouxing.shared.phones.events import Phone
 
 SETTING_OUT_S = 0.12  # from a closed mouth to the first phone
 PAUSE_S = 0.2  # a shorter hole between two phones does not close the mouth

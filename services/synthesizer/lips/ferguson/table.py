@@ -22,9 +22,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 
-from services.synthesizer.lips.ferguson.motion import MAX_OPENING
-from shared.errors import UserError
-from shared.phones.inventory import PhoneInventory
+from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.inventory import PhoneInventory
 
 COLUMNS = ("phone", "opening", "duration_s", "crossings", "level", "influence")
 
@@ -48,7 +48,9 @@ def load_table(inventory: PhoneInventory) -> PhoneTable:
     UserError
         If there is none, or it is damaged.
     """
-    file = resources.files("services.synthesizer.lips.ferguson") / f"{inventory.language}.tsv"
+    file = (
+        resources.files("kouxing.services.synthesizer.lips.ferguson") / f"{inventory.language}.tsv"
+    )
     if not file.is_file():
         raise UserError(
             f"the ferguson lips have no table for {inventory.language}; choose another lip model"

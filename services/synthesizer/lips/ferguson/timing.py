@@ -20,11 +20,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.ferguson.endpoints import SLICE_S, Piece, pieces_of
-from services.synthesizer.lips.ferguson.table import PhoneTable
-from shared.errors import UserError
-from shared.phones.events import Phone, Progress
-from shared.phones.inventory import Syllable
+from kouxing.services.synthesizer.lips.ferguson.endpoints import SLICE_S, Piece, pieces_of
+from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
+from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone, Progress
+from kouxing.shared.phones.inventory import Syllable
 
 Array = NDArray[np.float64]
 

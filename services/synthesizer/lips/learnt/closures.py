@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import Phone
-from shared.phones.inventory import PhoneInventory
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 

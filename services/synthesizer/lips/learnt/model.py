@@ -24,16 +24,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS
-from services.synthesizer.lips.dynamic_visemes.trajectory import (
+from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS
+from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import (
     NO_TRANSITION,
     Motion,
     Rest,
     Transition,
     motionless,
 )
-from services.synthesizer.lips.learnt.closures import (
+from kouxing.services.synthesizer.lips.learnt.closures import (
     ClosingPhones,
     ClosureRule,
     close_lips,
@@ -42,10 +42,10 @@ from services.synthesizer.lips.learnt.closures import (
     part_lips,
     shut_share,
 )
-from services.synthesizer.lips.learnt.track import HOLD_S, MAX_GAP_S, LipTrack
-from services.synthesizer.lips.lip_model import Articulation, MouthFrame
-from shared.face.faps import MOUTH_FAPS
-from shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from kouxing.services.synthesizer.lips.learnt.track import HOLD_S, MAX_GAP_S, LipTrack
+from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
+from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.synthesizer.lips.dynamic_visemes.trajectory import Motion, motionless
+from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import Motion, motionless
 
 Array = NDArray[np.float64]
 

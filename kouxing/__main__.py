@@ -1,4 +1,4 @@
-"""Runs the command line, as ``kouxing`` or ``python -m services``.
+"""Runs the command line, as ``kouxing`` or ``python -m kouxing``.
 
 Ctrl-C ends a command that still imports what it needs, without a traceback.
 """
@@ -11,7 +11,7 @@ import signal
 def main() -> None:
     """Run the command line."""
     interrupt = signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from services.cli.main import main as run_command_line
+    from kouxing.services.cli.main import main as run_command_line
 
     signal.signal(signal.SIGINT, interrupt)
     run_command_line()
