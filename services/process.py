@@ -51,7 +51,7 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
 
 
 def run_module(name: str) -> None:
-    """Run ``python -m services.<name>``: a service without the command line's other commands."""
+    """Run ``python -m kouxing.services.<name>``: a service without the command line's other commands."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.kinds import KINDS
     from kouxing.shared.errors import UserError

@@ -64,7 +64,7 @@ def run_keys_service(folder: Path, *command: str) -> None:
     shell, option, script, name = COMPOSE["services"]["keys"]["entrypoint"]
     programs = folder.parent / "programs"
     programs.mkdir(exist_ok=True)
-    (programs / "kouxing").write_text(f'#!/bin/sh\nexec {sys.executable} -m services "$@"\n')
+    (programs / "kouxing").write_text(f'#!/bin/sh\nexec {sys.executable} -m kouxing "$@"\n')
     (programs / "kouxing").chmod(0o755)
     script = script.replace("$$", "$").replace("/keys", str(folder))
     script = script.replace(

@@ -1,7 +1,7 @@
 """Write MediaPipe's face detector and face mesh as ONNX files, which ``kouxing track`` runs.
 
 The models (Apache-2.0) come out of the wheel of ``mediapipe`` 0.10.14 (PyPI), the last line of
-versions that carries them: ``python -m training.face_mesh [--data FOLDER]``. Weights stay as they
+versions that carries them: ``python -m kouxing.training.face_mesh [--data FOLDER]``. Weights stay as they
 are, 16-bit floats.
 """
 
