@@ -2,7 +2,7 @@
 
 Sources: Bazarevsky et al. 2019, "BlazeFace: sub-millisecond neural face detection on mobile GPUs";
 Kartynnik et al. 2019, "Real-time facial surface geometry from monocular video on mobile GPUs". The
-two networks are MediaPipe's (Apache-2.0), converted by ``python -m kouxing.training.face_mesh``.
+two networks come from MediaPipe 0.10.14 (Apache-2.0), converted from TFLite to ONNX.
 
 The detector looks at the whole picture, and again where the face was lost. The mesh looks at a
 square around the face, turned so that the eyes are level: where the detector, or the landmarks of

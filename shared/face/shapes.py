@@ -21,7 +21,7 @@ r       keeps shapes that nearly agree from rising together     mm        1
 What a set has no shape for counts for none of them: the head's turn (FAPs 48 to 50) for all, FAPs 1
 and 2 (``high_level`` turns these into others), and for the visemes whatever is no mouth.
 
-``arkit.tsv`` was measured on MakeHuman's face units (CC0), see ``training.heads.arkit_table``; the
+``arkit.tsv`` was measured on MakeHuman's face units (CC0); the
 visemes are those of FAP 1, whose fifteen entries are Oculus' fifteen. VRM's vowels are the visemes
 aa, ih, ou, E and oh, its blinks and looks both eyes' of ARKit. VRM adds "blink" to "blinkLeft" and
 "blinkRight", so what both eyes close by is in "blink", and only what one closes further in its own;

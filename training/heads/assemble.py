@@ -118,35 +118,6 @@ class Builder:
         output.parent.mkdir(parents=True, exist_ok=True)
         write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
 
-    def measured(
-        self,
-    ) -> tuple[dict[int, tuple[Float, Float]], dict[str, Float], dict[str, Float]]:
-        """Compare the reference head's fields with MakeHuman's face units, in dm.
-
-        Returns
-        -------
-        By FAP, its field at 1 FAPU over the outer face (V, 3) and on the lower front teeth (3,);
-        by face unit, its displacements there (V, 3) and (3,).
-        """
-        skin, mesh = self.reference, self._mesh
-        outer = ~self._cavity & (skin.vertices[:, 2] > PIVOT[2] + 0.2)
-        fapu = measure_fapu(skin, self._plain, mesh)
-        own = teeth_pieces(fapu)[1]
-        tooth = parts.middle_of_teeth(own.part)[0]
-        still = np.zeros_like(own.part.vertices)
-        faps = {
-            fap: (field[outer], own.fields.get(fap, still)[tooth])
-            for fap, field in self._face_fields(fapu).items()
-        }
-        teeth = np.unique(mesh.quads[mesh.group("helper-lower-teeth")])
-        front = teeth[np.argsort(-self._plain[teeth, 2])[:8]]
-        units = {name: self._source.face_unit(name) for name in self._source.face_units()}
-        return (
-            faps,
-            {name: skin.carry(unit)[outer] for name, unit in units.items()},
-            {name: unit[front].mean(axis=0) for name, unit in units.items()},
-        )
-
     def _face_fields(self, fapu: dict[str, float]) -> Fields:
         """Fields of the skin."""
         blink, squint = (

@@ -99,11 +99,6 @@ class MakeHuman:
         """Read an ARKit face unit as displacements (19158, 3) in dm."""
         return _displacements(self._archive.read(f"{_FACE_UNITS}{name}.target").decode())
 
-    def face_units(self) -> list[str]:
-        """Name the ARKit face units."""
-        names = (name for name in self._archive.namelist() if name.startswith(_FACE_UNITS))
-        return sorted(Path(name).stem for name in names if name.endswith(".target"))
-
     def _rig(self) -> dict[str, list[list[float]]]:
         text = self._archive.read(_DATA + "rigs/standard/weights.default.json")
         weights: dict[str, list[list[float]]] = json.loads(text)["weights"]

@@ -1,1 +1,0 @@
-"""MediaPipe's face mesh as ONNX; never imported by a command."""
