@@ -51,7 +51,7 @@ def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
 
 
 def run_module(name: str) -> None:
-    """Run ``python -m kouxing.services.<name>``: a service without the command line's other commands."""
+    """Run one service, as ``python -m kouxing.services.<name>`` does."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     from kouxing.services.kinds import KINDS
     from kouxing.shared.errors import UserError
