@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from kouxing.services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
 track_app = typer.Typer(add_completion=False)
 adapt_app = typer.Typer(add_completion=False)

@@ -12,8 +12,8 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from kouxing.services.cli.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
 if TYPE_CHECKING:
     from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.terminal import check_output, print_message
 from kouxing.shared.errors import UserError, install_command
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
+from kouxing.shared.terminal import check_output, print_message
 from kouxing.training import SYNTHETIC_WEIGHT
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Train the models.")

@@ -9,14 +9,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from kouxing.services.cli.services import Assignments, ConfigFile
-from kouxing.services.cli.terminal import (
-    JsonFile,
-    check_output,
-    print_message,
-    write_json,
-    write_output,
-)
+from kouxing.services.cli.options import Assignments, ConfigFile
+from kouxing.shared.terminal import JsonFile, check_output, print_message, write_json, write_output
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Let people judge videos.")
 

@@ -14,21 +14,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from kouxing.services.cli.options import CurveForm, Shown, VoiceFile
 from kouxing.services.cli.running_system import find_control
-from kouxing.services.cli.terminal import (
-    CONSOLE,
-    CurveForm,
-    JsonFile,
-    Shown,
-    VoiceFile,
-    print_message,
-    write_json,
-)
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, check_expressions
 from kouxing.shared.keys import control_endpoint
+from kouxing.shared.terminal import CONSOLE, JsonFile, print_message, write_json
 
 SHOWN_FIGURES = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kouxing.services.cli.services import ConfigFile
+from kouxing.services.cli.options import ConfigFile
 from kouxing.services.kinds import KINDS, read_settings
 from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command

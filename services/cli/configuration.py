@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.services import Assignments, ConfigFile
+from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.kinds import KINDS, read_settings
 from kouxing.shared.config import COMMON, ServiceConfig, Setting, Settings, parse_assignments
 from kouxing.shared.errors import UserError

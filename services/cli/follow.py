@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.cli.curves import check_curves, row_writer
-from kouxing.services.cli.terminal import CONSOLE, CurveForm, Shown, check_output, print_message
+from kouxing.services.cli.options import CurveForm, Shown
 from kouxing.shared.client import Client, Refused
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
@@ -23,6 +23,7 @@ from kouxing.shared.follower import PollingLoop, SessionFollower
 from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
+from kouxing.shared.terminal import CONSOLE, check_output, print_message
 from kouxing.shared.wire.control import SessionState
 from kouxing.shared.wire.events import phone_of
 from kouxing.shared.wire.face import EndOfFaps, FapFrame

@@ -7,17 +7,8 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.terminal import print_message
-from kouxing.services.driver.config import DriverConfig
-
-DEFAULT_HEAD = DriverConfig().head
-HeadName = Annotated[
-    str,
-    typer.Option(
-        "--head",
-        help="woman, man, elder, child, ada, leo, rosa, mika, an .npz, or a .glb with morphs.",
-    ),
-]
+from kouxing.services.cli.options import DEFAULT_HEAD, HeadName
+from kouxing.shared.terminal import print_message
 
 app = typer.Typer(no_args_is_help=True, help="The 3-D heads.")
 

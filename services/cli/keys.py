@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kouxing.services.cli.terminal import print_message
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import (
     CLIENT,
@@ -23,6 +22,7 @@ from kouxing.shared.keys import (
     revoke_guest,
     user_key,
 )
+from kouxing.shared.terminal import print_message
 
 app = typer.Typer(no_args_is_help=True, help="Who may connect to the services.")
 

@@ -15,9 +15,9 @@ from kouxing.services.cli import clients, cluster, configuration, offline, run
 from kouxing.services.cli.heads import app as head_app
 from kouxing.services.cli.keys import app as keys_app
 from kouxing.services.cli.services import service_command
-from kouxing.services.cli.terminal import CONSOLE
 from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import CONSOLE
 
 SERVICES = "One service alone (run starts them all)"
 ENTRY_POINTS = "kouxing.commands"  # each a typer.Typer, such as those of training and evaluation

@@ -12,7 +12,6 @@ from rich.progress import Progress
 
 from kouxing.services.cli.sound_file import read_mono_16k
 from kouxing.services.cli.spoken_text import does_not_fit, read_text
-from kouxing.services.cli.terminal import print_message
 from kouxing.services.driver.video import film
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -28,6 +27,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.terminal import print_message
 
 _IMAGE_RATE_HZ = 25.0  # of a video of a sound
 MAX_IMAGE_RATE_HZ = 240.0

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import Progress
 
+from kouxing.services.cli.options import Timing
 from kouxing.services.cli.sound_file import read_mono_16k
 from kouxing.services.cli.spoken_text import does_not_fit, read_text
-from kouxing.services.cli.terminal import CONSOLE, Timing, check_output, print_message, write_text
 from kouxing.services.driver.video.writer import VideoWriter, write_picture
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables, spoken, timed_syllables
@@ -33,6 +33,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
+from kouxing.shared.terminal import CONSOLE, check_output, print_message, write_text
 
 Span = tuple[float, float, str]  # from, to (seconds): what is said
 

@@ -8,18 +8,11 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.heads import DEFAULT_HEAD, HeadName
-from kouxing.services.cli.terminal import (
-    CONSOLE,
-    CurveForm,
-    Timing,
-    VoiceFile,
-    print_message,
-    write_output,
-)
+from kouxing.services.cli.options import DEFAULT_HEAD, CurveForm, HeadName, Timing, VoiceFile
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.terminal import CONSOLE, print_message, write_output
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file.")]
 Acoustic = Annotated[str, typer.Option(help="Model: neural, blocks, gmm, or a file.")]

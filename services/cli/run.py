@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kouxing.services.cli.heads import HeadName
+from kouxing.services.cli.options import ConfigFile, HeadName
 from kouxing.services.cli.running_system import announce, find_control
-from kouxing.services.cli.services import ConfigFile
-from kouxing.services.cli.terminal import CONSOLE, command_name, print_message
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.kinds import KINDS, available_addresses, more_workers, read_settings
@@ -23,6 +21,7 @@ from kouxing.shared.config import COMMON, ServiceConfig, Settings, parse_assignm
 from kouxing.shared.endpoints import WILDCARDS, split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import control_endpoint
+from kouxing.shared.terminal import CONSOLE, command_name, print_message
 
 if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource

@@ -10,13 +10,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from kouxing.services.cli.follow import OPEN_POLL_S, find_session
-from kouxing.services.cli.terminal import print_message
 from kouxing.services.senders.senders import Senders
 from kouxing.services.senders.target import Target
 from kouxing.shared.client import Client
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.terminal import print_message
 from kouxing.shared.wire.control import SessionState
 from kouxing.shared.wire.face import FapFrame
 

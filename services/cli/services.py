@@ -4,20 +4,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated
 
-import typer
-
+from kouxing.services.cli.options import Assignments, ConfigFile
 from kouxing.services.kinds import ServiceKind
-
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", help="TOML file with one table per service.")
-]
-Assignments = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set one key of the service; repeatable."),
-]
 
 
 def service_command(kind: ServiceKind) -> Callable[..., None]:

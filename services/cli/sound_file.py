@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.cli.terminal import print_message
 from kouxing.services.recognizer.front_end.resample import Resampler
 from kouxing.shared.audio_file import clipping_remarks, num_clipped, open_audio
+from kouxing.shared.terminal import print_message
 
 
 def read_mono_16k(path: Path) -> NDArray[np.float32]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kouxing.services.cli.terminal import print_message
 from kouxing.services.recognizer.alignment import MIN_FIT, Alignment
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.shared.phones.transcript import Transcript
+from kouxing.shared.terminal import print_message
 
 _MAX_BYTES = 1024 * 1024
 

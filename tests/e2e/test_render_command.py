@@ -18,8 +18,8 @@ from PIL import Image
 
 from kouxing.services.cli.heads import import_mesh
 from kouxing.services.cli.offline import render
+from kouxing.services.cli.options import CurveForm
 from kouxing.services.cli.run import head_environment
-from kouxing.services.cli.terminal import CurveForm
 from kouxing.services.driver.config import DriverConfig, Framing
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.head import Head

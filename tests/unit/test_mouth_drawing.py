@@ -14,7 +14,7 @@ from matplotlib.font_manager import findfont
 
 from kouxing.services.cli.mouth_drawing import CSV_COLUMNS, draw_mouth
 from kouxing.services.cli.offline import lips
-from kouxing.services.cli.terminal import Timing
+from kouxing.services.cli.options import Timing
 from kouxing.services.driver import picture
 from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour

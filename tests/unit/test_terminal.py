@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.cli.terminal import check_output, write_text
 from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import check_output, write_text
 
 pytestmark = pytest.mark.unit
 

@@ -1,0 +1,62 @@
+"""Options and choices that several commands share."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kouxing.services.driver.config import DriverConfig
+from kouxing.shared.face.shape_names import ShapeSetName
+
+DEFAULT_HEAD = DriverConfig().head
+HeadName = Annotated[
+    str,
+    typer.Option(
+        "--head",
+        help="woman, man, elder, child, ada, leo, rosa, mika, an .npz file, or a .glb file with"
+        " morph targets.",
+    ),
+]
+VoiceFile = Annotated[
+    Path | None, typer.Option("--voice", help="Mouth profile of the speaker, from kouxing adapt.")
+]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", help="TOML file with one table per service.")
+]
+Assignments = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one key of the service; repeatable."),
+]
+ServiceAssignments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="SERVICE.KEY=VALUE", help="Set one key of a service; repeatable."
+    ),
+]
+
+
+class CurveForm(StrEnum):
+    """Values of a face's curves."""
+
+    FAPS = "faps"
+    ARKIT = ShapeSetName.ARKIT
+    OCULUS = ShapeSetName.OCULUS
+    VRM = ShapeSetName.VRM
+
+
+class Shown(StrEnum):
+    """Output of ``kouxing listen``."""
+
+    FAPS = "faps"
+    SYLLABLES = "syllables"
+    PHONES = "phones"
+
+
+class Timing(StrEnum):
+    """Method that times the phones of a text."""
+
+    ENDPOINTS = "endpoints"  # energy and zero crossings
+    ALIGN = "align"  # forced alignment with the acoustic model

@@ -1,0 +1,94 @@
+"""The terminal, for every command: messages to the user, and files with results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from kouxing.shared.errors import UserError
+
+CONSOLE = Console(stderr=True)
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Also write the results here.")]
+
+
+def print_message(text: str) -> None:
+    """Print a message to standard error. Standard output is for results."""
+    CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def command_name() -> str:
+    """Return how the user starts this program: ``kouxing``, or its path if it is not in PATH."""
+    called = Path(sys.argv[0])
+    if shutil.which("kouxing") or called.name != "kouxing":
+        return "kouxing"
+    return str(called.relative_to(Path.cwd()) if called.is_relative_to(Path.cwd()) else called)
+
+
+def write_output(text: str, output: Path | None) -> None:
+    """Write a result to a file, or to standard output if ``output`` is None."""
+    if output is None:
+        sys.stdout.write(text)
+    else:
+        write_text(output, text)
+
+
+def write_json(path: Path | None, results: object) -> None:
+    """Write results as JSON, unless ``path`` is None."""
+    if path is not None:
+        write_text(path, json.dumps(results, indent=1, ensure_ascii=False, default=_to_python))
+
+
+def check_output(*paths: Path | None) -> None:
+    """Check that output files can be written. Call this before long work; None is skipped.
+
+    Raises
+    ------
+    UserError
+        If a file cannot be written.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        is_new = not path.exists()
+        try:
+            with path.open("a"):
+                pass
+            if is_new:
+                path.unlink()
+        except OSError as error:
+            raise cannot_write(path, error) from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file. Its folder must exist.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def cannot_write(path: Path, error: OSError) -> UserError:
+    """Return the error for a file that cannot be written."""
+    if isinstance(error, FileNotFoundError):
+        return UserError(
+            f"{path}: cannot be written: there is no such folder; first run: mkdir -p {path.parent}"
+        )
+    return UserError(f"{path}: cannot be written: {error.strerror}")
+
+
+def _to_python(value: object) -> object:
+    if hasattr(value, "item"):  # a NumPy scalar; importing NumPy would slow down every command
+        return value.item()
+    raise TypeError(f"cannot convert {type(value).__name__} to JSON")
