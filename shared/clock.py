@@ -6,12 +6,13 @@ whose clocks disagree. Wall clocks are compared only to report latencies between
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 
 MEDIA_RATE_HZ = 16_000  # media time counts samples at this rate
 MAX_GAP_S = 10.0  # of media time without sound that is filled with frames
-STOPPED_S = 0.5  # longer than a busy machine keeps a process waiting
+STALL_LIMIT_S = 0.5  # longer than a busy machine keeps a process waiting
 
 
 def to_samples(time_s: float) -> int:
@@ -56,14 +57,51 @@ def now_ns() -> int:
     return time.time_ns()
 
 
-def was_stopped(begin_s: float, timeout_s: float) -> bool:
-    """Return whether a wait, which ends now, took so long that the process was stopped meanwhile.
+class StallDetector:
+    """Detects that this process did not run for a while: it was stopped, or had no processor.
+
+    All times are in seconds on the same monotonic clock.
 
     Parameters
     ----------
-    begin_s
-        When it began, by ``time.monotonic``.
-    timeout_s
-        How long it was to take at most.
+    now_s
+        The present.
+    limit_s
+        A pause longer than this is a stall.
+
+    Attributes
+    ----------
+    resumed_at_s
+        When the process resumed after its latest stall; minus infinity before the first.
     """
-    return time.monotonic() > begin_s + timeout_s + STOPPED_S
+
+    def __init__(self, now_s: float, limit_s: float = STALL_LIMIT_S) -> None:
+        self.resumed_at_s = -math.inf
+        self._limit_s = limit_s
+        self._checked_s = now_s
+
+    def restart(self, now_s: float) -> None:
+        """Measure the next pause from now; the time since the last check was no stall."""
+        self._checked_s = now_s
+
+    def check(self, now_s: float, *, expected_s: float = 0.0) -> float:
+        """Return how much longer than expected the time since the last check was; 0 if no stall.
+
+        Parameters
+        ----------
+        now_s
+            The present.
+        expected_s
+            The longest time that the process meant to wait.
+        """
+        pause_s = now_s - self._checked_s - expected_s
+        self._checked_s = now_s
+        if pause_s <= self._limit_s:
+            return 0.0
+        self.resumed_at_s = now_s
+        return pause_s
+
+    def elapsed_s(self, now_s: float) -> float:
+        """Return the time since the last check, at most the limit: a stall does not count."""
+        elapsed_s, self._checked_s = now_s - self._checked_s, now_s
+        return min(elapsed_s, self._limit_s)

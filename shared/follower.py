@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.clock import was_stopped
+from kouxing.shared.clock import StallDetector
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.metrics import Metrics
@@ -36,7 +36,7 @@ class MessageLoop(Protocol):
 
     bus: Bus
     metrics: Metrics
-    went_on_s: float  # when it went on after the process had been stopped, if ever
+    stall: StallDetector  # tells when the process resumed after it had been stopped
     at_each_step: set[Callable[[], None]]  # what it calls besides, at least at each tick
 
     def register(self, socket: Socket, handlers: SocketHandlers) -> None:
@@ -222,7 +222,7 @@ class SessionFollower:
             self._on_complete()
 
     def _on_message(self, message: Any) -> None:
-        is_catching_up = time.monotonic() < self._loop.went_on_s + CATCH_UP_S
+        is_catching_up = time.monotonic() < self._loop.stall.resumed_at_s + CATCH_UP_S
         if self._live and is_catching_up and isinstance(message, FapFrame | Shapes):
             self._waiting.append(message)
             return
@@ -287,7 +287,7 @@ class PollingLoop:
     def __init__(self, bus: Bus) -> None:
         self.bus = bus
         self.metrics = Metrics()
-        self.went_on_s = -math.inf
+        self.stall = StallDetector(time.monotonic())
         self.at_each_step: set[Callable[[], None]] = set()
         self._poller = bus.poller()
         self._handlers: dict[Socket, SocketHandlers] = {}
@@ -307,10 +307,9 @@ class PollingLoop:
         """Handle what has arrived, waiting up to the timeout; return whether anything had."""
         for call in tuple(self.at_each_step):
             call()
-        begin_s = time.monotonic()
+        self.stall.restart(time.monotonic())
         sockets = self._poller.wait(timeout_s)
-        if was_stopped(begin_s, timeout_s):
-            self.went_on_s = time.monotonic()
+        self.stall.check(time.monotonic(), expected_s=timeout_s)
         for socket in sockets:
             for received in socket.receive():
                 message = received.message

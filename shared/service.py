@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import gc
-import math
 import os
 import secrets
 import signal
@@ -22,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from kouxing.shared.bus import Bus, Received, Socket
-from kouxing.shared.clock import ClockOffset, now_ns, was_stopped
+from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.connections import raise_file_limit
 from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
@@ -107,7 +106,7 @@ class Service:
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
         self.bus = Bus(self.key, extra_connections=extra_connections)
         self.metrics = Metrics()
-        self.went_on_s = -math.inf  # when it went on after the process had been stopped
+        self.stall = StallDetector(time.monotonic())
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # what it provides, by name
         self.language = ""  # of the phones that it recognises
@@ -233,11 +232,11 @@ class Service:
         """Handle what has arrived, waiting up to the timeout, then tick."""
         begin_s = time.monotonic()
         self._busy.waits(begin_s)
+        self.stall.restart(begin_s)
         sockets = self.wait(timeout_s)
         now_s = time.monotonic()
         self._busy.works(now_s)
-        if was_stopped(begin_s, timeout_s):
-            self.went_on_s = now_s
+        self.stall.check(now_s, expected_s=timeout_s)
         self._ask_what_changed()
         for socket in sockets:
             handlers = self._handlers.get(socket)

@@ -1,8 +1,16 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 
-from kouxing.shared.clock import ClockOffset, duration_to_samples, to_samples, to_seconds
+from kouxing.shared.clock import (
+    ClockOffset,
+    StallDetector,
+    duration_to_samples,
+    to_samples,
+    to_seconds,
+)
 
 pytestmark = pytest.mark.unit
 
@@ -23,3 +31,24 @@ def test_the_exchange_with_the_least_round_trip_gives_the_offset() -> None:
     clock.update(0, 1_000_000 + ahead_ns, 2_000_000 + ahead_ns, 3_000_000)  # 1 out, 1 back
     clock.update(0, 9_000_000 + ahead_ns, 9_000_000 + ahead_ns, 10_000_000)
     assert clock.offset_ms == pytest.approx(5.0)
+
+
+def test_a_pause_beyond_the_limit_is_a_stall() -> None:
+    stall = StallDetector(now_s=10.0, limit_s=0.5)
+    assert stall.check(10.4) == 0.0
+    assert stall.check(11.3, expected_s=0.5) == 0.0
+    assert stall.resumed_at_s == -math.inf
+    assert stall.check(12.0) == pytest.approx(0.7)
+    assert stall.resumed_at_s == 12.0
+
+
+def test_time_before_a_restart_is_no_stall() -> None:
+    stall = StallDetector(now_s=10.0, limit_s=0.5)
+    stall.restart(20.0)
+    assert stall.check(20.1) == 0.0
+
+
+def test_elapsed_time_excludes_a_stall() -> None:
+    stall = StallDetector(now_s=10.0, limit_s=0.5)
+    assert stall.elapsed_s(10.2) == pytest.approx(0.2)
+    assert stall.elapsed_s(60.0) == 0.5

@@ -234,7 +234,7 @@ def test_what_waited_while_the_process_was_stopped_is_left_but_for_the_newest(
     frames = [dataclasses.replace(frame(n, 1), media_time=320 * n) for n in range(1, 31)]
     studio.faps.send(frames[0])
     studio.step_until(lambda: len(studio.received) == 1)
-    studio.loop.went_on_s = time.monotonic()
+    studio.loop.stall.resumed_at_s = time.monotonic()
     for each in frames[1:-1]:
         studio.faps.send(each)
     end_s = time.monotonic() + 2 * follower.CATCH_UP_S
