@@ -1,4 +1,4 @@
-"""All services on one machine: started, watched, started again when one crashes or hangs."""
+"""Runs all services on one machine, and restarts a service that crashes or hangs."""
 
 from __future__ import annotations
 
@@ -16,35 +16,34 @@ from typing import IO
 
 from rich.console import Console
 
-from kouxing.services.cli.service_process import BLOCKED_S, LOOK_S, WORKED_S, ServiceProcess
-from kouxing.services.kinds import KINDS, WORKERS, kind_of
+from kouxing.services.cli.service_process import POLL_S, ServiceProcess
+from kouxing.services.kinds import KINDS, kind_of
 from kouxing.shared.client import Client
 from kouxing.shared.errors import UserError
 from kouxing.shared.service import DRAIN_LIMIT_S
 
-BACKOFF_S = (0.2, 5.0)  # least and longest wait before a service that crashed twice starts again
-STEADY_S = 30.0  # after which a crash counts as the first one again
-STANDBY_S = 3.0  # after the newest start, so that it has the processor for itself
-USER_ERROR = 2  # exit status of a service that was configured wrongly
+MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
+STEADY_S = 30.0  # a service that has run for longer restarts without delay
+USER_ERROR = 2  # exit status of a service with a wrong configuration
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 class Supervisor:
-    """Runs every service as a process of its own.
+    """Runs each service in a process.
 
     Parameters
     ----------
     arguments
-        Passed to every service, such as ``["--config", "my.toml"]``.
+        Command-line arguments of every service, such as ``["--config", "my.toml"]``.
     log_folder
-        One log of JSON lines a service; warnings also go to the console.
+        Folder for one log of JSON lines per service. Warnings also go to the console.
     environment
-        Added to this process's own.
+        Added to this process's environment.
     services
-        Which to run.
+        Kinds of service to run.
     more
-        Additions to the environment for more workers of their kinds, by name, as
-        ``kouxing.services.kinds.more_workers`` returns them.
+        Additional workers: for each name, such as ``recognizer-2``, its additions to the
+        environment. ``services.kinds.more_workers`` returns this.
     """
 
     def __init__(
@@ -58,26 +57,25 @@ class Supervisor:
         more: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         self._more = more or {}
-        self._services = (*services, *self._more)
+        self._names = (*services, *self._more)
         self._arguments = arguments
         self._log_folder = log_folder
         self._console = console
         self._environment = {**os.environ, **ONE_THREAD, **(environment or {})}
         self._processes: dict[str, ServiceProcess] = {}
-        self._standby: ServiceProcess | None = None  # becomes what crashes next
         self._started_s: dict[str, float] = {}
-        self._wait_s = dict.fromkeys(self._services, 0.0)
-        self._due_s: dict[str, float] = {}
+        self._backoff_s = dict.fromkeys(self._names, 0.0)
+        self._restart_at_s: dict[str, float] = {}
         self._watcher: threading.Thread | None = None
         self._stopping = threading.Event()
-        self._ended = threading.Event()  # a service has ended
+        self._process_ended = threading.Event()
         self._failure: UserError | None = None
         log_folder.mkdir(parents=True, exist_ok=True)
 
     def start(self) -> None:
         """Start every service."""
-        for service in self._services:
-            self._spawn(service)
+        for name in self._names:
+            self._start(name)
 
     def wait_ready(self, control: str, deadline_s: float = 120.0) -> None:
         """Wait until all services have registered with control.
@@ -85,7 +83,7 @@ class Supervisor:
         Raises
         ------
         UserError
-            If a service cannot start, or takes longer than the deadline.
+            If a service cannot start, or the deadline passes.
         """
         end_s = time.monotonic() + deadline_s
         with Client(control, deadline_s=2.0) as client:
@@ -93,87 +91,66 @@ class Supervisor:
                 self.check()
                 with contextlib.suppress(UserError):
                     ready = Counter(service.service for service in client.status().services)
-                    if ready >= Counter(map(kind_of, self._services)):
+                    if ready >= Counter(map(kind_of, self._names)):
                         return
                 time.sleep(0.1)
-        raise UserError(f"the services did not start; their logs are in {self._log_folder}")
+        raise UserError(f"the services did not start; see their logs in {self._log_folder}")
 
     @staticmethod
     def page_address(control: str) -> str:
-        """Return where the gateway serves the page, with the token if it needs one."""
+        """Return the address of the gateway's page, including its token."""
         with Client(control) as client:
-            gateways = [each for each in client.status().services if each.service == "gateway"]
-        return gateways[0].endpoints["page"].removesuffix("/")
+            services = client.status().services
+        gateway = next(service for service in services if service.service == "gateway")
+        return gateway.endpoints["page"].removesuffix("/")
 
     def watch(self) -> None:
-        """From now on start crashed services again, whatever this thread does; see ``wait``."""
+        """Restart crashed services from now on, in a thread; see also ``wait``."""
         self._watcher = threading.Thread(target=self._watch, daemon=True)
         self._watcher.start()
 
     def wait(self) -> None:
-        """Wait for ever.
+        """Wait until ``stop`` is called.
 
         Raises
         ------
         UserError
-            If a watched service says that it is configured wrongly.
+            If a service reports a wrong configuration.
         """
-        while not self._stopping.wait(LOOK_S):
+        while not self._stopping.wait(POLL_S):
             if self._failure is not None:
                 raise self._failure
 
-    def _watch(self) -> None:
-        while not self._stopping.is_set():
-            self._ended.wait(LOOK_S)
-            self._ended.clear()
-            try:
-                self.check()
-            except UserError as error:
-                self._failure = error
-                return
-
     def check(self) -> None:
-        """Start crashed services again, and end those that hang.
+        """Kill services that hang, and restart those that have ended.
 
         Raises
         ------
         UserError
-            If a service says that it is configured wrongly.
+            If a service reports a wrong configuration.
         """
         now_s = time.monotonic()
-        for service, process in list(self._processes.items()):
+        for name, process in list(self._processes.items()):
             status = process.poll()
             if status is None:
-                if process.hangs(WORKED_S if kind_of(service) in WORKERS else BLOCKED_S):
-                    self._console.print(f"[yellow]{service} hangs; ending it")
+                if process.hangs():
+                    self._warn(f"{name} hangs; killing it")
                     process.kill()
-                continue
-            if status == USER_ERROR:
-                raise UserError(f"{service} cannot start; see above")
-            del self._processes[service]
-            if now_s - self._started_s[service] > STEADY_S:
-                self._wait_s[service] = 0.0
-            wait_s = self._wait_s[service]
-            self._wait_s[service] = min(max(2 * wait_s, BACKOFF_S[0]), BACKOFF_S[1])
-            self._due_s[service] = now_s + wait_s
-            when = f"in {wait_s:g} s" if wait_s else "at once"
-            self._console.print(
-                f"[yellow]{service} ended with status {status}; starting it again {when}"
-            )
-        for service, due_s in list(self._due_s.items()):
-            if now_s >= due_s:
-                del self._due_s[service]
-                self._spawn(service)
-        all_settled = now_s > max(self._started_s.values()) + STANDBY_S
-        if self._watcher is not None and self._standby is None and all_settled:
-            self._standby = self._run("standby", stdin=subprocess.PIPE)
+            elif status == USER_ERROR:
+                raise UserError(f"{name} cannot start; see the message above")
+            else:
+                self._schedule_restart(name, status, now_s)
+        for name, restart_at_s in list(self._restart_at_s.items()):
+            if now_s >= restart_at_s:
+                del self._restart_at_s[name]
+                self._start(name)
 
-    def process_number(self, service: str) -> int:
-        """Return the process number of a running service."""
-        return self._processes[service].pid
+    def process_number(self, name: str) -> int:
+        """Return the process ID of a running service."""
+        return self._processes[name].pid
 
     def stop(self) -> None:
-        """Ask every service to finish, and end those that do not."""
+        """Ask every service to stop, and kill those that do not stop in time."""
         self._stopping.set()
         if self._watcher is not None:
             self._watcher.join()
@@ -187,69 +164,60 @@ class Supervisor:
                 process.kill()
                 process.wait()
         self._processes.clear()
-        if self._standby is not None:
-            with self._standby as process:
-                process.kill()
 
-    def _spawn(self, service: str) -> None:
-        kind, environment = kind_of(service), self._more.get(service, {})
-        process = self._told_to_become(kind, environment) or self._run(
-            kind, self._arguments, environment
-        )
-        self._processes[service] = process
-        self._started_s[service] = time.monotonic()
-        follow = threading.Thread(target=self._follow, args=(service, process), daemon=True)
-        follow.start()
+    def _watch(self) -> None:
+        while not self._stopping.is_set():
+            self._process_ended.wait(POLL_S)
+            self._process_ended.clear()
+            try:
+                self.check()
+            except UserError as error:
+                self._failure = error
+                return
 
-    def _told_to_become(self, kind: str, environment: Mapping[str, str]) -> ServiceProcess | None:
-        """Let the process that stands by be a service; return it, or None where it cannot."""
-        process, self._standby = self._standby, None
-        if process is None or process.stdin is None:
-            return None
-        order = {"service": kind, "arguments": self._arguments, "environment": {**environment}}
-        try:
-            with process.stdin as pipe:
-                pipe.write(json.dumps(order).encode() + b"\n")
-        except BrokenPipeError:  # it has ended itself
-            with process:
-                return None
-        return process
+    def _schedule_restart(self, name: str, status: int, now_s: float) -> None:
+        del self._processes[name]
+        is_steady = now_s - self._started_s[name] > STEADY_S
+        wait_s = 0.0 if is_steady else self._backoff_s[name]
+        self._backoff_s[name] = min(max(2 * wait_s, MIN_BACKOFF_S), MAX_BACKOFF_S)
+        self._restart_at_s[name] = now_s + wait_s
+        when = f"in {wait_s:g} s" if wait_s else "now"
+        self._warn(f"{name} ended with status {status}; restarting it {when}")
 
-    def _run(
-        self,
-        module: str,
-        arguments: Collection[str] = (),
-        environment: Mapping[str, str] | None = None,
-        stdin: int = subprocess.DEVNULL,
-    ) -> ServiceProcess:
-        return ServiceProcess(
-            module,
-            arguments,
-            environment={**self._environment, **(environment or {})},
-            stdin=stdin,
+    def _start(self, name: str) -> None:
+        process = ServiceProcess(
+            kind_of(name),
+            self._arguments,
+            environment={**self._environment, **self._more.get(name, {})},
+            stdin=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C reaches the supervisor alone, which asks in order
+            start_new_session=True,  # Ctrl-C must reach only the supervisor
         )
+        self._processes[name] = process
+        self._started_s[name] = time.monotonic()
+        threading.Thread(target=self._follow, args=(name, process), daemon=True).start()
 
-    def _follow(self, service: str, process: subprocess.Popen[bytes]) -> None:
-        """Write a service's log until it ends, and say so at once."""
+    def _follow(self, name: str, process: subprocess.Popen[bytes]) -> None:
+        """Copy a service's log until it ends, then wake the watcher."""
         if process.stderr is not None:
-            self._follow_log(service, process.stderr)
+            self._copy_log(name, process.stderr)
         process.wait()
-        self._ended.set()
+        self._process_ended.set()
 
-    def _follow_log(self, service: str, stream: IO[bytes]) -> None:
-        with stream, (self._log_folder / f"{service}.log").open("ab") as log:
+    def _copy_log(self, name: str, stream: IO[bytes]) -> None:
+        with stream, (self._log_folder / f"{name}.log").open("ab") as log:
             for line in stream:
                 log.write(line)
                 log.flush()
-                text = _as_warning(line)
-                if text:
-                    self._console.print(f"{service}: {text}", markup=False, highlight=False)
+                if text := _console_text(line):
+                    self._console.print(f"{name}: {text}", markup=False, highlight=False)
+
+    def _warn(self, text: str) -> None:
+        self._console.print(f"[yellow]{text}")
 
 
-def _as_warning(line: bytes) -> str:
-    """Return what the console shows of a log line: warnings, errors, and what is no JSON."""
+def _console_text(line: bytes) -> str:
+    """Return what the console shows of a log line: warnings, errors, and text that is not JSON."""
     try:
         entry = json.loads(line)
         if entry["level"] not in ("warning", "error", "critical"):
