@@ -1,16 +1,26 @@
-"""The commands ``kouxing track`` and ``kouxing adapt``: a speaker's own mouth."""
+"""The commands ``kouxing track`` and ``kouxing adapt``: learn a speaker's own mouth."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
+from kouxing.shared.errors import UserError
+from kouxing.shared.terminal import (
+    CONSOLE,
+    JsonFile,
+    check_output,
+    print_message,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from kouxing.services.mouth_profiles.learning import FilmedSpeech
 
 track_app = typer.Typer(add_completion=False)
 adapt_app = typer.Typer(add_completion=False)
@@ -22,38 +32,57 @@ def adapt(
         list[Path],
         typer.Argument(help="Clips (.json) and landmark files (.landmarks) of one speaker."),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Voice to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Mouth profile to write.")],
     json_file: JsonFile = None,
 ) -> None:
-    """Learn a speaker's own mouth from tracked lips; --voice uses it."""
-    from kouxing.corpora import voices
-    from kouxing.services.recognizer.lip_tracks import MEASURES
+    """Learn a mouth profile from tracked lips, for the option --mouth."""
+    from kouxing.services.mouth_profiles.adapt import learn_mouth_profile
+    from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 
     check_output(output, json_file)
-    voice = voices.adapt(sources)
-    output.write_bytes(voice.profile)
-    table = Table("correlation with the tracked lips", "without the voice", "with it")
-    for measure, *figures in zip(MEASURES, voice.gain.before, voice.gain.after, strict=True):
-        table.add_row(measure, *("-" if math.isnan(each) else f"{each:.2f}" for each in figures))
+    learned = learn_mouth_profile([_read(source) for source in sources])
+    output.write_bytes(learned.content)
+    table = Table("correlation with the tracked lips", "without the profile", "with it")
+    for measure, *figures in zip(MEASURES, learned.gain.before, learned.gain.after, strict=True):
+        cells = ("-" if math.isnan(figure) else f"{figure:.2f}" for figure in figures)
+        table.add_row(measure, *cells)
     Console().print(table)
-    write_json(json_file, voice.figures())
+    write_json(json_file, learned.figures())
     print_message(
-        f"wrote {output}, learnt from {voice.speech_s:.0f} s of speech; the table is of the last "
-        f"{voice.gain.speech_s:.0f} s, after learning from the rest alone"
+        f"wrote {output}, learned from {learned.speech_s:.0f} s of speech; the table compares the "
+        f"last {learned.gain.speech_s:.0f} s, with a profile learned from the rest only"
     )
+
+
+def _read(source: Path) -> FilmedSpeech:
+    """Read a clip or a landmark file."""
+    from kouxing.corpora.lip_clips import read_clip
+    from kouxing.services.mouth_profiles.landmark_file import SUFFIX, parse_landmark_file
+
+    if source.suffix != SUFFIX:
+        return read_clip(source).filmed_speech()
+    try:
+        return parse_landmark_file(source.read_bytes())
+    except OSError as error:
+        raise UserError(f"cannot read {source}: {error.strerror}") from None
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
 
 
 @track_app.command()
 def track(
-    video: Annotated[Path, typer.Argument(help="Video of somebody who speaks, face to camera.")],
+    video: Annotated[Path, typer.Argument(help="Video of a speaker who faces the camera.")],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Clip to write: .flac, .csv and .json.")
     ],
 ) -> None:
-    """Track the lips in a video: a clip for kouxing adapt."""
+    """Track the lips in a video, for kouxing adapt."""
     from kouxing.corpora.lip_tracking import track_video
 
     check_output(*(output.with_suffix(suffix) for suffix in (".flac", ".csv", ".json")))
     with CONSOLE.status(f"tracking {video}"):
-        num_seen, num_pictures = track_video(video, output)
-    print_message(f"wrote {output.with_suffix('.json')}: a face in {num_seen} of {num_pictures}")
+        num_tracked, num_images = track_video(video, output)
+    print_message(
+        f"wrote {output.with_suffix('.json')}; a face was found in {num_tracked} of "
+        f"{num_images} images"
+    )

@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import read_audio
 from kouxing.corpora.speech_corpus import may_ship
+from kouxing.services.mouth_profiles.learning import FilmedSpeech
+from kouxing.services.mouth_profiles.lip_tracks import lip_tracks
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_text
-from kouxing.services.recognizer.front_end.pcm import level_db
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS, columns
 from kouxing.shared.errors import UserError
@@ -36,7 +37,6 @@ from kouxing.shared.phones.events import Phone
 Array = NDArray[np.float64]
 
 SAMPLE_RATE_HZ = 16_000
-LEVEL_STEP_S = 0.02
 _OUT_OF_SYNC_GRADES = ("C",)  # the sound was recorded or processed apart from the picture
 
 # Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
@@ -96,12 +96,9 @@ class LipClip:
         """Where the clip comes from: the first part of its name."""
         return self.name.partition("_")[0]
 
-
-def level_track(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
-    """Return times in seconds and levels in dB of full scale, as the live system measures them."""
-    step = round(LEVEL_STEP_S * SAMPLE_RATE_HZ)
-    ends = range(step, len(samples) + 1, step)
-    return [(end / SAMPLE_RATE_HZ, level_db(samples[end - step : end])) for end in ends]
+    def filmed_speech(self) -> FilmedSpeech:
+        """Return the clip as input for learning a mouth profile."""
+        return FilmedSpeech(samples=self.samples, frame_s=self.time_s, lips=lip_tracks(self.faps))
 
 
 def part_of(name: str, *, may_train: bool) -> str:

@@ -10,11 +10,12 @@ import numpy as np
 import soundfile
 from numpy.typing import NDArray
 
-from kouxing.corpora.face_landmarks import LANDMARKS, mouth_faps
 from kouxing.corpora.face_mesh import FaceMesh
-from kouxing.corpora.landmark_file import MIN_FRAMES
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, level_track
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
 from kouxing.corpora.video_file import read_video
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS, mouth_faps
+from kouxing.services.mouth_profiles.landmark_file import MIN_FRAMES
+from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 

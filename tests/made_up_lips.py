@@ -25,8 +25,8 @@ class LoudLips:
         assert set(delays_s) <= set(self.delays_s)
         return LoudLipStream(delays_s)
 
-    def for_voice(self, profile: bytes) -> LoudLips:
-        raise UserError(f"it is no voice: {profile!r}")
+    def with_mouth_profile(self, profile: bytes) -> LoudLips:
+        raise UserError(f"it is not a mouth profile: {profile!r}")
 
 
 class LoudLipStream:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from kouxing.corpora.lip_clips import LipClip, level_track
+from kouxing.corpora.lip_clips import LipClip
 from kouxing.corpora.scoring import matched_pairs
 from kouxing.evaluation.lips.clip_scores import MEASURES, ClipScore, score_clip
 from kouxing.evaluation.lips.four_schemes import (
@@ -39,6 +39,7 @@ from kouxing.evaluation.lips.four_schemes import (
 from kouxing.evaluation.lips.measures import rms_jerk
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme
 from kouxing.evaluation.lips.scores import LipScore, pool
+from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
 from kouxing.shared.errors import UserError

@@ -22,16 +22,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import (
-    LEVEL_STEP_S,
-    SAMPLE_RATE_HZ,
-    LipClip,
-    aligned_phones,
-    level_track,
-)
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, aligned_phones
 from kouxing.corpora.scoring import is_emitted
 from kouxing.evaluation.lips.measures import is_near
 from kouxing.services.live_chain import sound_events
+from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_source import LipFrameStream, LipsFromSound, delay_for
@@ -113,8 +108,8 @@ class _SeveralDelays:
     def stream(self, _delays_s: Sequence[float]) -> LipFrameStream:
         return self.lips.stream(self.delays_s)
 
-    def for_voice(self, profile: bytes) -> Self:
-        return replace(self, lips=self.lips.for_voice(profile))
+    def with_mouth_profile(self, profile: bytes) -> Self:
+        return replace(self, lips=self.lips.with_mouth_profile(profile))
 
 
 def live_events(

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.figures import new_figure, save_figure
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, level_track
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ
 from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, FRAME_RATE_HZ, live_frames
 from kouxing.services.cli.sound_file import read_mono_16k
 from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.render.camera import Camera
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.live_chain import sound_events
+from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.offline import recognize

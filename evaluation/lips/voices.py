@@ -18,17 +18,18 @@ from rich.table import Table
 
 from kouxing.corpora.lip_clips import LipClip, read_clips
 from kouxing.corpora.speech_corpus import may_ship
-from kouxing.corpora.voices import clip_material, load_models
-from kouxing.services.recognizer.lip_positions import POSITION_S
-from kouxing.services.recognizer.lip_source import delay_for
-from kouxing.services.recognizer.lip_tracks import MEASURES
-from kouxing.services.recognizer.voice_learning import (
+from kouxing.services.mouth_profiles.adapt import load_models
+from kouxing.services.mouth_profiles.learning import (
     FACE_DELAY_S,
-    Material,
+    Observations,
+    apply_profile,
     correlations,
-    learn_voice,
-    with_voice,
+    fit_profile,
+    observe,
 )
+from kouxing.services.mouth_profiles.lip_tracks import MEASURES
+from kouxing.services.mouth_profiles.positions import POSITION_S
+from kouxing.services.recognizer.lip_source import delay_for
 from kouxing.shared.errors import UserError
 
 Array = NDArray[np.float64]
@@ -83,7 +84,7 @@ def score_voices(folder: Path, lips: Path, speakers: Sequence[str] = ()) -> list
     scores = []
     for speaker in track(chosen, description="speakers"):
         clips = by_speaker[speaker]
-        materials = [clip_material(model, predictor, clip) for clip in clips]
+        materials = [observe(model, predictor, clip.filmed_speech()) for clip in clips]
         learnt, held = _split(clips, materials)
         if len(learnt) >= _positions(AMOUNTS_S[0]) and _seconds(held) >= _MIN_HELD_S:
             scores += _scores(speaker, learnt, held, delay)
@@ -97,8 +98,8 @@ def _is_stranger(clips: Sequence[LipClip]) -> bool:
 
 
 def _split(
-    clips: Sequence[LipClip], materials: Sequence[Material]
-) -> tuple[Material, list[Material]]:
+    clips: Sequence[LipClip], materials: Sequence[Observations]
+) -> tuple[Observations, list[Observations]]:
     """Return what may be learnt from, and what is scored."""
     held = [
         material for clip, material in zip(clips, materials, strict=True) if clip.part == "held"
@@ -110,13 +111,13 @@ def _split(
         ends = [round(_LEARNT_SHARE * len(material)) for material in materials]
         held = [material[end:] for material, end in zip(materials, ends, strict=True)]
         rest = [material[:end] for material, end in zip(materials, ends, strict=True)]
-    return Material.join(rest), [material for material in held if len(material)]
+    return Observations.join(rest), [material for material in held if len(material)]
 
 
 def _scores(
-    speaker: str, learnt: Material, held: Sequence[Material], delay: int
+    speaker: str, learnt: Observations, held: Sequence[Observations], delay: int
 ) -> list[VoiceScore]:
-    before = correlations(held, [material.made for material in held], delay)
+    before = correlations(held, [material.predicted for material in held], delay)
     pieces = [learnt[start : start + _PIECE] for start in range(0, len(learnt), _PIECE)]
     amounts = [_positions(amount_s) for amount_s in AMOUNTS_S]
     scores = []
@@ -124,9 +125,9 @@ def _scores(
         rng = np.random.default_rng(0)
         after = []
         for _ in range(NUM_DRAWS):
-            drawn = Material.join([pieces[index] for index in rng.permutation(len(pieces))])
-            voice = learn_voice(drawn[:amount])
-            made = [with_voice(voice, material) for material in held]
+            drawn = Observations.join([pieces[index] for index in rng.permutation(len(pieces))])
+            voice = fit_profile(drawn[:amount])
+            made = [apply_profile(voice, material) for material in held]
             after.append(correlations(held, made, delay))
         scores.append(
             VoiceScore(
@@ -148,7 +149,7 @@ def _positions(duration_s: float) -> int:
     return round(duration_s / POSITION_S)
 
 
-def _seconds(materials: Sequence[Material]) -> float:
+def _seconds(materials: Sequence[Observations]) -> float:
     return sum(map(len, materials)) * POSITION_S
 
 

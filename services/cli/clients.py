@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kouxing.services.cli.options import CurveForm, Shown, VoiceFile
+from kouxing.services.cli.options import CurveForm, MouthFile, Shown
 from kouxing.services.cli.running_system import find_control
 from kouxing.services.kinds import read_settings
 from kouxing.shared.config import ServiceConfig
@@ -53,16 +53,16 @@ def speak(
     ] = "",
     rate: Annotated[int, typer.Option(help="Sample rate of '-', Hz.")] = 16000,
     channels: Annotated[int, typer.Option(help="Channels of '-'.")] = 1,
-    voice: VoiceFile = None,
+    mouth: MouthFile = None,
     control: Control = "",
 ) -> None:
     """Stream a file, standard input, a microphone or what is played to a running system."""
     from kouxing.services.cli.streaming import stream
-    from kouxing.services.recognizer.voice import read_profile
+    from kouxing.services.recognizer.mouth_profile import read_mouth_profile
     from kouxing.shared.audio_file import open_audio, raw_audio
     from kouxing.shared.sound_devices import microphone, monitor
 
-    profile = b"" if voice is None else read_profile(voice)
+    profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
         raise UserError("--device names a microphone or a monitor: kouxing speak mic --device NAME")
     if source == "mic":
@@ -80,7 +80,7 @@ def speak(
         session=_session_name(session),
         record=record,
         paced=not fast,
-        voice=profile,
+        mouth_profile=profile,
     )
     print_message(
         f"session {summary.session}: {summary.num_phones} phones in {summary.duration_s:.1f} s"

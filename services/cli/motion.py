@@ -18,7 +18,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables
 from kouxing.services.recognizer.lips import LipPredictor, lips_for
-from kouxing.services.recognizer.voice import read_profile
+from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.recording_chain import animate, hear_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -67,7 +67,7 @@ def motion_of_sound(
     *,
     live: bool,
     text: str | None,
-    voice: Path | None,
+    mouth: Path | None,
     expressiveness: float | None,
 ) -> Motion:
     """Make a face for each lip model, all of the same sound.
@@ -84,8 +84,8 @@ def motion_of_sound(
         As the services, by their defaults, would make it; else with everything known.
     text
         What is said, or the name of a file that holds it; None: it is recognised.
-    voice
-        The speaker's voice, for learnt lips.
+    mouth
+        The speaker's mouth profile, for the learnt lip model.
     expressiveness
         How large the mouth's movements are, 0.5 to 2; None: the default.
 
@@ -102,7 +102,7 @@ def motion_of_sound(
             for name, config in settings.items()
         }
     model = load_live_model()
-    lips_from_sound = _lips_of(model, voice)
+    lips_from_sound = _lips_of(model, mouth)
     events: Sequence[SoundEvent]
     if live:
         task = progress.add_task("recognising", total=len(lips) * len(samples))
@@ -147,13 +147,13 @@ def _aligned(
     return alignment.phones
 
 
-def _lips_of(model: AcousticModel, voice: Path | None) -> LipPredictor | None:
-    """Return the recognizer's model of lips with a speaker's voice."""
+def _lips_of(model: AcousticModel, mouth: Path | None) -> LipPredictor | None:
+    """Return the lip model, adapted to a speaker if there is a mouth profile."""
     lips = lips_for(model)
-    if voice is None or lips is None:
+    if mouth is None or lips is None:
         return lips
-    profile = read_profile(voice)
+    profile = read_mouth_profile(mouth)
     try:
-        return lips.for_voice(profile)
+        return lips.with_mouth_profile(profile)
     except UserError as error:
-        raise UserError(f"--voice {voice}: {error}") from None
+        raise UserError(f"--mouth {mouth}: {error}") from None

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from kouxing.services.cli.options import DEFAULT_HEAD, CurveForm, HeadName, Timing, VoiceFile
+from kouxing.services.cli.options import DEFAULT_HEAD, CurveForm, HeadName, MouthFile, Timing
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
@@ -83,7 +83,7 @@ def render(
     ] = None,
     sound: Annotated[Path | None, typer.Option(help="Sound for a .fap file.")] = None,
     at: Annotated[float | None, typer.Option(help="When one picture is taken, s.")] = None,
-    voice: VoiceFile = None,
+    mouth: MouthFile = None,
     expressiveness: Annotated[
         float | None,
         typer.Option(min=0.5, max=2, help="How large the mouth's movements are for a sound."),
@@ -98,7 +98,7 @@ def render(
 
     faces = lips or [DEFAULT_LIP_MODEL]
     _check_source(
-        source, lips=bool(lips), live=live, text=text is not None, voice=voice is not None,
+        source, lips=bool(lips), live=live, text=text is not None, mouth=mouth is not None,
         expressiveness=expressiveness is not None, sound=sound is not None,
     )  # fmt: skip
     shot = Shot(
@@ -125,7 +125,7 @@ def render(
                 progress,
                 live=live,
                 text=text,
-                voice=voice,
+                mouth=mouth,
                 expressiveness=expressiveness,
             )
         )

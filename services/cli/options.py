@@ -20,8 +20,8 @@ HeadName = Annotated[
         " morph targets.",
     ),
 ]
-VoiceFile = Annotated[
-    Path | None, typer.Option("--voice", help="Mouth profile of the speaker, from kouxing adapt.")
+MouthFile = Annotated[
+    Path | None, typer.Option("--mouth", help="Mouth profile of the speaker, from kouxing adapt.")
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", help="TOML file with one table per service.")

@@ -49,11 +49,11 @@ def stream(
     session: str = "",
     record: bool = False,
     paced: bool = True,
-    voice: bytes = b"",
+    mouth_profile: bytes = b"",
 ) -> StreamSummary:
     """Stream a source through a running system and wait for its last FAP frame.
 
-    ``voice`` is the profile of the speaker's voice, if any.
+    ``mouth_profile`` is the content of the speaker's mouth profile, if any.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def stream(
             num_channels=source.num_channels,
             record=record,
             paced=paced,
-            voice=voice,
+            voice=mouth_profile,
         )
         output = opened.subscribe(EndOfFaps, FapFrame)
         phones = opened.subscribe(Phone)

@@ -79,7 +79,7 @@ class Microphones:
             encoding=sound.encoding,
             sample_rate_hz=sound.sample_rate_hz,
             num_channels=sound.num_channels,
-            voice=hello.voice,
+            voice=hello.mouth_profile,
         ) as session:
             self._open[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})

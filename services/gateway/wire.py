@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from kouxing.services.gateway.sound_format import RATES_HZ, SoundFormat, check_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.expressions import DEFAULT_HOLD_S, check_expressions, check_expressiveness
-from kouxing.shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES, LipModelName
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
@@ -48,7 +48,7 @@ class Hello:
 
     sound: SoundFormat
     is_ahead: bool  # the sound may come before its time: it waits and goes on in real time
-    voice: bytes  # of the speaker, for lips from sound; empty: anybody's
+    mouth_profile: bytes  # of the speaker; empty: the average speaker
 
 
 def parse_hello(message: str) -> Hello:
@@ -63,7 +63,7 @@ def parse_hello(message: str) -> Hello:
     return Hello(
         sound=parse_sound_format(fields),
         is_ahead=bool(fields.get("ahead")),
-        voice=_parse_voice(fields.get("voice", "")),
+        mouth_profile=_parse_mouth_profile(fields.get("voice", "")),
     )
 
 
@@ -82,13 +82,13 @@ def parse_sound_format(fields: dict[str, object]) -> SoundFormat:
     )
 
 
-def _parse_voice(voice: object) -> bytes:
+def _parse_mouth_profile(field: object) -> bytes:
     try:
-        profile = base64.b64decode(voice, validate=True) if isinstance(voice, str) else None
+        profile = base64.b64decode(field, validate=True) if isinstance(field, str) else None
     except ValueError:
         profile = None
-    if profile is None or len(profile) > MAX_VOICE_BYTES:
-        raise UserError(f"voice must be at most {MAX_VOICE_BYTES >> 10} KiB in base64")
+    if profile is None or len(profile) > MAX_MOUTH_PROFILE_BYTES:
+        raise UserError(f"voice must be at most {MAX_MOUTH_PROFILE_BYTES >> 10} KiB in base64")
     return profile
 
 

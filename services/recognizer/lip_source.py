@@ -54,8 +54,8 @@ class LipsFromSound(Protocol):
     def stream(self, delays_s: Sequence[float]) -> LipFrameStream:
         """Start a session's lips with these of the delays."""
 
-    def for_voice(self, profile: bytes) -> Self:
-        """Return the model with the voice of one speaker; ``UserError`` if that does not fit."""
+    def with_mouth_profile(self, content: bytes) -> Self:
+        """Adapt the model to the speaker of a mouth profile; ``UserError`` if it does not fit."""
 
 
 def delay_for(delays_s: Sequence[float], face_delay_s: float) -> float:

@@ -49,7 +49,7 @@ from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION, NU
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.services.recognizer.voice import Voice, parse_profile
+from kouxing.services.recognizer.mouth_profile import MouthProfile, parse_mouth_profile
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame
@@ -131,7 +131,7 @@ class LipPredictor:
 
     @cached_property
     def digest(self) -> bytes:
-        """SHA-256 of the weights, by which a voice knows its model."""
+        """SHA-256 of the weights; a mouth profile names its model by it."""
         hasher = hashlib.sha256()
         for field in fields(self):
             hasher.update(getattr(self, field.name).tobytes())
@@ -139,31 +139,31 @@ class LipPredictor:
 
     @property
     def residual_shape(self) -> tuple[int, int, int]:
-        """Shape of the residual of a voice."""
+        """Shape of a mouth profile's residual."""
         num_inner, num_delays, _ = self.output_weights.shape
         return num_inner, num_delays, len(LIP_FAPS)
 
-    def for_voice(self, profile: bytes) -> LipPredictor:
-        """Return the model with the voice of one speaker.
+    def with_mouth_profile(self, content: bytes) -> LipPredictor:
+        """Adapt the model to the speaker of a mouth profile.
 
         Raises
         ------
         UserError
-            If the profile is none, or was made for another model.
+            If the content is not a mouth profile, or was made for another model.
         """
-        return self.with_voice(parse_profile(profile, self.digest, self.residual_shape))
+        return self.adapt(parse_mouth_profile(content, self.digest, self.residual_shape))
 
-    def with_voice(self, voice: Voice) -> LipPredictor:
-        """Return the model with the voice of one speaker."""
+    def adapt(self, profile: MouthProfile) -> LipPredictor:
+        """Adapt the model to one speaker."""
         faps = slice(len(LIP_FAPS))
         history, output, bias = (
             weights.copy()
             for weights in (self.history_weights, self.output_weights, self.output_bias)
         )
         for weights in (history, output, bias):
-            weights[..., faps] *= voice.scale
-        output[..., faps] += voice.residual
-        bias[..., faps] += voice.offset
+            weights[..., faps] *= profile.scale
+        output[..., faps] += profile.residual
+        bias[..., faps] += profile.offset
         return replace(self, history_weights=history, output_weights=output, output_bias=bias)
 
     def save(self, path: Path) -> None:

@@ -81,7 +81,7 @@ class _Session:
         self.sequence_out = 0
         self.last_audio_s = time.monotonic()
         self.silent_s = 0.0  # for how long this process listened and no audio came
-        self.voice_refusal = ""  # why the client's voice is not used, if it was not told yet
+        self.mouth_profile_error = ""  # why the profile is not used; empty once reported
         self.end: EndOfAudio | None = None  # has come
         self.finished = False  # all audio up to the end is processed
         self.num_gaps = 0  # of the stream's, counted
@@ -174,10 +174,10 @@ class RecognizerService(Service):
         session = self._sessions.get(start.session)
         is_new = False
         if session is None or session.start.token != start.token:
-            lips, voice_refusal = self._lips_of(start)
+            lips, mouth_profile_error = self._lips_of(start)
             socket = self._audio if start.paced else self._unpaced_audio
             session = _Session(start, self._new_stream(start, lips), socket)
-            session.voice_refusal = voice_refusal
+            session.mouth_profile_error = mouth_profile_error
             if start.media_time:
                 silence = self._model.inventory.silence
                 session.resumption = Resumption(to_seconds(start.media_time), silence)
@@ -192,15 +192,15 @@ class RecognizerService(Service):
         return True
 
     def _lips_of(self, start: StartSession) -> tuple[LipsFromSound | None, str]:
-        """Return the model of lips with the session's voice, or without it and why."""
+        """Return the lip model for a session, and why its mouth profile is not used, if so."""
         if not start.voice:
             return self._lips, ""
         if self._lips is None:
-            return None, "the voice is not used: this recognizer makes no lips from sound"
+            return None, "the mouth profile is not used: this recognizer has no lip model"
         try:
-            return self._lips.for_voice(start.voice), ""
+            return self._lips.with_mouth_profile(start.voice), ""
         except UserError as error:
-            return self._lips, f"the voice is not used: {error}"
+            return self._lips, f"the mouth profile is not used: {error}"
 
     def _new_stream(self, start: StartSession, lips: LipsFromSound | None) -> SpeechStream:
         return SpeechStream(
@@ -366,9 +366,11 @@ class RecognizerService(Service):
         )
 
     def _take_chunk(self, session: _Session, chunk: AudioChunk, sender: Peer) -> None:
-        if session.voice_refusal:
-            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_VOICE, session.voice_refusal)
-            session.voice_refusal = ""
+        if session.mouth_profile_error:
+            self._refuse(
+                session.socket, chunk, sender, ErrorCode.BAD_VOICE, session.mouth_profile_error
+            )
+            session.mouth_profile_error = ""
         start = session.start
         try:
             samples = samples_of(chunk.pcm, start.encoding, start.num_channels)

@@ -1,10 +1,10 @@
-"""What clients choose of lips: the lip model by its name, and a speaker's voice."""
+"""What clients choose of lips: the lip model by its name, and a speaker's mouth profile."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 
-MAX_VOICE_BYTES = 64 * 1024
+MAX_MOUTH_PROFILE_BYTES = 64 * 1024
 
 
 class LipModelName(StrEnum):

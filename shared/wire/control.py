@@ -24,6 +24,7 @@ from kouxing.shared.wire.message import (
     LipsOrNone,
     Message,
     MetricMap,
+    MouthProfile,
     Name,
     NameOrNone,
     Nanoseconds,
@@ -34,7 +35,6 @@ from kouxing.shared.wire.message import (
     ShapeSets,
     Share,
     Text,
-    VoiceProfile,
 )
 
 Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
@@ -179,7 +179,7 @@ class StartSession(Message):
     endpoints: EndpointMap  # of the session's workers: audio, phones, phone_input, faps, ...
     delay_ms: Delay = 0.0  # how much later than its sound a FAP frame is made
     lips: LipsOrNone = ""  # the lip model that moves the mouth at first
-    voice: VoiceProfile = b""  # of the speaker, for the recognizer's lips
+    voice: MouthProfile = b""  # of the speaker, for the lip model
     expressiveness: ExpressivenessOrNone = 0.0  # that was chosen; 0: none was
     expressions: ExpressionMap = field(default_factory=dict)  # that the face shows at first
     hold_s: HoldTime = 0.0  # that these stay before they fade

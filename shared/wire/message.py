@@ -21,7 +21,7 @@ from kouxing.shared.face.expressions import (
     ExpressionName,
 )
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES, LipModelName
 from kouxing.shared.face.shape_names import MAX_SHAPES, ShapeSetName
 
 VERSION = 2
@@ -55,7 +55,9 @@ ExpressionMap = Annotated[dict[KnownExpression, Strength], Meta(max_length=len(E
 HoldTime = Annotated[float, Meta(ge=0, le=MAX_HOLD_S)]  # s
 ExpressivenessAmount = Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)]
 ExpressivenessOrNone = Annotated[float, Meta(ge=0, le=MAX_EXPRESSIVENESS)]  # 0: not chosen
-VoiceProfile = Annotated[bytes, Meta(max_length=MAX_VOICE_BYTES)]  # empty: anybody's
+MouthProfile = Annotated[
+    bytes, Meta(max_length=MAX_MOUTH_PROFILE_BYTES)
+]  # empty: the average speaker
 Endpoint = Annotated[str, Meta(max_length=256)]
 FapValues = Annotated[bytes, Meta(min_length=4 * NUM_FAPS, max_length=4 * NUM_FAPS)]
 FapValuesOrNone = Annotated[bytes, Meta(max_length=4 * NUM_FAPS)]  # empty: not told

@@ -20,6 +20,7 @@ from kouxing.shared.wire.message import (
     HoldTime,
     LanguageName,
     Message,
+    MouthProfile,
     Name,
     NameOrNone,
     NumChannels,
@@ -27,7 +28,6 @@ from kouxing.shared.wire.message import (
     ShapeNameMap,
     ShapeSets,
     Text,
-    VoiceProfile,
 )
 
 
@@ -60,7 +60,7 @@ class OpenSession(Message):
     num_channels: NumChannels = 1
     record: bool = False  # the driver writes a video named after the session
     paced: bool = True  # audio comes in real time; false: as fast as the services take it
-    voice: VoiceProfile = b""  # of the speaker, for lips from sound
+    voice: MouthProfile = b""  # of the speaker, for the lip model
     shapes: ShapeSets = field(default_factory=list)  # sets that are published beside FAP frames
 
 

@@ -58,12 +58,14 @@ def test_nan_is_refused_and_the_session_goes_on(client: Client, witness: Session
     session.close()
 
 
-def test_a_bad_voice_is_refused_and_the_session_goes_on(client: Client, witness: Session) -> None:
-    session = client.open_session(encoding="f32le", voice=b"no voice")
+def test_a_bad_mouth_profile_is_refused_and_the_session_goes_on(
+    client: Client, witness: Session
+) -> None:
+    session = client.open_session(encoding="f32le", voice=b"no profile")
     output = session.subscribe(FapFrame)
     session.send(np.zeros(8000, np.float32))
     error = first_error(session)
-    assert (error.code, "no voice" in error.text) == ("bad-voice", True)
+    assert (error.code, "not a mouth profile" in error.text) == ("bad-voice", True)
     assert output.wait(60.0)
     session.close()
     with pytest.raises(Refused, match="bad-message"):

@@ -1,6 +1,6 @@
-"""*Learn my mouth* on the page: camera and microphone in, a voice out.
+"""*Learn my mouth* on the page: camera and microphone in, a mouth profile out.
 
-``kouxing adapt`` is the real one. The camera sees one of our own heads, which opens and closes its
+The profile is really learned. The camera sees one of our own heads, which opens and closes its
 mouth.
 """
 
@@ -16,11 +16,11 @@ import pytest
 import soundfile
 from PIL import Image
 
-from kouxing.corpora.face_landmarks import LANDMARKS
-from kouxing.corpora.landmark_file import landmark_file
 from kouxing.evaluation.system.chromium import wait_until
 from kouxing.services.driver.head.head import neutral_faps
 from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
+from kouxing.services.mouth_profiles.landmark_file import landmark_file
 from kouxing.shared.client import Client
 from tests import heads
 from tests.browser import Browser
@@ -128,12 +128,12 @@ def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Brow
         path = f"document.getElementById('lesson-{curve}')"
         assert browser.evaluate(f"{path}.getTotalLength()") > 100, curve
 
-    assert browser.evaluate("window.kouxing.state.voice") == ""
+    assert browser.evaluate("window.kouxing.state.mouthProfile") == ""
     browser.click("lesson-keep")
     browser.command("Page.navigate", url=browser.evaluate("location.href"))
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    browser.wait_for("window.kouxing.state.voice !== ''")
-    profile = base64.b64decode(browser.evaluate("window.kouxing.state.voice"))
+    browser.wait_for("window.kouxing.state.mouthProfile !== ''")
+    profile = base64.b64decode(browser.evaluate("window.kouxing.state.mouthProfile"))
     browser.click("microphone")
     browser.wait_for("window.kouxing.state.microphone")
     assert system.recognizer is not None
@@ -144,9 +144,9 @@ def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Brow
     browser.wait_for("!window.kouxing.state.microphone")
 
     browser.click("learn")
-    assert "opening" in text_of(browser, "lesson-voice")
+    assert "opening" in text_of(browser, "lesson-profile")
     browser.click("lesson-forget")
-    assert browser.evaluate("window.kouxing.state.voice + localStorage.length") == "0"
+    assert browser.evaluate("window.kouxing.state.mouthProfile + localStorage.length") == "0"
     wrong = [text for text in browser.complaints if '"error"' in text or "exception" in text]
     assert ["learn-mouth" in text for text in wrong] == [True]  # the refusal
 

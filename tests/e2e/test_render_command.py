@@ -27,7 +27,7 @@ from kouxing.services.driver.video.film import frames_of
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lips import load_lips
-from kouxing.services.recognizer.voice import Voice
+from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
@@ -113,7 +113,7 @@ def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
         ("a.png", {"head": "nobody"}, "there is no head 'nobody'"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
         ("a.mp4", {"lips": ["learnt"]}, "--lips is for a sound"),
-        ("a.mp4", {"voice": Path("me.voice")}, "--voice is for a sound"),
+        ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth is for a sound"),
         ("a.mp4", {"live": True}, "--live is for a sound"),
         ("a.csv", {"text": "你好"}, "--text is for a sound"),
         ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit is for curves"),
@@ -188,21 +188,21 @@ def test_lip_models_side_by_side(tmp_path: Path) -> None:
         render(SENTENCE, beside, lips=lips, size="401x160", **shot)
 
 
-def test_a_voice_moves_the_mouth(tmp_path: Path) -> None:
+def test_a_mouth_profile_changes_the_face(tmp_path: Path) -> None:
     lips = load_lips()
-    voice, nobodys = tmp_path / "me.voice", tmp_path / "nobodys.voice"
-    profile = Voice(
+    mouth, misfit = tmp_path / "me.mouth", tmp_path / "misfit.mouth"
+    profile = MouthProfile(
         scale=np.full(15, 3, np.float32),
         offset=np.zeros(15, np.float32),
         residual=np.zeros(lips.residual_shape, np.float32),
     )
-    voice.write_bytes(profile.to_profile(lips.digest))
-    nobodys.write_bytes(profile.to_profile(bytes(32)))
-    with pytest.raises(UserError, match=r"nobodys\.voice: it was made for another model"):
-        render(SENTENCE, tmp_path / "a.png", voice=nobodys, size="160x128")
+    mouth.write_bytes(profile.to_bytes(lips.digest))
+    misfit.write_bytes(profile.to_bytes(bytes(32)))
+    with pytest.raises(UserError, match=r"misfit\.mouth: it was made for another lip model"):
+        render(SENTENCE, tmp_path / "a.png", mouth=misfit, size="160x128")
     shot: dict[str, Any] = {"camera": Framing.MOUTH, "at": 1.2, "size": "160x128"}
     render(SENTENCE, tmp_path / "plain.png", **shot)
-    render(SENTENCE, tmp_path / "wide.png", voice=voice, **shot)
+    render(SENTENCE, tmp_path / "wide.png", mouth=mouth, **shot)
     plain, wide = (np.asarray(Image.open(tmp_path / f"{name}.png")) for name in ("plain", "wide"))
     assert np.abs(plain.astype(int) - wide).max() > 40
 

@@ -807,7 +807,7 @@ def test_only_the_face_meshs_frame_may_make_functions_from_text_and_it_sees_no_c
     asyncio.run(look())
 
 
-def test_a_voice_goes_with_the_microphones_session(
+def test_the_microphone_sends_the_mouth_profile(
     system: ScriptedSystem, gateway: GatewayProcess
 ) -> None:
     profile = bytes(range(256)) * 256  # 64 KiB, the largest

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from kouxing.corpora.face_landmarks import _STEADY, LANDMARKS, mouth_faps
-from kouxing.corpora.landmark_file import landmark_file, read_landmark_file
+from kouxing.services.mouth_profiles.face_landmarks import _STEADY, LANDMARKS, mouth_faps
+from kouxing.services.mouth_profiles.landmark_file import landmark_file, parse_landmark_file
+from kouxing.services.recognizer.lips import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 
@@ -65,7 +65,7 @@ def levels(speaking_db: float = -20.0) -> NDArray[np.float64]:
         (291, (0.5, 0, 0), 53, 102.4),
     ],
 )
-def test_a_point_that_moves_is_its_fap_in_any_pose_of_the_head(
+def test_the_motion_of_a_point_is_its_fap_in_any_head_pose(
     point: int, move: tuple[float, float, float], number: int, expected: float
 ) -> None:
     faps = mouth_faps(film({point: move}), levels())
@@ -78,7 +78,7 @@ def test_a_point_that_moves_is_its_fap_in_any_pose_of_the_head(
     assert np.isnan(faps[:, depths]).all()
 
 
-def test_the_neutral_face_is_silent_and_closed_or_else_the_most_closed() -> None:
+def test_the_neutral_face_is_silent_and_closed_or_the_most_closed() -> None:
     open_mouth = {14: (0.0, -1.0, 0.0)}
     assert fap(mouth_faps(film(open_mouth), levels()), 5) == pytest.approx(-512, abs=1)
     assert fap(mouth_faps(film(open_mouth), QUIET), 5) == pytest.approx(-512, abs=1)
@@ -86,10 +86,10 @@ def test_the_neutral_face_is_silent_and_closed_or_else_the_most_closed() -> None
     assert fap(mouth_faps(film(open_mouth), -levels()), 5) == pytest.approx(-512, abs=1)
 
 
-def test_landmarks_of_no_face_are_refused() -> None:
+def test_rejects_landmarks_that_form_no_face() -> None:
     with pytest.raises(UserError, match="coincide"):
         mouth_faps(np.zeros((NUM_FRAMES, len(LANDMARKS), 3)), QUIET)
-    with pytest.raises(UserError, match="no upright face"):
+    with pytest.raises(UserError, match="upright face"):
         mouth_faps(film({13: (0, 5, 0), 14: (0, 5, 0)})[NUM_FRAMES // 2 :], QUIET[::2])
 
 
@@ -106,14 +106,11 @@ def with_header(**changes: object) -> bytes:
     return len(header).to_bytes(4, "little") + header + BODY
 
 
-def test_a_landmark_file_is_read_back(tmp_path: Path) -> None:
-    path = tmp_path / "me.landmarks"
-    path.write_bytes(CONTENT)
-    clip = read_landmark_file(path)
-    np.testing.assert_array_equal(clip.time_s, TIMES)
-    assert fap(clip.faps, 5) == pytest.approx(-512, abs=2)
-    assert len(clip.samples) == pytest.approx(3 * 16_000, abs=2)
-    assert clip.speaker == "me"
+def test_parses_a_landmark_file() -> None:
+    filmed = parse_landmark_file(CONTENT)
+    np.testing.assert_array_equal(filmed.frame_s, TIMES)
+    assert filmed.lips[:, LIP_FAPS.index(5)].min() == pytest.approx(-512, abs=2)
+    assert len(filmed.samples) == pytest.approx(3 * 16_000, abs=2)
 
 
 def replaced(at: int, part: bytes) -> bytes:
@@ -123,30 +120,23 @@ def replaced(at: int, part: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "no landmark file"),
-        (b"\xff\xff\xff\xff" + CONTENT[4:], "no landmark file"),
-        (CONTENT[: 4 + HEADER_BYTES], "cut off"),
-        (CONTENT[:-1], "cut off"),
-        (with_header(times=2**60), "cut off"),
+        (b"", "not a landmark file"),
+        (b"\xff\xff\xff\xff" + CONTENT[4:], "not a landmark file"),
+        (CONTENT[: 4 + HEADER_BYTES], "truncated"),
+        (CONTENT[:-1], "truncated"),
+        (with_header(times=2**60), "truncated"),
         (with_header(times=True), "whole numbers"),
-        (with_header(times=49), "49 frames only"),
+        (with_header(times=49), "only 49 frames"),
         (with_header(points=468), "468 landmarks"),
-        (with_header(sample_rate_hz=4000), "4000 samples"),
+        (with_header(sample_rate_hz=4000), "4000 Hz"),
         (b"\x04\x00\x00\x00null" + BODY, "whole numbers"),
         (replaced(8, np.float64(np.nan).tobytes()), "times"),
         (replaced(8, np.float64(9.0).tobytes()), "times"),
         (replaced(8 * NUM_FRAMES, np.float32(np.nan).tobytes()), "pixels"),
         (replaced(8 * NUM_FRAMES, np.float32(1e9).tobytes()), "pixels"),
-        (CONTENT[: 4 + HEADER_BYTES + NUM_FRAMES * (8 + 12 * 43) + 20], "second of sound"),
+        (CONTENT[: 4 + HEADER_BYTES + NUM_FRAMES * (8 + 12 * 43) + 20], "second of audio"),
     ],
 )
-def test_a_broken_landmark_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
-    path = tmp_path / "me.landmarks"
-    path.write_bytes(content)
+def test_rejects_a_broken_landmark_file(content: bytes, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        read_landmark_file(path)
-
-
-def test_a_landmark_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"nobody\.landmarks: No such file"):
-        read_landmark_file(tmp_path / "nobody.landmarks")
+        parse_landmark_file(content)

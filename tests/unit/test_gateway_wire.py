@@ -10,7 +10,7 @@ import pytest
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.sound_format import SoundFormat
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import MAX_VOICE_BYTES, LipModelName
+from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES, LipModelName
 
 pytestmark = pytest.mark.unit
 
@@ -28,8 +28,8 @@ def test_a_hello_describes_the_audio() -> None:
     assert hello.sound == SoundFormat(sample_rate_hz=44100, num_channels=2, encoding="f32le")
     assert hello.sound.frame_bytes == 8
     assert wire.parse_hello('{"sample_rate_hz": 8000}').sound.frame_bytes == 2
-    assert hello.voice == b""
-    assert wire.parse_hello('{"sample_rate_hz": 8000, "voice": "YWJj"}').voice == b"abc"
+    assert hello.mouth_profile == b""
+    assert wire.parse_hello('{"sample_rate_hz": 8000, "voice": "YWJj"}').mouth_profile == b"abc"
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_a_hello_describes_the_audio() -> None:
         ({"sample_rate_hz": 16000, "voice": "no base64!"}, "voice"),
         ({"sample_rate_hz": 16000, "voice": "ü"}, "voice"),
         ({"sample_rate_hz": 16000, "voice": ["YWJj"]}, "voice"),
-        ({"sample_rate_hz": 16000, "voice": "AAAA" * (MAX_VOICE_BYTES // 3 + 1)}, "voice"),
+        ({"sample_rate_hz": 16000, "voice": "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)}, "voice"),
         ([1], "object"),
     ],
 )

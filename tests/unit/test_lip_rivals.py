@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip, level_track
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.clip_scores import score_clip
 from kouxing.evaluation.lips.report import print_comparison
 from kouxing.evaluation.lips.rivals import rows as rivals_rows
@@ -25,6 +25,7 @@ from kouxing.evaluation.lips.rivals.rows import (
 )
 from kouxing.evaluation.lips.schemes import DELAYS_S, HeardClip
 from kouxing.evaluation.lips.scores import pool
+from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.corpora.figures import new_figure, save_figure
-from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, level_track
+from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.evaluation.lips.clip_scores import score_clip
 from kouxing.evaluation.lips.closure_fit import TRIED, compare
 from kouxing.evaluation.lips.report import print_scores
@@ -32,6 +32,7 @@ from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool
 from kouxing.evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
 from kouxing.evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
 from kouxing.services.live_chain import sound_events
+from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lips import lips_for
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend

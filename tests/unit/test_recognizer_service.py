@@ -15,6 +15,7 @@ from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.audio_order import AudioMessage
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
+from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.recognizer.service import (
     MAX_LEAD_S,
     MAX_QUEUED_S,
@@ -22,7 +23,6 @@ from kouxing.services.recognizer.service import (
     RecognizerService,
 )
 from kouxing.services.recognizer.stream import SpeechStream
-from kouxing.services.recognizer.voice import Voice
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.phones.events import LipFrame
@@ -254,15 +254,15 @@ def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:
 @pytest.mark.parametrize(
     "voice",
     [
-        b"no voice",
-        Voice(
+        b"not a profile",
+        MouthProfile(
             scale=np.ones(15, np.float32),
             offset=np.zeros(15, np.float32),
             residual=np.zeros((2, 2, 15), np.float32),
-        ).to_profile(bytes(32)),
+        ).to_bytes(bytes(32)),
     ],
 )
-def test_a_voice_that_does_not_fit_is_refused_once_and_the_session_goes_on(
+def test_a_mouth_profile_that_does_not_fit_is_refused_once_and_the_session_goes_on(
     service: Watched, voice: bytes
 ) -> None:
     service.start_session(start_of(voice))
@@ -270,18 +270,18 @@ def test_a_voice_that_does_not_fit_is_refused_once_and_the_session_goes_on(
         service.take(AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)))
     service.work_off()
     assert [reason for reason, _ in service.warnings_given] == ["bad-voice"]
-    assert "the voice is not used" in service.warnings_given[0][1]
+    assert "the mouth profile is not used" in service.warnings_given[0][1]
     assert service.media_times[-1] == pytest.approx(6400, abs=640)
 
 
-def test_a_session_has_the_lips_of_its_voice(service: Watched) -> None:
+def test_a_session_has_the_lips_of_its_mouth_profile(service: Watched) -> None:
     lips = load_lips()
-    voice = Voice(
+    profile = MouthProfile(
         scale=np.zeros(15, np.float32),
         offset=np.full(15, 77, np.float32),
         residual=np.zeros(lips.residual_shape, np.float32),
     )
-    start = start_of(voice.to_profile(lips.digest))
+    start = start_of(profile.to_bytes(lips.digest))
     service.start_session(start)
     stream = service._sessions["s"].stream
     events = stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])

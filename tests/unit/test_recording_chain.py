@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.corpora.lip_clips import level_track
+from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_live_model, load_model
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.lips import lips_for

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
-from kouxing.services.recognizer.lip_positions import POSITION_S
+from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.lips import LIP_FAPS, NUM_OUTPUTS, LipPredictor
 from kouxing.training.lips.positions import Speech, components_of
 from kouxing.training.lips.recurrent import Example

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import cache_folder
 from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.mouth_profiles.positions import record_positions
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lip_positions import lip_positions
 from kouxing.training.neural.augmentation import augment_samples, scale_level
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def _positions(model: NeuralModel, sounds: Sequence[Floats]) -> list[dict[str, N
     of_model.update(model.network.tobytes())
     paths = [_cache_path(of_model, samples) for samples in sounds]
     new = [number for number, path in enumerate(paths) if not path.is_file()]
-    recorded = lip_positions(model, [sounds[number] for number in new])
+    recorded = record_positions(model, [sounds[number] for number in new])
     for number, each in zip(new, recorded, strict=True):
         np.savez(
             paths[number],

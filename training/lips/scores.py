@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
+from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, lip_tracks
 from kouxing.services.recognizer.lips import CLOSURE
 from kouxing.training.lips.targets import Touch, opening
 
@@ -68,11 +68,11 @@ def _compared(
         time_s = stretch.known_s - delay_s
         spoken |= (clip.time_s >= time_s[0]) & (clip.time_s <= time_s[-1])
         times += [time_s[:1] - _TO_REST_S, time_s, time_s[-1:] + _TO_REST_S]
-        values += [rest, measures_of(stretch.outputs[:, delay]), rest]
+        values += [rest, lip_measures(stretch.outputs[:, delay]), rest]
     time_s = np.concatenate(times)
     order = np.argsort(time_s, kind="stable")
     made = np.concatenate(values)[order]
-    tracked = measures_of(lip_tracks(clip.faps))
+    tracked = lip_measures(lip_tracks(clip.faps))
     pairs = []
     for measure in range(len(MEASURES)):
         known = ~np.isnan(tracked[:, measure]) & (spoken if in_speech else True)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.services.recognizer.lip_tracks import lip_tracks, values_at
+from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_tracks
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 
@@ -94,8 +94,8 @@ def targets_at(
         FAPs in FAP units, closure, lip to teeth (0 or 1), (n, delays, 17); NaN where unknown.
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
-    faps = [values_at(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]
-    height = values_at(clip.time_s, opening(clip), time_s)
+    faps = [interpolate_track(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]
+    height = interpolate_track(clip.time_s, opening(clip), time_s)
     closure = np.where(np.isnan(height), np.nan, height < touch.closed_below)
     lip_to_teeth = np.full(time_s.shape, np.nan if phones is None else 0.0)
     for phone in phones or ():

@@ -39,8 +39,8 @@ from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.corpora.kept_back import is_kept_back
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.corpora.speech_corpus import audio_files, duration_s
+from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lip_positions import POSITION_S
 from kouxing.services.recognizer.lips import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS

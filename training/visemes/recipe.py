@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from kouxing.corpora.lip_clips import LEVEL_STEP_S, LipClip, label_clip, level_track, read_clips
+from kouxing.corpora.lip_clips import LipClip, label_clip, read_clips
+from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters

@@ -1,4 +1,4 @@
-// "Learn my mouth": records the own lips and voice, has the gateway learn from them, shows what it
+// "Learn my mouth": records the own lips and speech, has the gateway learn from them, shows what it
 // brought, and keeps it or not.
 
 import { pathOf } from "./address.js";
@@ -38,19 +38,19 @@ const dialog = element("learn-mouth");
 
 export class MouthLesson {
   readingS = 40;
-  #voices;
+  #profiles;
   #handlers;
   #stop = new AbortController(); // of what is going on
   #finish = () => {}; // ends the reading
   #recording = null; // landmark file that nothing was learnt from yet
-  #learnt = null; // voice that is neither kept nor discarded yet
+  #learnt = null; // profile that the user has neither kept nor discarded
 
   /**
-   * @param voices VoiceStore
-   * @param handlers { opened(), closed(), voice(): it has changed }
+   * @param profiles MouthProfileStore
+   * @param handlers { opened(), closed(), profileChanged() }
    */
-  constructor(voices, handlers) {
-    this.#voices = voices;
+  constructor(profiles, handlers) {
+    this.#profiles = profiles;
     this.#handlers = handlers;
     element("lesson-text").value = document.documentElement.lang;
     for (const [id, act] of Object.entries({
@@ -77,12 +77,12 @@ export class MouthLesson {
 
   open() {
     this.#recording = this.#learnt = null;
-    const { voice } = this.#voices;
-    element("lesson-voice").hidden = voice === null;
-    if (voice !== null) {
-      const [, before, after] = figures(voice)[0];
-      const day = new Date(voice.learntOn).toLocaleDateString();
-      element("lesson-voice").firstElementChild.textContent =
+    const { current } = this.#profiles;
+    element("lesson-profile").hidden = current === null;
+    if (current !== null) {
+      const [, before, after] = figures(current)[0];
+      const day = new Date(current.learntOn).toLocaleDateString();
+      element("lesson-profile").firstElementChild.textContent =
         say({
           en: `Your mouth was learnt on ${day}: opening ${before} → ${after}.`,
           zh: `${day} 学会了你的口型：张口 ${before} → ${after}。`,
@@ -252,14 +252,14 @@ export class MouthLesson {
   }
 
   #keep() {
-    this.#voices.keep(this.#learnt);
-    this.#handlers.voice();
+    this.#profiles.keep(this.#learnt);
+    this.#handlers.profileChanged();
     dialog.close();
   }
 
   #forget() {
-    this.#voices.forget();
-    this.#handlers.voice();
+    this.#profiles.forget();
+    this.#handlers.profileChanged();
     dialog.close();
   }
 }

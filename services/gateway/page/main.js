@@ -29,7 +29,7 @@ import {
   waitText,
 } from "./status.js";
 import { BACKGROUND, VideoRecorder } from "./video.js";
-import { VoiceStore } from "./voice.js";
+import { MouthProfileStore } from "./mouth-profile.js";
 
 const LABEL_EVERY_MS = 250;
 const DELAY_MS = 2000; // over which the delay is measured
@@ -42,7 +42,7 @@ const programs = new Programs(element("settings"));
 const delays = new Recent(DELAY_MS); // ms, from the own voice to the picture
 const frameDelays = new Recent(DELAY_MS); // ms, from the own voice to the arrival of its frame
 const sound = new Sound(onSoundState);
-const voices = new VoiceStore(storage());
+const mouthProfiles = new MouthProfileStore(storage());
 const choices = new Choices(storage());
 const caption = new Caption(choices);
 const notice = new Notice();
@@ -88,7 +88,7 @@ window.kouxing = {
       microphone: microphoneState === "on",
       lips,
       caption: caption.text,
-      voice: voices.voice?.profile ?? "",
+      mouthProfile: mouthProfiles.current?.profile ?? "",
       drawing: head?.drawing ?? null,
       recording: video.isRecording,
       lesson: lesson.step,
@@ -317,8 +317,8 @@ element("sound").onclick = () => {
 let wasSoundWanted = false; // before the microphone was turned on, or a lesson began
 
 const microphone = new Microphone({
-  voice() {
-    return voices.voice?.profile ?? "";
+  mouthProfile() {
+    return mouthProfiles.current?.profile ?? "";
   },
   lips() {
     return chosenLips();
@@ -418,7 +418,7 @@ element("record").onclick = async () => {
   element("record").setAttribute("aria-pressed", video.isRecording);
 };
 
-const lesson = new MouthLesson(voices, {
+const lesson = new MouthLesson(mouthProfiles, {
   opened() {
     microphone.stop();
     wasSoundWanted = sound.wanted;
@@ -427,16 +427,16 @@ const lesson = new MouthLesson(voices, {
   closed() {
     if (wasSoundWanted) sound.turnOn();
   },
-  voice: showVoice,
+  profileChanged: showMouthProfile,
 });
 
-/** Return the lip model for sessions to come; null for the system's. No others have a voice. */
+/** Return the lip model for sessions to come; null for the system's. Other models take no mouth profile. */
 function chosenLips() {
-  return choices.get("lips") ?? (voices.voice === null ? null : "learnt");
+  return choices.get("lips") ?? (mouthProfiles.current === null ? null : "learnt");
 }
 
-function showVoice() {
-  element("learn").setAttribute("aria-pressed", voices.voice !== null);
+function showMouthProfile() {
+  element("learn").setAttribute("aria-pressed", mouthProfiles.current !== null);
 }
 
 element("learn").onclick = () => lesson.open();
@@ -454,7 +454,7 @@ element("head").onkeydown = (event) => {
   event.preventDefault();
   setText(element("turned"), turnText(head.turn(...TURNS[event.key])));
 };
-showVoice();
+showMouthProfile();
 
 // --- begin ---------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ export class Microphone {
   #giveUpMs = null; // until when to try again, once it has streamed
 
   /**
-   * @param handlers { voice(): the speaker's in base64, or "", lips(): the lip model to begin with,
+   * @param handlers { mouthProfile(): the speaker's in base64, or "", lips(): the lip model to begin with,
    *   or null, state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
    *   error({ code, text }) }
    */
@@ -116,7 +116,7 @@ export class Microphone {
     socket.onopen = () => {
       const { sampleRate } = this.#context;
       const hello = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
-      socket.send(JSON.stringify({ ...hello, voice: this.#handlers.voice() }));
+      socket.send(JSON.stringify({ ...hello, voice: this.#handlers.mouthProfile() }));
     };
     socket.onmessage = (event) => {
       if (this.#socket !== socket) return;

@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import test from "node:test";
 import { curvePath, extent, figures, verdict } from "../lip-curves.js";
 import { FaceRecording, LANDMARKS, NO_FACE, TOO_QUIET, TOO_SLOW } from "../recording.js";
-import { VoiceStore } from "../voice.js";
+import { MouthProfileStore } from "../mouth-profile.js";
 
 const RATE_HZ = 48000;
 const CHUNK = Int16Array.from({ length: 960 }, (_, i) => i);
@@ -117,24 +117,24 @@ class FakeStorage {
   removeItem(key) { this.items.delete(key); }
 }
 
-test("a voice is kept until it is forgotten", () => {
+test("a mouth profile is kept until it is forgotten", () => {
   const storage = new FakeStorage();
-  const voice = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
-  new VoiceStore(storage).keep(voice);
-  const later = new VoiceStore(storage);
-  assert.deepEqual(later.voice, voice);
+  const learned = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
+  new MouthProfileStore(storage).keep(learned);
+  const later = new MouthProfileStore(storage);
+  assert.deepEqual(later.current, learned);
   later.forget();
-  assert.equal(later.voice, null);
-  assert.equal(new VoiceStore(storage).voice, null);
+  assert.equal(later.current, null);
+  assert.equal(new MouthProfileStore(storage).current, null);
 });
 
-test("without a storage a voice is kept for now, and rubbish in it is none", () => {
-  const now = new VoiceStore(null);
+test("without a storage a mouth profile is kept for now, and invalid content is ignored", () => {
+  const now = new MouthProfileStore(null);
   now.keep({ profile: "YWJj" });
-  assert.equal(now.voice.profile, "YWJj");
+  assert.equal(now.current.profile, "YWJj");
   for (const text of ["{", "1", '{"profile": 5}', '{"profile": ""}']) {
     const storage = new FakeStorage();
     storage.getItem = () => text;
-    assert.equal(new VoiceStore(storage).voice, null);
+    assert.equal(new MouthProfileStore(storage).current, null);
   }
 });

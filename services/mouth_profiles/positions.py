@@ -1,7 +1,7 @@
-"""What a model of lips from sound is told of whole recordings, as in the product.
+"""Record what the recognizer passes to the lip model for whole recordings.
 
-The voice detector and the sound before its decision are those of the live recognizer, so the
-network starts again with each stretch of speech.
+Voice activity detection runs as in the live recognizer. The network therefore restarts at each
+stretch of speech.
 """
 
 from __future__ import annotations
@@ -20,23 +20,22 @@ from kouxing.services.recognizer.speech_scores import SpeechScores
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import LipFrame
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 POSITION_S = FRAMES_PER_POSITION * HOP_S
 
 
 class LipPositions:
-    """Keeps what lips from sound are told.
+    """The lip model's inputs over one recording.
 
     Attributes
     ----------
     starts : list of int
         First position of each stretch of speech.
     known_s : list of float
-        Media time up to which the sound is known at each position.
+        Media time up to which the audio is known at each position.
     features : list of NDArray
-        Of each position as ``LipPredictor`` takes them, (features,).
+        Input of ``LipPredictor`` at each position, (features,).
     """
 
     def __init__(self) -> None:
@@ -45,26 +44,24 @@ class LipPositions:
         self.features: list[NDArray[np.float16]] = []
 
     def accept(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
-        """Take what the network computes at a position."""
+        """Store the network's values at a position."""
         self.known_s.append(known_s)
         self.features.append(features_at(frames, values).astype(np.float16))
         return []
 
     def reset(self) -> None:
-        """Note that a stretch of speech begins."""
+        """Mark the start of a stretch of speech."""
         self.starts.append(len(self.known_s))
 
 
-def lip_positions(model: NeuralModel, recordings: Sequence[Floats]) -> list[LipPositions]:
-    """Return all positions of recordings, each 16 kHz mono, shape (n,).
+def record_positions(model: NeuralModel, recordings: Sequence[Floats]) -> list[LipPositions]:
+    """Run the network over recordings, each 16 kHz mono, (n,).
 
-    The network hears them side by side, which takes half the time; no value depends on it.
+    Processing them together takes half the time. It does not change the values.
     """
     positions = [LipPositions() for _ in recordings]
-    scores = [SpeechScores(model, MEDIA_RATE_HZ, lips=each) for each in positions]
-    run_scoring_tasks(
-        model,
-        [each.process(samples) for each, samples in zip(scores, recordings, strict=True)],
-    )
-    run_scoring_tasks(model, [each.finish() for each in scores])
+    scores = [SpeechScores(model, MEDIA_RATE_HZ, lips=recorder) for recorder in positions]
+    tasks = [score.process(samples) for score, samples in zip(scores, recordings, strict=True)]
+    run_scoring_tasks(model, tasks)
+    run_scoring_tasks(model, [score.finish() for score in scores])
     return positions

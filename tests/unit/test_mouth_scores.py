@@ -1,4 +1,4 @@
-"""What a speaker's own lips bring: who is scored, on what, and after learning from how much."""
+"""Scores of mouth profiles: which speakers, on what, after learning from how much."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import pytest
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.evaluation.lips import voices
 from kouxing.evaluation.lips.voices import score_voices
+from kouxing.services.mouth_profiles.learning import FilmedSpeech, Observations, apply_profile
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lips import LipPredictor
-from kouxing.services.recognizer.voice import Voice
-from kouxing.services.recognizer.voice_learning import Material, with_voice
+from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
 from tests.lip_predictors import made_up_model
 
 pytestmark = pytest.mark.unit
 MODEL = made_up_model()
 RNG = np.random.default_rng(0)
-VOICE = Voice(
+PROFILE = MouthProfile(
     scale=np.ones(15, np.float32),
     offset=np.zeros(15, np.float32),
     residual=RNG.normal(0, 50, MODEL.residual_shape).astype(np.float32),
@@ -42,16 +42,17 @@ def clip(speaker: str, seconds: float, *, licence: str = "none", part: str = "ch
     )
 
 
-def material_of_clip(_model: object, _lips: object, spoken: LipClip) -> Material:
-    """As if the speaker had said something in this voice all the time."""
-    num_positions = len(spoken.samples) // 320
-    num_inner, *shape = MODEL.residual_shape
-    made = 30 * RNG.normal(size=(num_positions, *shape)).astype(np.float32)
-    inner = RNG.normal(size=(num_positions, num_inner)).astype(np.float32)
+def observe(_model: object, _lips: object, filmed: FilmedSpeech) -> Observations:
+    """Observe a speaker who has this mouth and never pauses."""
+    num_positions = len(filmed.samples) // 320
+    num_hidden, *shape = MODEL.residual_shape
+    predicted = 30 * RNG.normal(size=(num_positions, *shape)).astype(np.float32)
+    hidden = RNG.normal(size=(num_positions, num_hidden)).astype(np.float32)
     known_s = 0.02 * np.arange(num_positions, dtype=np.float64)
-    plain = Material(known_s=known_s, made=made, inner=inner, tracked=np.zeros(made.shape))
-    tracked = with_voice(VOICE, plain) + 30 * RNG.normal(size=made.shape)
-    return Material(known_s=known_s, made=made, inner=inner, tracked=tracked)
+    tracked = 30 * RNG.normal(size=predicted.shape)
+    speech = Observations(known_s=known_s, predicted=predicted, hidden=hidden, tracked=tracked)
+    tracked += apply_profile(PROFILE, speech)
+    return speech
 
 
 CLIPS = [
@@ -69,7 +70,7 @@ def made_up_clips(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(voices, "read_clips", lambda *_, **__: CLIPS)
     monkeypatch.setattr(voices, "load_models", models)
-    monkeypatch.setattr(voices, "clip_material", material_of_clip)
+    monkeypatch.setattr(voices, "observe", observe)
 
 
 def test_strangers_with_enough_speech_are_scored_on_what_was_not_learnt_from() -> None:

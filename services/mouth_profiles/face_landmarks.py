@@ -1,16 +1,16 @@
-"""From the landmarks of a face in pictures to the FAPs of its mouth, the head's motion taken out.
+"""Compute the mouth's FAPs from the landmarks of a face, without the motion of the head.
 
-Landmarks are those of MediaPipe's face mesh (Kartynnik et al. 2019, "Real-time facial surface
+The landmarks are those of MediaPipe's face mesh (Kartynnik et al. 2019, "Real-time facial surface
 geometry from monocular video on mobile GPUs"), in pixels: x to the right, y down, z away from the
-camera in the same unit (MediaPipe's x and z times the picture's width, y times its height). Left
-and right are the person's.
+camera in the same unit (MediaPipe's x and z times the image width, y times its height). Left and
+right are the person's.
 
 ======== ============================================================== =============
 symbol   meaning                                                        unit, shape
 ======== ============================================================== =============
-p        the points of a frame                                          px, (43, 3)
-c        where the points that neither mouth nor jaw move are on        cm, (25, 3)
-         MediaPipe's canonical face
+p        points of a frame                                              px, (43, 3)
+c        points of MediaPipe's canonical face that neither mouth nor    cm, (25, 3)
+         jaw move
 s, R, t  scale, rotation and translation: c ~ s R p + t by least        1, (3, 3), cm
          squares (Umeyama 1991, eq. 39 to 43)
 n        median of s R p + t over the neutral frames                    cm, (43, 3)
@@ -19,8 +19,8 @@ MW0      width of the mouth in n                                        cm
 ======== ============================================================== =============
 
 A FAP is the displacement of its feature point (ISO/IEC 14496-2, tables C-1 and C-5) from n in
-MNS0 / 1024 or MW0 / 1024. The neutral frames are silent ones with the lips closed. Depth (FAP 14,
-16, 17) is left out: what one camera tells of it did not follow the lips of a rendered head.
+MNS0 / 1024 or MW0 / 1024. The neutral frames are silent frames with closed lips. Depth (FAP 14,
+16, 17) is omitted: measured with one camera, it did not follow the lips of a rendered head.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from kouxing.shared.face.faps import MOUTH_FAPS
 
 Array = NDArray[np.float64]
 
-# Of MediaPipe's canonical face model (Apache-2.0), cm, right-handed, y up, z out of the face: those
-# points that its own alignment uses, without jaw and cheeks.
+# Points of MediaPipe's canonical face model (Apache-2.0) that its own alignment uses, without jaw
+# and cheeks: cm, right-handed, y up, z out of the face.
 _STEADY = {
     4: (0.000000, -0.463170, 7.586580),
     6: (0.000000, 2.473255, 5.788627),
@@ -64,7 +64,7 @@ _STEADY = {
 }
 _UNDER_NOSE, _UPPER_LIP, _LOWER_LIP, _RIGHT_CORNER, _LEFT_CORNER = 2, 13, 14, 61, 291
 _X, _Y = range(2)
-# By FAP: the landmark at its feature point, the axis, the sign of the FAP's direction on it.
+# By FAP: landmark at its feature point, axis, and sign of the FAP's direction on that axis.
 _FAPS = {
     3: (152, _Y, -1), 4: (13, _Y, -1), 5: (14, _Y, 1), 6: (308, _X, 1), 7: (78, _X, -1),
     8: (311, _Y, -1), 9: (81, _Y, -1), 10: (402, _Y, 1), 11: (178, _Y, 1), 12: (308, _Y, 1),
@@ -74,49 +74,48 @@ _FAPS = {
 }  # fmt: skip
 
 LANDMARKS = tuple(sorted({*_STEADY, _UNDER_NOSE, *(point for point, _, _ in _FAPS.values())}))
-"""Which of MediaPipe's 468 landmarks are needed, rising."""
+"""Indices of the needed ones among MediaPipe's 468 landmarks, ascending."""
 
-_QUIET_DB = 30.0  # below the loud frames
+_QUIET_DB = 30.0  # silent frames are this far below the loud ones
 _LOUD_PERCENTILE = 95.0
-_CLOSED_SHARE = 0.35  # of the frames, those with the lips closest together
-_CLOSED_SHARE_SPEAKING = 0.08  # where nobody is silent
+_CLOSED_SHARE = 0.35  # fraction of the frames whose lips count as closed
+_CLOSED_SHARE_SPEAKING = 0.08  # likewise, without silent frames
 _MIN_NEUTRAL = 5  # frames
 
 
 def mouth_faps(landmarks: NDArray[np.floating], level_db: Array) -> Array:
-    """Return the FAPs of a mouth relative to its own neutral face.
+    """Compute the FAPs of a mouth relative to its own neutral face.
 
     Parameters
     ----------
     landmarks
-        Of each frame those of ``LANDMARKS``, pixels, shape (n, 43, 3).
+        ``LANDMARKS`` of each frame, pixels, shape (n, 43, 3).
     level_db
-        Level of the sound at each frame, dB, shape (n,).
+        Audio level at each frame, dB, shape (n,).
 
     Returns
     -------
     NDArray
-        Of each frame the FAPs of the mouth in FAP units, shape (n, 28); NaN where it has no
-        landmark.
+        Mouth FAPs of each frame, FAP units, shape (n, 28); NaN for FAPs without a landmark.
 
     Raises
     ------
     UserError
-        If the landmarks are those of no face.
+        If the landmarks do not form an upright face.
     """
-    points = _without_head_motion(landmarks.astype(np.float64))
+    points = _align_head(landmarks.astype(np.float64))
     height = points[:, _at(_UPPER_LIP), _Y] - points[:, _at(_LOWER_LIP), _Y]
     neutral = np.median(points[_is_neutral(height, level_db)], axis=0)
     mouth_y = neutral[[_at(_UPPER_LIP), _at(_LOWER_LIP)], _Y].mean()
     nose_to_mouth = neutral[_at(_UNDER_NOSE), _Y] - mouth_y
     width = neutral[_at(_LEFT_CORNER), _X] - neutral[_at(_RIGHT_CORNER), _X]
     if not (nose_to_mouth > 0 and width > 0):
-        raise UserError("the landmarks are those of no upright face; film the face from the front")
+        raise UserError("the landmarks do not form an upright face; film the face from the front")
     faps = np.full((len(points), len(MOUTH_FAPS)), np.nan)
     for fap, (point, axis, sign) in _FAPS.items():
-        moved = points[:, _at(point), axis] - neutral[_at(point), axis]
+        displacement = points[:, _at(point), axis] - neutral[_at(point), axis]
         unit = width if axis == _X else nose_to_mouth
-        faps[:, MOUTH_FAPS.index(fap)] = sign * moved * 1024 / unit
+        faps[:, MOUTH_FAPS.index(fap)] = sign * displacement * 1024 / unit
     return faps
 
 
@@ -124,22 +123,22 @@ def _at(point: int) -> int:
     return LANDMARKS.index(point)
 
 
-def _without_head_motion(landmarks: Array) -> Array:
-    """Lay each frame on the canonical face, cm."""
+def _align_head(landmarks: Array) -> Array:
+    """Align each frame with the canonical face, cm."""
     points = landmarks * (1, -1, -1)  # y up, z out of the face
     steady = points[:, [_at(point) for point in _STEADY]]
     canonical = np.array(list(_STEADY.values()))
-    centre, goal = steady.mean(axis=1, keepdims=True), canonical.mean(axis=0)
-    steady = steady - centre
+    center, goal = steady.mean(axis=1, keepdims=True), canonical.mean(axis=0)
+    steady = steady - center
     size = (steady**2).sum(axis=(1, 2))
     if not (size > 0).all():
-        raise UserError("the landmarks of a frame coincide; leave out frames without a face")
+        raise UserError("the landmarks of a frame coincide; omit frames without a face")
     covariance = np.einsum("ki,nkj->nij", canonical - goal, steady)
     left, strength, right = np.linalg.svd(covariance)
     strength[:, -1] *= np.sign(np.linalg.det(left @ right))  # no reflection
     left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
     scale = strength.sum(axis=1) / size
-    aligned: Array = scale[:, None, None] * (points - centre) @ (left @ right).transpose(0, 2, 1)
+    aligned: Array = scale[:, None, None] * (points - center) @ (left @ right).transpose(0, 2, 1)
     aligned += goal
     return aligned
 

@@ -1,4 +1,4 @@
-"""From a video to a clip, and from what a camera saw to a voice: the commands."""
+"""The commands ``kouxing track`` and ``kouxing adapt``."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from kouxing.corpora.commands import adapt_app, track_app
-from kouxing.corpora.face_landmarks import LANDMARKS
-from kouxing.corpora.landmark_file import landmark_file
 from kouxing.corpora.lip_clips import read_clip
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video.film import render_video
 from kouxing.services.driver.video.writer import VideoWriter
 from kouxing.services.live_chain import LiveChain
+from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
+from kouxing.services.mouth_profiles.landmark_file import landmark_file
+from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, lip_tracks
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lip_tracks import MEASURES, lip_tracks, measures_of
 from kouxing.services.recognizer.lips import load_lips
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -53,7 +53,7 @@ def run(app: object, *arguments: object) -> None:
     RUNNER.invoke(app, [str(each) for each in arguments], catch_exceptions=False)  # type: ignore[arg-type]
 
 
-def test_a_video_becomes_a_clip_of_its_lips(tmp_path: Path) -> None:
+def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
     shut, wide, nobody = (
         picture("woman_rest"),
         picture("woman_a"),
@@ -73,7 +73,7 @@ def test_a_video_becomes_a_clip_of_its_lips(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_lips_of_a_rendered_head_are_tracked(tmp_path: Path) -> None:
+def test_tracks_the_lips_of_a_rendered_head(tmp_path: Path) -> None:
     """The head turns and nods while it speaks; the FAPs that move it are known."""
     samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * 16_000]
     visemes = LipModelName.DYNAMIC_VISEMES
@@ -91,12 +91,12 @@ def test_the_lips_of_a_rendered_head_are_tracked(tmp_path: Path) -> None:
     frame_s = np.array([time_s for time_s, _ in frames])
     mouth = np.array([faps[[fap - 1 for fap in MOUTH_FAPS]] for _, faps in frames])
     true = np.stack([np.interp(clip.time_s, frame_s, fap) for fap in mouth.T], axis=1)
-    made, tracked = (measures_of(lip_tracks(faps)) for faps in (true, clip.faps))
+    made, tracked = (lip_measures(lip_tracks(faps)) for faps in (true, clip.faps))
     for measure in range(len(MEASURES)):
         assert np.corrcoef(made[:, measure], tracked[:, measure])[0, 1] > 0.65, MEASURES[measure]
 
 
-def test_videos_that_cannot_be_tracked_are_refused(tmp_path: Path) -> None:
+def test_rejects_videos_that_cannot_be_tracked(tmp_path: Path) -> None:
     video = tmp_path / "me.mp4"
     write_video(video, [np.zeros((144, 192, 3), np.uint8)] * 3)
     with pytest.raises(UserError, match="a face is seen in 0 pictures"):
@@ -111,7 +111,7 @@ def test_videos_that_cannot_be_tracked_are_refused(tmp_path: Path) -> None:
         run(track_app, tmp_path / "nobody.mp4", "-o", tmp_path / "me")
 
 
-def test_what_a_camera_saw_becomes_a_voice(tmp_path: Path) -> None:
+def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     """The mouth opens with the loudness of the sound."""
     sentences = [samples_of_file(DEMO / f"{name}.wav") for name in ("hello-female", "hello-male")]
     samples = np.concatenate([*sentences, sentences[0]])
@@ -124,10 +124,10 @@ def test_what_a_camera_saw_becomes_a_voice(tmp_path: Path) -> None:
     pcm = (32767 * samples).astype(np.int16)
     seen = landmark_file(time_s, (20 * points * (1, -1, -1)).astype(np.float32), pcm, 16_000)
     (tmp_path / "me.landmarks").write_bytes(seen)
-    voice, figures = tmp_path / "me.voice", tmp_path / "me.json"
-    run(adapt_app, tmp_path / "me.landmarks", "-o", voice, "--json", figures)
+    profile, figures = tmp_path / "me.mouth", tmp_path / "me.json"
+    run(adapt_app, tmp_path / "me.landmarks", "-o", profile, "--json", figures)
     lips = load_lips()
-    assert lips.for_voice(voice.read_bytes()).digest != lips.digest
+    assert lips.with_mouth_profile(profile.read_bytes()).digest != lips.digest
     found = json.loads(figures.read_text(encoding="utf-8"))
     assert found["held_back_s"] == pytest.approx(found["speech_s"] / 4, abs=0.05)
     assert found["after"]["opening"] > found["before"]["opening"] + 0.05
@@ -136,6 +136,6 @@ def test_what_a_camera_saw_becomes_a_voice(tmp_path: Path) -> None:
     assert len(found["curves"]["time_s"]) == len(curve["before"]) == len(curve["tracked"]) > 100
 
 
-def test_clips_that_are_missing_are_named(tmp_path: Path) -> None:
+def test_names_missing_files(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"nobody\.json: cannot be read: No such file"):
-        run(adapt_app, tmp_path / "nobody.json", "-o", tmp_path / "me.voice")
+        run(adapt_app, tmp_path / "nobody.json", "-o", tmp_path / "me.mouth")

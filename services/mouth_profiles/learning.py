@@ -1,0 +1,285 @@
+"""Fit a mouth profile to filmed speech: an affine map of the FAPs and a ridge regression.
+
+Source: Hoerl and Kennard 1970, "Ridge regression: biased estimation for nonorthogonal problems".
+
+======== ============================================================ ===================
+symbol   meaning                                                      shape
+======== ============================================================ ===================
+y        FAPs that the lip model predicts                             (n, delays, 15)
+t        tracked FAPs                                                 (n, delays, 15)
+P        hidden values [h, u] of the lip model                        (n, 2 units)
+s, b     scale and offset of each FAP, s shrunk toward 1              (15,)
+r        residual, shrunk toward 0                                    (2 units, delays, 15)
+k        strength of the ridge, positions                             1
+v        mean variance of the hidden values                           1
+======== ============================================================ ===================
+
+    r = (P' P + k v I)^-1 P' (t - s y - b)        P and the errors about their means
+
+Cross-validation chooses k, so little speech gives a strong ridge. An infinite k leaves only the
+affine map. Some cameras deliver their images late. Each recording of sufficient length is therefore
+shifted to where the tracked lips follow the prediction best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
+from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lip_source import delay_for
+from kouxing.services.recognizer.lips import LIP_FAPS, LipPredictor
+from kouxing.services.recognizer.mouth_profile import MouthProfile
+from kouxing.shared.errors import UserError
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+STRENGTHS = (30.0, 100.0, 300.0, 1000.0, 3000.0, np.inf)  # of the ridge, positions
+FACE_DELAY_S = 0.06  # delay of the face for which the gain is measured
+MIN_SPEECH_S = 10.0
+
+_NUM_FAPS = len(LIP_FAPS)
+_BLOCK = 250  # adjacent positions that stay in one fold
+_MAX_FOLDS = 5
+_SCALE_SHRINKAGE = 250.0  # weight of a scale of 1, positions
+_HELD_OUT = 0.25  # fraction, at the end
+_LAGS_S = np.arange(-20, 21) / 100  # of a camera
+_MIN_LAG_CORRELATION = 0.3  # below this a camera's lag is not estimated
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmedSpeech:
+    """A recording of a speaker with tracked lips."""
+
+    samples: Floats  # 16 kHz mono
+    frame_s: Array  # (frames,) times of the images in the audio
+    lips: Array  # (frames, 15) FAP units, NaN where not tracked
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observations:
+    """Predicted and tracked lips at the positions of speech."""
+
+    known_s: Array  # (n,)
+    predicted: Floats  # (n, delays, 15)
+    hidden: Floats  # (n, 2 units)
+    tracked: Array  # (n, delays, 15), NaN where unknown
+
+    def __len__(self) -> int:
+        return len(self.known_s)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_]) -> Self:
+        return type(self)(
+            known_s=self.known_s[rows],
+            predicted=self.predicted[rows],
+            hidden=self.hidden[rows],
+            tracked=self.tracked[rows],
+        )
+
+    @classmethod
+    def join(cls, parts: Sequence[Observations]) -> Self:
+        """Concatenate observations."""
+        return cls(
+            known_s=np.concatenate([part.known_s for part in parts]),
+            predicted=np.concatenate([part.predicted for part in parts]),
+            hidden=np.concatenate([part.hidden for part in parts]),
+            tracked=np.concatenate([part.tracked for part in parts]),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProfileGain:
+    """What a profile improves on held-out speech."""
+
+    speech_s: float
+    delay_s: float
+    before: Array  # (3,) correlation of each of ``MEASURES``; NaN for one that does not move
+    after: Array  # (3,)
+    time_s: Array  # (n,)
+    curves: Array  # (3, 3, n): measure; tracked, before, after
+
+
+def observe(model: NeuralModel, lips: LipPredictor, filmed: FilmedSpeech) -> Observations:
+    """Run the lip model over a recording; the result is empty if there is no speech."""
+    (positions,) = record_positions(model, [filmed.samples])
+    stream = lips.stream(lips.delays_s)
+    predicted = np.zeros((len(positions.known_s), len(lips.delays_s), _NUM_FAPS), np.float32)
+    hidden = np.zeros((len(predicted), len(stream.inner)), np.float32)
+    starts = {*positions.starts}
+    for position, features in enumerate(positions.features):
+        if position in starts:
+            stream.reset()
+        predicted[position] = stream.step(features.astype(np.float32))[:, :_NUM_FAPS]
+        hidden[position] = stream.inner
+    known_s = np.array(positions.known_s)
+    time_s = known_s[:, None] - np.array(lips.delays_s)
+    frame_s = filmed.frame_s - _camera_lag_s(filmed, time_s[:, -1], predicted[:, -1])
+    tracks = [interpolate_track(frame_s, track, time_s) for track in filmed.lips.T]
+    return Observations(
+        known_s=known_s, predicted=predicted, hidden=hidden, tracked=np.stack(tracks, axis=-1)
+    )
+
+
+def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> float:
+    """Estimate how much later than the audio the images arrive; 0 if there is too little speech."""
+    if len(time_s) * POSITION_S < MIN_SPEECH_S:
+        return 0.0
+    tracked, opening = (lip_measures(lips)[:, :1] for lips in (filmed.lips, predicted))
+    figures = np.zeros(len(_LAGS_S))
+    for index, lag_s in enumerate(_LAGS_S):
+        shifted = interpolate_track(filmed.frame_s, tracked[:, 0], time_s + lag_s)
+        figures[index] = _correlate([(opening, shifted[:, None])])[0]
+    figures = np.nan_to_num(figures)
+    return float(_LAGS_S[figures.argmax()]) if figures.max() > _MIN_LAG_CORRELATION else 0.0
+
+
+def fit_profile(observations: Observations) -> MouthProfile:
+    """Fit a profile; cross-validation chooses the strength of the ridge.
+
+    Raises
+    ------
+    UserError
+        If there is too little speech with tracked lips.
+    """
+    usable = observations[_is_known(observations)]
+    speech_s = len(usable) * POSITION_S
+    if speech_s < MIN_SPEECH_S:
+        raise UserError(
+            f"there are {speech_s:.0f} s of speech with lips in view; film "
+            f"{MIN_SPEECH_S:.0f} s or more, better a minute"
+        )
+    block = np.arange(len(usable)) // _BLOCK
+    fold_of = block % min(_MAX_FOLDS, block[-1] + 1)
+    errors = [
+        sum(
+            _error(_fit(usable[fold_of != fold], strength), usable[fold_of == fold])
+            for fold in range(fold_of.max() + 1)
+        )
+        for strength in STRENGTHS
+    ]
+    return _fit(usable, STRENGTHS[int(np.argmin(errors))])
+
+
+def measure_gain(lips: LipPredictor, observations: Observations) -> ProfileGain:
+    """Fit a profile to all but the last quarter, and measure it there.
+
+    Raises
+    ------
+    UserError
+        As ``fit_profile``.
+    """
+    first_held_out = round((1 - _HELD_OUT) * len(observations))
+    profile = fit_profile(observations[:first_held_out])
+    held_out = observations[first_held_out:]
+    adapted = apply_profile(profile, held_out)
+    delay_s = delay_for(lips.delays_s, FACE_DELAY_S)
+    delay = lips.delays_s.index(delay_s)
+    versions = (held_out.tracked, held_out.predicted, adapted)
+    curves = np.stack([lip_measures(faps[:, delay]) for faps in versions], axis=1)
+    return ProfileGain(
+        speech_s=len(held_out) * POSITION_S,
+        delay_s=delay_s,
+        before=correlations([held_out], [held_out.predicted], delay),
+        after=correlations([held_out], [adapted], delay),
+        time_s=held_out.known_s - delay_s,
+        curves=curves.transpose(2, 1, 0),
+    )
+
+
+def apply_profile(profile: MouthProfile, observations: Observations) -> Floats:
+    """Predict the FAPs with a profile, (n, delays, 15)."""
+    scaled: Floats = profile.scale * observations.predicted + profile.offset
+    return scaled + np.tensordot(observations.hidden, profile.residual, axes=1)
+
+
+def correlations(parts: Sequence[Observations], predictions: Sequence[Floats], delay: int) -> Array:
+    """Correlate predictions, (n, delays, 15), with the tracked lips, at the delay of this index.
+
+    Returns
+    -------
+    NDArray
+        One figure for each of ``MEASURES``, pooled over the parts after removing their means.
+    """
+    return _correlate(
+        [
+            (lip_measures(faps[:, delay]), lip_measures(part.tracked[:, delay]))
+            for part, faps in zip(parts, predictions, strict=True)
+        ]
+    )
+
+
+def _correlate(pairs: Sequence[tuple[Array, Array]]) -> Array:
+    """Correlate predicted and tracked curves, (n, curves); NaN for one that does not move."""
+    figures = []
+    for measure in range(pairs[0][0].shape[1]):
+        sums = np.zeros((2, 2))
+        for pair in pairs:
+            both = np.stack([curves[:, measure] for curves in pair])
+            both = both[:, ~np.isnan(both).any(axis=0)]
+            if both.size:
+                centered = both - both.mean(axis=1, keepdims=True)
+                sums += centered @ centered.T
+        size = np.sqrt(sums[0, 0] * sums[1, 1])
+        figures.append(sums[0, 1] / size if size > 0 else np.nan)
+    return np.array(figures)
+
+
+def _is_tracked(observations: Observations) -> NDArray[np.bool_]:
+    """Mask of the FAPs that are tracked anywhere, (15,)."""
+    return np.logical_not(np.isnan(observations.tracked).all(axis=(0, 1)))
+
+
+def _is_known(observations: Observations) -> NDArray[np.bool_]:
+    """Mask of the positions where these FAPs are known for all delays, (n,)."""
+    unknown = np.isnan(observations.tracked[..., _is_tracked(observations)])
+    known: NDArray[np.bool_] = ~unknown.any(axis=(1, 2)) & (unknown.shape[2] > 0)
+    return known
+
+
+def _fit(observations: Observations, strength: float) -> MouthProfile:
+    """Fit a profile to known positions."""
+    faps = _is_tracked(observations)
+    predicted = observations.predicted[..., faps].astype(np.float64)
+    tracked = observations.tracked[..., faps]
+    predicted_mean, tracked_mean = predicted.mean(axis=(0, 1)), tracked.mean(axis=(0, 1))
+    deviations = predicted - predicted_mean
+    variance = (deviations**2).mean(axis=(0, 1))
+    covariance = (deviations * (tracked - tracked_mean)).mean(axis=(0, 1))
+    prior = _SCALE_SHRINKAGE / len(observations) * variance
+    scale = (covariance + prior) / np.maximum(variance + prior, 1e-9)
+    offset = tracked_mean - scale * predicted_mean
+    num_hidden, num_delays = observations.hidden.shape[1], observations.predicted.shape[1]
+    profile = MouthProfile(
+        scale=np.ones(_NUM_FAPS, np.float32),
+        offset=np.zeros(_NUM_FAPS, np.float32),
+        residual=np.zeros((num_hidden, num_delays, _NUM_FAPS), np.float32),
+    )
+    if np.isfinite(strength):
+        mean = observations.hidden.mean(axis=0, dtype=np.float64)
+        centered = observations.hidden - mean
+        products = centered.T @ centered
+        ridge = strength * np.trace(products) / (len(observations) * len(products))
+        errors = tracked - scale * predicted - offset
+        fitted = np.linalg.solve(
+            products + ridge * np.eye(len(products)), centered.T @ errors.reshape(len(errors), -1)
+        ).reshape(-1, *errors.shape[1:])
+        profile.residual[..., faps] = fitted
+        offset = offset - np.tensordot(mean, fitted, axes=1).mean(axis=0)
+    profile.scale[faps], profile.offset[faps] = scale, offset
+    return profile
+
+
+def _error(profile: MouthProfile, observations: Observations) -> float:
+    """Sum the squared errors over positions, relative to each FAP's variance."""
+    faps = _is_tracked(observations)
+    tracked = observations.tracked[..., faps]
+    squares = (apply_profile(profile, observations)[..., faps] - tracked) ** 2
+    relative = squares / np.maximum(tracked.var(axis=(0, 1)), 1e-9)
+    return float(relative.mean()) * len(observations)

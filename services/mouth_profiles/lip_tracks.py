@@ -1,0 +1,52 @@
+"""Tracked lips in the form that the lip model uses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.recognizer.front_end.pcm import level_db
+from kouxing.services.recognizer.lips import LIP_FAPS, OTHER_SIDE
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.face.faps import MOUTH_FAPS
+
+Array = NDArray[np.float64]
+
+MEASURES = ("opening", "width", "jaw")
+LEVEL_STEP_S = 0.02
+
+_MAX_GAP_S = 0.1  # longer gaps between tracked frames are not interpolated
+_SIDES = [[MOUTH_FAPS.index(fap), MOUTH_FAPS.index(OTHER_SIDE.get(fap, fap))] for fap in LIP_FAPS]
+_JAW, _UPPER_LIP, _LOWER_LIP, _CORNER = (LIP_FAPS.index(fap) for fap in (3, 4, 5, 6))
+
+
+def lip_tracks(faps: Array) -> Array:
+    """Select the lips' FAPs from the mouth's, (n, 28) to (n, 15); left and right are averaged."""
+    return np.stack([faps[:, pair].mean(axis=1) for pair in _SIDES], axis=1)
+
+
+def lip_measures(lips: NDArray[np.floating]) -> Array:
+    """Compute opening, width and jaw, (n, 3), from FAPs, (n, 15 or more)."""
+    height = -lips[:, _UPPER_LIP] - lips[:, _LOWER_LIP]
+    measures: Array = np.stack([height, 2 * lips[:, _CORNER], lips[:, _JAW]], axis=1)
+    return measures
+
+
+def interpolate_track(frame_s: Array, values: Array, time_s: Array) -> Array:
+    """Interpolate a track, (n,), at times of any shape; NaN outside it and within long gaps."""
+    known = ~np.isnan(values)
+    if known.sum() < 2:
+        return np.full(time_s.shape, np.nan)
+    frame_s, values = frame_s[known], values[known]
+    after = np.clip(np.searchsorted(frame_s, time_s), 1, len(frame_s) - 1)
+    is_gap = frame_s[after] - frame_s[after - 1] > _MAX_GAP_S
+    outside = (time_s < frame_s[0]) | (time_s > frame_s[-1])
+    interpolated: Array = np.interp(time_s, frame_s, values)
+    return np.where(is_gap | outside, np.nan, interpolated)
+
+
+def level_track(samples: NDArray[np.float32]) -> list[tuple[float, float]]:
+    """Measure the level as the live system does: pairs of time (s) and level (dB full scale)."""
+    step = round(LEVEL_STEP_S * MEDIA_RATE_HZ)
+    ends = range(step, len(samples) + 1, step)
+    return [(end / MEDIA_RATE_HZ, level_db(samples[end - step : end])) for end in ends]

@@ -1,0 +1,119 @@
+"""A mouth profile: how one speaker's lips differ from those that the lip model predicts.
+
+    y' = s y + b + r [h, u]
+
+y are the FAPs that the lip model predicts (``lips.py``), h and u its hidden values. A profile fits
+only the model that it was learned with.
+
+======== ====================================================== =================== ===========
+symbol   meaning                                                shape               unit
+======== ====================================================== =================== ===========
+s        scale of each FAP                                      (15,)               1
+b        offset of each FAP                                     (15,)               FAP units
+r        residual: what the model misses about the speaker      (2 units, delays,   FAP units
+                                                                15)
+======== ====================================================== =================== ===========
+
+Format in files and messages:
+
+    16 bytes  "kouxing voice 1" and a line feed
+    32 bytes  SHA-256 of the model
+    rest      s, b and r: float16, little endian
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+
+Floats = NDArray[np.float32]
+
+_MAGIC = b"kouxing voice 1\n"  # mouth profiles were first called voices
+_DIGEST_BYTES = 32
+MAX_SCALE, MAX_OFFSET, MAX_RESIDUAL = 4.0, 2000.0, 2000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class MouthProfile:
+    """One speaker's mouth."""
+
+    scale: Floats  # (15,)
+    offset: Floats  # (15,)
+    residual: Floats  # (2 units, delays, 15)
+
+    def to_bytes(self, model_digest: bytes) -> bytes:
+        """Serialize the profile; values out of bounds are clipped."""
+        bounded = (
+            np.clip(self.scale, 0, MAX_SCALE),
+            np.clip(self.offset, -MAX_OFFSET, MAX_OFFSET),
+            np.clip(self.residual, -MAX_RESIDUAL, MAX_RESIDUAL),
+        )
+        arrays = [values.astype("<f2").tobytes() for values in bounded]
+        return b"".join((_MAGIC, model_digest, *arrays))
+
+
+def parse_mouth_profile(
+    content: bytes, model_digest: bytes, shape: tuple[int, int, int]
+) -> MouthProfile:
+    """Parse a profile from an untrusted source.
+
+    Parameters
+    ----------
+    content
+        The profile's bytes.
+    model_digest
+        SHA-256 of the lip model that will use the profile.
+    shape
+        Shape of the residual with this model.
+
+    Raises
+    ------
+    UserError
+        If it is not a profile, fits another model, or its values are out of bounds.
+    """
+    values_at = len(_MAGIC) + _DIGEST_BYTES
+    if content[: len(_MAGIC)] != _MAGIC:
+        raise UserError("it is not a mouth profile; make one with 'kouxing adapt'")
+    if content[len(_MAGIC) : values_at] != model_digest:
+        raise UserError("it was made for another lip model; run 'kouxing adapt' again")
+    num_faps = shape[2]
+    sizes = (num_faps, num_faps, int(np.prod(shape)))
+    if len(content) != values_at + 2 * sum(sizes):
+        raise UserError(
+            f"it has {len(content)} bytes instead of {values_at + 2 * sum(sizes)}; copy it again"
+        )
+    values = np.frombuffer(content[values_at:], "<f2").astype(np.float32)
+    scale, offset, residual = np.split(values, np.cumsum(sizes)[:-1])
+    in_bounds = (  # false for NaN
+        (scale >= 0).all()
+        and (scale <= MAX_SCALE).all()
+        and (np.abs(offset) <= MAX_OFFSET).all()
+        and (np.abs(residual) <= MAX_RESIDUAL).all()
+    )
+    if not in_bounds:
+        raise UserError("its values are out of bounds; run 'kouxing adapt' again")
+    return MouthProfile(scale=scale, offset=offset, residual=residual.reshape(shape))
+
+
+def read_mouth_profile(path: Path) -> bytes:
+    """Read a file that starts like a mouth profile.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read or is not a mouth profile.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_MOUTH_PROFILE_BYTES + 1)
+    except OSError as error:
+        raise UserError(f"cannot read the mouth profile {path}: {error.strerror}") from None
+    if content[: len(_MAGIC)] != _MAGIC or len(content) > MAX_MOUTH_PROFILE_BYTES:
+        raise UserError(f"{path} is not a mouth profile; make one with 'kouxing adapt'")
+    return content

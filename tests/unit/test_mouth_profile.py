@@ -1,0 +1,188 @@
+"""Mouth profiles: the file format, what a profile changes, and learning one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from kouxing.services.mouth_profiles import learning
+from kouxing.services.mouth_profiles.learning import (
+    FilmedSpeech,
+    Observations,
+    apply_profile,
+    fit_profile,
+    measure_gain,
+    observe,
+)
+from kouxing.services.mouth_profiles.lip_tracks import lip_measures
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.neural import NeuralModel
+from kouxing.services.recognizer.lips import LIP_FAPS
+from kouxing.services.recognizer.mouth_profile import (
+    MouthProfile,
+    parse_mouth_profile,
+    read_mouth_profile,
+)
+from kouxing.shared.errors import UserError
+from tests.e2e.following import samples_of_file
+from tests.lip_predictors import made_up_model
+from tests.system import VOWELS_FILE
+
+pytestmark = pytest.mark.unit
+MODEL = made_up_model()
+SHAPE = MODEL.residual_shape
+NUM_FAPS = len(LIP_FAPS)
+RNG = np.random.default_rng(0)
+PROFILE = MouthProfile(
+    scale=RNG.uniform(0.5, 1.5, NUM_FAPS).astype(np.float32),
+    offset=RNG.normal(0, 30, NUM_FAPS).astype(np.float32),
+    residual=RNG.normal(0, 20, SHAPE).astype(np.float32),
+)
+CONTENT = PROFILE.to_bytes(MODEL.digest)
+VALUES_AT = 48
+
+
+def test_parses_what_it_writes_at_16_bit_precision() -> None:
+    parsed = parse_mouth_profile(CONTENT, MODEL.digest, SHAPE)
+    for name in ("scale", "offset", "residual"):
+        expected = getattr(PROFILE, name)
+        np.testing.assert_allclose(getattr(parsed, name), expected, rtol=1e-3, atol=1e-4)
+
+
+def with_value(index: int, value: float) -> bytes:
+    at = VALUES_AT + 2 * index
+    return CONTENT[:at] + np.array(value, "<f2").tobytes() + CONTENT[at + 2 :]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "not a mouth profile"),
+        (b"PK\x03\x04" + CONTENT[4:], "not a mouth profile"),
+        (CONTENT[:16] + bytes(32) + CONTENT[48:], "another lip model"),
+        (CONTENT[:40], "another lip model"),
+        (CONTENT[:-2], "bytes instead of"),
+        (CONTENT + b"\0\0", "bytes instead of"),
+        (with_value(0, np.nan), "out of bounds"),
+        (with_value(0, -1.0), "out of bounds"),
+        (with_value(NUM_FAPS, 3000.0), "out of bounds"),
+        (with_value(2 * NUM_FAPS, -np.inf), "out of bounds"),
+    ],
+)
+def test_rejects_invalid_profiles(content: bytes, message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        MODEL.with_mouth_profile(content)
+
+
+def test_clips_values_to_their_bounds() -> None:
+    wild = MouthProfile(
+        scale=PROFILE.scale - 9, offset=PROFILE.offset * 1e6, residual=PROFILE.residual * 1e6
+    )
+    MODEL.with_mouth_profile(wild.to_bytes(MODEL.digest))
+
+
+def test_reads_only_small_files_that_start_like_a_profile(tmp_path: Path) -> None:
+    path = tmp_path / "me.mouth"
+    with pytest.raises(UserError, match="No such file"):
+        read_mouth_profile(path)
+    for content in (b"RIFF", CONTENT + bytes(65536)):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match="is not a mouth profile"):
+            read_mouth_profile(path)
+    path.write_bytes(CONTENT)
+    assert read_mouth_profile(path) == CONTENT
+
+
+def test_the_adapted_model_computes_the_formula() -> None:
+    plain = MODEL.stream(MODEL.delays_s)
+    adapted = MODEL.adapt(PROFILE).stream(MODEL.delays_s)
+    for features in RNG.normal(size=(30, len(MODEL.feature_mean))).astype(np.float32):
+        outputs, changed = plain.step(features), adapted.step(features)
+        expected = PROFILE.scale * outputs[:, :NUM_FAPS] + PROFILE.offset
+        expected += np.tensordot(plain.inner, PROFILE.residual, axes=1)
+        np.testing.assert_allclose(changed[:, :NUM_FAPS], expected, rtol=1e-4, atol=1e-3)
+        np.testing.assert_array_equal(changed[:, NUM_FAPS:], outputs[:, NUM_FAPS:])
+
+
+def observations(num_positions: int, profile: MouthProfile, noise: float = 20.0) -> Observations:
+    """Speech of somebody with this mouth."""
+    rng = np.random.default_rng(1)
+    hidden = rng.normal(size=(num_positions, SHAPE[0])).astype(np.float32)
+    predicted = 100 * rng.normal(size=(num_positions, SHAPE[1], NUM_FAPS)).astype(np.float32)
+    known_s: NDArray[np.float64] = 0.02 * np.arange(num_positions, dtype=np.float64)
+    untracked = Observations(
+        known_s=known_s, predicted=predicted, hidden=hidden, tracked=np.zeros(predicted.shape)
+    )
+    untracked.tracked[:] = apply_profile(profile, untracked)
+    untracked.tracked[:] += noise * rng.normal(size=predicted.shape)
+    return untracked
+
+
+def test_learns_a_profile_from_enough_speech() -> None:
+    learned = fit_profile(observations(4000, PROFILE))
+    np.testing.assert_allclose(learned.scale, PROFILE.scale, atol=0.1)
+    np.testing.assert_allclose(learned.offset, PROFILE.offset, atol=3)
+    np.testing.assert_allclose(learned.residual, PROFILE.residual, atol=5)
+
+
+def test_learns_only_the_affine_map_if_there_is_no_residual() -> None:
+    affine = MouthProfile(
+        scale=PROFILE.scale, offset=PROFILE.offset, residual=np.zeros(SHAPE, np.float32)
+    )
+    learned = fit_profile(observations(600, affine, noise=200.0))
+    assert np.abs(learned.residual).max() < 10
+    np.testing.assert_allclose(learned.offset, PROFILE.offset, atol=30)
+
+
+def test_untracked_faps_keep_the_models_prediction() -> None:
+    speech = observations(1000, PROFILE)
+    depth = LIP_FAPS.index(16)
+    speech.tracked[..., depth] = np.nan
+    speech.tracked[100:200] = np.nan
+    learned = fit_profile(speech)
+    assert (learned.scale[depth], learned.offset[depth]) == (1, 0)
+    assert not learned.residual[..., depth].any()
+    assert learned.scale[0] != 1
+
+
+def test_measures_the_gain_on_held_out_speech() -> None:
+    gain = measure_gain(MODEL, observations(2000, PROFILE))
+    assert (gain.speech_s, gain.delay_s) == (10.0, 0.055)
+    assert (gain.after > gain.before + 0.02).all()
+    assert gain.curves.shape == (3, 3, 500)
+    tracked, before, after = gain.curves[0]
+    assert np.abs(after - tracked).mean() < np.abs(before - tracked).mean()
+
+
+@pytest.mark.parametrize("num_positions", [0, 499])
+def test_rejects_too_little_speech(num_positions: int) -> None:
+    with pytest.raises(UserError, match="s of speech with lips in view"):
+        fit_profile(observations(num_positions, PROFILE))
+
+
+def test_corrects_the_lag_of_a_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learning, "MIN_SPEECH_S", 1.0)
+    samples = samples_of_file(VOWELS_FILE)[:80_000]
+    frame_s = np.arange(250) / 50
+    still = FilmedSpeech(samples=samples, frame_s=frame_s, lips=np.zeros((250, NUM_FAPS)))
+    model = load_model()
+    assert isinstance(model, NeuralModel)
+    plain = observe(model, MODEL, still)
+    time_s = plain.known_s - MODEL.delays_s[-1]
+    lips = np.stack(
+        [np.interp(frame_s - 0.08, time_s, track) for track in plain.predicted[:, -1].T], axis=1
+    )
+    late = observe(model, MODEL, FilmedSpeech(samples=samples, frame_s=frame_s, lips=lips))
+    assert opening_error(late) < 0.1 * opening_error(plain)
+
+
+def opening_error(speech: Observations) -> float:
+    tracked, predicted = (
+        lip_measures(lips[:, -1])[:, 0] for lips in (speech.tracked, speech.predicted)
+    )
+    known: NDArray[np.bool_] = ~np.isnan(tracked)
+    assert known.sum() > 50
+    return float(((tracked - predicted)[known] ** 2).mean())
