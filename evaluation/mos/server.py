@@ -15,9 +15,9 @@ request                     answer
                             the state
 ==========================  ==============================================================
 
-Those below ``/judges`` take ``?judge=TOKEN``; all but the page's files take what ``Access`` asks
-for. No request names a file or a condition: a judge's places do. A video that was not fetched has
-no answer (409).
+Those below ``/judges`` take ``?judge=TOKEN``; all but the page's files must meet the gateway's
+``AccessPolicy``. No request names a file or a condition: a judge's places do. A video that was not
+fetched has no answer (409).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from kouxing.evaluation.mos.order import places_of_judge
 from kouxing.evaluation.mos.store import Answer, Judge, Store
 from kouxing.evaluation.mos.study import LANGUAGES, SCALES, Study
 from kouxing.services.gateway import http
-from kouxing.services.gateway.access import Access
+from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.gateway.entrance import make_entrance
-from kouxing.services.gateway.listener import Listener, bind
+from kouxing.services.gateway.page_endpoint import make_page_endpoint
+from kouxing.services.gateway.web_server import WebServer, bind_port
 from kouxing.shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
@@ -59,7 +59,7 @@ class ListeningTest:
         self._study = study
         self._store = store
 
-    def make_application(self, access: Access) -> web.Application:
+    def make_application(self, access: AccessPolicy) -> web.Application:
         """Return the web application."""
         routes = [
             web.get("/study", self._show_study),
@@ -71,7 +71,7 @@ class ListeningTest:
             web.post("/answers", self._add_answer),
         ]
         application = web.Application(
-            middlewares=[access.guard({route.path for route in routes})],
+            middlewares=[access.middleware({route.path for route in routes})],
             client_max_size=MAX_BODY_BYTES,
         )
         application.on_response_prepare.append(http.add_headers)
@@ -176,19 +176,19 @@ async def serve(
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    listening = bind(config.host, config.port)
-    entrance = make_entrance(config, listening.getsockname()[1])
-    listener = Listener(
+    listening = bind_port(config.host, config.port)
+    endpoint = make_page_endpoint(config, listening.getsockname()[1])
+    server = WebServer(
         listening,
-        entrance.tls,
+        endpoint.tls,
         on_refused=lambda address: LOG.warning("refused a connection of %s: too many", address),
-        on_bad_request=lambda: LOG.warning("dropped a request: it is no HTTP"),
-        share=config.address_share,
+        on_bad_request=lambda: LOG.warning("dropped a request: it is not HTTP"),
+        address_share=config.address_share,
     )
-    await listener.start(ListeningTest(study, store).make_application(entrance.access), ())
-    on_ready(entrance.url)
+    await server.start(ListeningTest(study, store).make_application(endpoint.access), ())
+    on_ready(endpoint.url)
     await stop.wait()
-    await listener.stop()
+    await server.stop()
 
 
 async def _serve_page(request: web.Request) -> web.StreamResponse:

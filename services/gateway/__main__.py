@@ -1,4 +1,4 @@
-"""Runs the gateway as a process of its own."""
+"""Run the gateway in this process."""
 
 from kouxing.services.process import run_module
 

@@ -1,4 +1,4 @@
-"""Who may ask the gateway for what: host names, pages of other origins, and the token."""
+"""Access control for HTTP requests: host names, origins of other pages, and the token."""
 
 from __future__ import annotations
 
@@ -20,31 +20,33 @@ _READABLE = {"Access-Control-Expose-Headers": "Location"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Access:
-    """What a request must show."""
+class AccessPolicy:
+    """Conditions that a request must meet."""
 
-    is_own_host: Callable[[str], bool] = is_loopback
-    """Tells whether a host name or address, as a browser shows it, is the gateway's own."""
+    is_gateway_host: Callable[[str], bool] = is_loopback
+    """Returns whether a host name or address belongs to the gateway."""
     token: str = ""
-    """Secret that sessions and uploads need in their query; empty: none."""
+    """Secret that private paths require. If empty, they require no token."""
     allowed_origins: Collection[str] = ()
     """Origins of other pages that may connect."""
 
-    def guard(self, private: Collection[str]) -> Middleware:
-        """Return what refuses requests; paths of ``private`` also need origin and token.
+    def middleware(self, private_paths: Collection[str]) -> Middleware:
+        """Return middleware that rejects requests with status 403.
 
-        Pages of other origins that may connect can read the answers (CORS).
+        Every request must name a host of the gateway. Requests for ``private_paths`` must also
+        come from an allowed origin and carry the token. Pages of allowed origins can read the
+        answers (CORS).
         """
 
         @web.middleware
-        async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+        async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
             self._check_host(request)
-            if request.method == "OPTIONS":  # what browsers ask first for a page of another origin
+            if request.method == "OPTIONS":  # a browser's preflight for a page of another origin
                 self._check_origin(request)
                 return web.Response(status=204, headers={**_PREFLIGHT, **self._cors(request)})
             resource = request.match_info.route.resource
             pattern = resource.canonical if resource is not None else ""
-            if request.path not in private and pattern not in private:
+            if request.path not in private_paths and pattern not in private_paths:
                 return await handler(request)
             self._check_origin(request)
             self._check_token(request)
@@ -53,27 +55,25 @@ class Access:
                 response.headers.update(self._cors(request))
             return response
 
-        return guard
+        return check
 
     def _check_host(self, request: web.Request) -> None:
-        # A page of a strange host that resolves to this machine (DNS rebinding) shows its own name
-        # here; one that only connects to us shows it as the origin.
+        # DNS rebinding: a foreign page whose name resolves to this machine sends its own name as
+        # the host. A foreign page that only connects here is caught by its origin.
         try:
             host = urlsplit(f"//{request.headers.get('Host', '')}").hostname or ""
         except ValueError:
             host = ""
-        if not self.is_own_host(host):
-            text = "this is not the gateway's name; gateway.names says which others it has\n"
+        if not self.is_gateway_host(host):
+            text = f"{host!r} is not a name of this gateway; add it to gateway.names\n"
             raise web.HTTPForbidden(text=text)
 
     def _check_origin(self, request: web.Request) -> None:
         origin = request.headers.get("Origin")
-        if origin is None or origin in self.allowed_origins:  # no browser, or a page that may
+        if origin is None or origin in self.allowed_origins:  # None: not a browser
             return
         if urlsplit(origin).netloc != request.headers.get("Host"):
-            text = (
-                "only this gateway's own page may connect, and those of gateway.allowed_origins\n"
-            )
+            text = f"pages of {origin} may not connect; add the origin to gateway.allowed_origins\n"
             raise web.HTTPForbidden(text=text)
 
     def _cors(self, request: web.Request) -> dict[str, str]:
@@ -86,5 +86,5 @@ class Access:
         bearer = request.headers.get("Authorization", "").removeprefix("Bearer ")
         given = request.query.get("token", bearer)
         if self.token and not secrets.compare_digest(given.encode(), self.token.encode()):
-            text = "the token is missing or wrong; the command that serves the page shows it\n"
+            text = "the token is missing or wrong; use the whole address that kouxing printed\n"
             raise web.HTTPForbidden(text=text)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import Annotated, ClassVar
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
-from kouxing.services.gateway.places import ADDRESS_SHARE
+from kouxing.services.gateway.connection_quota import ADDRESS_SHARE
 from kouxing.services.senders.target import parse_target
 from kouxing.shared.config import BoundHost, BoundPort, Form, ServiceConfig, Switch
 from kouxing.shared.errors import UserError
@@ -43,47 +43,44 @@ Targets = Annotated[
 
 
 class GatewayConfig(ServiceConfig):
-    """The gateway's own keys."""
+    """Configuration keys of the gateway."""
 
     safer: ClassVar[str] = (
-        "bind a loopback address, or serve https with gateway.certificate=kouxing.pem "
-        "(a new file is made), or plain http to a proxy with gateway.plain_http = true"
+        "bind a loopback address, serve https with gateway.certificate=kouxing.pem (the file is "
+        "created), or serve plain http to a proxy with gateway.plain_http = true"
     )
 
     host: BoundHost = "127.0.0.1"
     """Address at which the page is served."""
     port: BoundPort = 8080
-    """Port at which the page is served; 0 takes a free one."""
-    vosk_port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Port at which clients of vosk-server find it under no path, 2700 as a rule; 0: none, they
-    reach it under the page's address as /vosk."""
+    """Port at which the page is served; 0 uses any free port."""
     head: str = ""
-    """Another head for the page: a GLB that 'kouxing head export' wrote."""
+    """GLB file to show as the page's head, from 'kouxing head export'."""
     certificate: str = ""
-    """PEM file with a certificate and its private key, for https; if there is no such file, a
-    self-signed certificate is written there."""
+    """PEM file with a certificate and its private key, for https. If the file does not exist, it is
+    created with a self-signed certificate."""
     token: str = ""
-    """Secret that the page's address carries; with a certificate or plain_http one is made if this
-    is empty."""
+    """Secret that the page's address must contain. If empty, one is created when a certificate or
+    plain_http is set."""
     plain_http: Switch = False
-    """Serve an address that others can reach unencrypted: where only a proxy that encrypts, or a
-    port that is published to this machine alone, leads there."""
+    """Serve unencrypted http at an address that other machines can reach. Use it only behind a
+    proxy that encrypts, or for a port that is published to this machine only."""
     names: str = ""
-    """Other names by which browsers reach the page, as through a proxy, separated by spaces."""
+    """Other host names of the page, for example a proxy's, separated by spaces."""
     allowed_origins: Origins = ""
-    """Other pages that may connect to the page's sessions."""
+    """Origins of other pages that may connect to the page's sessions."""
     frame_ancestors: Origins = ""
-    """Other pages that may show this one in a frame."""
+    """Origins of other pages that may show this page in a frame."""
     senders: Targets = ""
-    """Programs that the face is sent to: vmc://, livelink://, osc:// and vts:// as of
+    """Programs to send the face to: vmc://, livelink://, osc:// and vts:// addresses, as for
     'kouxing send'."""
 
     @property
     def is_encrypted(self) -> bool:
-        """Whether what others can reach is encrypted, here or by a proxy."""
+        """Whether traffic from other machines is encrypted, here or by a proxy."""
         return bool(self.certificate) or self.plain_http
 
     @property
     def address_share(self) -> float:
-        """How many of the places one address may have: all where that is a proxy's."""
+        """Maximum fraction of a connection quota for one address; 1 if it is a proxy's."""
         return 1.0 if self.plain_http else ADDRESS_SHARE

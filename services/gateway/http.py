@@ -1,4 +1,4 @@
-"""HTTP: the page's files, who may ask for them, and the WebSockets that are open."""
+"""The web application: the page's files, security headers, and open WebSockets."""
 
 from __future__ import annotations
 
@@ -11,36 +11,28 @@ from collections.abc import AsyncIterator, Collection
 from pathlib import Path
 
 from aiohttp import WSCloseCode, web
-from aiohttp.typedefs import Handler
 
 import kouxing.shared.face
-from kouxing.services.gateway.access import Access
-from kouxing.services.gateway.places import Places
+from kouxing.services.gateway.access import AccessPolicy
+from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.shared.logs import LOG
 
 PAGE = Path(__file__).parent / "page"
-LIGHT = Path(kouxing.shared.face.__file__).with_name(
-    "light.glsl"
-)  # the page and the driver share it
-THREE = PAGE / "node_modules" / "three"
-FACE_MESH = PAGE / "node_modules" / "@mediapipe" / "face_mesh"
-# The files that are served: of the page, and of the module that finds a face in a picture.
-SUFFIXES = {
-    PAGE: {".html", ".js", ".css", ".svg", ".glb", ".webp"},
-    FACE_MESH: {".js", ".wasm", ".data", ".binarypb"},
-}
-PING_S = 20.0  # a browser that has vanished is noticed within this
-MAX_MESSAGE_BYTES = 128 * 1024  # the most that one message of a session may carry
+LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
+PING_S = 20.0  # a browser that has vanished is detected within this time
+MAX_MESSAGE_BYTES = 128 * 1024  # of one WebSocket message
 MAX_UPLOAD_BYTES = 8 * 1024 * 1024
 FACE_MESH_FRAME = "face-mesh.html"
+_PAGE_SUFFIXES = {".html", ".js", ".css", ".svg", ".glb", ".webp"}
+_FACE_MESH_SUFFIXES = {".js", ".wasm", ".data", ".binarypb"}
 _HEADERS = {  # of every answer
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-cache",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
-# WebAssembly's own glue makes functions from text, so it runs in a frame of its own, which is
-# allowed that and is denied the camera and the microphone.
+# The face mesh's WebAssembly glue compiles text into functions. It runs in a frame that permits
+# this but has no access to the camera or the microphone.
 _FACE_MESH_POLICIES = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self' 'unsafe-eval'; connect-src 'self'; "
@@ -49,10 +41,11 @@ _FACE_MESH_POLICIES = {
     "Permissions-Policy": "camera=(), microphone=()",
 }
 _IMPORT_MAP = re.compile(r'<script type="importmap">(.*?)</script>', re.DOTALL)
+_NO_MODULES = f"the page's JavaScript modules are missing; run 'npm ci' in {PAGE}"
 
 
 class WebSockets:
-    """The WebSockets that browsers have open."""
+    """The browsers' open WebSockets."""
 
     def __init__(self) -> None:
         self._open: set[web.WebSocketResponse] = set()
@@ -62,13 +55,19 @@ class WebSockets:
         return len(self._open)
 
     @contextlib.asynccontextmanager
-    async def accept(
-        self, request: web.Request, places: Places
+    async def open(
+        self, request: web.Request, quota: ConnectionQuota
     ) -> AsyncIterator[web.WebSocketResponse]:
-        """Open a WebSocket, if there is a place for it, and close it in the end."""
+        """Answer a request with a WebSocket that is open while the context is.
+
+        Raises
+        ------
+        web.HTTPServiceUnavailable
+            If the quota is used up or the gateway is stopping.
+        """
         if self._is_closing:
-            raise web.HTTPServiceUnavailable(text="the gateway stops\n")
-        with places.held(request):
+            raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
+        with quota.hold(request):
             browser = web.WebSocketResponse(
                 heartbeat=PING_S, max_msg_size=MAX_MESSAGE_BYTES, timeout=1.0, compress=False
             )
@@ -81,10 +80,10 @@ class WebSockets:
                 await browser.close()
 
     async def close_all(self) -> None:
-        """Close every WebSocket, and accept no more."""
+        """Close every WebSocket and reject new ones."""
         self._is_closing = True
         closing = [
-            browser.close(code=WSCloseCode.GOING_AWAY, message=b"the gateway stops")
+            browser.close(code=WSCloseCode.GOING_AWAY, message=b"the gateway is stopping")
             for browser in self._open
         ]
         await asyncio.gather(*closing, return_exceptions=True)
@@ -92,84 +91,96 @@ class WebSockets:
 
 def make_application(
     *,
-    page_asset: str,
+    head_file: str,
     routes: Collection[web.RouteDef],
-    access: Access = Access(),  # noqa: B008 - it is frozen
+    access: AccessPolicy,
     frame_ancestors: str = "",
 ) -> web.Application:
     """Return the web application.
 
     Parameters
     ----------
-    page_asset
-        Another GLB to serve as the page's head; empty: the one beside the page.
+    head_file
+        GLB to serve as ``head.glb``. If empty, the file in the page's folder.
     routes
-        Further paths: sessions and uploads.
+        Private paths: sessions and uploads.
     access
-        What requests must show.
+        Conditions that requests must meet.
     frame_ancestors
         Origins of pages that may show the page in a frame, separated by spaces.
     """
     application = web.Application(
-        middlewares=[access.guard({route.path for route in routes})],
+        middlewares=[access.middleware({route.path for route in routes})],
         client_max_size=MAX_UPLOAD_BYTES,
     )
     application.on_response_prepare.append(add_headers)
+    modules = _modules_folder()
+    if modules is None:
+        LOG.warning("%s", _NO_MODULES)
 
     async def serve_page(request: web.Request) -> web.StreamResponse:
-        return _page_file(request.match_info.get("name", "index.html"), page_asset, frame_ancestors)
-
-    async def serve_face_mesh(request: web.Request) -> web.StreamResponse:
-        return web.FileResponse(_find(FACE_MESH, request.match_info["name"]))
+        name = request.match_info.get("name", "index.html")
+        response = _page_file(name, head_file, frame_ancestors)
+        if modules is None:
+            raise web.HTTPServiceUnavailable(text=f"{_NO_MODULES}\n")
+        return response
 
     application.add_routes(routes)
     application.router.add_get("/", serve_page)
     application.router.add_get("/{name}", serve_page)
-    application.router.add_get("/modules/face_mesh/{name}", serve_face_mesh)
-    if _has_modules():
+    if modules is not None:
+        face_mesh = modules / "@mediapipe" / "face_mesh"
+
+        async def serve_face_mesh(request: web.Request) -> web.StreamResponse:
+            return web.FileResponse(
+                _find(face_mesh, request.match_info["name"], _FACE_MESH_SUFFIXES)
+            )
+
+        application.router.add_get("/modules/face_mesh/{name}", serve_face_mesh)
         for folder in ("build", "examples/jsm"):
-            application.router.add_static(f"/modules/three/{folder}", THREE / folder)
-    else:
-        LOG.warning("the page's modules are missing; run 'npm ci' in %s", PAGE)
-    return application
-
-
-def make_socket_application(serve: Handler, access: Access) -> web.Application:
-    """Return an application that is nothing but one WebSocket, under no path."""
-    application = web.Application(middlewares=[access.guard({"/"})])
-    application.router.add_get("/", serve)
+            path = modules / "three" / folder
+            application.router.add_static(f"/modules/three/{folder}", path)
     return application
 
 
 async def add_headers(_request: web.Request, response: web.StreamResponse) -> None:
-    """Forbid browsers what no answer of this server needs."""
+    """Add the security headers of every answer."""
     response.headers.update(_HEADERS)
 
 
-def _has_modules() -> bool:
-    return THREE.is_dir() and FACE_MESH.is_dir()
+def _modules_folder() -> Path | None:
+    """Return the folder of the page's JavaScript modules.
+
+    An installed package has them in ``vendor``, a source tree in ``node_modules``.
+    """
+    for folder in (PAGE / "vendor", PAGE / "node_modules"):
+        if (folder / "three").is_dir() and (folder / "@mediapipe" / "face_mesh").is_dir():
+            return folder
+    return None
 
 
-def _find(folder: Path, name: str) -> Path:
-    """Return a file that is served."""
+def _find(folder: Path, name: str, suffixes: Collection[str]) -> Path:
+    """Return a file of a folder.
+
+    Raises
+    ------
+    web.HTTPNotFound
+        If the file does not exist or its suffix is not one of ``suffixes``.
+    """
     path = folder / name
-    if path.parent != folder or path.suffix not in SUFFIXES[folder] or not path.is_file():
+    if path.parent != folder or path.suffix not in suffixes or not path.is_file():
         raise web.HTTPNotFound
     return path
 
 
-def _page_file(name: str, page_asset: str, frame_ancestors: str) -> web.StreamResponse:
+def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamResponse:
     if name in ("head.glb", "head-woman.glb"):
-        is_own = name == "head.glb" and page_asset
-        path = Path(page_asset) if is_own else PAGE / "head.glb"
+        path = Path(head_file) if head_file and name == "head.glb" else PAGE / "head.glb"
         if not path.is_file():
-            text = f"the head is missing; make it with 'kouxing head export {path}'\n"
+            text = f"{path} does not exist; create it with 'kouxing head export {path}'\n"
             raise web.HTTPNotFound(text=text)
     else:
-        path = LIGHT if name == LIGHT.name else _find(PAGE, name)
-    if not _has_modules():
-        text = "the page's modules are missing; run 'npm ci' in services/gateway/page\n"
-        raise web.HTTPServiceUnavailable(text=text)
+        path = LIGHT if name == LIGHT.name else _find(PAGE, name, _PAGE_SUFFIXES)
     response = web.FileResponse(path)
     if name == "index.html":
         response.headers["Content-Security-Policy"] = _content_policy(path, frame_ancestors)
@@ -179,16 +190,16 @@ def _page_file(name: str, page_asset: str, frame_ancestors: str) -> web.StreamRe
 
 
 def _content_policy(index: Path, frame_ancestors: str) -> str:
-    """Return the policy that lets the page load nothing but its own files.
+    """Return a policy that restricts the page to its own files.
 
-    The import map has to stand in the page itself, so it is allowed by its digest.
+    The import map must be inline, so the policy allows it by its digest.
     """
-    found = _IMPORT_MAP.search(index.read_text(encoding="utf-8"))
-    allowed = frame_ancestors or "'none'"
-    digest = hashlib.sha256(found[1].encode() if found else b"").digest()
+    match = _IMPORT_MAP.search(index.read_text(encoding="utf-8"))
+    digest = hashlib.sha256(match[1].encode() if match else b"").digest()
+    ancestors = frame_ancestors or "'none'"
     import_map = f"'sha256-{base64.b64encode(digest).decode()}'"
     return (
         f"default-src 'self'; script-src 'self' {import_map}; img-src 'self' blob: data:; "
         "connect-src 'self' blob:; object-src 'none'; base-uri 'none'; "
-        f"frame-ancestors {allowed}"
+        f"frame-ancestors {ancestors}"
     )

@@ -1,4 +1,4 @@
-"""The browsers that look on: which session each of them sees, and what is sent to it."""
+"""Viewers: browsers that each show one session."""
 
 from __future__ import annotations
 
@@ -12,187 +12,188 @@ from dataclasses import dataclass, field
 from aiohttp import WSMsgType, web
 
 from kouxing.services.gateway import wire
+from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.services.gateway.http import WebSockets
-from kouxing.services.gateway.outbox import Kind, Outbox
-from kouxing.services.gateway.pace import COMMAND_S, Pace
-from kouxing.services.gateway.places import Places
-from kouxing.services.gateway.shape_view import ShapeView, parse_shape_view
+from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
+from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
+from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
+from kouxing.services.gateway.wire import FaceSettings
 from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import Metrics
 
 MAX_VIEWERS = 64
-SEND_BUFFER_BYTES = 64 * 1024  # what the kernel may hold for a slow viewer, about a second
-_SESSION = re.compile(r"[A-Za-z0-9_-]{1,64}")
+SEND_BUFFER_BYTES = 64 * 1024  # in the kernel, for a slow viewer; about a second
+_SESSION_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 @dataclass(slots=True)
-class _Session:
+class _ShownSession:
     epoch: int
-    lips: str  # the lip model that moves the mouth; empty: not known
+    lips: str  # name of the lip model; empty: unknown
 
 
 @dataclass(slots=True, eq=False)
 class Viewer:
-    """One browser that looks on."""
+    """One browser that shows a session."""
 
-    chosen: str  # the session it asked for; empty: the newest
-    shapes: ShapeView | None  # that it gets beside FAP frames
-    outbox: Outbox = field(default_factory=Outbox)
-    shown: tuple[str, int] | None = None  # session and epoch that it was notified of last
+    chosen: str  # the requested session; empty: the newest
+    shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
+    queue: ViewerQueue = field(default_factory=ViewerQueue)
+    shown: tuple[str, int] | None = None  # session and epoch last announced to the viewer
 
 
 class Viewers:
-    """Sends each viewer the session that it asked for, or the newest.
+    """Sends every viewer the messages of the session that it requested, or of the newest.
 
     Parameters
     ----------
     web_sockets
-        Opens the browsers' connections.
-    share
-        Of the places, for one address.
+        Opens the browsers' WebSockets.
+    address_share
+        Maximum fraction of the viewers for one address.
     metrics
-        Counts what slow viewers lose.
+        Counts messages that are dropped for slow viewers.
     play_sample
-        Starts to speak the sample sentence with a lip model, unless it is being spoken; returns its
-        session, which counts as the newest only if there is no other.
+        Starts the sample sentence with a lip model, unless it is playing; returns its session.
+        This session counts as the newest only if there is no other.
     choose_sample_lips
-        Lets another lip model move the mouth while the sample sentence is spoken.
-    express
-        Lets the face of a session show expressions.
-    choose_expressiveness
-        Lets the mouth of a session move more or less.
+        Changes the lip model of the sample sentence while it is playing.
+    set_face
+        Sends control the settings of a session's face.
     """
 
     def __init__(
         self,
         web_sockets: WebSockets,
-        share: float,
+        address_share: float,
         metrics: Metrics,
         play_sample: Callable[[str], str],
         choose_sample_lips: Callable[[str], None],
-        express: Callable[[str, wire.Expressions], None],
-        choose_expressiveness: Callable[[str, float], None],
+        set_face: Callable[[str, FaceSettings], None],
     ) -> None:
         self._web_sockets = web_sockets
-        self._places = Places(MAX_VIEWERS, "viewers", share)
+        self._quota = ConnectionQuota(MAX_VIEWERS, "viewers", address_share)
         self._metrics = metrics
         self._play_sample = play_sample
         self._choose_sample_lips = choose_sample_lips
-        self._express = express
-        self._choose_expressiveness = choose_expressiveness
+        self._set_face = set_face
         self._viewers: set[Viewer] = set()
-        self._sessions: dict[str, _Session] = {}  # in the order they were opened
-        self._sample = ""  # the session of the sample sentence, while it is spoken
+        self._sessions: dict[str, _ShownSession] = {}  # in the order in which they were opened
+        self._sample = ""  # session of the sample sentence while it is playing
         self._missing: tuple[str, ...] = ("control",)
 
+    # --- sessions ------------------------------------------------------------------------------
+
     def add_session(self, session: str, epoch: int, lips: str) -> None:
-        """Show a session to whom it concerns; again when it goes on in another epoch."""
-        self._sessions[session] = _Session(epoch, lips)
+        """Announce a session to its viewers; again when it continues in a new epoch."""
+        self._sessions[session] = _ShownSession(epoch, lips)
         self._notify_viewers()
 
     def set_lips(self, session: str, lips: str) -> None:
-        """Say that another lip model moves the mouth of a session."""
+        """Announce that the lip model of a session has changed."""
         if session in self._sessions:
             self._sessions[session].lips = lips
-            self.forward(session, Kind.TEXT, wire.text("lips", lips=lips))
+            self.forward(session, MessageKind.TEXT, wire.text("lips", lips=lips))
 
     def remove_session(self, session: str) -> None:
-        """Show a session no longer."""
+        """Announce to a session's viewers that it has ended."""
         self._sessions.pop(session, None)
         self._notify_viewers()
 
     def end_sample(self, error: str = "") -> None:
-        """Let those who asked for the sample sentence see the newest session again.
+        """Show the newest session again to viewers of the sample sentence.
 
         Parameters
         ----------
         error
-            An error message for them, if the sentence could not be spoken.
+            Error message for these viewers, if the sentence could not be played.
         """
         for viewer in self._viewers:
             if self._sample and viewer.chosen == self._sample:
                 viewer.chosen = ""
                 if error:
-                    self._put(viewer, Kind.TEXT, error)
+                    self._put(viewer, MessageKind.TEXT, error)
         self._sample = ""
         self._notify_viewers()
 
     def set_missing(self, missing: tuple[str, ...]) -> None:
-        """Tell every viewer which services do not run, if these are others than before."""
+        """Announce which services are not running, if this has changed."""
         if missing != self._missing:
             self._missing = missing
             for viewer in self._viewers:
-                self._put(viewer, Kind.TEXT, self._status())
+                self._put(viewer, MessageKind.TEXT, self._status())
 
-    def forward(self, session: str, kind: Kind, message: str | bytes) -> None:
+    def forward(self, session: str, kind: MessageKind, message: str | bytes) -> None:
         """Send a message to the viewers of a session."""
         for viewer in self._viewers_of(session):
             self._put(viewer, kind, message)
 
     def show_frame(self, session: str, epoch: int, media_time: int, faps: bytes) -> None:
-        """Send the viewers of a session a frame of its face."""
+        """Send a frame to the viewers of a session."""
         message = wire.binary(wire.FAP_TYPE, epoch, media_time, faps)
-        self.forward(session, Kind.FRAME, message)
+        self.forward(session, MessageKind.FRAME, message)
         viewers = self._viewers_of(session)
-        self._put_shapes(viewers, Kind.SHAPES, "weights", epoch, media_time, faps)
+        self._put_shapes(viewers, MessageKind.SHAPES, "weights", epoch, media_time, faps)
+
+    def show_rest(self, faps: bytes) -> None:
+        """Send every viewer the face at rest, which is shown while no session moves the face."""
+        message = wire.binary(wire.REST_TYPE, 0, 0, faps)
+        for viewer in self._viewers:
+            self._put(viewer, MessageKind.REST, message)
+        self._put_shapes(self._viewers, MessageKind.REST_SHAPES, "rest", 0, 0, faps)
 
     @property
     def newest(self) -> str:
-        """The session that is shown to who chose none; empty if there is none."""
+        """The session shown to viewers that requested none; empty if there is no session."""
         names = (name for name in reversed(self._sessions) if name != self._sample)
         return next(names, self._sample)
 
     @property
-    def is_anybody_there(self) -> bool:
-        """Whether a browser is connected."""
+    def has_viewers(self) -> bool:
+        """Whether any browser is connected."""
         return bool(self._viewers)
 
-    def show_rest(self, faps: bytes) -> None:
-        """Send every viewer the face at rest, which is seen while no session moves it."""
-        message = wire.binary(wire.REST_TYPE, 0, 0, faps)
-        for viewer in self._viewers:
-            self._put(viewer, Kind.REST, message)
-        self._put_shapes(self._viewers, Kind.REST_SHAPES, "rest", 0, 0, faps)
+    # --- viewers -------------------------------------------------------------------------------
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
-        """Serve one viewer until it leaves."""
+        """Serve one viewer until it disconnects."""
         chosen = request.query.get("session", "")
-        if chosen and not _SESSION.fullmatch(chosen):
-            raise web.HTTPBadRequest(text="session: up to 64 letters, digits, '-' and '_'\n")
+        if chosen and not _SESSION_NAME.fullmatch(chosen):
+            raise web.HTTPBadRequest(
+                text="session must be a name of up to 64 letters, digits, '-' and '_'\n"
+            )
         try:
-            shapes = parse_shape_view(request.query)
+            shape_encoder = parse_shape_query(request.query)
         except UserError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
-        viewer = Viewer(chosen, shapes)
-        self._viewers.add(viewer)
-        try:
-            async with self._web_sockets.accept(request, self._places) as browser:
-                _limit_send_buffer(request)
-                self._welcome(viewer)
-                await self._converse(viewer, browser)
-        finally:
-            self._viewers.discard(viewer)
+        async with self._web_sockets.open(request, self._quota) as browser:
+            _limit_send_buffer(request)
+            with self.connected(chosen, shape_encoder) as viewer:
+                await self._serve_commands(viewer, browser)
         return browser
 
     @contextlib.contextmanager
-    def join(self, session: str, shapes: ShapeView | None) -> Iterator[Outbox]:
-        """Let somebody look at a session who is sent messages by other means."""
-        viewer = Viewer(session, shapes)
+    def connected(self, session: str, shape_encoder: ShapeEncoder | None) -> Iterator[Viewer]:
+        """Add a viewer while the context is open. The caller sends the messages of its queue."""
+        viewer = Viewer(session, shape_encoder)
         self._viewers.add(viewer)
         try:
-            self._welcome(viewer)
-            yield viewer.outbox
+            self._put(viewer, MessageKind.TEXT, self._status())
+            if shape_encoder is not None:
+                self._put(viewer, MessageKind.TEXT, shape_encoder.names_message())
+            self._notify_viewer(viewer)
+            yield viewer
         finally:
             self._viewers.discard(viewer)
 
-    async def _converse(self, viewer: Viewer, browser: web.WebSocketResponse) -> None:
-        writer = asyncio.create_task(_write(browser, viewer.outbox))
-        pace = Pace()
+    async def _serve_commands(self, viewer: Viewer, browser: web.WebSocketResponse) -> None:
+        writer = asyncio.create_task(_write(browser, viewer.queue))
+        rate_limit = RateLimit()
         try:
             async for message in browser:
                 if message.type is WSMsgType.TEXT:
                     self._handle_command(viewer, message.data)
-                await pace.keep(COMMAND_S)
+                await rate_limit.wait(COMMAND_S)
         finally:
             writer.cancel()
 
@@ -200,24 +201,18 @@ class Viewers:
         try:
             command = wire.parse_object(message)
             session = command.get("follow")
-            lips = wire.parse_lips(command)
-            expressions = wire.parse_expressions(command)
-            amount = wire.parse_expressiveness(command)
+            settings = wire.parse_face_settings(command)
             if command.get("play") == "sample":
-                self._sample = viewer.chosen = self._play_sample(lips)
-            elif expressions is not None:
-                if viewer.shown is None:
-                    raise UserError("no session is shown whose face could express anything")
-                self._express(viewer.shown[0], expressions)
-            elif amount is not None:
-                if viewer.shown is None:
-                    raise UserError("no session is shown whose mouth could move more or less")
-                self._choose_expressiveness(viewer.shown[0], amount)
-            elif lips:
+                self._sample = viewer.chosen = self._play_sample(settings.lips)
+            elif settings.lips:
                 if not self._sample or viewer.chosen != self._sample:
-                    raise UserError("lips can be chosen here only for the sample sentence")
-                self._choose_sample_lips(lips)
-            elif isinstance(session, str) and (not session or _SESSION.fullmatch(session)):
+                    raise UserError("a viewer can choose the lips of the sample sentence only")
+                self._choose_sample_lips(settings.lips)
+            elif settings:
+                if viewer.shown is None:
+                    raise UserError("no session is shown; start a microphone or the sample first")
+                self._set_face(viewer.shown[0], settings)
+            elif isinstance(session, str) and (not session or _SESSION_NAME.fullmatch(session)):
                 viewer.chosen = session
             else:
                 raise UserError(
@@ -225,13 +220,7 @@ class Viewers:
                     "or 'expressiveness'"
                 )
         except UserError as error:
-            self._put(viewer, Kind.TEXT, wire.error_text(str(error)))
-        self._notify_viewer(viewer)
-
-    def _welcome(self, viewer: Viewer) -> None:
-        self._put(viewer, Kind.TEXT, self._status())
-        if viewer.shapes is not None:
-            self._put(viewer, Kind.TEXT, viewer.shapes.hello())
+            self._put(viewer, MessageKind.TEXT, wire.error_text(str(error)))
         self._notify_viewer(viewer)
 
     def _notify_viewers(self) -> None:
@@ -239,7 +228,7 @@ class Viewers:
             self._notify_viewer(viewer)
 
     def _notify_viewer(self, viewer: Viewer) -> None:
-        """Say which session the viewer sees now, if it is another than before."""
+        """Announce the session that the viewer sees, if it has changed."""
         name = viewer.chosen or self.newest
         session = self._sessions.get(name)
         shown = (name, session.epoch) if session else None
@@ -253,30 +242,30 @@ class Viewers:
                 lips=session.lips if session else "",
                 sample=session is not None and name == viewer.chosen == self._sample,
             )
-            self._put(viewer, Kind.TEXT, message)
+            self._put(viewer, MessageKind.TEXT, message)
 
     def _viewers_of(self, session: str) -> list[Viewer]:
-        return [each for each in self._viewers if each.shown and each.shown[0] == session]
+        return [v for v in self._viewers if v.shown and v.shown[0] == session]
 
     def _put_shapes(
         self,
         viewers: Iterable[Viewer],
-        kind: Kind,
-        shown: str,
+        kind: MessageKind,
+        message_type: str,
         epoch: int,
         media_time: int,
         faps: bytes,
     ) -> None:
-        """Send the viewers that asked for shapes a frame in these."""
-        messages: dict[ShapeView, str | bytes] = {}
+        """Send a frame as blend shapes to the viewers that asked for them."""
+        messages: dict[ShapeEncoder, str | bytes] = {}
         for viewer in viewers:
-            if (view := viewer.shapes) is not None:
-                if view not in messages:
-                    messages[view] = view.message(shown, epoch, media_time, faps)
-                self._put(viewer, kind, messages[view])
+            if (encoder := viewer.shape_encoder) is not None:
+                if encoder not in messages:
+                    messages[encoder] = encoder.encode(message_type, epoch, media_time, faps)
+                self._put(viewer, kind, messages[encoder])
 
-    def _put(self, viewer: Viewer, kind: Kind, message: str | bytes) -> None:
-        num_dropped = viewer.outbox.put(kind, message)
+    def _put(self, viewer: Viewer, kind: MessageKind, message: str | bytes) -> None:
+        num_dropped = viewer.queue.put(kind, message)
         if num_dropped:
             self._metrics.count("dropped_slow_viewer", num_dropped)
 
@@ -290,10 +279,10 @@ def _limit_send_buffer(request: web.Request) -> None:
         raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
 
 
-async def _write(browser: web.WebSocketResponse, outbox: Outbox) -> None:
+async def _write(browser: web.WebSocketResponse, queue: ViewerQueue) -> None:
     with contextlib.suppress(ConnectionError):
         while True:
-            message = await outbox.get()
+            message = await queue.get()
             if isinstance(message, str):
                 await browser.send_str(message)
             else:

@@ -1,7 +1,7 @@
-"""WHIP (RFC 9725): WebRTC by one POST. Sound comes as a track, frames go by a data channel.
+"""WHIP (RFC 9725): a WebRTC client connects with one POST request.
 
-Each client has a session of its own. Its data channel gets what a viewer of that session gets,
-but the sound, and takes the commands of a microphone.
+The client's audio track streams into a session of its own. Its data channel receives the messages
+of a viewer of that session, except the sound, and accepts a microphone's commands.
 """
 
 from __future__ import annotations
@@ -18,11 +18,16 @@ from typing import TYPE_CHECKING
 from aiohttp import web
 
 from kouxing.services.gateway import wire
-from kouxing.services.gateway.outbox import Kind
-from kouxing.services.gateway.own_sessions import OwnSession, OwnSessions, error_text, retry_after_s
-from kouxing.services.gateway.pace import COMMAND_S, Pace
-from kouxing.services.gateway.places import Places
-from kouxing.services.gateway.shape_view import ShapeView, parse_shape_view
+from kouxing.services.gateway.connection_quota import ConnectionQuota
+from kouxing.services.gateway.own_sessions import (
+    OwnSession,
+    OwnSessions,
+    error_text,
+    retry_after_s,
+)
+from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
+from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
+from kouxing.services.gateway.viewer_queue import MessageKind
 from kouxing.services.gateway.viewers import Viewers
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
@@ -34,81 +39,80 @@ if TYPE_CHECKING:
 
 MAX_CLIENTS = 16
 SDP = "application/sdp"
-MAX_COMMANDS = 100  # of one client that wait
-MAX_BUFFERED_BYTES = 64 * 1024  # of a data channel; then messages wait, and old frames are dropped
-BUFFER_WAIT_S = 0.02
+MAX_COMMANDS = 100  # queued, for one client
+MAX_BUFFERED_BYTES = 64 * 1024  # of a data channel; above it messages wait and old ones are dropped
+BUFFER_CHECK_S = 0.02
 MISSING = (
-    "this gateway has no WebRTC; for that type in kouxing's folder, where the gateway runs: "
-    ".venv/bin/pip install 'kouxing[webrtc]'\n"
+    "this gateway has no WebRTC; install it where the gateway runs: pip install 'kouxing[webrtc]'\n"
 )
 
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    shapes: ShapeView | None  # that it gets beside FAP frames
-    place: contextlib.ExitStack  # holds it
+    shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
+    quota: contextlib.ExitStack  # closing it releases the client's share of the quota
     peer: Peer | None = None
     session: OwnSession | None = None
-    is_ending: bool = False  # the session's end is our own
-    tasks: set[asyncio.Task[None]] = field(default_factory=set)  # of its data channels
+    is_ending: bool = False  # the gateway itself closes the session
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)  # of the data channel
 
 
 class WhipClients:
-    """Streams the sound of each WebRTC client into a session of its own.
+    """Serves ``/whip``.
 
     Parameters
     ----------
-    share
-        Of the places, for one address.
+    address_share
+        Maximum fraction of the clients for one address.
     own_sessions
         Opens the sessions.
     viewers
-        Know what to show of a session.
+        Provides the messages for the data channels.
     addresses
-        Of this machine, at which clients may connect; none: all but loopback.
+        Addresses of this machine at which clients may connect; empty: all except loopback.
     """
 
     def __init__(
         self,
-        share: float,
+        address_share: float,
         own_sessions: OwnSessions,
         viewers: Viewers,
         addresses: Sequence[str],
     ) -> None:
-        self._places = Places(MAX_CLIENTS, "WebRTC clients", share)
+        self._quota = ConnectionQuota(MAX_CLIENTS, "WebRTC clients", address_share)
         self._own_sessions = own_sessions
         self._viewers = viewers
         self._addresses = addresses
-        self._open: dict[str, _Client] = {}  # by the names of their resources
+        self._clients: dict[str, _Client] = {}  # by the names of their resources
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_closing = False
 
     def __len__(self) -> int:
-        return len(self._open)
+        return len(self._clients)
 
-    async def serve_offer(self, request: web.Request) -> web.StreamResponse:
-        """Answer an offer."""
+    async def serve_post(self, request: web.Request) -> web.StreamResponse:
+        """Answer an SDP offer and open a session."""
         if request.content_type != SDP:
             raise web.HTTPUnsupportedMediaType(text=f"expected an SDP offer ({SDP})\n")
         offer = (await request.read()).decode(errors="replace")
         if self._is_closing:
-            raise web.HTTPServiceUnavailable(text="the gateway stops\n")
+            raise web.HTTPServiceUnavailable(text="the gateway is stopping\n")
         try:
-            shapes = parse_shape_view(request.query)
+            shape_encoder = parse_shape_query(request.query)
         except UserError as error:
             raise web.HTTPBadRequest(text=f"{error}\n") from None
-        place = contextlib.ExitStack()
-        place.enter_context(self._places.held(request))
-        name, client = secrets.token_urlsafe(12), _Client(shapes, place)
-        self._open[name] = client
+        quota = contextlib.ExitStack()
+        quota.enter_context(self._quota.hold(request))
+        name, client = secrets.token_urlsafe(12), _Client(shape_encoder, quota)
+        self._clients[name] = client
         try:
             client.peer = await self._make_peer(client)
             answer = await client.peer.answer(offer)
         except UserError as error:
-            await self._drop(name)
+            await self._remove(name)
             raise web.HTTPUnprocessableEntity(text=f"{error}\n") from None
         except BaseException:
-            await self._drop(name)
+            await self._remove(name)
             raise
         opened: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         task = asyncio.create_task(self._stream(name, client, client.peer, opened))
@@ -123,32 +127,31 @@ class WhipClients:
         headers = {"Location": f"{request.path}/{name}"}
         return web.Response(status=201, text=answer, content_type=SDP, headers=headers)
 
-    async def serve_end(self, request: web.Request) -> web.StreamResponse:
+    async def serve_delete(self, request: web.Request) -> web.StreamResponse:
         """End a client's connection."""
-        client = self._open.get(request.match_info["name"])
+        client = self._clients.get(request.match_info["name"])
         if client is None or client.peer is None:
             raise web.HTTPNotFound
         await client.peer.close()
         return web.Response()
 
     async def close_session(self, session: str) -> None:
-        """End the connection of a session, if there is one, that control has closed."""
-        for client in [*self._open.values()]:
-            is_its = client.session is not None and client.session.name == session
-            if is_its and not client.is_ending and client.peer is not None:
+        """End the connection whose session was closed by control."""
+        for client in [*self._clients.values()]:
+            has_session = client.session is not None and client.session.name == session
+            if has_session and not client.is_ending and client.peer is not None:
                 await client.peer.close()
 
     async def close_all(self) -> None:
-        """End every connection, and take no more."""
+        """End every connection and reject new ones."""
         self._is_closing = True
-        peers = [client.peer for client in self._open.values() if client.peer is not None]
+        peers = [client.peer for client in self._clients.values() if client.peer is not None]
         await asyncio.gather(*(peer.close() for peer in peers), return_exceptions=True)
 
     async def _make_peer(self, client: _Client) -> Peer:
+        name = "kouxing.services.gateway.webrtc"
         try:
-            webrtc = await asyncio.to_thread(
-                importlib.import_module, "kouxing.services.gateway.webrtc"
-            )
+            webrtc = await asyncio.to_thread(importlib.import_module, name)
         except ModuleNotFoundError:
             raise web.HTTPNotImplemented(text=MISSING) from None
         if self._addresses:
@@ -159,7 +162,7 @@ class WhipClients:
     async def _stream(
         self, name: str, client: _Client, peer: Peer, opened: asyncio.Future[None]
     ) -> None:
-        """Open a session for a client, and stream its sound until it leaves."""
+        """Open a session for a client and stream its sound until it disconnects."""
         try:
             async with self._own_sessions.open(
                 encoding="s16le", sample_rate_hz=peer.rate_hz, num_channels=peer.num_channels
@@ -171,18 +174,18 @@ class WhipClients:
                     session.skip(num_lost)
                     session.send(pcm, num_frames)
                     for error in session.errors():
-                        self._viewers.forward(session.name, Kind.TEXT, error_text(error))
+                        self._viewers.forward(session.name, MessageKind.TEXT, error_text(error))
                 client.is_ending = True
         except Exception as error:
             if opened.done():
                 raise
             opened.set_exception(error)
         finally:
-            await self._drop(name)
+            await self._remove(name)
 
-    async def _drop(self, name: str) -> None:
-        client = self._open.pop(name)
-        client.place.close()
+    async def _remove(self, name: str) -> None:
+        client = self._clients.pop(name)
+        client.quota.close()
         for task in client.tasks:
             task.cancel()
         if client.peer is not None:
@@ -190,45 +193,44 @@ class WhipClients:
 
     def _on_channel(self, client: _Client, channel: RTCDataChannel) -> None:
         if client.session is None or client.tasks:
-            channel.close()  # one is enough
+            channel.close()  # a client has at most one
             return
         commands: asyncio.Queue[str | bytes] = asyncio.Queue(MAX_COMMANDS)
 
-        def keep(message: str | bytes) -> None:
+        def enqueue(message: str | bytes) -> None:
             with contextlib.suppress(asyncio.QueueFull):
                 commands.put_nowait(message)
 
-        channel.on("message", keep)
+        channel.on("message", enqueue)
         client.tasks |= {
-            asyncio.create_task(self._show(client.session, client.shapes, channel)),
-            asyncio.create_task(self._obey(client.session, channel, commands)),
+            asyncio.create_task(self._send_messages(client.session, client.shape_encoder, channel)),
+            asyncio.create_task(self._handle_commands(client.session, channel, commands)),
         }
 
-    async def _show(
-        self, session: OwnSession, shapes: ShapeView | None, channel: RTCDataChannel
+    async def _send_messages(
+        self, session: OwnSession, shape_encoder: ShapeEncoder | None, channel: RTCDataChannel
     ) -> None:
-        """Send what a viewer of the session gets, but the sound."""
-        with self._viewers.join(session.name, shapes) as outbox:
+        """Send the messages of a viewer of the session, except the sound."""
+        with self._viewers.connected(session.name, shape_encoder) as viewer:
             while True:
-                message = await outbox.get()
+                message = await viewer.queue.get()
                 if isinstance(message, bytes) and message[0] == wire.SOUND_TYPE:
                     continue
                 if channel.readyState != "open":
                     return
                 channel.send(message)
                 while channel.bufferedAmount > MAX_BUFFERED_BYTES:
-                    await asyncio.sleep(BUFFER_WAIT_S)
+                    await asyncio.sleep(BUFFER_CHECK_S)
 
-    async def _obey(
+    async def _handle_commands(
         self, session: OwnSession, channel: RTCDataChannel, commands: asyncio.Queue[str | bytes]
     ) -> None:
-        """Do what the client asks for."""
-        pace = Pace()
+        rate_limit = RateLimit()
         while True:
             message = await commands.get()
             try:
                 if isinstance(message, bytes):
-                    raise UserError("expected a JSON object, as a text message")
+                    raise UserError("expected a JSON object in a text message")
                 command = wire.parse_command(message)
                 if command.flush:
                     await session.flush()
@@ -237,4 +239,4 @@ class WhipClients:
             except UserError as error:
                 if channel.readyState == "open":
                     channel.send(error_text(error))
-            await pace.keep(COMMAND_S)
+            await rate_limit.wait(COMMAND_S)

@@ -27,7 +27,7 @@ import pytest
 from numpy.typing import NDArray
 from pythonosc.osc_bundle import OscBundle
 
-from kouxing.services.gateway.microphone import SAMPLE, SAMPLE_TEXT
+from kouxing.services.gateway.sample import SAMPLE_FILE, SAMPLE_TEXT
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
 from kouxing.shared.bus import AUDIO_QUEUE_LENGTH, Bus
 from kouxing.shared.clock import now_ns
@@ -490,7 +490,7 @@ def test_what_is_no_http_is_one_line_in_the_log(own_gateway: GatewayProcess) -> 
     own_gateway.process.terminate()
     assert own_gateway.process.stderr is not None
     log = own_gateway.process.stderr.read()
-    assert log.count("no HTTP") == 1
+    assert log.count("not HTTP") == 1
     assert "raceback" not in log
 
 
@@ -609,7 +609,7 @@ def test_the_sample_sentence_is_streamed_once_for_whoever_asks(
 def test_the_text_of_the_sample_is_its_transcript() -> None:
     with (DEMO / "transcripts.tsv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file, delimiter="\t"))
-    texts = [row["text"] for row in rows if row["file"] == SAMPLE.name]
+    texts = [row["text"] for row in rows if row["file"] == SAMPLE_FILE.name]
     assert texts == [SAMPLE_TEXT]
 
 
@@ -635,7 +635,7 @@ def test_microphone_and_sample_may_choose_their_lips(
             await viewer.send_json({"play": "sample", "lips": "muscles"})
             assert "lips must be one of" in (await receive_json(viewer, "error"))["text"]
             await viewer.send_json({"lips": "learnt"})
-            assert "only for the sample" in (await receive_json(viewer, "error"))["text"]
+            assert "of the sample sentence only" in (await receive_json(viewer, "error"))["text"]
             await viewer.send_json({"play": "sample", "lips": "learnt"})
             await until(lambda: len(system.chosen) == 3)
             while not (await receive_json(viewer, "session"))["sample"]:

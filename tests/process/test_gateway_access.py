@@ -88,7 +88,7 @@ def can_connect(connection: HTTPSConnection) -> bool:
     return True
 
 
-@pytest.mark.parametrize("path", ["viewer", "microphone", "vosk", "whip", "learn-mouth", "senders"])
+@pytest.mark.parametrize("path", ["viewer", "microphone", "whip", "learn-mouth", "senders"])
 def test_sessions_need_the_token(gateway: Gateway, certificate: Path, path: str) -> None:
     for query in ("", "?token=wrong"):
         assert get(gateway, certificate, path + query, UPGRADE).status == 403

@@ -16,13 +16,11 @@ from aiohttp import web
 from aiohttp.test_utils import TestServer
 from aiohttp.typedefs import Handler
 
-from kouxing.services.gateway import listener, microphone, viewers, vosk, whip
+from kouxing.services.gateway import microphone, viewers, web_server, whip
 from kouxing.services.gateway.http import WebSockets
-from kouxing.services.gateway.listener import Listener
 from kouxing.services.gateway.microphone import Microphones
-from kouxing.services.gateway.pace import Pace
 from kouxing.services.gateway.viewers import Viewers
-from kouxing.services.gateway.vosk import VoskClients
+from kouxing.services.gateway.web_server import WebServer
 from kouxing.services.gateway.whip import WhipClients
 from kouxing.shared.metrics import Metrics
 
@@ -33,7 +31,7 @@ UPGRADE = b"GET /long HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: u
 
 @dataclass
 class Served:
-    """A listener with an application of one short and one endless answer."""
+    """A server with an application of one short and one endless answer."""
 
     address: tuple[str, int]
     refused: list[str] = field(default_factory=list)
@@ -73,10 +71,10 @@ async def never_end(request: web.Request) -> web.StreamResponse:
 async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[Served]:
     """Serve with other limits; ``/long`` may take its time."""
     for name, limit in {"_CHECK_S": 0.02, **limits}.items():
-        monkeypatch.setattr(listener, name, limit)
-    bound = listener.bind("127.0.0.1", 0)
+        monkeypatch.setattr(web_server, name, limit)
+    bound = web_server.bind_port("127.0.0.1", 0)
     served = Served(bound.getsockname())
-    port = Listener(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
+    port = WebServer(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
     application = web.Application()
     application.add_routes(
         [web.get("/", answer), web.get("/slow", never_end), web.route("*", "/long", never_end)]
@@ -100,7 +98,7 @@ async def check_open(answer: asyncio.StreamReader) -> None:
 @pytest.mark.parametrize("half", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
 def test_who_asks_for_nothing_is_sent_away(monkeypatch: pytest.MonkeyPatch, half: bytes) -> None:
     async def wait() -> None:
-        async with serve(monkeypatch, IDLE_LIMIT_S=0.2) as served:
+        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
             assert await asyncio.wait_for((await served.connect(half)).read(), 20) == b""
             assert await served.answers()
 
@@ -109,7 +107,7 @@ def test_who_asks_for_nothing_is_sent_away(monkeypatch: pytest.MonkeyPatch, half
 
 def test_who_has_asked_once_is_sent_away_too(monkeypatch: pytest.MonkeyPatch) -> None:
     async def wait() -> None:
-        async with serve(monkeypatch, IDLE_LIMIT_S=0.2) as served:
+        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
             reader = await served.connect(b"GET / HTTP/1.1\r\nHost: a\r\n\r\nGET / HT")
             received = await asyncio.wait_for(reader.read(), 20)
             assert received.endswith(b"here")
@@ -121,7 +119,7 @@ def test_an_answer_that_is_never_taken_ends_unless_it_may_take_its_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def wait() -> None:
-        async with serve(monkeypatch, IDLE_LIMIT_S=0.2, ANSWER_LIMIT_S=0.5) as served:
+        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2, ANSWER_TIMEOUT_S=0.5) as served:
             long = await served.connect(b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n")
             slow = await served.connect(b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n")
             assert b"begun" in await asyncio.wait_for(slow.read(), 20)
@@ -142,7 +140,7 @@ def test_half_a_body_is_not_waited_for_but_a_whole_one_gives_its_answer_all_time
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, half: bytes
 ) -> None:
     async def wait() -> None:
-        async with serve(monkeypatch, BODY_LIMIT_S=0.3) as served:
+        async with serve(monkeypatch, BODY_TIMEOUT_S=0.3) as served:
             post = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n"
             whole = [await served.connect(post), await served.connect(UPGRADE)]
             served.writers[0].write(b"12")
@@ -160,7 +158,7 @@ def test_one_connection_too_many_is_refused_and_room_returns(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def fill() -> None:
-        async with serve(monkeypatch, IDLE_LIMIT_S=0.5, MAX_CONNECTIONS=6) as served:
+        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.5, MAX_CONNECTIONS=6) as served:
             held = [await served.connect() for _ in range(5)]
             with contextlib.suppress(ConnectionResetError):
                 assert await (await served.connect()).read() == b""
@@ -177,10 +175,9 @@ def test_one_connection_too_many_is_refused_and_room_returns(
 NOTHING: Any = None
 CLIENTS: dict[str, Callable[[float], Handler]] = {
     "viewers": lambda share: (
-        Viewers(WebSockets(), share, Metrics(), NOTHING, NOTHING, NOTHING, NOTHING).serve
+        Viewers(WebSockets(), share, Metrics(), NOTHING, NOTHING, NOTHING).serve
     ),
     "microphones": lambda share: Microphones(WebSockets(), share, NOTHING).serve,
-    "vosk": lambda share: VoskClients(WebSockets(), share, NOTHING).serve,
 }
 
 
@@ -192,7 +189,6 @@ def test_one_address_has_not_all_places_unless_all_come_from_a_proxys(
     for module, name in (
         (viewers, "MAX_VIEWERS"),
         (microphone, "MAX_MICROPHONES"),
-        (vosk, "MAX_CLIENTS"),
     ):
         monkeypatch.setattr(module, name, 4)
 
@@ -235,7 +231,7 @@ def test_one_address_has_not_all_places_of_webrtc(monkeypatch: pytest.MonkeyPatc
 
         monkeypatch.setattr(clients, "_make_peer", wait)
         application = web.Application()
-        application.add_routes([web.post("/", clients.serve_offer)])
+        application.add_routes([web.post("/", clients.serve_post)])
         async with TestServer(application) as server, aiohttp.ClientSession() as http:
 
             async def offer() -> int:
@@ -265,10 +261,10 @@ def test_no_descriptor_left_is_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
     failures = ["Too many open files"]
 
     async def wait() -> None:
-        monkeypatch.setattr(listener, "_RETRY_S", 0.05)
-        bound = listener.bind("127.0.0.1", 0)
+        monkeypatch.setattr(web_server, "_RETRY_S", 0.05)
+        bound = web_server.bind_port("127.0.0.1", 0)
         exhausted = Exhausted(fileno=bound.detach())
-        port = Listener(exhausted, None, on_refused=lambda _: None, on_bad_request=lambda: None)
+        port = WebServer(exhausted, None, on_refused=lambda _: None, on_bad_request=lambda: None)
         application = web.Application()
         application.add_routes([web.get("/", answer)])
         await port.start(application, set())
@@ -277,15 +273,3 @@ def test_no_descriptor_left_is_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
         await port.stop()
 
     asyncio.run(wait())
-
-
-def test_a_flood_is_slowed_down_to_real_time() -> None:
-    async def flood() -> None:
-        loop = asyncio.get_running_loop()
-        pace = Pace()
-        begin_s = loop.time()
-        for _ in range(106):
-            await pace.keep(0.05)
-        assert loop.time() - begin_s >= 0.25
-
-    asyncio.run(flood())

@@ -12,7 +12,7 @@ from aiohttp import web
 
 from kouxing.services.gateway.whip import MISSING, WhipClients
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.process
 
 
 def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,7 +23,7 @@ def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.Monkey
 
     async def post() -> tuple[int, str]:
         application = web.Application()
-        application.add_routes([web.post("/whip", clients.serve_offer)])
+        application.add_routes([web.post("/whip", clients.serve_post)])
         runner = web.AppRunner(application)
         await runner.setup()
         site = web.TCPSite(runner, "127.0.0.1", 0)

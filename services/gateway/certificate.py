@@ -1,4 +1,4 @@
-"""https: a certificate that was given, or a self-signed one that is made once."""
+"""The certificate for https: the configured one, or a self-signed one created on first use."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from cryptography.x509.oid import NameOID
 
 from kouxing.shared.errors import UserError
 
-_DAYS = 397  # browsers take no longer ones
+_VALID_DAYS = 397  # browsers reject certificates that are valid for longer
 
 
 def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
     """Return the TLS context of a PEM file with a certificate and its private key.
 
-    If there is no such file, a self-signed certificate for the hosts is written there.
+    If the file does not exist, it is created with a self-signed certificate for the hosts.
 
     Raises
     ------
     UserError
-        If the file can neither be read nor written, or holds no certificate with its key.
+        If the file cannot be read or written, or does not contain a certificate and its key.
     """
     try:
         if not certificate.exists():
@@ -37,14 +37,14 @@ def tls_context(certificate: Path, hosts: Iterable[str]) -> ssl.SSLContext:
         context.load_cert_chain(certificate)
     except (OSError, ssl.SSLError) as error:
         raise UserError(
-            f"gateway.certificate: {certificate}: {error.strerror or error}; name a PEM file with "
-            "a certificate and its private key, or a new file, which is then made"
+            f"gateway.certificate: {certificate}: {error.strerror or error}; give a PEM file with "
+            "a certificate and its private key, or the path of a file to create"
         ) from None
     return context
 
 
-def own_names() -> tuple[str, str]:
-    """Return the names that this machine goes by in its own network."""
+def local_host_names() -> tuple[str, str]:
+    """Return the names of this machine in its local network."""
     name = socket.gethostname()
     return name, f"{name}.local"
 
@@ -61,7 +61,7 @@ def _self_signed(hosts: Iterable[str]) -> bytes:
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=_DAYS - 1))
+        .not_valid_after(now + datetime.timedelta(days=_VALID_DAYS - 1))
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .sign(key, hashes.SHA256())

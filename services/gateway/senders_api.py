@@ -1,7 +1,7 @@
-"""Other programs that show the face: those of the configuration, and those the page asks for.
+"""HTTP API of the senders: other programs that show the face.
 
-No page may make the gateway send to whatever it likes: beside what the configuration names only
-programs on the gateway's own machine are sent to.
+A page can start senders only to programs on the gateway's machine and to addresses in the
+configuration. It cannot make the gateway send to arbitrary hosts.
 """
 
 from __future__ import annotations
@@ -20,63 +20,65 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
 
-class Sending:
-    """Sends the face that the gateway shows, and tells the page about it.
+class SendersApi:
+    """Sends the face that the gateway shows to other programs, and reports their state.
 
     Parameters
     ----------
     urls
-        Of ``gateway.senders``.
+        Value of ``gateway.senders``.
     idle_motion_seed
-        Of the face while nobody speaks.
+        Seed of the face's idle motion.
     """
 
     def __init__(self, urls: str, idle_motion_seed: int) -> None:
         self._configured = {url: parse_target(url) for url in urls.split()}
-        self._senders = Senders(idle_motion_seed, _report)
+        self._senders = Senders(idle_motion_seed, _log_problem)
         for target in self._configured.values():
             self._senders.start(target)
 
-    def accept(self, media_time: int, values: bytes) -> None:
-        """Show a frame of the session that is shown now: 68 float32, FAP units."""
+    def send_frame(self, media_time: int, values: bytes) -> None:
+        """Send a frame: 68 little-endian float32, FAP units."""
         faps = np.frombuffer(values, "<f4").astype(np.float32)
         self._senders.accept(to_seconds(media_time), faps)
 
     def close(self) -> None:
-        """Stop all."""
+        """Stop all senders."""
         self._senders.close()
 
-    async def show(self, _request: web.Request) -> web.StreamResponse:
-        """Answer what is sent to whom."""
-        return self._answer()
+    async def serve_get(self, _request: web.Request) -> web.StreamResponse:
+        """Answer with the state of all senders."""
+        return self._state()
 
-    async def change(self, request: web.Request) -> web.StreamResponse:
-        """Start or stop a sender, or delay all; answer as ``show`` does, or what is wrong."""
+    async def serve_post(self, request: web.Request) -> web.StreamResponse:
+        """Start or stop a sender, or delay all; answer with their state or with an error."""
         try:
             command = wire.parse_object(await request.text())
             start, stop, delay_ms = (command.get(key) for key in ("start", "stop", "delay_ms"))
             if isinstance(start, str):
-                self._senders.start(self._allowed(start))
+                self._senders.start(self._allowed_target(start))
             elif isinstance(stop, str):
                 self._senders.stop(stop)
             elif isinstance(delay_ms, int | float):
                 self._senders.delay(parse_delay_s(delay_ms))
             else:
-                raise UserError("expected 'start' or 'stop' with an address such as vmc://")
+                raise UserError(
+                    "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"
+                )
         except UserError as error:
             return web.json_response({"error": str(error)}, status=422)
-        return self._answer()
+        return self._state()
 
-    def _allowed(self, url: str) -> Target:
+    def _allowed_target(self, url: str) -> Target:
         target = parse_target(url)
         if not (target.is_local or url in self._configured):
             raise UserError(
-                f"{target.host} is another machine: name the address in gateway.senders, "
+                f"{target.host} is another machine; add the address to gateway.senders, "
                 "or use 'kouxing send'"
             )
         return target
 
-    def _answer(self) -> web.Response:
+    def _state(self) -> web.Response:
         states = self._senders.states()
         running = {state.target for state in states}
         return web.json_response(
@@ -88,8 +90,8 @@ class Sending:
         )
 
 
-def _report(url: str, problem: str) -> None:
+def _log_problem(url: str, problem: str) -> None:
     if problem:
         LOG.warning("%s: %s", url, problem)
     else:
-        LOG.info("%s: frames leave again", url)
+        LOG.info("%s: sending frames again", url)

@@ -1,4 +1,4 @@
-"""How browsers come in: the address that is served, its certificate, and what they must show."""
+"""The page's endpoint: its URL, its certificate and its access policy."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from kouxing.services.gateway.access import Access
+from kouxing.services.gateway.access import AccessPolicy
+from kouxing.services.gateway.certificate import local_host_names, tls_context
 from kouxing.services.gateway.config import GatewayConfig
-from kouxing.services.gateway.https import own_names, tls_context
 from kouxing.shared.endpoints import WILDCARDS, is_address, is_loopback, own_address
 
 
 @dataclass(frozen=True, slots=True)
-class Entrance:
-    """What ``make_entrance`` returns."""
+class PageEndpoint:
+    """Where and to whom the page is served."""
 
     url: str
-    """Of the page, with the token if there is one."""
+    """The page's URL, with the token if one is required."""
     tls: ssl.SSLContext | None
-    """For https; None: http."""
-    access: Access
+    """TLS context for https; None for http."""
+    access: AccessPolicy
 
 
-def make_entrance(config: GatewayConfig, port: int) -> Entrance:
-    """Return what the configuration says of the page that is served at a port.
+def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
+    """Return the endpoint that a configuration describes, on a port that is already bound.
 
     Raises
     ------
     UserError
-        If the certificate can neither be read nor made.
+        If the certificate can neither be read nor created.
     """
     host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
-    names = {host, *own_names(), *config.names.split()}
+    names = {host, *local_host_names(), *config.names.split()}
     tls = None
     if config.certificate:
         tls = tls_context(Path(config.certificate), [*sorted(names), "localhost", "127.0.0.1"])
     address = f"{f'[{host}]' if ':' in host else host}:{port}"
-    secret = f"#token={quote(token)}" if token else ""
-    access = Access(
-        is_own_host=lambda name: (
+    fragment = f"#token={quote(token)}" if token else ""
+    access = AccessPolicy(
+        is_gateway_host=lambda name: (
             is_loopback(name)
             or name in names
             or (not is_loopback(config.host) and is_address(name))
@@ -50,4 +50,4 @@ def make_entrance(config: GatewayConfig, port: int) -> Entrance:
         token=token,
         allowed_origins=config.allowed_origins.split(),
     )
-    return Entrance(f"{'https' if tls else 'http'}://{address}/{secret}", tls, access)
+    return PageEndpoint(f"{'https' if tls else 'http'}://{address}/{fragment}", tls, access)

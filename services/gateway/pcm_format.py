@@ -1,4 +1,4 @@
-"""The sound that a client says it sends, and whether what comes is that."""
+"""The PCM format that a client announces, and checks that its data has this format."""
 
 from __future__ import annotations
 
@@ -12,20 +12,26 @@ from kouxing.shared.errors import UserError
 
 SAMPLE_BYTES = {"s16le": 2, "f32le": 4}
 RATES_HZ = (8000, 48000)
-MAX_FLOAT = 8.0  # of a sample; what is a little above 1 is clipped
-_FILES = {  # by how they begin
+MAX_FLOAT = 8.0  # sample value; smaller values above 1 are clipped
+_FILES = {  # by their first bytes
     b"RIFF": "a WAV file",
     b"OggS": "an Ogg file",
     b"fLaC": "a FLAC file",
     b"ID3": "an MP3 file",
     b"FORM": "an AIFF file",
-    b"\x1aE\xdf\xa3": "WebM, as MediaRecorder makes it",
+    b"\x1aE\xdf\xa3": "WebM, the format of MediaRecorder",
 }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SoundFormat:
-    """The format of the PCM that a client sends."""
+class PcmFormat:
+    """Sample rate, number of channels and encoding of raw PCM.
+
+    Raises
+    ------
+    UserError
+        If a field is out of range; the text names the field.
+    """
 
     sample_rate_hz: int
     num_channels: int = 1
@@ -35,7 +41,7 @@ class SoundFormat:
         rate_hz = self.sample_rate_hz
         if type(rate_hz) is not int or not RATES_HZ[0] <= rate_hz <= RATES_HZ[1]:
             raise UserError(
-                f"sample_rate_hz must be a whole number of {RATES_HZ[0]} to {RATES_HZ[1]}, "
+                f"sample_rate_hz must be a whole number from {RATES_HZ[0]} to {RATES_HZ[1]}, "
                 f"not {rate_hz!r}"
             )
         if type(self.num_channels) is not int or self.num_channels not in (1, 2):
@@ -53,26 +59,28 @@ class SoundFormat:
         return f"{self.encoding} samples, {self.sample_rate_hz} Hz {channels}, without a header"
 
     def num_frames(self, pcm: bytes, *, is_first: bool) -> int:
-        """Return how many samples of each channel a binary message holds.
+        """Return the number of samples per channel in a binary message.
 
         Parameters
         ----------
+        pcm
+            Payload of the message.
         is_first
-            Whether the sound begins with it, where files have their headers.
+            Whether this is the first message, in which a file would have its header.
 
         Raises
         ------
         UserError
-            If it cannot be of this format; says what was expected.
+            If the data does not have this format; the text says what was expected.
         """
         if is_first and (kind := _file_kind(pcm)):
-            raise UserError(f"expected {self}; this begins as {kind}")
+            raise UserError(f"expected {self}; this begins like {kind}")
         if pcm[:1] == b"{" and _is_json(pcm):
             raise UserError(f"expected {self}; this is JSON: send it as a text message")
         num_frames, rest = divmod(len(pcm), self.frame_bytes)
         if rest:
             raise UserError(
-                f"expected {self}: a multiple of {self.frame_bytes} bytes; {len(pcm)} came"
+                f"expected {self}: a multiple of {self.frame_bytes} bytes, got {len(pcm)}"
             )
         if self.encoding == "f32le":
             self._check_level(np.frombuffer(pcm, "<f4"))
@@ -80,25 +88,27 @@ class SoundFormat:
 
     def _check_level(self, samples: np.ndarray) -> None:
         peak = float(np.abs(samples).max(initial=0.0))
-        if not peak <= MAX_FLOAT:  # or no number
+        if not peak <= MAX_FLOAT:  # also true for NaN
             raise UserError(
-                f"expected {self}, between -1 and 1; one is {peak:g}: divide integers by 32768, "
-                "or say encoding s16le"
+                f"expected {self}, between -1 and 1, got {peak:g}: divide integers by 32768, "
+                "or announce encoding s16le"
             )
 
 
 def check_text(text: str, expected: str) -> None:
-    """Refuse a text message that holds sound.
+    """Check that a text message does not contain encoded audio.
 
     Parameters
     ----------
+    text
+        Content of the message.
     expected
-        What may come.
+        Description of the valid messages, for the error text.
 
     Raises
     ------
     UserError
-        If it looks like base64.
+        If the text looks like base64.
     """
     if len(text) >= 16 and not text.lstrip().startswith("{") and _is_base64(text):
         raise UserError(
@@ -107,7 +117,7 @@ def check_text(text: str, expected: str) -> None:
 
 
 def _file_kind(pcm: bytes) -> str:
-    kinds = (kind for begin, kind in _FILES.items() if pcm.startswith(begin))
+    kinds = (kind for prefix, kind in _FILES.items() if pcm.startswith(prefix))
     return next(kinds, "an MP4 file" if pcm[4:8] == b"ftyp" else "")
 
 
@@ -121,7 +131,7 @@ def _is_json(pcm: bytes) -> bool:
 
 def _is_base64(text: str) -> bool:
     try:
-        base64.b64decode(text.partition(",")[2] or text, validate=True)  # of a data URL, too
+        base64.b64decode(text.partition(",")[2] or text, validate=True)  # also of a data URL
     except ValueError:
         return False
     return True

@@ -1,0 +1,58 @@
+"""The sample sentence: a recording that the gateway speaks in a session of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from importlib import resources
+from pathlib import Path
+
+from kouxing.services.gateway.own_sessions import OwnSessions
+from kouxing.shared.audio_file import open_audio
+
+SAMPLE_FILE = Path(str(resources.files("kouxing.shared") / "demo" / "hello-female.wav"))
+SAMPLE_TEXT = "你好，欢迎来到口型。你听到的每一个字，都由我的脸实时说出来。"
+
+
+class Sample:
+    """One playback of the sample sentence.
+
+    Parameters
+    ----------
+    own_sessions
+        Opens the session.
+    lips
+        Name of the lip model; empty for the system's default. It can be changed during playback.
+    """
+
+    def __init__(self, own_sessions: OwnSessions, lips: str) -> None:
+        self.session = f"sample-{secrets.token_hex(4)}"
+        self.lips = lips
+        self._own_sessions = own_sessions
+
+    async def speak(self) -> None:
+        """Speak the sentence in real time.
+
+        Raises
+        ------
+        UserError
+            If no session can be opened.
+        """
+        loop = asyncio.get_running_loop()
+        source = open_audio(SAMPLE_FILE)
+        async with self._own_sessions.open(
+            session=self.session,
+            sample_rate_hz=source.sample_rate_hz,
+            num_channels=source.num_channels,
+        ) as session:
+            lips = ""
+            due_s = loop.time()
+            for block in source.blocks:
+                if session.is_closed:
+                    break
+                if lips != self.lips:
+                    lips = self.lips
+                    await session.choose_lips(lips)
+                session.send((block * 32767).astype("<i2").tobytes(), len(block))
+                due_s += len(block) / source.sample_rate_hz
+                await asyncio.sleep(due_s - loop.time())

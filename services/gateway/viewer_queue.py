@@ -1,0 +1,69 @@
+"""The bounded queue of messages for one viewer. It favors new frames over complete delivery."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from enum import Enum
+
+MAX_QUEUED = 200  # messages; about 2 s of a talking session
+NUM_FRAMES_KEPT = 5
+NUM_TEXTS_KEPT = 50
+
+
+class MessageKind(Enum):
+    """Kind of a queued message; it decides how many old messages are kept."""
+
+    TEXT = "text"
+    FRAME = "frame"
+    SHAPES = "shapes"  # blend shapes of a frame
+    REST = "rest"  # the face while no session moves it
+    REST_SHAPES = "rest shapes"
+    SOUND = "sound"
+
+
+_NUM_KEPT = {
+    MessageKind.SOUND: 0,
+    MessageKind.FRAME: NUM_FRAMES_KEPT,
+    MessageKind.SHAPES: NUM_FRAMES_KEPT,
+    MessageKind.REST: 1,
+    MessageKind.REST_SHAPES: 1,
+    MessageKind.TEXT: NUM_TEXTS_KEPT,
+}
+
+
+class ViewerQueue:
+    """A queue that drops old messages when its reader is too slow."""
+
+    def __init__(self) -> None:
+        self._messages: deque[tuple[MessageKind, str | bytes]] = deque()
+        self._not_empty = asyncio.Event()
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def put(self, kind: MessageKind, message: str | bytes) -> int:
+        """Queue a message; return the number of messages dropped to make room."""
+        self._messages.append((kind, message))
+        self._not_empty.set()
+        return self._drop_old() if len(self._messages) > MAX_QUEUED else 0
+
+    async def get(self) -> str | bytes:
+        """Remove and return the oldest message; wait if the queue is empty."""
+        while not self._messages:
+            self._not_empty.clear()
+            await self._not_empty.wait()
+        return self._messages.popleft()[1]
+
+    def _drop_old(self) -> int:
+        # Sound that is seconds late is useless, and so are the frames of that sound. Text (the
+        # session's name, errors) keeps its order relative to the remaining frames.
+        num_before = len(self._messages)
+        num_left = dict(_NUM_KEPT)
+        kept: deque[tuple[MessageKind, str | bytes]] = deque()
+        for kind, message in reversed(self._messages):
+            if num_left[kind] > 0:
+                num_left[kind] -= 1
+                kept.appendleft((kind, message))
+        self._messages = kept
+        return num_before - len(kept)

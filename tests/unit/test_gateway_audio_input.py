@@ -1,0 +1,170 @@
+"""Client audio: format checks, and playback in real time."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import selectors
+from collections.abc import Coroutine
+
+import numpy as np
+import pytest
+
+from kouxing.services.gateway import rate_limit
+from kouxing.services.gateway.audio_input import MAX_AHEAD_S, AudioInput
+from kouxing.services.gateway.pcm_format import PcmFormat, check_text
+from kouxing.services.gateway.rate_limit import RateLimit
+from kouxing.shared.errors import UserError
+
+pytestmark = pytest.mark.unit
+
+PCM16 = PcmFormat(sample_rate_hz=16000)
+FLOAT = PcmFormat(sample_rate_hz=16000, encoding="f32le")
+
+
+@pytest.mark.parametrize(
+    ("pcm_format", "pcm", "error"),
+    [
+        (PCM16, bytes(3), "s16le samples, 16000 Hz mono.*multiple of 2 bytes, got 3"),
+        (FLOAT, bytes(6), "multiple of 4 bytes, got 6"),
+        (PCM16, b"RIFF" + bytes(40), "without a header; this begins like a WAV file"),
+        (PCM16, b"\x1aE\xdf\xa3" + bytes(100), "WebM, the format of MediaRecorder"),
+        (PCM16, b"\0\0\0\x20ftypM4A " + bytes(20), "an MP4 file"),
+        (PCM16, json.dumps({"audio": "AAAA"}).encode(), "this is JSON: send it as a text message"),
+        (FLOAT, np.array([0, 12345], "<f4").tobytes(), "between -1 and 1, got 12345"),
+        (FLOAT, np.array([0, np.nan], "<f4").tobytes(), "between -1 and 1, got nan"),
+        (FLOAT, np.array([5, -5, 900, -900], "<i2").tobytes(), "or announce encoding s16le"),
+    ],
+)
+def test_rejects_audio_of_another_format(pcm_format: PcmFormat, pcm: bytes, error: str) -> None:
+    with pytest.raises(UserError, match=error):
+        pcm_format.num_frames(pcm, is_first=True)
+
+
+def test_counts_the_frames_of_valid_audio() -> None:
+    assert PCM16.num_frames(b"{}" * 100, is_first=True) == 100
+    assert PCM16.num_frames(b"RIFF", is_first=False) == 2
+    assert FLOAT.num_frames(np.array([1.5, -1.5], "<f4").tobytes(), is_first=True) == 2
+    assert PCM16.num_frames(b"", is_first=True) == 0
+
+
+def test_rejects_audio_in_text_messages() -> None:
+    for text in ("AAAAAQACAAMABAAFAAYABwAIAAkA", "data:audio/wav;base64,UklGRiQAAABXQVZF"):
+        with pytest.raises(UserError, match="expected pcm; this text looks like base64"):
+            check_text(text, "pcm")
+    check_text('{"eof" : 1}', "pcm")
+
+
+class FakeSession:
+    """Collects the audio that it receives."""
+
+    def __init__(self) -> None:
+        self.pcm = b""
+        self.num_flushes = 0
+
+    def send(self, pcm: bytes, num_frames: int) -> None:
+        assert len(pcm) == 2 * num_frames
+        self.pcm += pcm
+
+    async def flush(self) -> None:
+        self.num_flushes += 1
+
+
+class InstantSelector(selectors.DefaultSelector):
+    """A selector that moves a fake clock instead of waiting."""
+
+    now_s = 0.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self.now_s += timeout or 0.0
+        return super().select(0)
+
+
+class FakeTimeLoop(asyncio.SelectorEventLoop):
+    """An event loop in which waiting takes no time."""
+
+    def __init__(self) -> None:
+        self._clock = InstantSelector()
+        super().__init__(self._clock)
+
+    def time(self) -> float:
+        return self._clock.now_s
+
+
+def run(coroutine: Coroutine[None, None, None]) -> None:
+    with asyncio.Runner(loop_factory=FakeTimeLoop) as runner:
+        runner.run(coroutine)
+
+
+@pytest.mark.parametrize("rate_hz", [8000, 22050, 48000])
+@pytest.mark.parametrize("chunk", [2, 1234, 100_000])
+def test_early_audio_is_passed_on_completely_in_real_time(rate_hz: int, chunk: int) -> None:
+    pcm = bytes(range(256)) * (rate_hz // 128)  # 1 s
+
+    async def speak() -> None:
+        session = FakeSession()
+        pcm_format = PcmFormat(sample_rate_hz=rate_hz)
+        audio_input = AudioInput(session, pcm_format, is_ahead=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            for begin in range(0, len(pcm), chunk):
+                await audio_input.push(pcm[begin : begin + chunk])
+            await asyncio.sleep(0.5)
+            assert 0.45 < len(session.pcm) / len(pcm) < 0.6
+            await asyncio.sleep(0.6)
+        assert session.pcm == pcm
+
+    run(speak())
+
+
+def test_a_flush_drops_queued_audio() -> None:
+    async def speak() -> None:
+        session = FakeSession()
+        audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            await audio_input.push(b"\1\0" * 16000 * 20)
+            await asyncio.sleep(1.0)
+            await audio_input.flush()
+            assert session.num_flushes == 1
+            num_before = len(session.pcm)
+            assert num_before < 2 * 16000 * 2
+            await audio_input.push(b"\2\0" * 320)
+            await asyncio.sleep(1.0)
+        assert session.pcm[num_before:] == b"\2\0" * 320
+
+    run(speak())
+
+
+def test_push_waits_while_the_queue_is_full() -> None:
+    async def speak() -> None:
+        audio_input = AudioInput(FakeSession(), PCM16, is_ahead=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            await audio_input.push(b"\1\0" * 16000 * (int(MAX_AHEAD_S) + 3))
+            assert 2.5 < asyncio.get_running_loop().time() < 3.5
+
+    run(speak())
+
+
+def test_silence_keeps_a_paused_stream_open() -> None:
+    async def pause() -> None:
+        session = FakeSession()
+        audio_input = AudioInput(session, PCM16, is_ahead=True)  # type: ignore[arg-type]
+        async with audio_input.running():
+            await asyncio.sleep(30.0)
+        assert set(session.pcm) == {0}
+
+    run(pause())
+
+
+def test_the_rate_limit_allows_a_burst_and_then_real_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def flood() -> None:
+        loop = asyncio.get_running_loop()
+        monkeypatch.setattr(rate_limit.time, "monotonic", loop.time)
+        limit = RateLimit()
+        for _ in range(100):
+            await limit.wait(0.05)
+        assert loop.time() == pytest.approx(0.0, abs=0.01)
+        for _ in range(20):
+            await limit.wait(0.05)
+        assert loop.time() == pytest.approx(1.0, abs=0.01)
+
+    run(flood())

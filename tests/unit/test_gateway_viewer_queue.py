@@ -1,0 +1,83 @@
+"""The queue of one viewer is bounded and favors new messages."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from kouxing.services.gateway.viewer_queue import (
+    MAX_QUEUED,
+    NUM_FRAMES_KEPT,
+    MessageKind,
+    ViewerQueue,
+)
+
+pytestmark = pytest.mark.unit
+
+
+def drain(viewer_queue: ViewerQueue) -> list[str | bytes]:
+    async def take_all() -> list[str | bytes]:
+        return [await viewer_queue.get() for _ in range(len(viewer_queue))]
+
+    return asyncio.run(take_all())
+
+
+def test_keeps_the_order_of_messages() -> None:
+    queue = ViewerQueue()
+    num_dropped = [
+        queue.put(MessageKind.TEXT, "session"),
+        queue.put(MessageKind.SOUND, b"s"),
+        queue.put(MessageKind.FRAME, b"f"),
+    ]
+
+    assert drain(queue) == ["session", b"s", b"f"]
+    assert num_dropped == [0, 0, 0]
+
+
+def test_drops_sound_and_old_frames_but_not_text() -> None:
+    queue = ViewerQueue()
+    queue.put(MessageKind.TEXT, "session")
+    num_dropped = 0
+    for number in range(MAX_QUEUED):
+        kind = MessageKind.SOUND if number % 2 else MessageKind.FRAME
+        num_dropped += queue.put(kind, b"%d" % number)
+
+    left = drain(queue)
+    assert left[0] == "session"
+    assert len(left) == 1 + NUM_FRAMES_KEPT
+    assert left[-1] == b"%d" % (MAX_QUEUED - 2)  # the newest frame
+    assert num_dropped == MAX_QUEUED - NUM_FRAMES_KEPT
+
+
+def test_keeps_one_frame_at_rest() -> None:
+    queue = ViewerQueue()
+    for number in range(MAX_QUEUED // 2):
+        queue.put(MessageKind.FRAME, b"frame %d" % number)
+        queue.put(MessageKind.REST, b"rest %d" % number)
+    queue.put(MessageKind.TEXT, "one too many")
+
+    newest = range(MAX_QUEUED // 2 - NUM_FRAMES_KEPT, MAX_QUEUED // 2)
+    frames = [b"frame %d" % number for number in newest]
+    assert drain(queue) == [*frames, b"rest %d" % newest[-1], "one too many"]
+
+
+def test_text_cannot_exceed_the_limit() -> None:
+    queue = ViewerQueue()
+    for number in range(10 * MAX_QUEUED):
+        queue.put(MessageKind.TEXT, str(number))
+        assert len(queue) <= MAX_QUEUED
+
+    assert drain(queue)[-1] == str(10 * MAX_QUEUED - 1)
+
+
+def test_get_waits_for_the_next_message() -> None:
+    async def read() -> str | bytes:
+        queue = ViewerQueue()
+        reader = asyncio.ensure_future(queue.get())
+        await asyncio.sleep(0)
+        assert not reader.done()
+        queue.put(MessageKind.TEXT, "late")
+        return await reader
+
+    assert asyncio.run(read()) == "late"
