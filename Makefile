@@ -8,7 +8,6 @@ BIN := .venv/bin
 PAGE := services/gateway/page
 HEADS := $(PAGE)/head.glb $(patsubst %,$(PAGE)/head-%.glb,man elder child ada leo rosa mika)
 EXPORT := services/driver/head/glb_export.py services/driver/render/shaders.py
-RIVALS := evaluation/lips/rivals
 MOS := evaluation/mos/page
 CLIENT := proto/node
 JAVASCRIPT := clients/javascript
@@ -33,12 +32,12 @@ demo: setup
 setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(HEADS)
 
 # Two processes begin with the tests that start services, a third with the others.
-test: .venv/installed-dev setup $(patsubst %,%/node_modules/.package-lock.json,$(RIVALS) $(CLIENT) $(JAVASCRIPT) $(AVATAR))
+test: .venv/installed-dev setup $(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR))
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --no-loadscope-reorder -rfER -m "not alone"
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m alone
 	$(NPM) $(PAGE) test
 
-quick: .venv/installed-dev $(RIVALS)/node_modules/.package-lock.json
+quick: .venv/installed-dev
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 \
 		-m "(unit or property or contract) and not slow"
 
@@ -53,7 +52,6 @@ check: .venv/installed-dev $(PAGE)/node_modules/.bin/eslint
 	$(BIN)/gdformat --check --diff examples/godot/*.gd
 	$(NPM) $(PAGE) run lint
 	cd $(MOS) && PATH="$(CURDIR)/$(BIN):$$PATH" $(CURDIR)/$(PAGE)/node_modules/.bin/eslint --max-warnings 0 -c $(CURDIR)/$(PAGE)/eslint.config.mjs .
-	$(NPM) $(RIVALS) run lint
 	$(NPM) $(JAVASCRIPT) run lint
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
 	$(BIN)/hadolint deploy/Dockerfile
@@ -65,7 +63,7 @@ lock: .venv/installed
 		--no-annotate --custom-compile-command 'make lock' --output-file $(LOCK) pyproject.toml -
 
 clean:
-	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(RIVALS)/node_modules $(CLIENT)/node_modules \
+	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
 		$(JAVASCRIPT)/node_modules $(AVATAR)/node_modules $(HEADS) out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
@@ -88,7 +86,7 @@ $(PAGE)/node_modules/.bin/eslint: $(PAGE)/package-lock.json | .venv/installed
 	$(NPM) $(PAGE) ci
 	touch $@ $(PAGE)/node_modules/.package-lock.json
 
-$(patsubst %,%/node_modules/.package-lock.json,$(RIVALS) $(CLIENT) $(JAVASCRIPT) $(AVATAR)): \
+$(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR)): \
 		%/node_modules/.package-lock.json: %/package-lock.json | .venv/installed
 	$(NPM) $* ci
 	touch $@

@@ -235,30 +235,6 @@ def schemes(
 
 
 @app.command()
-def rivals(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
-    picture: Annotated[
-        Path | None, typer.Option(help="Picture of the figures over the delay (.png).")
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Compare the lip models with HeadAudio, wLipSync and loudness at several delays.
-
-    These run in Node; 'npm ci' in evaluation/lips/rivals installs them.
-    """
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.report import print_comparison
-    from kouxing.evaluation.lips.rivals.comparison import figure, main
-
-    check_output(picture, json_file)
-    scores = main(clips)
-    print_comparison(scores, Console())
-    if picture is not None:
-        save_figure(figure(scores), picture)
-    write_json(json_file, [asdict(score) for score in scores])
-
-
-@app.command()
 def ferguson(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     part: Annotated[Part, typer.Option(help="Which clips.")] = Part.HELD,
@@ -280,64 +256,6 @@ def ferguson(
 
 
 @app.command()
-def contour(
-    picture: Annotated[
-        Path | None, typer.Option(help="Picture of contours and curvatures (.png).")
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Check the shapes of the Ferguson lips: gap, outline, bends and dents at every opening."""
-    import numpy as np
-
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.contour_shapes import check_shapes, print_shapes, shapes_figure
-
-    check_output(picture, json_file)
-    figures = check_shapes(np.linspace(0.0, 5.0, 501))
-    print_shapes(figures, Console())
-    if picture is not None:
-        save_figure(shapes_figure(), picture)
-    write_json(json_file, {name: values.tolist() for name, values in asdict(figures).items()})
-
-
-@app.command()
-def closures(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
-    json_file: JsonFile = None,
-) -> None:
-    """Compare how the learnt lips may weigh evidence of closures, on clips for choices."""
-    from kouxing.evaluation.lips.closure_fit import main, print_scores
-
-    check_output(json_file)
-    scores = main(clips)
-    print_scores(scores, Console())
-    write_json(json_file, [asdict(score) for score in scores])
-
-
-@app.command()
-def voices(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
-    lips: Annotated[Path | None, typer.Option(help="Model of lips (.npz).")] = None,
-    speaker: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Speakers whom the model has not learnt from; repeatable. Else those whom the "
-            "model that ships has not."
-        ),
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Show what some seconds of a speaker's own lips bring, on clips held out."""
-    from kouxing.evaluation.lips.voices import print_scores, score_voices
-    from kouxing.services.recognizer.lips import LIPS_PATH
-
-    check_output(json_file)
-    scores = score_voices(clips, lips or LIPS_PATH, speaker or ())
-    print_scores(scores, Console())
-    write_json(json_file, [asdict(score) for score in scores])
-
-
-@app.command()
 def visemes(
     clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
     parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
@@ -351,35 +269,6 @@ def visemes(
 
     check_output(picture, json_file)
     write_json(json_file, main(clips, parameters, picture))
-
-
-@app.command()
-def endpoints(
-    manifest: Manifest,
-    audio: Audio = None,
-    split: Split = "dev",
-    picture: Annotated[
-        Path | None, typer.Option(help="Picture of the pieces over a waveform (.png).")
-    ] = None,
-    recording: Annotated[
-        str | None, typer.Option(help="The recording to draw; else the first one.")
-    ] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Compare syllables found by energy and zero crossings with forced alignment."""
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.segmentation import figure, print_score, score_segmentation
-    from kouxing.shared.errors import UserError
-
-    check_output(picture, json_file)
-    score, recordings = score_segmentation(manifest, split, audio)
-    print_score(score, Console())
-    write_json(json_file, asdict(score))
-    if picture is not None:
-        chosen = [one for one in recordings if recording in (None, one.name)]
-        if not chosen:
-            raise UserError(f"there is no recording {recording!r} in split {split!r}")
-        save_figure(figure(chosen[0]), picture)
 
 
 @app.command()
@@ -424,72 +313,6 @@ def faults(
     write_json(json_file, [asdict(outcome) for outcome in outcomes])
 
 
-@app.command()
-def senders(
-    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
-    seconds: Annotated[float, typer.Option(min=10.0, help="How long to speak at least.")] = 60.0,
-    json_file: JsonFile = None,
-) -> None:
-    """Measure how many frames arrive at other programs that show the face, and how evenly."""
-    from kouxing.evaluation.system.sending import measure, show
-
-    check_output(json_file)
-    arrivals = measure(audio, seconds, CONSOLE)
-    show(arrivals, Console())
-    write_json(json_file, [asdict(arrival) for arrival in arrivals])
-
-
-@app.command()
-def control(
-    workers: Annotated[
-        int, typer.Option(min=2, max=1500, help="Recognizers and synthesizers together.")
-    ] = 1000,
-    sessions: Annotated[int, typer.Option(min=1, help="Sessions that they serve.")] = 100_000,
-    json_file: JsonFile = None,
-) -> None:
-    """Measure what many workers and sessions cost one control: CPU, memory, delay of an open.
-
-    The workers are played: each sends its heartbeats and starts what it is told. A tenth and a
-    hundredth of them are measured, too.
-    """
-    from kouxing.evaluation.system.control_scale import measure, show
-
-    check_output(json_file)
-    costs = [
-        measure(max(2, workers // part), max(1, sessions // part), CONSOLE) for part in (100, 10, 1)
-    ]
-    show(costs, Console())
-    write_json(json_file, [asdict(cost) for cost in costs])
-
-
-@app.command()
-def soak(
-    audio: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings to speak; else the samples.")
-    ] = None,
-    hours: Annotated[float, typer.Option(min=0.0, help="Of sound; one round at least.")] = 24.0,
-    picture: Annotated[Path | None, typer.Option(help="Picture of the curves (.png).")] = None,
-    json_file: JsonFile = None,
-) -> None:
-    """Speak without end, as fast as the services work: drift, memory, lost phones.
-
-    The file is written after each round, so an interrupted run keeps its figures.
-    """
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.system.soak import Round, draw, measure, show, summary
-
-    def keep(rounds: list[Round]) -> None:
-        figures = [asdict(each) for each in rounds]
-        write_json(json_file, {"rounds": figures, "summary": summary(rounds)})
-
-    check_output(picture, json_file)
-    recordings = audio or sorted(SENTENCE.parent.glob("*.wav"))
-    rounds = measure(recordings, hours, CONSOLE, keep)
-    show(rounds, Console())
-    if picture is not None:
-        save_figure(draw(rounds), picture)
-
-
 @bench_app.command()
 def chain(
     audio: Annotated[Path, typer.Argument(help="Audio file to stream.")],
@@ -498,7 +321,7 @@ def chain(
 ) -> None:
     """Measure latency, CPU and images per second of the whole chain on this machine.
 
-    The page is measured where Chromium is installed, and how far its sound is from its picture.
+    The page is measured if Chromium is installed.
     """
     from kouxing.evaluation.system import chromium, latency, page, rendering, sessions
 
@@ -516,7 +339,7 @@ def chain(
         json_file,
         asdict(delays)
         | {"sessions": costs, "rendering": asdict(pictures)}
-        | {"page": asdict(figures) if figures is not None else {}},
+        | {"page": {"drawings": {name: asdict(each) for name, each in (figures or {}).items()}}},
     )
 
 
@@ -552,44 +375,6 @@ def load(
 @plot_app.callback()
 def plot() -> None:
     """Draw pictures and videos of the models."""
-
-
-@plot_app.command(name="visemes")
-def plot_visemes(
-    folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/visemes"),
-    audio: Annotated[Path, typer.Option(help="The sentence to draw.")] = SENTENCE,
-    parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
-) -> None:
-    """Draw the visemes' faces, their dominance curves, and the FAP curves of a sentence."""
-    from kouxing.evaluation.lips.viseme_plots import plot_visemes as draw
-
-    for path in draw(folder, audio, parameters):
-        print_message(f"wrote {path}")
-
-
-@plot_app.command(name="lip-line")
-def plot_lip_line(
-    output: Annotated[Path, typer.Argument(help="Picture to write (.png).")],
-) -> None:
-    """Draw the head's lips beside lips that plain zones of influence move; print their bumps."""
-    from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.lip_line import lip_line_figure, print_lip_lines
-
-    check_output(output)
-    print_lip_lines(Console())
-    save_figure(lip_line_figure(), output)
-    print_message(f"wrote {output}")
-
-
-@plot_app.command(name="mouths")
-def plot_mouths(
-    folder: Annotated[Path, typer.Argument(help="Folder for the pictures.")] = Path("out/mouths"),
-) -> None:
-    """Draw visemes and expressions on every head, and mouths with more or less expressiveness."""
-    from kouxing.evaluation.lips.mouth_sheets import draw_mouth_sheets
-
-    for path in draw_mouth_sheets(folder):
-        print_message(f"wrote {path}")
 
 
 @plot_app.command(name="heads")

@@ -26,7 +26,6 @@ from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.clip_scores import MEASURES, real_faps
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
 from kouxing.evaluation.lips.scores import clips_to_score
-from kouxing.evaluation.lips.viseme_plots import draw_sound
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -280,7 +279,7 @@ def _draw_fit(axes: Any, each: FittedClip, start_s: float, end_s: float) -> None
     first, last = (round(max(time_s, 0.0) * SAMPLE_RATE_HZ) for time_s in (start_s, end_s))
     inside = [phone for phone in each.phones if start_s <= phone.onset_s < end_s]
     samples = each.clip.samples[first:last]
-    draw_sound(axes[0], samples, inside, each.inventory.silence, first / SAMPLE_RATE_HZ)
+    _draw_sound(axes[0], samples, inside, each.inventory.silence, first / SAMPLE_RATE_HZ)
     axes[0].set_title(each.clip.name, fontsize=9)
     shown = (each.clip.time_s >= start_s) & (each.clip.time_s <= end_s)
     time_s = each.clip.time_s[shown]
@@ -292,3 +291,23 @@ def _draw_fit(axes: Any, each: FittedClip, start_s: float, end_s: float) -> None
         for phone in inside:
             axis.axvline(phone.onset_s, color="0.92", zorder=0)
     axes[-1].set_xlabel("s")
+
+
+def _draw_sound(
+    axis: Any,
+    samples: NDArray[np.float32],
+    phones: Sequence[Phone],
+    silence: str,
+    start_s: float = 0.0,
+) -> None:
+    """Draw a waveform that begins at ``start_s``, with its phones above."""
+    time_s = start_s + np.arange(len(samples)) / SAMPLE_RATE_HZ
+    axis.plot(time_s, samples, color="0.6", linewidth=0.3)
+    top = 1.1 * float(np.abs(samples).max(initial=1e-3))
+    for number, phone in enumerate(phones):
+        axis.axvline(phone.onset_s, color="0.9", zorder=0)
+        if phone.symbol != silence:
+            # two heights, so that short phones do not overlap
+            axis.text(phone.onset_s, top * (1.0 + 0.25 * (number % 2)), phone.symbol, fontsize=8)
+    axis.set_ylim(-top, 1.5 * top)
+    axis.set_yticks([])

@@ -1,7 +1,8 @@
-"""Hostile peers: of a socket, as ZeroMQ's wire protocol (ZMTP 3) lets them be, and of the page.
+"""Attackers for `evaluate attacks`: ZeroMQ peers and web clients that break the rules.
 
-Those of ``ALLOWED`` have a key that is allowed, the others need none; none knows a session. Each
-stops by itself, at the latest after the given time.
+Some have no key and never get past the handshake. The others have a client key that control
+accepts. Each attack runs for a given time, and connects from a given loopback address, so that a
+service can tell it from the clients that it must keep serving.
 """
 
 from __future__ import annotations
@@ -10,52 +11,72 @@ import contextlib
 import socket
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from random import Random
 
 import numpy as np
 import zmq
 
 from kouxing.shared.client import Client
 from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Key, user_key
 
-MORE, LONG, COMMAND = 1, 2, 4  # flags of a frame
+# The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and the flags of its frames.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
-BLOCK_BYTES = 64 * 1024
-NUM_SILENT = 100  # subscribers
-TARGETS = {  # sockets of all kinds: their service, their setting, and the kind of their peers
-    "commands": ("control", "COMMANDS", "DEALER"),
-    "events": ("control", "EVENTS", "SUB"),
-    "audio": ("recognizer", "AUDIO", "DEALER"),
-    "phone_input": ("synthesizer", "PHONE_INPUT", "DEALER"),
-    "faps": ("synthesizer", "FAPS", "SUB"),
-}
+CURVE_GREETING = GREETING[:12] + b"CURVE".ljust(20, b"\0") + bytes(32)
+MORE, LONG, COMMAND = 1, 2, 4
+
+LOCALHOST = "127.0.0.1"
+BLOCK = b"x" * 65_536
+NUM_CONNECTIONS = 1500
+NUM_SILENT_SUBSCRIBERS = 100
+BUSY_PROCESSOR = "busy processor"
+
+AttackFunction = Callable[[str, str, float], None]
+"""Takes an endpoint, the source address and a duration in seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attack:
+    """One attack, and the sockets that it is run against."""
+
+    run: AttackFunction
+    targets: tuple[str, ...]
+    has_key: bool = False
 
 
 def ready(kind: str) -> bytes:
-    """Return what follows the greeting, of a socket of some kind."""
+    """Return the READY command of a socket kind, such as ``DEALER``."""
     command = b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind.encode()
     return bytes([COMMAND, len(command)]) + command
 
 
-def connected(port: int, kind: str = "DEALER", host: str = "127.0.0.1") -> socket.socket:
-    """Return a connection that shook hands as a socket of some kind, without any key.
+def connected(port: int, kind: str = "DEALER", host: str = LOCALHOST) -> socket.socket:
+    """Connect and complete the handshake of a socket without keys.
 
-    ``host`` is the address that it comes from.
+    Parameters
+    ----------
+    port
+        Port on this machine.
+    kind
+        ZeroMQ's name of the socket kind.
+    host
+        Source address.
 
     Raises
     ------
     OSError
-        If the other end refuses.
+        If the other end rejects the connection.
     """
-    connection = socket.create_connection(("127.0.0.1", port), 5.0, (host, 0))
+    connection = socket.create_connection((LOCALHOST, port), 5.0, (host, 0))
     try:
         connection.sendall(GREETING + ready(kind))
         answer = b""
-        while len(answer) < len(GREETING) + 2:  # and the beginning of its READY
+        while len(answer) < len(GREETING) + 2:  # up to the start of the peer's READY
             received = connection.recv(1024)
             if not received:
-                raise ConnectionResetError("the handshake is refused")
+                raise ConnectionResetError("the peer rejected the handshake")
             answer += received
     except BaseException:
         connection.close()
@@ -64,174 +85,140 @@ def connected(port: int, kind: str = "DEALER", host: str = "127.0.0.1") -> socke
 
 
 def frame(body: bytes, *, more: bool = False) -> bytes:
-    """Return one part of a message as it is on the wire."""
+    """Return one message part as it is on the wire."""
     flags = MORE if more else 0
     if len(body) < 256:
         return bytes([flags, len(body)]) + body
     return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
 
 
-def flood(connection: socket.socket, block: bytes, seconds: float) -> int:
-    """Send a block again and again until the other end has had enough; return how many bytes."""
-    num_bytes, end_s = 0, time.monotonic() + seconds
-    connection.settimeout(seconds)
-    with contextlib.suppress(OSError):
-        while time.monotonic() < end_s:
-            num_bytes += connection.send(block)
-    return num_bytes
-
-
-def endless_message(port: int, kind: str, part: bytes, seconds: float) -> int:
-    """Send a message that does not end."""
-    one = frame(part, more=True)
-    with connected(port, kind) as connection:
-        return flood(connection, one * max(1, BLOCK_BYTES // len(one)), seconds)
-
-
-def many_messages(port: int, kind: str, body: bytes, seconds: float) -> int:
-    """Send messages that say nothing, as fast as they are taken."""
-    one = frame(body)
-    with connected(port, kind) as connection:
-        return flood(connection, one * max(1, BLOCK_BYTES // len(one)), seconds)
-
-
-def many_parts(port: int, kind: str, num_parts: int) -> int:
-    """Send a message of very many empty parts that does end."""
-    with connected(port, kind) as connection:
-        return flood(connection, frame(b"", more=True) * num_parts + frame(b""), 1.0)
-
-
-def many_subscriptions(port: int, num_bytes: int, seconds: float) -> int:
-    """Subscribe to ever new topics of some length."""
-    sent, number, end_s = 0, 0, time.monotonic() + seconds
-    with connected(port, "SUB") as connection:
-        connection.settimeout(seconds)
-        with contextlib.suppress(OSError):
-            while time.monotonic() < end_s:
-                block = b"".join(
-                    frame(b"\x01" + str(n).encode().rjust(num_bytes, b"x")[::-1])
-                    for n in range(number, number + max(1, BLOCK_BYTES // num_bytes))
-                )
-                number += max(1, BLOCK_BYTES // num_bytes)
-                connection.sendall(block)
-                sent += len(block)
-    return sent
-
-
-@contextlib.contextmanager
-def many_connections(port: int, num: int) -> Iterator[list[socket.socket]]:
-    """Hold very many connections that never say anything."""
-    with contextlib.ExitStack() as held:
-        connections = []
-        with contextlib.suppress(OSError):  # the own limit of open files, or refused
-            for _ in range(num):
-                connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
-                connections.append(held.enter_context(connection))
-        yield connections
-
-
-Attack = Callable[[int, str, float], object]  # of a port, by a kind of peer, for some seconds
-
-
-def _together(num: int, attack: Callable[[], object]) -> None:
-    """Attack over several connections; where one is refused the others go on."""
-
-    def one(_: int) -> None:
-        with contextlib.suppress(OSError):
-            attack()
-
-    with ThreadPoolExecutor(num) as pool:
-        list(pool.map(one, range(num)))
-
-
-def _endless(part: bytes, num: int) -> Attack:
-    return lambda port, kind, seconds: _together(
-        num, lambda: endless_message(port, kind, part, seconds)
-    )
-
-
-def _flood(body: bytes, num: int) -> Attack:
-    return lambda port, kind, seconds: _together(
-        num, lambda: many_messages(port, kind, body, seconds)
-    )
-
-
-def _parts(port: int, kind: str, _seconds: float) -> None:
-    _together(1, lambda: many_parts(port, kind, 200_000))
-
-
-FLOODS: dict[str, Attack] = {
-    "an endless message of large parts": _endless(b"x" * 65_536, 1),
-    "an endless message of small parts": _endless(b"x" * 300, 1),
-    "endless messages of empty parts": _endless(b"", 4),
-    "a message of very many parts": _parts,
-    "messages of 1 MiB": _flood(b"x" * 2**20, 4),
-    "messages of the largest size": _flood(b"x" * 65_000, 4),
-    "small messages": _flood(b"x" * 10, 1),
-}
-
-
-def _subscriptions(num_bytes: int) -> Attack:
-    return lambda port, _kind, seconds: _together(
-        12, lambda: many_subscriptions(port, num_bytes, seconds)
-    )
-
-
-SUBSCRIPTIONS = {
-    "subscriptions of 1 MiB": _subscriptions(2**20),
-    "very many subscriptions": _subscriptions(120),
-}
-
-
-def hold_connections(port: int, _kind: str, seconds: float) -> None:
-    """Hold more connections than a process takes."""
-    with many_connections(port, 1500):
-        time.sleep(seconds)
-
-
-def hold_half_requests(port: int, _kind: str, seconds: float) -> None:
-    """Hold more half requests than a web server should."""
-    with many_connections(port, 300) as connections:
-        for connection in connections:
-            with contextlib.suppress(OSError):  # refused meanwhile
-                connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
-        time.sleep(seconds)
-
-
-def hold_thousands(port: int, _kind: str, seconds: float) -> None:
-    """Connect thousands of times."""
-    with many_connections(port, 4000):
-        time.sleep(seconds)
-
-
-PAGE: dict[str, Attack] = {
-    "300 half requests": hold_half_requests,
-    "4000 connections": hold_thousands,
-}
-
-AllowedAttack = Callable[[str, float], None]  # of an endpoint, for some seconds
-
-
-def connect(raw: zmq.Socket[bytes], endpoint: str, key: Key) -> None:
-    """Connect a socket as any program does that has a key, where one is needed."""
+def connect(raw: zmq.Socket[bytes], endpoint: str, key: Key, source: str = "") -> None:
+    """Connect a ZeroMQ socket to an endpoint, with a key if the endpoint names the server's key."""
     address, _, server_key = endpoint.partition(" ")
     if server_key:
         raw.curve_serverkey = server_key.encode()
         raw.curve_publickey, raw.curve_secretkey = key.public.encode(), key.secret.encode()
-    raw.connect(address)
+    raw.connect(address.replace("tcp://", f"tcp://{source}:0;") if source else address)
 
 
-def never_read(control: str, seconds: float) -> None:
-    """Let the frames of a session wait for subscribers that take none; gaps make very many."""
-    with Client(control) as client, zmq.Context() as context, contextlib.ExitStack() as held:
+def spin(_endpoint: str, _source: str, seconds: float) -> None:
+    """Keep one processor core busy. The attackers do that too, so this is the baseline."""
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        pass
+
+
+# Attackers without a key.
+
+
+def random_bytes(endpoint: str, source: str, seconds: float) -> None:
+    """Open connections and send random bytes, some of them after a valid greeting."""
+    random = Random(1)  # noqa: S311 - no secret
+    starts = (b"", GREETING, GREETING + ready("DEALER"), CURVE_GREETING, b"GET / HTTP/1.1\r\n")
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        with contextlib.suppress(OSError), _open(endpoint, source) as connection:
+            connection.settimeout(0.02)
+            connection.sendall(random.choice(starts) + random.randbytes(random.choice((10, 10**4))))
+            connection.recv(1000)
+
+
+def half_open_connections(endpoint: str, source: str, seconds: float) -> None:
+    """Hold many connections, each with an unfinished handshake or web request."""
+    start = b"GET / HTTP/1.1\r\nHost: " if endpoint.startswith("http") else CURVE_GREETING[:40]
+    end_s = time.monotonic() + seconds
+    with many_connections(_port(endpoint), NUM_CONNECTIONS, source) as connections:
+        for connection in connections:
+            with contextlib.suppress(OSError):  # closed by the peer
+                connection.sendall(start)
+        time.sleep(max(0.0, end_s - time.monotonic()))
+
+
+def endless_handshake(endpoint: str, source: str, seconds: float) -> None:
+    """Announce a command of a terabyte in the handshake, and send it as fast as possible."""
+    end_s = time.monotonic() + seconds
+    while time.monotonic() < end_s:
+        with contextlib.suppress(OSError), _open(endpoint, source) as connection:
+            connection.sendall(
+                CURVE_GREETING + bytes([COMMAND | LONG]) + (2**40).to_bytes(8, "big")
+            )
+            while time.monotonic() < end_s:
+                connection.sendall(BLOCK)
+
+
+@contextlib.contextmanager
+def many_connections(
+    port: int, number: int, source: str = LOCALHOST
+) -> Iterator[list[socket.socket]]:
+    """Hold up to ``number`` TCP connections; the peer or this process's limit may allow fewer."""
+    with contextlib.ExitStack() as stack:
+        connections = []
+        with contextlib.suppress(OSError):
+            for _ in range(number):
+                connection = socket.create_connection((LOCALHOST, port), 1.0, (source, 0))
+                connections.append(stack.enter_context(connection))
+        yield connections
+
+
+def _open(endpoint: str, source: str) -> socket.socket:
+    return socket.create_connection((LOCALHOST, _port(endpoint)), 1.0, (source, 0))
+
+
+def _port(endpoint: str) -> int:
+    return int(endpoint.partition(" ")[0].rstrip("/").rpartition(":")[2])
+
+
+# Attackers with a client key.
+
+
+def _send(make_message: Callable[[int], list[bytes]], kind: int = zmq.DEALER) -> AttackFunction:
+    """Return an attack that sends messages as fast as the socket takes them."""
+
+    def attack(endpoint: str, source: str, seconds: float) -> None:
+        with zmq.Context() as context, context.socket(kind) as raw:
+            raw.sndtimeo, raw.linger = 100, 0
+            connect(raw, endpoint, user_key(), source)
+            number, end_s = 0, time.monotonic() + seconds
+            while time.monotonic() < end_s:
+                with contextlib.suppress(zmq.Again):
+                    raw.send_multipart(make_message(number))
+                    number += 1
+
+    return attack
+
+
+def _random_message(number: int) -> list[bytes]:
+    random = Random(number)  # noqa: S311 - no secret
+    return [random.randbytes(random.choice((0, 1, 30, 3000))) for _ in range(random.randint(1, 4))]
+
+
+def keyed_connections(endpoint: str, source: str, seconds: float) -> None:
+    """Hold many ZeroMQ connections of one key."""
+    end_s = time.monotonic() + seconds
+    with zmq.Context() as context, contextlib.ExitStack() as stack:
+        context.set(zmq.MAX_SOCKETS, NUM_CONNECTIONS + 10)
+        with contextlib.suppress(zmq.ZMQError):  # this process's limit of open files
+            while time.monotonic() < end_s:
+                raw = stack.enter_context(context.socket(zmq.DEALER))
+                raw.linger = 0
+                connect(raw, endpoint, user_key(), source)
+                raw.send(b"", zmq.NOBLOCK)
+        time.sleep(max(0.0, end_s - time.monotonic()))
+
+
+def silent_subscribers(control: str, source: str, seconds: float) -> None:
+    """Subscribe to a session's frames many times and never read them.
+
+    The session skips audio, which makes the synthesizer send many frames at once.
+    """
+    end_s = time.monotonic() + seconds
+    with Client(control) as client, zmq.Context() as context, contextlib.ExitStack() as stack:
         session = client.open_session(paced=False)
-        for _ in range(NUM_SILENT):
-            raw = held.enter_context(context.socket(zmq.SUB))
+        for _ in range(NUM_SILENT_SUBSCRIBERS):
+            raw = stack.enter_context(context.socket(zmq.SUB))
             raw.rcvhwm, raw.rcvbuf, raw.linger = 1, 4096, 0
-            connect(raw, session.opened.faps, user_key())
+            connect(raw, session.opened.faps, user_key(), source)
             raw.subscribe(f"fap-frame/{session.name}/")
-        time.sleep(seconds / 4)
-        end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             if session.send(np.zeros(320, np.int16)):
                 session.skip(round(9.9 * MEDIA_RATE_HZ))
@@ -239,37 +226,38 @@ def never_read(control: str, seconds: float) -> None:
         session.close()
 
 
-SESSIONS: dict[str, AllowedAttack] = {"subscribers that never read": never_read}  # at control
-
-
-def _sends(kind: int, part: bytes, num_parts: int = 1) -> AllowedAttack:
-    """Return an attack that sends the same message again and again, or ever new subscriptions.
-
-    ZeroMQ sends no message that is not complete, so that one without end is not among them.
-    """
-
-    def attack(endpoint: str, seconds: float) -> None:
-        with zmq.Context() as context, context.socket(kind) as raw:
-            raw.sndtimeo, raw.linger = 100, int(1000 * seconds)
-            connect(raw, endpoint, user_key())
-            number, end_s = 0, time.monotonic() + seconds
+def many_sessions(control: str, _source: str, seconds: float) -> None:
+    """Open sessions until control refuses, and keep them."""
+    end_s = time.monotonic() + seconds
+    with Client(control) as client:
+        with contextlib.suppress(UserError):  # refused
             while time.monotonic() < end_s:
-                number += 1
-                last = part + (b"%08d" % number if kind == zmq.XSUB else b"")
-                with contextlib.suppress(zmq.Again):
-                    raw.send_multipart([part] * (num_parts - 1) + [last])
-
-    return attack
+                client.open_session()
+        time.sleep(max(0.0, end_s - time.monotonic()))
 
 
-ALLOWED = {  # by a key that is allowed
-    f"with a key: {name}": attack
-    for name, attack in {
-        "a message of 2500 large parts": _sends(zmq.DEALER, b"x" * 60_000, 2500),
-        "a message of 300000 small parts": _sends(zmq.DEALER, b"x" * 300, 300_000),
-        "messages of 100000 empty parts": _sends(zmq.DEALER, b"", 100_000),
-        "messages of the largest size": _sends(zmq.DEALER, b"x" * 65_000),
-        "small messages": _sends(zmq.DEALER, b"x" * 10),
-        "very many subscriptions": _sends(zmq.XSUB, b"\x01" + b"x" * 110),
-    }.items()
+ATTACKS: dict[str, Attack] = {
+    BUSY_PROCESSOR: Attack(spin, ("",)),
+    "random bytes": Attack(random_bytes, ("commands", "audio", "faps", "page")),
+    "half-open connections": Attack(half_open_connections, ("commands", "audio", "faps", "page")),
+    "endless handshake": Attack(endless_handshake, ("commands", "audio", "faps")),
+    "huge messages": Attack(
+        _send(lambda _: [bytes(64 * 2**20)]), ("commands", "audio"), has_key=True
+    ),
+    "messages of many parts": Attack(
+        _send(lambda _: [bytes(300)] * 300_000), ("commands", "audio"), has_key=True
+    ),
+    "flood of large messages": Attack(
+        _send(lambda _: [bytes(65_000)]), ("commands", "audio"), has_key=True
+    ),
+    "flood of small messages": Attack(
+        _send(lambda _: [bytes(10)]), ("commands", "audio"), has_key=True
+    ),
+    "malformed messages": Attack(_send(_random_message), ("commands", "audio"), has_key=True),
+    "many subscriptions": Attack(
+        _send(lambda number: [b"\x01" + b"%0120d" % number], zmq.XSUB), ("faps",), has_key=True
+    ),
+    "many connections": Attack(keyed_connections, ("commands", "audio"), has_key=True),
+    "silent subscribers": Attack(silent_subscribers, ("commands",), has_key=True),
+    "many sessions": Attack(many_sessions, ("commands",), has_key=True),
 }

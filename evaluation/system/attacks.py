@@ -1,22 +1,22 @@
-"""What hostile peers cost: memory of the services, and delay of others' faces.
+"""Measure what attackers cost: memory of each service, and delay of another client's frames.
 
-The services run as under ``kouxing run``, on ports of their own. For each attack a session is
-streamed in real time, before, during and after it. The attacker is a process of its own that begins
-again as soon as it was cut; the first row is a process that only spins, for the attacker needs a
-processor, too. Without a key its handshake fails where all have one; where none has it may speak.
-Other attackers have a key that control lets in.
+The services run as under ``kouxing run``, with keys, on free ports. During each attack a session
+is streamed in real time: before, during and after it. The attacker is a separate process, which
+starts over whenever it is cut off. The first row is a process that only keeps a core busy, because
+an attacker also takes processor time.
+
+On Linux only: memory is read from ``/proc``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import socket
 import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
@@ -25,16 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from kouxing.evaluation.system.attackers import (
-    ALLOWED,
-    FLOODS,
-    PAGE,
-    SESSIONS,
-    SUBSCRIPTIONS,
-    TARGETS,
-    Attack,
-    hold_connections,
-)
+from kouxing.evaluation.system.attackers import ATTACKS
 from kouxing.evaluation.system.latency import percentiles, stream
 from kouxing.evaluation.system.memory import Memory
 from kouxing.evaluation.system.systems import LocalSystem
@@ -42,183 +33,131 @@ from kouxing.services.kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.client import Client
-from kouxing.shared.connection import BAN_S, KIB
 from kouxing.shared.errors import UserError
 
+PHASES = ("before", "during", "after")
 PHASE_S = 3.0
-SLACK_S = 0.5  # in which a session opens
-RETURN_S = 15.0  # for memory to come back, unless this much at most is kept already
-LITTLE_MB = 4.0
-LET_IN_S = 0.5  # that a connection lasts unless it is cut
-AT_ENDPOINT = {**ALLOWED, **SESSIONS}  # the others attack a port
-ATTACKED = {  # sockets, by whether others have keys; then nobody else gets far
-    False: ("commands", "audio", "faps"),
-    True: ("audio",),
-}
+SESSION_START_S = 0.5
+RELEASE_DEADLINE_S = 15.0
+RELEASED_MB = 4.0  # a service that has grown by no more has released the memory
 
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """What one attack did; memory in MB of 2^20 bytes, of the service that grew most."""
+    """Effects of one attack. Memory is in MB of 2^20 bytes."""
 
-    keys: bool  # whether all others have one
     attack: str
-    socket: str
-    growth_mb: float
-    kept_mb: float
-    before_p95_ms: float | None  # None: no frame came in time
-    during_p95_ms: float | None
-    after_p95_ms: float | None
+    target: str
+    has_key: bool
+    growth_mb: dict[str, float]  # peak, by service
+    kept_mb: dict[str, float]  # after up to RELEASE_DEADLINE_S, by service
+    restarted: list[str]  # services that ended during the attack; they have no memory figures
+    p95_ms: dict[str, float | None]  # of the other client, by phase; None: no frame in time
 
 
 def measure(path: Path, names: Collection[str], console: Console) -> list[Damage]:
-    """Start the services and attack them; return the figures.
+    """Start the services, attack them and return the figures.
 
     Parameters
     ----------
+    path
+        Audio file that the other client streams.
     names
-        Of attacks; empty: all.
+        Keys of ``ATTACKS``. If empty, run all.
+    console
+        For progress messages.
 
     Raises
     ------
     UserError
-        If there is no such attack, the file is no audio, or the services cannot start.
+        If an attack does not exist, the file is not audio, or the services cannot start.
     """
-    known = dict.fromkeys(name for keys in (False, True) for name, _ in _attacks(keys))
-    if unknown := [name for name in names if name not in known]:
-        raise UserError(f"{unknown[0]!r} is no attack; there are {', '.join(known)}")
+    if unknown := [name for name in names if name not in ATTACKS]:
+        raise UserError(f"no attack is named {unknown[0]!r}; choose from {', '.join(ATTACKS)}")
     samples, rate_hz = read_audio(path)
-    sound = np.resize(samples, (round((3 * PHASE_S + 2 * SLACK_S) * rate_hz), samples.shape[1]))
-    return [
-        damage
-        for keys in (False, True)
-        for damage in _measure(sound, rate_hz, keys, names or known, console)
-    ]
-
-
-def _measure(
-    sound: NDArray[np.float32],
-    rate_hz: int,
-    keys: bool,
-    names: Collection[str],
-    console: Console,
-) -> list[Damage]:
-    attacks = [(name, target) for name, target in _attacks(keys) if name in names]
-    if not attacks:
-        return []
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        LocalSystem(Path(folder), console, insecure=not keys) as system,
-    ):
-        _p95_ms(system.control, sound, rate_hz)  # what runs for the first time is slow
-        numbers = [system.supervisor.process_number(service) for service in KINDS]
-        endpoints = _endpoints(system.control)
-        return [
-            _damage(keys, attack, target, numbers, endpoints, sound, rate_hz)
-            for attack, target in attacks
-        ]
-
-
-def _endpoints(control: str) -> dict[str, str]:
-    """Return where everything is bound, with its key, by name."""
-    with Client(control) as client:
-        services = client.status().services
-    return {name: each for state in services for name, each in state.endpoints.items()}
+    length_s = len(PHASES) * PHASE_S + 2 * SESSION_START_S
+    speech = np.resize(samples, (round(length_s * rate_hz), samples.shape[1]))
+    runs = [(name, target) for name in names or ATTACKS for target in ATTACKS[name].targets]
+    with tempfile.TemporaryDirectory() as folder, LocalSystem(Path(folder), console) as system:
+        _delays_ms(system.control, speech, rate_hz)  # the first session of a process is slow
+        damages = []
+        for number, (name, target) in enumerate(runs, start=2):
+            console.print(f"attack: {name}" + (f" on {target}" if target else ""))
+            # A new source address each time: a service may reject one that has misbehaved.
+            damages.append(_damage(system, name, target, f"127.0.0.{number}", speech, rate_hz))
+        return damages
 
 
 def show(damages: list[Damage], console: Console) -> None:
-    """Print the figures as a table."""
-    table = Table(
-        "keys", "attack", "socket", "growth MB", "kept MB", "p95 ms before", "during", "after"
-    )
+    """Print the figures as a table, with the memory of the service that grew most."""
+    columns = ("attack", "target", "key", "service", "growth MB", "kept MB", "p95 ms by phase")
+    table = Table(*columns)
     for damage in damages:
-        keys, attack, socket, *figures = asdict(damage).values()
+        worst = max(damage.growth_mb, key=lambda service: damage.growth_mb[service])
+        delays = (damage.p95_ms[phase] for phase in PHASES)
+        notes = [f"{service} restarted" for service in damage.restarted]
         table.add_row(
-            "yes" if keys else "no",
-            attack,
-            socket,
-            *("none" if figure is None else f"{figure:.1f}" for figure in figures),
+            "; ".join([damage.attack, *notes]),
+            damage.target,
+            "yes" if damage.has_key else "no",
+            worst,
+            f"{damage.growth_mb[worst]:.1f}",
+            f"{damage.kept_mb[worst]:.1f}",
+            " / ".join("none" if delay is None else f"{delay:.0f}" for delay in delays),
         )
     console.print(table)
 
 
-def _attacks(keys: bool) -> Iterator[tuple[str, str]]:
-    """Yield each attack and the socket that it attacks."""
-    yield "none, but a busy processor", ""
-    for target in ATTACKED[keys]:
-        for attack in FLOODS:
-            yield attack, target
-    for attack in SUBSCRIPTIONS:
-        yield attack, "faps"
-    for attack in SESSIONS:
-        yield attack, "commands"
-    yield "very many connections", "audio"
-    if keys:
-        for attack in ALLOWED:
-            targets = ("faps",) if "subscriptions" in attack else ("commands", "audio")
-            yield from ((attack, target) for target in targets)
-        for attack in PAGE:
-            yield attack, "page"
-
-
 def _damage(
-    keys: bool,
-    attack: str,
+    system: LocalSystem,
+    name: str,
     target: str,
-    numbers: list[int],
-    endpoints: Mapping[str, str],
-    sound: NDArray[np.float32],
+    source: str,
+    speech: NDArray[np.float32],
     rate_hz: int,
 ) -> Damage:
-    control = endpoints["commands"]
-    wait_until_let_in(control)
-    memories = [Memory(number) for number in numbers]
-    with _attacker(attack, target, endpoints.get(target, "")):
-        p95_ms = _p95_ms(control, sound, rate_hz)
-    growth_mb = max(memory.growth_mb for memory in memories)
-    end_s = time.monotonic() + RETURN_S
-    for memory in memories:
-        memory.wait_until_kept(LITTLE_MB, end_s - time.monotonic())
-    kept_mb = max(memory.kept_mb for memory in memories)
-    return Damage(keys, attack, target, growth_mb, kept_mb, *p95_ms)
+    with Client(system.control) as client:
+        services = client.status().services
+    endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
+    processes = {kind: system.supervisor.process_number(kind) for kind in KINDS}
+    memories = {kind: Memory(process_id) for kind, process_id in processes.items()}
+    with _attacker(name, endpoints.get(target, ""), source):
+        delays_ms = _delays_ms(system.control, speech, rate_hz)
+    restarted = [
+        kind for kind in KINDS if system.supervisor.process_number(kind) != processes[kind]
+    ]
+    for kind in restarted:
+        del memories[kind]
+    growth_mb = {kind: memory.growth_mb for kind, memory in memories.items()}
+    deadline_s = time.monotonic() + RELEASE_DEADLINE_S
+    for memory in memories.values():
+        memory.wait_until_kept(RELEASED_MB, deadline_s - time.monotonic())
+    kept_mb = {kind: memory.kept_mb for kind, memory in memories.items()}
+    has_key = ATTACKS[name].has_key
+    return Damage(name, target, has_key, growth_mb, kept_mb, restarted, delays_ms)
 
 
-def wait_until_let_in(control: str) -> None:
-    """Wait while faults count against this address: a connection of it is cut then."""
-    host, port = control.partition(" ")[0].removeprefix("tcp://").rsplit(":", 1)
-    for _ in range(2 * BAN_S):
-        with (
-            contextlib.suppress(ConnectionError),
-            socket.create_connection((host, int(port)), LET_IN_S) as connection,
-        ):
-            try:
-                while connection.recv(KIB):  # the greeting, then nothing
-                    pass
-            except TimeoutError:
-                return
-        time.sleep(1.0)
-
-
-def _p95_ms(control: str, sound: NDArray[np.float32], rate_hz: int) -> list[float | None]:
-    """Return the delay before, during and after the attack, of a session that lasts throughout."""
+def _delays_ms(control: str, speech: NDArray[np.float32], rate_hz: int) -> dict[str, float | None]:
+    """Stream a session through all phases; return the 95th percentile of its delays by phase."""
     with Client(control) as client:
-        times_s, delays_s, _ = stream(client, sound, rate_hz, SynthesizerConfig().delay_ms / 1e3)
-    ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SLACK_S])
-    phases = [delays_s[np.digitize(times_s, ends_s) == phase] * 1e3 for phase in range(3)]
-    return [percentiles(delays_ms)["p95"] if delays_ms.size else None for delays_ms in phases]
+        times_s, delays_s, _ = stream(client, speech, rate_hz, SynthesizerConfig().delay_ms / 1e3)
+    phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
+    phase = np.digitize(times_s, phase_ends_s)
+    delays_ms = [delays_s[phase == number] * 1e3 for number in range(len(PHASES))]
+    p95_ms = [percentiles(values)["p95"] if values.size else None for values in delays_ms]
+    return dict(zip(PHASES, p95_ms, strict=True))
 
 
 @contextlib.contextmanager
-def _attacker(attack: str, target: str, endpoint: str) -> Iterator[None]:
-    """Let a process attack in the second phase of the three."""
+def _attacker(name: str, endpoint: str, source: str) -> Iterator[None]:
+    """Run an attacking process during the second phase."""
     context = multiprocessing.get_context("spawn")
-    begins = context.Event()
-    arguments = (attack, target, endpoint, begins)
-    process = context.Process(target=_attack, args=arguments, daemon=True)
+    start = context.Event()
+    process = context.Process(target=_attack, args=(name, endpoint, source, start), daemon=True)
     process.start()
     timers = [
-        threading.Timer(PHASE_S + SLACK_S, begins.set),
-        threading.Timer(2 * PHASE_S + SLACK_S, process.terminate),
+        threading.Timer(PHASE_S + SESSION_START_S, start.set),
+        threading.Timer(2 * PHASE_S + SESSION_START_S, process.terminate),
     ]
     for timer in timers:
         timer.start()
@@ -230,22 +169,9 @@ def _attacker(attack: str, target: str, endpoint: str) -> Iterator[None]:
         process.join()
 
 
-def _attack(attack: str, target: str, endpoint: str, begins: Event) -> None:
-    """Attack for ever, once it begins; without an endpoint only spin."""
-    attacks: dict[str, Attack] = {
-        **FLOODS,
-        **SUBSCRIPTIONS,
-        **PAGE,
-        "very many connections": hold_connections,
-    }
-    begins.wait()
+def _attack(name: str, endpoint: str, source: str, start: Event) -> None:
+    """Attack until the process is terminated."""
+    start.wait()
     while True:
-        if not endpoint:
-            continue
-        with contextlib.suppress(OSError):  # refused
-            if attack in AT_ENDPOINT:
-                AT_ENDPOINT[attack](endpoint, 1.0)
-            else:
-                address = endpoint.partition(" ")[0].rstrip("/")
-                kind = TARGETS[target][2] if target in TARGETS else ""
-                attacks[attack](int(address.rpartition(":")[2]), kind, 1.0)
+        with contextlib.suppress(OSError, UserError):  # rejected or cut off
+            ATTACKS[name].run(endpoint, source, PHASE_S)

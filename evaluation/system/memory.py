@@ -1,4 +1,4 @@
-"""How much memory a process takes more than at some time."""
+"""Memory growth of a process of this user. Linux only."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from pathlib import Path
 
 
 class Memory:
-    """The growth of a process of this user since this was made; on Linux only."""
+    """Memory of a process, relative to when this object was made; MB of 2^20 bytes."""
 
-    def __init__(self, process: int) -> None:
-        self._folder = Path(f"/proc/{process}")
-        (self._folder / "clear_refs").write_text("5")  # the peak begins anew
-        self._before_mb = self._read_mb("VmRSS")
+    def __init__(self, process_id: int) -> None:
+        self._folder = Path(f"/proc/{process_id}")
+        (self._folder / "clear_refs").write_text("5")  # resets the peak
+        self._start_mb = self._read_mb("VmRSS")
 
     @property
     def growth_mb(self) -> float:
-        """The most it took since, in MB of 2^20 bytes."""
-        return self._read_mb("VmHWM") - self._before_mb
+        """Peak growth since the start."""
+        return self._read_mb("VmHWM") - self._start_mb
 
     @property
     def kept_mb(self) -> float:
-        """What it takes now, in the same unit."""
-        return self._read_mb("VmRSS") - self._before_mb
+        """Growth at present."""
+        return self._read_mb("VmRSS") - self._start_mb
 
-    def wait_until_kept(self, limit_mb: float, deadline_s: float = 10.0) -> bool:
-        """Wait until it keeps no more than that; return whether it came to that."""
-        end_s = time.monotonic() + deadline_s
+    def wait_until_kept(self, limit_mb: float, timeout_s: float = 10.0) -> bool:
+        """Wait until ``kept_mb`` is at most ``limit_mb``; return False after the timeout."""
+        end_s = time.monotonic() + timeout_s
         while self.kept_mb > limit_mb:
             if time.monotonic() > end_s:
                 return False

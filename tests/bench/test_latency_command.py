@@ -44,7 +44,4 @@ def test_it_prints_a_table_and_writes_the_same_figures(
     drawings = latency["page"]["drawings"]
     assert list(drawings) == ["idle", "microphone"]
     assert all(drawing["pictures_per_s"] > 0 for drawing in drawings.values())
-    offsets = latency["page"]["offsets"]
-    assert offsets["num_clicks"] > 0
-    assert offsets["p5_ms"] <= offsets["mean_ms"] <= offsets["p95_ms"]
     assert f"{latency['chunk_to_frame_ms']['p50']:.1f}" in result.stdout

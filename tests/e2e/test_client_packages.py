@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.system import sync
 from kouxing.shared.client import Client
 from kouxing.shared.face.shapes import SHAPE_SETS
+from tests import sync
 from tests.browser import Browser
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file

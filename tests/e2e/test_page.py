@@ -22,10 +22,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.evaluation.system import sync
 from kouxing.evaluation.system.chromium import wait_until
 from kouxing.shared.client import Client, Session
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from tests import sync
 from tests.browser import SIZE_PX, Browser
 from tests.scripted_system import LOOK_AHEAD_MS, Gateway, System
 from tests.system import ROOT, free_port

@@ -13,7 +13,6 @@ from kouxing.evaluation.lips.contour_accuracy import (
     mean_mouths,
     scaled,
 )
-from kouxing.evaluation.lips.contour_shapes import check_shapes
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.shared.face.faps import MOUTH_FAPS
 
@@ -61,14 +60,3 @@ def test_limits_of_one_opening_and_of_none() -> None:
     found = limits(real)
     assert found[BEST_OPENING] == pytest.approx(1.0)
     assert found[STILL] < 0.6
-
-
-def test_shapes_of_the_shipped_contour_are_sound() -> None:
-    figures = check_shapes(np.linspace(0.0, 5.0, 11))
-    assert not len(figures.faults)
-    assert figures.gap[0] == pytest.approx(0.0, abs=1e-9)
-    assert (np.diff(figures.gap) > 0.0).all()
-
-
-def test_crossed_lips_are_a_fault() -> None:
-    assert list(check_shapes([-1.0, 2.0]).faults) == [0]

@@ -1,4 +1,4 @@
-"""Learning the table of the ferguson lips, and scoring a segmentation."""
+"""Training of the Ferguson lips' table."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.evaluation.lips.segmentation import SegmentedRecording, figure, pair, score
-from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.endpoints import pieces_of
 from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.shared.errors import UserError
@@ -89,45 +86,6 @@ def test_levels_group_finals_of_like_shares() -> None:
     level, influence = influence_levels(share, dict.fromkeys(share, 1.0))
     assert level == {"a": 1, "o": 1, "e": 2, "i": 3, "u": 3, "v": 4}
     assert influence["u"] == pytest.approx(0.295)
-
-
-def test_boundaries_are_paired_in_order() -> None:
-    real, found = np.array([0.0, 0.3, 0.6, 0.9]), np.array([0.02, 0.28, 0.33, 0.75, 0.95])
-    assert pair(real, found) == [(0, 0), (1, 1), (3, 4)]
-    assert pair(real, np.zeros(0)) == []
-
-
-def test_a_segmentation_is_scored_and_drawn(tmp_path: Path) -> None:
-    slices = [
-        Progress(time_s=0.02 * number, level_db=-20.0 if 20 < number <= 50 else -70.0)
-        for number in range(1, 71)
-    ]
-    phones = [
-        replace(phone, onset_s=0.42 + phone.onset_s)
-        for phone in aligned([("m", 0.1), ("a", 0.2), ("m", 0.1), ("a", 0.2), ("sil", 0.2)])
-    ]
-    recording = SegmentedRecording(
-        name="made-up",
-        samples=np.zeros(22_400, np.float32),
-        slices=slices,
-        pieces=pieces_of(slices),
-        syllables=[("m", "a"), ("m", "a")],
-        aligned=spoken(phones, INVENTORY),
-    )
-    found = score([recording], TABLE)
-    as_recorded = found.pieces["as recorded"]
-    assert (found.num_syllables, as_recorded.num_pieces, as_recorded.mean_count_error) == (
-        2,
-        1,
-        0.5,
-    )
-    assert (as_recorded.recall, as_recorded.precision) == (0.5, 1.0)
-    assert as_recorded.mean_boundary_error_ms == pytest.approx(20.0)
-    assert found.pieces["noise 5 dB below"].num_pieces == 0  # of a sound of zeros
-    assert found.by_text.mean_ms < 30.0
-    assert found.by_text.within_50_ms == 1.0
-    figure(recording).savefig(tmp_path / "pieces.png")
-    assert (tmp_path / "pieces.png").stat().st_size > 5000
 
 
 def test_a_folder_without_clips_is_named(tmp_path: Path) -> None:

@@ -11,10 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 
-from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.evaluation.lips.clip_scores import score_clip
-from kouxing.evaluation.lips.closure_fit import TRIED, compare
 from kouxing.evaluation.lips.report import print_scores
 from kouxing.evaluation.lips.schemes import (
     DEFAULT_DELAY_S,
@@ -30,7 +29,6 @@ from kouxing.evaluation.lips.schemes import (
 )
 from kouxing.evaluation.lips.scores import LipScore, clips_to_score, pool
 from kouxing.evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_clip, fit_figure
-from kouxing.evaluation.lips.viseme_plots import dominance_figure, faces_figure, sentence_figure
 from kouxing.services.live_chain import sound_events
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -47,8 +45,8 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, b
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.phones.events import LipFrame, Phone, Progress, SoundEvent, SpeechChange
-from tests.lips import INVENTORY, LIPS, clip_of, utterance
+from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
+from tests.lips import INVENTORY, clip_of, utterance
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
@@ -249,34 +247,6 @@ def test_loudness_opens_the_mouth() -> None:
     np.testing.assert_array_equal(loudness_frames(samples, 0.3), faps)
 
 
-def test_the_rule_of_closures_is_chosen_by_what_the_lips_do() -> None:
-    """The sound doubts closures of lips that it tells to be half open: it is to be believed."""
-    times = np.arange(100) / 50.0
-    is_shut = (times * 2.0) % 1.0 < 0.2
-    faps = np.zeros((100, len(MOUTH_FAPS)))
-    faps[:, MOUTH_FAPS.index(5)] = np.where(is_shut, 0.0, -300.0)
-    events: list[SoundEvent] = [SpeechChange(active=True, time_s=0.0)]
-    for time_s, shut in zip(times, is_shut, strict=True):
-        mouth = np.zeros(len(MOUTH_FAPS), np.float32)
-        mouth[MOUTH_FAPS.index(5)] = -150.0 if shut else -300.0
-        events.append(
-            LipFrame(
-                time_s=time_s,
-                delay_s=0.055,
-                faps=mouth,
-                closure=0.25 if shut else 0.01,
-                lip_to_teeth=0.0,
-            )
-        )
-        events.append(Progress(time_s=time_s + 0.06, level_db=-20.0))
-    lips = heard(clip_of(times, faps), events=events)
-    *tried, best = compare(LIPS, [lips])
-    assert len(tried) == sum(map(len, TRIED.values()))
-    assert best.rule.sound >= 1.0
-    assert best.f1 > 0.9
-    assert min(score.f1 for score in tried) < 0.5
-
-
 def test_a_closure_is_sought_where_the_phone_is_quietest() -> None:
     phones = utterance(4, 20)
     labials = [phone for phone in phones if phone.symbol == "b"]
@@ -385,35 +355,6 @@ def test_the_fit_report_finds_who_made_the_curves() -> None:
     clip.faps[:, MOUTH_FAPS.index(3)] = np.nan
     assert "jaw" not in {error.measure for error in errors_of_visemes(fitted)}
     assert len(fit_figure(fitted).axes) == 8
-
-
-@pytest.mark.slow
-def test_pictures_of_visemes_are_drawn(tmp_path: Path) -> None:
-    figure = faces_figure(LIPS)
-    titles = [axis.get_title() for axis in figure.axes if axis.images]
-    assert len(titles) == 26
-    assert titles[0] == "rest"
-    faces = [np.asarray(axis.images[0].get_array()) for axis in figure.axes if axis.images]
-    assert all(face.std() > 10.0 for face in faces)
-    vowel = titles.index("a ang\n")
-    assert np.abs(faces[vowel].astype(float) - faces[0]).max() > 60.0
-    save_figure(dominance_figure(LIPS), tmp_path / "dominance.png")
-    assert (tmp_path / "dominance.png").read_bytes()[:4] == b"\x89PNG"
-    with pytest.raises(UserError, match="cannot be written"):
-        save_figure(figure, tmp_path / "no" / "such.png")
-
-
-@pytest.mark.slow
-def test_a_sentence_is_drawn_with_the_parameters_given() -> None:
-    model = load_model()
-    samples, _ = read_audio(VOWELS_FILE)
-    still = replace(START, target=np.zeros_like(START.target))
-    for parameters, moves in ((START, True), (still, False)):
-        lips = DynamicVisemes(parameters, INVENTORY)
-        jaw = sentence_figure(lips, model, samples[:24_000, 0]).axes[1]
-        full, live = (np.asarray(line.get_ydata()) for line in jaw.get_lines()[:2])
-        assert (np.ptp(full) > 100.0, np.ptp(live) > 100.0) == (moves, moves)
-    assert len(sentence_figure(LIPS, model, np.zeros(10, np.float32)).axes) == 6
 
 
 def test_pictures_without_matplotlib_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

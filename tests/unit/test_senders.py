@@ -19,12 +19,12 @@ from pythonosc.osc_bundle import OscBundle
 from pythonosc.osc_server import BlockingOSCUDPServer
 from websockets.sync import client as websockets
 
-from kouxing.evaluation.system.vtube_studio import VTubeStudioStub
 from kouxing.services.senders.playout import PAUSE_S, WINDOW_S, Playout
 from kouxing.services.senders.senders import MAX_SENDERS, STALL_S, Senders
 from kouxing.services.senders.target import parse_target
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.shapes import SHAPE_SETS
+from tests.vtube_studio import VTubeStudioStub
 
 pytestmark = pytest.mark.unit
 

@@ -41,8 +41,7 @@ _INNER_LIPS, _CORNERS = ([MOUTH_FAPS.index(fap) for fap in pair] for pair in ((4
 class ClosureRule:
     """How the evidence is weighed.
 
-    Chosen on speakers left out of training; ``kouxing evaluate closures`` compares values on clips
-    for choices.
+    Chosen on speakers left out of training.
     """
 
     sound: float = 2.0  # added to the sound's log odds: it rather misses a closure than invents one

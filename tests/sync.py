@@ -1,8 +1,8 @@
-"""How far the page's sound is from its picture, of clicks and the pictures that belong to them.
+"""Measures how far the page's sound is from its picture.
 
-A click is found where the sound leaves the page, behind its last node, and is heard when the
-browser says that the sound card plays that sample. A picture is seen at the tick of the display
-after it is drawn. Neither asks what the page itself believes of its delay.
+A click is detected where the sound leaves the page, after its last audio node. It is heard when the
+browser says that the sound card plays that sample. A picture is seen at the display's first refresh
+after it was drawn. Neither relies on the delay that the page itself assumes.
 """
 
 from __future__ import annotations
@@ -12,15 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from kouxing.evaluation.system.chromium import Chromium
 
-APART_MS = 200.0  # between a click and its picture at most, and between two clicks at least
-AROUND_MS = (500.0, 250.0)  # of a click: the time before it and after it for which it counts
-MAX_GAP_MS = 70.0  # between two pictures; a page that the processor draws has one each 50 ms
-# Before the page's own scripts: what is connected to the loudspeaker is also looked at.
+AROUND_MS = (500.0, 250.0)  # a click counts if pictures were drawn this long before and after it
+MAX_GAP_MS = 70.0  # between two pictures; a page that the processor draws has one every 50 ms
+# Runs before the page's own scripts, and also watches every node connected to the loudspeaker.
 _PROBE = """
 window.probe = { clicks: new Map(), pictures: [] };
 const connect = AudioNode.prototype.connect;
@@ -41,7 +38,7 @@ function watch(node) {
       if (wave[i] < 0.2 || wave[i] < wave[i - 1] || wave[i] <= wave[i + 1]) continue;
       const frame = end - wave.length + i;
       const heardMs = performanceTime + 1000 * (frame / context.sampleRate - contextTime);
-      const known = [...window.probe.clicks.keys()].find((each) => Math.abs(each - frame) < 1600);
+      const known = [...window.probe.clicks.keys()].find((at) => Math.abs(at - frame) < 1600);
       const readings = window.probe.clicks.get(known) ?? [];
       window.probe.clicks.set(known ?? frame, [...readings, heardMs]);
     }
@@ -60,21 +57,19 @@ _READ = """
 class Offsets:
     """How long after its picture a sound is heard, ms; negative: before it."""
 
-    num_clicks: int
     mean_ms: float
     p5_ms: float
     p95_ms: float
-    worst_ms: float  # the one that is farthest from 0
 
 
 def install(browser: Chromium) -> None:
-    """Have the page that is opened next be watched."""
+    """Watch the page that is opened next."""
     browser.command("Page.enable")
     browser.command("Page.addScriptToEvaluateOnNewDocument", source=_PROBE)
 
 
 def begin(browser: Chromium) -> None:
-    """Begin to note clicks and pictures of a page that was loaded."""
+    """Start to record clicks and pictures."""
     browser.evaluate(
         "window.probe.clicks.clear(); window.probe.pictures = [];"
         "window.kouxing.onPicture = ({ seenMs, mediaTime, faps }) =>"
@@ -85,30 +80,17 @@ def begin(browser: Chromium) -> None:
 def read(browser: Chromium) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return when clicks were heard, ms, and the pictures, shape (n, 3).
 
-    Each picture's row is when it was seen first, ms, its media time, and open_jaw.
+    A picture's row holds when it was first seen, ms, its media time, and its open_jaw.
     """
-    found = browser.evaluate(_READ)
-    clicks_ms = np.sort([np.median(readings) for readings in found["clicks"]])
-    return clicks_ms, np.array(found["pictures"]).reshape(-1, 3)
-
-
-def passages_ms(pictures: NDArray[np.float64], every: int) -> NDArray[np.float64]:
-    """Return when media time was first seen to have passed each multiple of ``every`` samples."""
-    number = pictures[:, 1] // every
-    passages: NDArray[np.float64] = pictures[1:, 0][np.diff(number) == 1]
-    return passages
-
-
-def offsets_ms(clicks_ms: NDArray[np.float64], seen_ms: NDArray[np.float64]) -> list[float]:
-    """Return how long after what was seen each click was heard, ms, of those with a picture."""
-    nearest = [float(min(click - seen_ms, key=abs)) for click in clicks_ms if len(seen_ms)]
-    return [offset for offset in nearest if abs(offset) <= APART_MS]
+    result = browser.evaluate(_READ)
+    clicks_ms = np.sort([np.median(readings) for readings in result["clicks"]])
+    return clicks_ms, np.array(result["pictures"]).reshape(-1, 3)
 
 
 def with_pictures(
     clicks_ms: NDArray[np.float64], seen_ms: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the clicks around which pictures could be drawn: none waited for long for the next."""
+    """Return the clicks around which no picture was late."""
     gaps_ms = np.diff(seen_ms)
     before, after = AROUND_MS
     return np.array(
@@ -124,19 +106,6 @@ def with_pictures(
 
 
 def summary(offsets: Sequence[float]) -> Offsets:
-    """Return the figures of offsets, at least one, ms."""
-    return Offsets(
-        num_clicks=len(offsets),
-        mean_ms=float(np.mean(offsets)),
-        p5_ms=float(np.percentile(offsets, 5)),
-        p95_ms=float(np.percentile(offsets, 95)),
-        worst_ms=max(offsets, key=abs),
-    )
-
-
-def show(offsets: Offsets, console: Console) -> None:
-    """Print the figures as a table."""
-    table = Table("sound after picture", "mean", "p5", "p95", "worst")
-    figures = (offsets.mean_ms, offsets.p5_ms, offsets.p95_ms, offsets.worst_ms)
-    table.add_row(f"{offsets.num_clicks} clicks", *(f"{figure:+.0f} ms" for figure in figures))
-    console.print(table)
+    """Return the mean and percentiles of at least one offset, ms."""
+    p5, p95 = np.percentile(offsets, [5, 95])
+    return Offsets(float(np.mean(offsets)), float(p5), float(p95))
