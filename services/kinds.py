@@ -109,7 +109,7 @@ def free_addresses(
                 address = f"tcp://{host}:{port}" if bound is Bound.ENDPOINT else port
                 environment[variable(name, key)] = address
     if "control" in names:
-        environment[variable(COMMON, "control")] = environment[variable("control", "commands")]
+        environment[variable(COMMON, "control")] = environment[variable("control", "control")]
     return environment
 
 
@@ -133,7 +133,7 @@ def available_addresses(settings: Settings) -> dict[str, str]:
             if port not in ("0", "*"):
                 if not _is_taken(endpoint_host or host, int(port)):
                     continue
-                if setting.origin != "default":
+                if not setting.is_default:
                     raise UserError(
                         f"{kind.name}.{key}: another program has port {port}; choose another, or"
                         " none to get a free one"

@@ -36,7 +36,7 @@ class Stage:
     def __init__(self, *, insecure: bool) -> None:
         self.control = ControlService(
             ControlConfig(
-                commands=LOCAL, events=LOCAL, insecure=insecure, lost_after_s=60.0, max_load=1000.0
+                control=LOCAL, events=LOCAL, insecure=insecure, lost_after_s=60.0, max_load=1000.0
             )
         )
         self.buses = []

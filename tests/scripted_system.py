@@ -104,7 +104,7 @@ class System:
     def __init__(self) -> None:
         local = "tcp://127.0.0.1:*"
         self.control = ControlService(
-            ControlConfig(commands=local, events=local, lost_after_s=10.0, max_load=1000.0)
+            ControlConfig(control=local, events=local, lost_after_s=10.0, max_load=1000.0)
         )
         self.address = self.control.endpoints["commands"]
         control = self.address.partition(" ")[0]

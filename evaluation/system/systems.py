@@ -25,7 +25,7 @@ SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 60.0
 ON_HOSTS = ("control", "recognizer", "synthesizer")
 PORTS = {  # where services are bound that have hosts of their own
-    "control": {"commands": 5550, "events": 5551},
+    "control": {"control": 5550, "events": 5551},
     "recognizer": {"audio": 5560, "phones": 5561, "unpaced_audio": 5562},
     "synthesizer": {"phone_input": 5570, "faps": 5571},
 }
@@ -204,7 +204,7 @@ class HostsSystem:
         )
 
     def _control_for(self, host: str) -> str:
-        return f"tcp://{self.network.address('control', host)}:{PORTS['control']['commands']}"
+        return f"tcp://{self.network.address('control', host)}:{PORTS['control']['control']}"
 
     def _bring_key(self, host: str, name: str, role: str) -> None:
         """Make a key on control's host and copy it to another."""

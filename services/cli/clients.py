@@ -138,8 +138,9 @@ def send(
     """Send the face to avatars in other programs: VMC, Live Link Face, OSC, VTube Studio."""
     from kouxing.services.cli.send import send_to
     from kouxing.services.senders.target import parse_target
+    from kouxing.services.synthesizer.config import SynthesizerConfig
 
-    config = read_settings().load(ServiceConfig)
+    config = read_settings().load(SynthesizerConfig)
     send_to(
         [parse_target(url) for url in targets],
         _session_name(session),
@@ -238,9 +239,9 @@ def control_address(given: str) -> str:
     Its public key follows the address, unless all is plain.
     """
     settings, overrides = read_settings(), {"control": given} if given else {}
-    (origin,) = (
-        each.origin for each in settings.describe(ServiceConfig, overrides) if each.key == "control"
+    (setting,) = (
+        each for each in settings.describe(ServiceConfig, overrides) if each.key == "control"
     )
     config = settings.load(ServiceConfig, overrides)
-    found = find_control() if origin == "default" else ""
+    found = find_control() if setting.is_default else ""
     return found or control_endpoint(config.control, insecure=config.insecure)

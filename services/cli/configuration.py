@@ -1,4 +1,4 @@
-"""``kouxing config``: every key with its meaning, its present value and where that came from."""
+"""``kouxing config``: prints every key with its meaning, its present value and its origin."""
 
 from __future__ import annotations
 
@@ -21,28 +21,31 @@ TABLES: dict[str, type[ServiceConfig]] = {
 PAGE_HEAD = """\
 # Configuration
 
-Made by `kouxing config --markdown > docs/configuration.md`; a test says when it is out of date.
+`kouxing config --markdown > docs/configuration.md` generates this page. A test checks it.
 
-A value comes from, weakest first:
+The sources of a value, from weakest to strongest:
 
-1. the default below,
-2. a TOML file (`--config FILE`) with one table per service, such as `[recognizer]`,
-3. the environment, as `KOUXING_<SERVICE>_<KEY>`, such as `KOUXING_RECOGNIZER_MIN_CONFIDENCE`,
-4. the command line: `--set KEY=VALUE` of a service, `--set SERVICE.KEY=VALUE` of `kouxing run`.
+1. the default in the tables below
+2. a TOML file (`--config FILE`) with one table per service, such as `[recognizer]`
+3. the environment: `KOUXING_<SERVICE>_<KEY>`, such as `KOUXING_RECOGNIZER_MIN_CONFIDENCE`
+4. the command line: `--set KEY=VALUE` of a service, `--set SERVICE.KEY=VALUE` of `kouxing run`
 
-Every service also has the keys of `[common]`. They can be set for all services, in the table
-`[common]` or as `KOUXING_<KEY>`, and for one service, which counts more. A key, table or variable
-that is not listed here is an error. What is separated by spaces may also be a list in the file:
-`senders = ["vmc://", "vts://"]`.
+Every service also has the keys of `[common]`. To set one for all services, use the table `[common]`
+or `KOUXING_<KEY>`.
+Within one source, a value for one service overrides the value for all services.
+An unknown key, table or variable is an error.
 
-`kouxing config` prints all keys with their present values and where each came from, as a TOML file;
-`kouxing config recognizer --set min_confidence=0.8` does so for one service.
+The TOML file has lists, such as `senders = ["vmc://", "vts://"]`. In the environment and on the
+command line, a list is a text with spaces between the items.
+
+`kouxing config` prints a TOML file with all keys, their values and the origin of each value.
+`kouxing config recognizer --set min_confidence=0.8` does the same for one service.
 """
 
 
 def config(
     service: Annotated[
-        str, typer.Argument(help=f"One of {', '.join(TABLES)}; without it, all.")
+        str, typer.Argument(help=f"One of {', '.join(TABLES)}; by default all of them.")
     ] = "",
     config: ConfigFile = None,
     assignments: Assignments = None,
@@ -50,17 +53,17 @@ def config(
         bool, typer.Option("--markdown", help="Print the documentation page instead.")
     ] = False,
 ) -> None:
-    """Print all keys: meaning, range, default, present value and where it came from."""
+    """Print all keys: meaning, allowed values, default, present value and its origin."""
     if service and service not in TABLES:
-        raise UserError(f"there is no service {service!r}; write one of {', '.join(TABLES)}")
+        raise UserError(f"there is no service {service!r}; choose one of {', '.join(TABLES)}")
     values = parse_assignments(assignments or [])
     if markdown:
         text = markdown_page()
     elif service:
         text = _toml_table(service, read_settings(config).describe(TABLES[service], values))
     else:
-        settings = read_settings(config, values)
-        text = "\n".join(_toml_table(*each) for each in _all_settings(settings))
+        tables = _all_settings(read_settings(config, values))
+        text = "\n".join(_toml_table(name, settings) for name, settings in tables)
     sys.stdout.write(text)
 
 
@@ -69,8 +72,9 @@ def markdown_page() -> str:
     tables = []
     for name, settings in _all_settings(Settings(TABLES, environment={})):
         rows = [
-            f"| `{each.key}` | `{_as_toml(each.default)}` | {each.allowed} | {each.meaning} |\n"
-            for each in settings
+            f"| `{setting.key}` | `{_as_toml(setting.default)}` | {setting.allowed} |"
+            f" {setting.meaning} |\n"
+            for setting in settings
         ]
         head = "| key | default | allowed | meaning |\n|---|---|---|---|\n"
         tables.append(f"\n## [{name}]\n\n{head}{''.join(rows)}")
@@ -78,20 +82,21 @@ def markdown_page() -> str:
 
 
 def _all_settings(settings: Settings) -> Iterable[tuple[str, list[Setting]]]:
-    """Yield each table with its keys: common ones only where a service has a value of its own."""
+    """Yield each table with its keys; a common key only where it differs from ``[common]``."""
     common = settings.describe(ServiceConfig)
     for name, config_type in TABLES.items():
         keys = settings.describe(config_type)
-        yield name, common if name == COMMON else [each for each in keys if each not in common]
+        yield name, common if name == COMMON else [key for key in keys if key not in common]
 
 
 def _toml_table(name: str, settings: list[Setting]) -> str:
     lines = [f"[{name}]"]
-    for each in settings:
+    for setting in settings:
+        allowed = f"{setting.allowed[0].upper()}{setting.allowed[1:]}"
         lines += [
-            f"# {each.meaning}",
-            f"# {each.allowed[0].upper()}{each.allowed[1:]}; default {_as_toml(each.default)}.",
-            f"{each.key} = {_as_toml(each.value)}  # {each.origin}",
+            f"# {setting.meaning}",
+            f"# {allowed}; default {_as_toml(setting.default)}.",
+            f"{setting.key} = {_as_toml(setting.value)}  # {setting.origin}",
         ]
     return "\n".join(lines) + "\n"
 

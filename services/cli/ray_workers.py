@@ -152,8 +152,8 @@ def _environment(kind: ServiceKind, settings: Settings) -> dict[str, str]:
     environment = {}
     bound = bound_keys(kind.config_type)
     for setting in settings.describe(kind.config_type):
-        if setting.origin != "default":
-            environment[variable(kind.name, setting.key)] = str(setting.value)
+        if not setting.is_default:
+            environment[variable(kind.name, setting.key)] = setting.text
         elif bound.get(setting.key) is Bound.ENDPOINT:
             environment[variable(kind.name, setting.key)] = "tcp://0.0.0.0:*"
     return environment

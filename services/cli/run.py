@@ -17,8 +17,8 @@ from kouxing.services.cli.running_system import announce, find_control
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.kinds import KINDS, available_addresses, more_workers, read_settings
-from kouxing.shared.config import COMMON, ServiceConfig, Settings, parse_assignments, variable
-from kouxing.shared.endpoints import WILDCARDS, split_endpoint
+from kouxing.shared.config import COMMON, Settings, parse_assignments, variable
+from kouxing.shared.endpoints import WILDCARDS, split_endpoint, with_host
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import control_endpoint
 from kouxing.shared.terminal import CONSOLE, command_name, print_message
@@ -70,12 +70,16 @@ def run(
     arguments = ["--config", str(config)] if config else []
     out = Path(driver.out)
     addresses = available_addresses(settings)
-    control = _control_address(settings, addresses)
+    bound_control = addresses.get(
+        variable("control", "control"), settings.load(ControlConfig).bound_control
+    )
+    control = _control_address(bound_control)
     environment = {
         **_assigned_environment(given),
         **head_environment(head or driver.head, out),
         **addresses,
         variable(COMMON, "control"): control,
+        variable("control", "control"): bound_control,
     }
     insecure = settings.load(ControlConfig).insecure
     client_control = control_endpoint(control, insecure=insecure)
@@ -151,15 +155,10 @@ def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
     return environment
 
 
-def _control_address(settings: Settings, moved: Mapping[str, str]) -> str:
+def _control_address(bound: str) -> str:
     """Return where services and clients of this machine find control."""
-    control = next(each for each in settings.describe(ServiceConfig) if each.key == "control")
-    commands = variable("control", "commands")
-    if commands not in moved and control.origin != "default":
-        return str(control.value)
-    address = moved.get(commands, settings.load(ControlConfig).commands)
-    host, port = split_endpoint(address, "control.commands")
-    return f"tcp://127.0.0.1:{port}" if host in WILDCARDS else address
+    host, _ = split_endpoint(bound, "control.control")
+    return with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
 
 
 def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str) -> Iterator[str]:
@@ -168,11 +167,11 @@ def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str
         str(each.value)
         for kind in KINDS.values()
         for each in settings.describe(kind.config_type)
-        if each.origin == "default" and variable(kind.name, each.key) in moved
+        if each.is_default and variable(kind.name, each.key) in moved
     ]
     if taken:
         yield f"taken by other programs: {', '.join(taken)}; free ports are used instead"
-    if variable("control", "commands") in moved:
+    if variable("control", "control") in moved:
         if running := find_control():
             where, _, _ = running.partition(" ")
             yield f"kouxing runs already, with control at {where}; this is one more"

@@ -7,14 +7,22 @@ from typing import Annotated
 from pydantic import Field
 
 from kouxing.shared.config import BoundEndpoint, ServiceConfig
-from kouxing.shared.endpoints import is_loopback, own_address, split_endpoint
+from kouxing.shared.endpoints import (
+    WILDCARDS,
+    is_address,
+    is_loopback,
+    own_address,
+    split_endpoint,
+    with_host,
+)
 
 
 class ControlConfig(ServiceConfig):
     """Control's own keys."""
 
-    commands: BoundEndpoint = "tcp://127.0.0.1:5550"
-    """Where control takes commands."""
+    control: BoundEndpoint = "tcp://127.0.0.1:5550"
+    """Address that control binds to take commands. For a host name, control binds every address of
+    this host."""
     events: BoundEndpoint = "tcp://127.0.0.1:5551"
     """Where control publishes events."""
     max_sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 64
@@ -27,7 +35,14 @@ class ControlConfig(ServiceConfig):
     """Seconds without heartbeat after which a service counts as lost."""
 
     @property
-    def own_host(self) -> str:
-        """The host at which all others find control, so that its events are found there, too."""
+    def bound_control(self) -> str:
+        """Endpoint that control binds."""
         host, _ = split_endpoint(self.control, "control")
-        return own_address() if is_loopback(host) else host
+        is_own = host in WILDCARDS or is_address(host) or is_loopback(host)
+        return self.control if is_own else with_host(self.control, "0.0.0.0")  # noqa: S104 - documented
+
+    @property
+    def own_host(self) -> str:
+        """Host by which others find control, and so its events."""
+        host, _ = split_endpoint(self.control, "control")
+        return own_address() if is_loopback(host) or host in WILDCARDS else host

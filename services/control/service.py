@@ -112,7 +112,7 @@ class ControlService(Service):
         self._observed: dict[str, Collection[str]] = {}  # sessions that observers follow meanwhile
         self._deferred: list[tuple[Handler, Request, Peer]] = []
         self._told_version = (0, 0)  # of the allowed keys
-        self._commands = self.bus.bind_router(config.commands, "control.commands", COMMANDS)
+        self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         own = self.key.public if self.key else ""
         self.endpoints = {

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from kouxing.shared.config import Form, ServiceConfig, Switch
+from kouxing.shared.config import Form, Switch
+from kouxing.shared.face.config import FaceConfig
 
 
 class Framing(StrEnum):
@@ -18,7 +19,7 @@ class Framing(StrEnum):
     MOUTH = "mouth"
 
 
-class DriverConfig(ServiceConfig):
+class DriverConfig(FaceConfig):
     """The driver's own keys."""
 
     view: Literal["auto", "window", "none"] = "auto"

@@ -9,43 +9,43 @@ from pydantic import AfterValidator
 
 from kouxing.services.gateway.connection_quota import ADDRESS_SHARE
 from kouxing.services.senders.target import parse_target
-from kouxing.shared.config import BoundHost, BoundPort, Form, ServiceConfig, Switch
+from kouxing.shared.config import BoundHost, BoundPort, Form, Switch, Texts
 from kouxing.shared.errors import UserError
+from kouxing.shared.face.config import FaceConfig
 
 _ORIGIN = re.compile(r"https?://[A-Za-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-fA-F:]+\](:\d{1,5})?")
 
 
-def _check_origins(value: str) -> str:
-    if not all(_ORIGIN.fullmatch(origin) for origin in value.split()):
+def _check_origins(values: tuple[str, ...]) -> tuple[str, ...]:
+    if not all(_ORIGIN.fullmatch(origin) for origin in values):
         raise ValueError
-    return value
+    return values
 
 
-def _check_targets(value: str) -> str:
+def _check_targets(values: tuple[str, ...]) -> tuple[str, ...]:
     try:
-        for url in value.split():
+        for url in values:
             parse_target(url)
     except UserError as error:
         raise ValueError(str(error)) from None
-    return value
+    return values
 
 
 Origins = Annotated[
-    str,
-    AfterValidator(_check_origins),
-    Form("origins such as https://example.org, separated by spaces", is_list=True),
+    Texts, AfterValidator(_check_origins), Form("a list of origins such as https://example.org")
 ]
 Targets = Annotated[
-    str,
+    Texts,
     AfterValidator(_check_targets),
-    Form("addresses such as vmc://127.0.0.1:39540, separated by spaces", is_list=True),
+    Form("a list of addresses such as vmc://127.0.0.1:39540"),
 ]
+Names = Annotated[Texts, Form("a list of host names")]
 
 
-class GatewayConfig(ServiceConfig):
+class GatewayConfig(FaceConfig):
     """Configuration keys of the gateway."""
 
-    safer: ClassVar[str] = (
+    safe_alternative: ClassVar[str] = (
         "bind a loopback address, serve https with gateway.certificate=kouxing.pem (the file is "
         "created), or serve plain http to a proxy with gateway.plain_http = true"
     )
@@ -65,13 +65,13 @@ class GatewayConfig(ServiceConfig):
     plain_http: Switch = False
     """Serve unencrypted http at an address that other machines can reach. Use it only behind a
     proxy that encrypts, or for a port that is published to this machine only."""
-    names: str = ""
-    """Other host names of the page, for example a proxy's, separated by spaces."""
-    allowed_origins: Origins = ""
+    names: Names = ()
+    """Other host names of the page, for example a proxy's."""
+    allowed_origins: Origins = ()
     """Origins of other pages that may connect to the page's sessions."""
-    frame_ancestors: Origins = ""
+    frame_ancestors: Origins = ()
     """Origins of other pages that may show this page in a frame."""
-    senders: Targets = ""
+    senders: Targets = ()
     """Programs to send the face to: vmc://, livelink://, osc:// and vts:// addresses, as for
     'kouxing send'."""
 

@@ -35,7 +35,7 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
     """
     host = config.advertise or (own_address() if config.host in WILDCARDS else config.host)
     token = config.token or (secrets.token_urlsafe(16) if config.is_encrypted else "")
-    names = {host, *local_host_names(), *config.names.split()}
+    names = {host, *local_host_names(), *config.names}
     tls = None
     if config.certificate:
         tls = tls_context(Path(config.certificate), [*sorted(names), "localhost", "127.0.0.1"])
@@ -48,6 +48,6 @@ def make_page_endpoint(config: GatewayConfig, port: int) -> PageEndpoint:
             or (not is_loopback(config.host) and is_address(name))
         ),
         token=token,
-        allowed_origins=config.allowed_origins.split(),
+        allowed_origins=config.allowed_origins,
     )
     return PageEndpoint(f"{'https' if tls else 'http'}://{address}/{fragment}", tls, access)

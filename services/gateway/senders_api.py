@@ -7,6 +7,7 @@ configuration. It cannot make the gateway send to arbitrary hosts.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
 
 import numpy as np
@@ -31,8 +32,8 @@ class SendersApi:
         Seed of the face's idle motion.
     """
 
-    def __init__(self, urls: str, idle_motion_seed: int) -> None:
-        self._configured = {url: parse_target(url) for url in urls.split()}
+    def __init__(self, urls: Iterable[str], idle_motion_seed: int) -> None:
+        self._configured = {url: parse_target(url) for url in urls}
         self._senders = Senders(idle_motion_seed, _log_problem)
         for target in self._configured.values():
             self._senders.start(target)

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from kouxing.shared.config import BoundEndpoint, ServiceConfig
-
-# Settings that suit an acoustic model and differ from the defaults below. Who chooses the model
-# has them, unless others are given.
-_SUITED: dict[str, dict[str, Any]] = {
-    name: {"num_stable_frames": 1, "min_confidence": 0.9} for name in ("neural", "gmm")
-}
+from kouxing.shared.config import BoundEndpoint, DefaultBy, ServiceConfig
 
 
 class RecognizerConfig(ServiceConfig):
@@ -29,15 +23,11 @@ class RecognizerConfig(ServiceConfig):
     look_ahead_ms: Annotated[float, Field(ge=0, le=300)] = 10.0
     """Future audio that the neural model, which runs beside blocks too, waits for, ms: 10, 30, 60,
     100, 200."""
-    num_stable_frames: Annotated[int, Field(ge=1, le=20)] = 2
-    """Frames that must agree before a phone is emitted (N of Li 2011, who has 3); 1 with neural
-    and gmm, unless another value is given."""
-    min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.95
-    """Confidence that each of those frames must reach; 0 is the rule of Li 2011; 0.9 with neural
-    and gmm, unless another value is given."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _suited(cls, values: dict[str, object]) -> dict[str, object]:
-        """Take the settings that suit the acoustic model, where none are given."""
-        return {**_SUITED.get(str(values.get("acoustic")), {}), **values}
+    num_stable_frames: Annotated[int, Field(ge=1, le=20)] = Field(
+        default_factory=DefaultBy("acoustic", {"neural": 1, "gmm": 1}, 2)
+    )
+    """Frames that must agree before a phone is emitted (N of Li 2011, who uses 3)."""
+    min_confidence: Annotated[float, Field(ge=0, le=1)] = Field(
+        default_factory=DefaultBy("acoustic", {"neural": 0.9, "gmm": 0.9}, 0.95)
+    )
+    """Confidence that each of these frames must reach; 0 is the rule of Li 2011."""

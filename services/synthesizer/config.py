@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from kouxing.shared.config import BoundEndpoint, ServiceConfig
+from kouxing.shared.config import BoundEndpoint, DefaultBy
+from kouxing.shared.face.config import FaceConfig
 from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 
 # Default delay of each lip model.
@@ -17,7 +18,7 @@ DELAYS_MS: dict[str, float] = {
 }
 
 
-class SynthesizerConfig(ServiceConfig):
+class SynthesizerConfig(FaceConfig):
     """The synthesizer's own keys."""
 
     phone_input: BoundEndpoint = "tcp://127.0.0.1:5570"
@@ -26,18 +27,12 @@ class SynthesizerConfig(ServiceConfig):
     """Where FAP frames are published."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
     """FAP frames per second."""
-    delay_ms: Annotated[float, Field(ge=0, le=300)] = DELAYS_MS[DEFAULT_LIP_MODEL]
-    """How much later than its sound a frame is made, in steps of 20 ms; 160 with dynamic-visemes
-    and ferguson, unless another value is given."""
     lips: LipModelName = DEFAULT_LIP_MODEL
     """Lip model: of recognised phones (dynamic-visemes), of the sound itself (learnt), or of one
     opening (ferguson)."""
+    delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(
+        default_factory=DefaultBy("lips", DELAYS_MS, DELAYS_MS[DEFAULT_LIP_MODEL])
+    )
+    """How much later than its audio a frame is made, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
     """How large the mouth's movements are; 1 for those of the lip model. Closures stay closed."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _delay_of_the_lips(cls, values: dict[str, object]) -> dict[str, object]:
-        """Without a delay, take the default of the lip model that was chosen."""
-        lips = str(values.get("lips", DEFAULT_LIP_MODEL))
-        return {"delay_ms": DELAYS_MS[lips], **values} if lips in DELAYS_MS else values

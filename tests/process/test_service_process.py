@@ -78,7 +78,7 @@ def test_ctrl_c_amid_the_imports_is_no_error(tmp_path: Path, module: str, slow_i
 
 @pytest.mark.parametrize(
     ("service", "key"),
-    [("control", "commands"), ("recognizer", "audio"), ("synthesizer", "phone_input")],
+    [("control", "control"), ("recognizer", "audio"), ("synthesizer", "phone_input")],
 )
 def test_a_port_in_use_is_named(service: str, key: str) -> None:
     with socket.socket() as taken:

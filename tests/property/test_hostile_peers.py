@@ -163,7 +163,7 @@ class PeersOfControl(Peers):
     @initialize()
     def start(self) -> None:
         config = ControlConfig(
-            commands=LOCAL, events=LOCAL, insecure=True, max_sessions=MAX_SESSIONS
+            control=LOCAL, events=LOCAL, insecure=True, max_sessions=MAX_SESSIONS
         )
         service = ControlService(config)
         self.service, self.router, self.publisher = service, service._commands, service._events

@@ -67,9 +67,10 @@ def test_a_service_understands_its_environment(name: str) -> None:
     assert not config.insecure
     assert config.metrics_port == ports(name)["metrics"]
     for key, bound in bound_keys(type(config)).items():
-        value = getattr(config, key)
+        value = getattr(config, "bound_control" if key == "control" else key)
         if bound is Bound.ENDPOINT:
-            assert value == f"tcp://0.0.0.0:{ports(name)[key.replace('_', '-')]}"
+            port = "commands" if key == "control" else key.replace("_", "-")
+            assert value == f"tcp://0.0.0.0:{ports(name)[port]}"
         elif bound is Bound.PORT:
             assert value == ports(name)["page"]
 

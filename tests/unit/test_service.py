@@ -302,7 +302,7 @@ def test_it_registers_where_something_else_answered_before(
     worker = Worker(commands)
     worker.endpoints = {"input": worker.input.endpoint}
     answer_handshake(listener, curve, rest)
-    config = ControlConfig(commands=commands, events="tcp://127.0.0.1:*", insecure=True)
+    config = ControlConfig(control=commands, events="tcp://127.0.0.1:*", insecure=True)
     control = ControlService(config)
     end_s = time.monotonic() + 30
     while worker.instance not in control._registry:
