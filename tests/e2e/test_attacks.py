@@ -46,44 +46,7 @@ def test_rejects_a_handshake_without_a_key(system: System, target: str, kind: st
         attackers.connected(port, kind, "127.0.2.1")
 
 
-<<<<<<< HEAD
 def test_survives_random_bytes_at_every_port(system: System, witness: Session) -> None:
-=======
-@pytest.mark.parametrize("attack", attackers.SESSIONS)
-def test_what_nobody_takes_is_bounded(system: System, witness: Session, attack: str) -> None:
-    memory = Memory(system.processes["synthesizer"].pid)
-    with LiveFace(system.control):
-        attackers.SESSIONS[attack](system.control, 4 * SECONDS)
-    assert memory.growth_mb < MAX_GROWTH_MB
-    assert memory.wait_until_kept(MAX_KEPT_MB), memory.kept_mb
-
-
-@pytest.fixture
-def few_files(tmp_path: Path) -> Iterator[System]:
-    """A system started where a process may open no more files than it needs, and raise that."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
-    try:
-        running = System(("control", "recognizer", "synthesizer"), tmp_path, insecure=True)
-        running.__enter__()
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    with contextlib.closing(contextlib.ExitStack()) as stack:
-        stack.push(running)
-        yield running
-
-
-def test_with_very_many_connections_sessions_still_open(few_files: System) -> None:
-    with contextlib.ExitStack() as held:
-        for service, key in (("control", "CONTROL"), ("recognizer", "AUDIO")):
-            port = int(few_files.environment[f"KOUXING_{service.upper()}_{key}"].rpartition(":")[2])
-            held.enter_context(attackers.many_connections(port, MAX_CONNECTIONS + 200))
-        assert stream(few_files.control, np.zeros(3200, np.float32)).ended
-    few_files.assert_all_alive()
-
-
-def test_raw_bytes_at_every_port_harm_nobody(system: System, witness: Session) -> None:
->>>>>>> f67f9ac (One key per address, real lists, and defaults that depend on another key)
     for port in system.ports:
         pour(port, SECONDS / 4)
     system.assert_all_alive()
