@@ -1,7 +1,7 @@
-"""The training set: recordings with features, phones and weights, and the rule which may be used.
+"""The training set: recordings with features, phones and weights.
 
-Corpora are unbalanced: one speaker reads words for three hours, thirty others read one sentence
-each, and a synthesiser makes any amount. The weight of a recording in the estimates is
+Corpora are unbalanced. One speaker reads words for three hours, thirty others read one sentence
+each, and a synthesizer makes any amount. The weight of a recording is
 
     w = clip(sqrt(30 min / minutes of its speaker), 0.3, 3) * (synthetic_weight if synthetic)
 """
@@ -30,12 +30,12 @@ from kouxing.services.recognizer.front_end.features import HOP_SAMPLES, WINDOW_S
 from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training import SYNTHETIC_WEIGHT
 
-MAX_WORD_PHONES = 8  # a recording with no more phones is a word, not connected speech
+MAX_WORD_PHONES = 8  # a recording with more phones is connected speech
 FRAMES_PER_MINUTE = 6000
 _NEUTRAL_MINUTES = 30.0  # a speaker with this much speech has weight 1
 _MIN_WEIGHT, _MAX_WEIGHT = 0.3, 3.0
 _MIN_FRAMES_PER_PHONE = 3
-_MARGIN_FRAMES = 25  # silence left at both ends
+_MARGIN_FRAMES = 25  # silence that is kept at both ends
 _MIN_PIECE_FRAMES = 20  # shorter recordings without text are skipped
 _MAX_PIECE_FRAMES = 2000  # longer recordings without text are cut
 
@@ -53,9 +53,11 @@ class Example:
     samples: NDArray[np.int16] | None = None  # (n,) 16 kHz, the samples of the frames
 
     @property
-    def is_word(self) -> bool:
-        """Whether this is a word or a syllable alone instead of connected speech."""
-        return len(self.phones) <= MAX_WORD_PHONES
+    def kind(self) -> str:
+        """The kind of speech: ``sentence``, ``word`` or ``synthetic``."""
+        if is_synthetic(self.licence):
+            return "synthetic"
+        return "word" if len(self.phones) <= MAX_WORD_PHONES else "sentence"
 
 
 def load_examples(
@@ -68,7 +70,7 @@ def load_examples(
     synthetic_weight: float = SYNTHETIC_WEIGHT,
     with_samples: bool = False,
 ) -> list[Example]:
-    """Read corpora with their log-mel features, computed or cached, and weight the recordings.
+    """Read the recordings of one split, with their log-mel features and weights.
 
     Parameters
     ----------
@@ -81,11 +83,11 @@ def load_examples(
     split
         Split to read.
     shipping
-        Leave out rows whose licence forbids giving the model away.
+        Exclude rows whose license does not allow distributing the model.
     synthetic_weight
         Weight of synthetic relative to real speech.
     with_samples
-        Load the samples too.
+        Also load the samples.
 
     Raises
     ------
@@ -131,15 +133,18 @@ def load_examples(
 
 
 def _shippable(rows: Sequence[Utterance], errors: RowErrors) -> list[Utterance]:
-    """Drop the rows whose licence forbids giving the model away."""
+    """Drop the rows whose license does not allow distributing the model."""
     for row in rows:
         if not may_ship(row.licence):
-            errors.add(row.utterance_id, f"its licence ({row.licence or 'none'}) is not free")
+            errors.add(
+                row.utterance_id,
+                f"its license ({row.licence or 'none'}) does not allow distributing a model",
+            )
     return [row for row in rows if may_ship(row.licence)]
 
 
 def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[float]:
-    """Weight the recordings by the formula above."""
+    """Compute the weights with the formula above."""
     minutes: dict[str, float] = defaultdict(float)
     for utterance in utterances:
         minutes[utterance.speaker] += utterance.seconds / 60
@@ -152,7 +157,7 @@ def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[f
 
 
 def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArray[np.int16]]:
-    """Read recordings without text, in any language, but not those kept back.
+    """Read recordings without text, in any language, except those held out for measuring.
 
     Parameters
     ----------
@@ -164,12 +169,12 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
     Returns
     -------
     list
-        Samples at 16 kHz without the long silence at both ends, in pieces of up to 20 s.
+        Samples at 16 kHz, trimmed and cut into pieces of up to 20 s.
 
     Raises
     ------
     UserError
-        If a folder holds no audio files, or none of them can be used.
+        If a folder contains no audio files, or none of them can be used.
     """
     pieces = []
     for folder in folders:
@@ -205,7 +210,7 @@ def _file_without_text(path: Path) -> Utterance:
 
 
 def speech_span(log_mel: NDArray[np.float16]) -> slice:
-    """Find the frames between the silence at both ends; a quarter of a second of it stays."""
+    """Find the frames from a quarter of a second before the speech to as long after it."""
     log_energy = np.asarray(log_mel[:, 0], dtype=np.float32)
     low, high = np.percentile(log_energy, [5, 95])
     loud = np.flatnonzero(log_energy >= low + 0.3 * (high - low))
@@ -213,6 +218,6 @@ def speech_span(log_mel: NDArray[np.float16]) -> slice:
 
 
 def _samples_of(span: slice, num_frames: int) -> slice:
-    """Find the samples that the first ``num_frames`` frames of a span are computed from."""
+    """Return the range of samples behind the first ``num_frames`` frames of a span."""
     first = HOP_SAMPLES * span.start
     return slice(first, first + HOP_SAMPLES * (num_frames - 1) + WINDOW_SAMPLES)

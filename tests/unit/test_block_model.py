@@ -19,6 +19,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import onnx_of
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout, layout
+from kouxing.training.blocks.readout import READOUT
 from kouxing.training.neural.network import Shape
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
@@ -44,7 +45,7 @@ def networks(num_states: int = 180) -> tuple[BlockEncoder, BlockReadout]:
         for name, weight in encoder.named_parameters():
             if name.endswith("query_key_value.weight"):
                 weight.mul_(2)
-    return encoder, BlockReadout(96, num_states).eval()
+    return encoder, BlockReadout(96, num_states, READOUT).eval()
 
 
 @cache
@@ -255,7 +256,7 @@ def test_files_are_checked(tmp_path: Path) -> None:
     blocks().save(path)
     arrays = read_archive(path).arrays
     encoder, _ = networks()
-    broken = BlockReadout(96, 180).eval()
+    broken = BlockReadout(96, 180, READOUT).eval()
     with torch.no_grad():
         broken.output.bias[3] = float("nan")
     changes: list[tuple[dict[str, np.ndarray], str]] = [

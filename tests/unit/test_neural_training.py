@@ -31,9 +31,10 @@ from kouxing.training.neural.augmentation import (
 from kouxing.training.neural.batches import Recording, Targets, augment, batches_of
 from kouxing.training.neural.export import network_of, onnx_of
 from kouxing.training.neural.network import Network, Shape, output_frames
+from kouxing.training.neural.optimizer import cross_entropy
 from kouxing.training.neural.recipe import train_neural
 from kouxing.training.neural.scoring import first_hypothesis_error_rate, log_posteriors_of
-from kouxing.training.neural.trainer import Trainer, cross_entropy, shift_targets
+from kouxing.training.neural.trainer import Trainer, shift_targets
 from kouxing.training.neural.whisper_weights import load_whisper
 from kouxing.training.training_set import load_examples, load_untranscribed
 from tests.languages import MANDARIN, SIL
@@ -580,12 +581,12 @@ def test_the_recipe_writes_model_card_and_curves(
     assert "step 5: realigned" in lines
     assert lines.count("1 of 1 recordings aligned") == 2
     assert "1 of 1 recordings encoded for the teacher" in lines
-    assert "1 of 1 recordings labelled by the teacher" in lines
+    assert "1 of 1 recordings labeled by the teacher" in lines
     assert sum("teacher, step" in line for line in lines) == 5
     card = output.with_suffix(".md").read_text()
     assert "CC0-1.0" in card
     assert "Whisper's weights (Radford et al. 2023, MIT licence)" in card
-    assert "taught by a readout of Whisper's whole encoder." in card
+    assert "with a readout of Whisper's whole encoder as the teacher." in card
     assert output.with_suffix(".png").stat().st_size > 1000
 
 
@@ -641,13 +642,13 @@ def test_the_teacher_labels_recordings_without_text(
             assert one.weight * len(one.targets) == pytest.approx(mix)
     for first, again in zip(*learnt, strict=True):
         np.testing.assert_array_equal(first.targets.states[:, 1:], again.targets.states[:, 1:])
-    assert "2 of 2 recordings labelled by the teacher" in lines
+    assert "2 of 2 recordings labeled by the teacher" in lines
     assert "1 rows skipped" in lines
     assert "also on 0.0 minutes without text" in output.with_suffix(".md").read_text()
     train(tmp_path / "further.npz", whisper=whisper, start=output, num_steps=1, report=lines.append)
     card = (tmp_path / "further.md").read_text()
     assert "started with `neural.npz`" in card
-    assert "taught by" in card
+    assert "as the teacher" in card
 
 
 def test_recordings_without_text_are_trimmed_and_cut(tmp_path: Path) -> None:
@@ -709,7 +710,7 @@ def test_the_same_seed_gives_the_same_model_and_it_learns_further(
         torch.testing.assert_close(new[name], weights, atol=0.02, rtol=0.05)
     card = further.with_suffix(".md").read_text()
     assert "started with `first.npz`" in card
-    assert "aligned by the same" in card
+    assert "aligned by the same model" in card
     np.testing.assert_array_equal(after.topology.phone_lm.phone, shipped_phone_lm().phone)
     assert len(before.topology.phone_lm.phone) < len(shipped_phone_lm().phone)
 
@@ -718,7 +719,7 @@ def test_training_needs_a_start(corpus: Path, tmp_path: Path) -> None:
     train = partial(train_neural, [corpus], tmp_path / "n.npz", aligner=model_path("gmm"))
     with pytest.raises(UserError, match="give --whisper, --start-from or both"):
         train(num_threads=1)
-    with pytest.raises(UserError, match="what --untranscribed names: give --whisper too"):
+    with pytest.raises(UserError, match="need a teacher; also give --whisper"):
         train(num_threads=1, start=model_path("gmm"), untranscribed=[corpus])
     with pytest.raises(UserError, match="give --aligner or --start-from"):
         train(aligner=None, num_threads=1, whisper=tmp_path)

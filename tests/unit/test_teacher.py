@@ -17,7 +17,7 @@ from kouxing.training.neural.network import Shape
 from kouxing.training.neural.teacher import (
     Teacher,
     WholeEncoder,
-    centred_mel,
+    centered_mel,
     process_all,
     train_teacher,
 )
@@ -44,7 +44,7 @@ def test_bands_are_whispers() -> None:
     """Frame 30 against its definition; the floor lies eight decades below the loudest band."""
     samples = np.zeros(16_000, np.float32)
     samples[:8000] = np.random.default_rng(0).normal(0, 0.1, 8000)
-    bands = centred_mel(samples).numpy()
+    bands = centered_mel(samples).numpy()
     assert bands.shape == (NUM_MELS, 100)
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(400) / 400)
     power = np.abs(np.fft.rfft(window * samples[30 * 160 - 200 : 30 * 160 + 200])) ** 2

@@ -243,7 +243,7 @@ def test_weights_and_licence_filter(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no usable recordings of split 'test'"):
         load_examples([tmp_path], RowErrors(), MANDARIN, split="test")
     write_corpus(tmp_path, ["b\t1.wav\tB\tx\tCC BY-NC\ttrain\t1.25\t你好\tni3 hao3"])
-    with pytest.raises(UserError, match=r"last of them: b: its licence \(CC BY-NC\)"):
+    with pytest.raises(UserError, match=r"last of them: b: its license \(CC BY-NC\)"):
         load_examples([tmp_path], RowErrors(), MANDARIN)
 
 

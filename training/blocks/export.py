@@ -1,8 +1,8 @@
-"""Write the block network as ONNX, which the recognizer runs one block at a time.
+"""Export the block network to ONNX; the recognizer runs it one block at a time.
 
-The graph computes :class:`training.blocks.network.BlockEncoder` and its readout for the block and
-the right context of several sessions. All have room for ``B + R`` positions; a session has fewer
-where its speech begins and ends.
+The graph computes :class:`kouxing.training.blocks.network.BlockEncoder` and its readout for a block
+and its right context, for several sessions. Each has room for ``B + R`` positions, and fewer
+positions where its speech starts and ends.
 
 =============== ================================================== =============================
 symbol          meaning                                            shape
@@ -10,7 +10,7 @@ symbol          meaning                                            shape
 frames          log-mel frames, oldest first, two before the first (sessions, 2 (B + R) + 3, 80)
                 position's
 positions       rows of the table of positions                     (sessions, B + R, width)
-num_positions   positions that there are, 1 or more                (sessions,)
+num_positions   number of positions, 1 or more                     (sessions,)
 num_cached      positions in the caches                            (sessions,)
 state           state of the recurrent layer before the block      (sessions, GRU's width)
 keys_l,         of the positions before the block, for each layer; (sessions, heads, PAST, size)
@@ -21,13 +21,14 @@ new             keys and values of the block, in the order of the  (sessions, 2 
                 inputs, 16-bit floats                              B, size)
 =============== ================================================== =============================
 
-Products are of 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`); norms, attention and the
-recurrent layer are floats. A product with a single row may be summed in another order than
-one with more. The recurrent layer has a row for each session, so it gets the first session's once
-more.
+Products use 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`). Norms, attention and the
+recurrent layer use floats. onnxruntime may sum a product with a single row in another order. The
+recurrent layer has one row for each session, so the first session's row is repeated.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +36,8 @@ from onnx import TensorProto, helper
 
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.training.blocks.network import PAST, RIGHT_CONTEXT, BlockEncoder, BlockReadout
-from kouxing.training.blocks.readout import MAX_DEVIATIONS
 from kouxing.training.neural.onnx_graph import DOMAIN, Floats, Graph, arrays_of, floats, halves
+from kouxing.training.neural.readout import MAX_DEVIATIONS
 from kouxing.training.neural.teacher import KEPT_LAYERS
 
 _KINDS = ("keys", "values")
@@ -49,7 +50,7 @@ def onnx_of(
     right_context: int = RIGHT_CONTEXT,
     past: int = PAST,
 ) -> NDArray[np.uint8]:
-    """Export a network: return the bytes of an ONNX file, its inputs and outputs as above.
+    """Export a network as the bytes of an ONNX file with the inputs and outputs above.
 
     Parameters
     ----------
@@ -118,31 +119,22 @@ class _BlockGraph(Graph):
         mask = self._mask()
         after = []
         for number in range(self._shape.layers):
-            hidden = self._layer(number, hidden, mask)
+            attend = partial(self._attention, number, mask)
+            hidden = self.layer(hidden, self._encoder, f"layers.{number}", attend)
             after.append(hidden)
         return self.node("Concat", [after[place] for place in KEPT_LAYERS], axis=-1)
 
     def _mask(self) -> str:
-        """Return what is added to products with keys: the cached ones, then the block's."""
+        """Return the attention mask: of the cached positions, then of the block's."""
         parts = []
-        for name, most in (("num_cached", self._past), ("num_positions", self._length)):
+        for name, limit in (("num_cached", self._past), ("num_positions", self._length)):
             count = self.node("Unsqueeze", [name, self.integers("three_axes", 1, 2, 3)])
-            there = self.node("Less", [self.integers(f"{name}.places", *range(most)), count])
+            there = self.node("Less", [self.integers(f"{name}.places", *range(limit)), count])
             limits = [self.number("may", 0.0), self.number("may_not", -np.inf)]
             parts.append(self.node("Where", [there, *limits]))
         return self.node("Concat", parts, axis=-1)
 
-    def _layer(self, number: int, hidden: str, mask: str) -> str:
-        name, parameters = f"layers.{number}", self._encoder
-        normed = self.norm(hidden, parameters, f"{name}.attention_norm")
-        joint = self.product(normed, parameters, f"{name}.query_key_value")
-        seen = self._attention(number, joint, mask)
-        hidden = self.node("Add", [hidden, self.product(seen, parameters, f"{name}.attended")])
-        normed = self.norm(hidden, parameters, f"{name}.inner_norm")
-        inner = self.node("Gelu", [self.product(normed, parameters, f"{name}.inner")])
-        return self.node("Add", [hidden, self.product(inner, parameters, f"{name}.outer")])
-
-    def _attention(self, number: int, joint: str, mask: str) -> str:
+    def _attention(self, number: int, mask: str, joint: str) -> str:
         """Attend to the cached positions and to the block's, (rows, width)."""
         heads, size, width = self._shape.heads, self._size, self._shape.width
         name = f"layers.{number}"
@@ -153,8 +145,8 @@ class _BlockGraph(Graph):
             for part in parts
         )
         ends = [self.integers("zero", 0), self.integers("block", self._block)]
-        for each in (key, value):
-            of_block = self.node("Slice", [each, *ends, self.integers("place_axis", 2)])
+        for values in (key, value):
+            of_block = self.node("Slice", [values, *ends, self.integers("place_axis", 2)])
             self._new.append(self.node("Unsqueeze", [of_block, self.integers("ring_axis", 1)]))
         old_keys, old_values = (self.floats_of(f"{kind}_{number}") for kind in _KINDS)
         products = [
@@ -199,14 +191,14 @@ class _BlockGraph(Graph):
         of_sessions = self.node("Reshape", [inner, by_session])
         in_order = self.node("Transpose", [of_sessions], perm=[1, 0, 2])
         zero, one = self.integers("zero", 0), self.integers("one_row", 1)
-        one_more = []  # row: the first session's again
-        for each, axis in ((in_order, 1), ("num_positions", 0), ("state", 0)):
-            first = self.node("Slice", [each, zero, one, self.integers(f"axis_{axis}", axis)])
-            one_more.append(self.node("Concat", [each, first], axis=axis))
-        inputs, num_positions, state = one_more
+        repeated = []  # with the first session's row once more
+        for values, axis in ((in_order, 1), ("num_positions", 0), ("state", 0)):
+            first = self.node("Slice", [values, zero, one, self.integers(f"axis_{axis}", axis)])
+            repeated.append(self.node("Concat", [values, first], axis=axis))
+        inputs, num_positions, state = repeated
         counts = self.node("Cast", [num_positions], to=TensorProto.INT32)
         nothing = self.node("Mul", [state, self.number("nothing", 0.0)])
-        directions = [self.node("Unsqueeze", [each, zero]) for each in (state, nothing)]
+        directions = [self.node("Unsqueeze", [start, zero]) for start in (state, nothing)]
         states = self.node("Concat", directions, axis=0)
         context = self.node(
             "GRU",
@@ -239,6 +231,6 @@ class _BlockGraph(Graph):
 
 
 def _gates(stacked: Floats) -> Floats:
-    """PyTorch's gates reset, update, new in ONNX's order: update, reset, new."""
+    """Reorder PyTorch's gates (reset, update, new) for ONNX (update, reset, new)."""
     reset, update, new = np.split(stacked, 3)
     return np.concatenate([update, reset, new])

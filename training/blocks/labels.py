@@ -1,8 +1,8 @@
-"""Target states of all recordings, from the alignment and from the teacher, kept in a file.
+"""Target states of all recordings, from the alignment and from the teacher, stored in a file.
 
-The model that ships aligns the recordings that have a text. The teacher
-(:mod:`training.neural.teacher`) learns this alignment and labels all recordings, heard whole and
-clean. A target is the average of alignment and teacher; without a text it is the teacher's.
+The shipped model aligns the recordings that have a text. The teacher
+(:mod:`kouxing.training.neural.teacher`) learns this alignment and labels all recordings, clean and
+whole. A target is the average of both, or only the teacher's label if there is no text.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.training.neural.alignment import align_all, aligner_scores
 from kouxing.training.neural.batches import Recording, Targets
@@ -23,14 +23,14 @@ from kouxing.training.neural.teacher import WholeEncoder, process_all, train_tea
 from kouxing.training.progress import Report
 from kouxing.training.training_set import FRAMES_PER_MINUTE, Example, load_untranscribed
 
-_FULL_FOLDER_MINUTES = 35  # a folder with more counts no more
+_FULL_FOLDER_MINUTES = 35  # longer folders get the weight of this much speech
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Draw:
-    """How much of each kind of speech is drawn, and the share that it has in training."""
+    """How much of each kind of speech is drawn, and its share in training."""
 
-    kinds: Mapping[str, tuple[float, int]]  # share, and the most recordings
+    kinds: Mapping[str, tuple[float, int]]  # share, and maximum number of recordings
     untranscribed_share: float
     max_untranscribed: int  # pieces of each folder
 
@@ -46,7 +46,7 @@ def label(
     seed: int,
     report: Report,
 ) -> list[Recording]:
-    """Align and label recordings; of each kind at most some, drawn at random.
+    """Align and label a random selection of recordings.
 
     Parameters
     ----------
@@ -55,23 +55,23 @@ def label(
     untranscribed
         Folders of recordings without text.
     draw
-        Of both.
+        How much to draw of both.
     aligner
         A model of the examples' language.
     encoder
-        Whisper's, for the teacher.
+        Whisper's encoder, for the teacher.
     errors
         Receives a message for every file that cannot be used.
     seed
-        Of the draw, and of the teacher's training.
+        Seed of the draw and of the teacher's training.
     report
         Receives lines of progress.
     """
     rng = np.random.default_rng(seed)
     drawn: list[Example] = []
-    for kind, (_, most) in draw.kinds.items():
-        of_kind = [example for example in examples if _kind(example) == kind]
-        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:most]]
+    for kind, (_, limit) in draw.kinds.items():
+        of_kind = [example for example in examples if example.kind == kind]
+        drawn += [of_kind[place] for place in rng.permutation(len(of_kind))[:limit]]
     folders: list[list[NDArray[np.int16]]] = []
     for folder in untranscribed:
         pieces = load_untranscribed([folder], errors)
@@ -81,10 +81,10 @@ def label(
     aligned = align_all(aligner_scores(aligner, drawn), aligner.topology, drawn, report)
     frames = dict.fromkeys(draw.kinds, 0.0)
     for one in aligned:
-        frames[_kind(one.example)] += one.example.weight * len(one.states)
+        frames[one.example.kind] += one.example.weight * len(one.states)
     recordings = []
     for one in aligned:
-        kind = _kind(one.example)
+        kind = one.example.kind
         weight = draw.kinds[kind][0] * one.example.weight * len(one.states) / frames[kind]
         targets = Targets.hard(one.states)
         recordings.append(
@@ -95,8 +95,8 @@ def label(
         *(recording.samples for recording in recordings),
         *(sound for sounds in folders for sound in sounds),
     ]
-    labels = process_all(teacher.targets_of, all_sounds, "labelled by the teacher", report)
-    labelled = [
+    labels = process_all(teacher.targets_of, all_sounds, "labeled by the teacher", report)
+    labeled = [
         Recording(
             samples=recording.samples,
             targets=recording.targets.averaged_with(targets),
@@ -111,18 +111,12 @@ def label(
     for pairs, size, count in zip(of_folders, sizes, counted, strict=True):
         for sound, targets in pairs:
             weight = draw.untranscribed_share * count / sum(counted) * len(targets) / size
-            labelled.append(Recording(samples=sound, targets=targets, weight=weight))
-    return labelled
-
-
-def _kind(example: Example) -> str:
-    if is_synthetic(example.licence):
-        return "synthetic"
-    return "word" if example.is_word else "sentence"
+            labeled.append(Recording(samples=sound, targets=targets, weight=weight))
+    return labeled
 
 
 def save_labels(path: Path, recordings: Sequence[Recording]) -> None:
-    """Write labelled recordings, so that training can go on with them later."""
+    """Write labeled recordings, so that training can resume."""
     width = max(recording.targets.states.shape[1] for recording in recordings)
 
     def padded(rows: NDArray[np.generic]) -> NDArray[np.generic]:
@@ -140,7 +134,7 @@ def save_labels(path: Path, recordings: Sequence[Recording]) -> None:
 
 
 def load_labels(path: Path) -> list[Recording]:
-    """Read what :func:`save_labels` has written."""
+    """Read a file of :func:`save_labels`."""
     with np.load(path, allow_pickle=False) as file:
         kept = {name: file[name] for name in file.files}
     samples = np.split(kept["samples"], np.cumsum(kept["num_samples"])[:-1])

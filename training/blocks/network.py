@@ -8,14 +8,15 @@ memory RNNs for distant speech recognition" (a recurrent layer whose backward di
 few positions after its block); Cho et al. 2014, "Learning phrase representations using RNN
 encoder-decoder for statistical machine translation" (the GRU).
 
-A recording's positions come in blocks of ``B``. The positions of a block and ``R`` positions after
-it, its right context, attend to each other and to the ``PAST`` positions before the block, in all
-layers. Live, a block is computed at once with its right context; keys and values of its own
-positions are kept, and the right context is computed anew as a part of later blocks. For training,
-all blocks of a recording are computed together: its positions, then a copy of each block's right
-context, with a mask that lets each attend to what it may. Both compute the same. The outputs of a
-block's own positions are settled, those of its right context provisional. The network does not
-depend on ``B``, so another one can be used live than in training.
+A recording's positions form blocks of ``B``. A block and the ``R`` positions after it, its right
+context, attend to each other and to the ``PAST`` positions before the block, in all layers. Live, a
+block is computed together with its right context. Keys and values of the block's own positions are
+cached. The right context is computed again as a part of later blocks.
+
+For training, all blocks of a recording are computed at once: first its positions, then a copy of
+each block's right context, with an attention mask. Both ways give the same results. Outputs of a
+block's own positions are final, those of its right context provisional. The network does not depend
+on ``B``, so live use may choose another ``B`` than training.
 
     z = clip((concat(h_4, h_5, h_6) - mean) / deviation, -6, 6)
     a = gelu(W z)
@@ -24,20 +25,19 @@ depend on ``B``, so another one can be used live than in training.
 ======== ================================================================ =====================
 symbol   meaning                                                          shape
 ======== ================================================================ =====================
-x        log-mel frames; two of zeros stand before the first              (batch, frames, 80)
+x        log-mel frames; two frames of zeros precede the first            (batch, frames, 80)
 h_l      positions after layer l                                          (batch, n, width)
 R        right context, positions; a recording's last blocks have less    1
 n        positions, and copies of right contexts                          1
-a        input of the recurrent layer; it runs forwards over all blocks   (batch, n, 320)
-         and, from the block's end, over its right context; backwards
-         over the right context and then the block
+a        input of the recurrent layer. It runs forward over all blocks    (batch, n, 320)
+         and, from a block's end, over its right context. It runs
+         backward over the right context and then the block.
 y        log posteriors of the states at the frames 2 p and 2 p + 1       (batch, n, 2, states)
          of position p
 ======== ================================================================ =====================
 
-Position ``p`` has seen the frames up to ``2 p + 2``. So a block that begins with position ``p``
-needs the frames up to ``2 (p + B + R)``. No band lies deeper than eight decades below the loudest
-one so far.
+Position ``p`` has seen the frames up to ``2 p + 2``, so a block that starts at position ``p`` needs
+the frames up to ``2 (p + B + R)``. Bands are floored at eight decades below the loudest one so far.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS
-from kouxing.training.blocks.readout import Readout
 from kouxing.training.neural.network import PADDING_FRAMES, Encoder, Shape
+from kouxing.training.neural.readout import Readout
 from kouxing.training.neural.teacher import KEPT_LAYERS
 
 RIGHT_CONTEXT = 10  # positions, 200 ms
@@ -63,7 +63,7 @@ _GRU_WEIGHTS = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The positions that are computed for a recording, and what each may attend to."""
+    """The positions that are computed for a recording, and their attention mask."""
 
     num_positions: int  # of the recording
     places: Tensor  # (n,) in the recording: all positions, then each block's right context
@@ -127,7 +127,7 @@ class BlockEncoder(Encoder):
 
 
 class BlockReadout(Readout):
-    """Computes the posteriors of the states; the backward direction begins anew in each block."""
+    """A readout whose backward direction restarts in each block."""
 
     def read(self, features: Tensor, laid: Layout) -> Tensor:
         """Compute log posteriors: (batch, n, features) to (batch, n, 2, states)."""
@@ -154,7 +154,7 @@ class BlockReadout(Readout):
         return outputs
 
     def _backwards(self, of_blocks: Tensor, laid: Layout) -> Tensor:
-        """Run over each right context and its block, from their end: (batch, n, width)."""
+        """Run backward over each right context and its block: (batch, n, width)."""
         weights = [getattr(self.gru, f"{kind}_l0_reverse") for kind in _GRU_WEIGHTS]
         state = of_blocks.new_zeros(
             of_blocks[:, :, 0].numel() // of_blocks.shape[-1], self.gru.hidden_size

@@ -1,12 +1,12 @@
 """From corpora to the block model: labels, readout, tuned encoder, model card.
 
-HMMs, phone language model, the states' prior and the acoustic scale are those of a neural model
-made before, which also aligns the recordings with their texts. A first readout is learnt of
-Whisper's encoder as it is, on windows. Then encoder and readout are tuned in blocks.
+A trained neural model supplies HMMs, phone language model, state prior and acoustic scale, and
+aligns the recordings with their texts. First a readout is trained on windows of Whisper's unchanged
+encoder. Then encoder and readout are tuned in blocks.
 
-The training can be interrupted: labels, readout and network are kept beside the output, as
-``.labels.npz``, ``.readout.pt`` and ``.network.pt``, and the same command goes on from them. They
-are deleted at the end.
+Training can be interrupted. Labels and checkpoints are stored next to the output, as
+``.labels.npz``, ``.readout.pt`` and ``.network.pt``. The same command resumes from them, and
+deletes them at the end.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from kouxing.training.blocks.labels import Draw, label, load_labels, save_labels
 from kouxing.training.blocks.network import BlockEncoder, BlockReadout
 from kouxing.training.blocks.readout import train_readout
 from kouxing.training.blocks.trainer import BlockNetwork, train_network
-from kouxing.training.blocks.window_features import encode_by
 from kouxing.training.model_card import write_card
 from kouxing.training.neural.initial_network import init_encoder
 from kouxing.training.neural.whisper_weights import load_whisper
@@ -37,7 +36,7 @@ from kouxing.training.training_set import FRAMES_PER_MINUTE, load_examples
 
 NUM_READOUT_STEPS, NUM_STEPS = 450, 475
 BLOCK_LENGTH = 5  # positions, live
-_PHONE_PENALTY = 2.0  # most of the network's errors are phones that it leaves out
+_PHONE_PENALTY = 2.0  # most of the network's errors are deletions
 
 _DRAW = Draw(
     kinds={"sentence": (0.20, 400), "word": (0.04, 150), "synthetic": (0.04, 450)},
@@ -64,37 +63,36 @@ def train_blocks(
     Parameters
     ----------
     corpora
-        Folders that :func:`corpora.speech_corpus.read_corpus` reads; splits ``train`` and ``dev``.
+        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads; splits ``train`` and
+        ``dev``.
     output
-        The ``.npz`` file to write; the card is written beside it as ``.md``.
+        The ``.npz`` file to write; the card gets the suffix ``.md``.
     whisper
-        Folder with Whisper base, see :func:`kouxing.training.neural.whisper_weights.load_whisper`.
+        Folder with Whisper base, see :mod:`kouxing.training.neural.whisper_weights`.
     start
-        A neural model: its HMMs, phone language model, prior and weights are taken over; it aligns.
-        Without it, that is the model that ships.
+        Neural model that aligns, and whose HMMs, phone language model and prior are used. Without
+        it, the shipped one.
     untranscribed
-        Folders of recordings in any language, which the teacher labels. Their licences are
-        unknown: name only folders that may be used.
+        Folders of recordings in any language, which the teacher labels. Their licenses are
+        unknown, so name only folders that may be used.
     seed
-        Of the draw of recordings, new weights, excerpts and disturbances.
-    num_readout_steps
-        Number of batches of 70 s that the readout of the untouched encoder learns from.
-    num_steps
-        Number of batches that encoder and readout are tuned on.
+        Seed of the draw of recordings, new weights, excerpts and disturbances.
+    num_readout_steps, num_steps
+        Number of batches for the first readout, and for tuning.
     shipping
-        Leave out rows whose licence forbids giving the model away.
+        Exclude rows whose license does not allow distributing the model.
     report
         Receives lines of progress.
 
     Raises
     ------
     UserError
-        If there is nothing to train on, ``start`` is no neural model, or a file cannot be read.
+        If there is nothing to train on, ``start`` is not a neural model, or a file cannot be read.
     """
     start = start or NEURAL_PATH
     before = load_model(start)
     if not isinstance(before, NeuralModel):
-        raise UserError(f"{start} is no neural model; give one that 'kouxing train neural' made")
+        raise UserError(f"{start} is not a neural model; give one that 'kouxing train neural' made")
     torch.set_num_threads(1)  # the same sums on every machine
     torch.manual_seed(seed)
     whole = init_encoder(whisper, before.topology.num_states).eval()
@@ -102,11 +100,11 @@ def train_blocks(
     examples = load_examples(
         corpora, errors, before.inventory, shipping=shipping, with_samples=True
     )
-    labels, readout_state, network_state = kept = [
+    labels, readout_state, network_state = stored = [
         output.with_suffix(suffix) for suffix in (".labels.npz", ".readout.pt", ".network.pt")
     ]
     if not labels.exists():
-        labelled = label(
+        labeled = label(
             examples,
             untranscribed,
             draw=_DRAW,
@@ -116,20 +114,20 @@ def train_blocks(
             seed=seed,
             report=report,
         )
-        save_labels(labels, labelled)
+        save_labels(labels, labeled)
     recordings = load_labels(labels)
     first = train_readout(
-        encode_by(whole),
+        whole,
         recordings,
         before.topology.num_states,
         seed=seed,
         num_steps=num_readout_steps,
-        kept=readout_state,
+        checkpoint=readout_state,
         report=report,
     )
     encoder = BlockEncoder(whole.shape)
     load_whisper(encoder, whisper)
-    readout = BlockReadout(len(first.mean), encoder.shape.num_states)
+    readout = BlockReadout(len(first.mean), encoder.shape.num_states, first.shape)
     readout.load_state_dict(first.state_dict())
     network = train_network(
         BlockNetwork(encoder, readout),
@@ -137,7 +135,7 @@ def train_blocks(
         recordings,
         seed=seed,
         num_steps=num_steps,
-        kept=network_state,
+        checkpoint=network_state,
         report=report,
     )
     model = BlockModel(
@@ -160,5 +158,5 @@ def train_blocks(
         chosen=None,
     )
     errors.print_to(report)
-    for path in kept:
+    for path in stored:
         path.unlink()

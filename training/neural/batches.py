@@ -21,7 +21,7 @@ from kouxing.training.neural.augmentation import (
 )
 
 _POOL_BATCHES = 8  # recordings of similar length are grouped within a pool of this many batches
-_MAX_FRAMES = 800  # of a recording in a batch; longer ones are cropped
+_MAX_FRAMES = 800  # in a batch; longer recordings are cropped
 _AUGMENT_PROB = 0.9
 _TEMPO_PROB = 0.5
 

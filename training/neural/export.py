@@ -1,7 +1,7 @@
-"""Write a trained network as ONNX, which the recognizer runs; read it again.
+"""Export a trained network to ONNX for the recognizer, and read it again.
 
-The graph computes ``training.neural.network.Network`` at one position, for any number of sessions:
-keys and values of earlier positions are inputs, those of this position are outputs.
+The graph computes ``training.neural.network.Network`` at one position for any number of sessions.
+Keys and values of earlier positions are inputs, those of this position are outputs.
 
 ============== ============================================================ ===================
 symbol         meaning                                                      shape
@@ -10,20 +10,18 @@ frames         the five frames at a position, oldest first                  (row
 position       its row of the sinusoidal table                              (rows, width)
 output_layer   number of the output layer                                   1
 past_mask      0 in the slots of earlier positions and in the last slot;    (sessions, 1, 1,
-               elsewhere minus infinity                                     128)
+               minus infinity elsewhere                                     128)
 keys_l,        keys and values of earlier positions in layer l, in any      (sessions, heads,
-values_l       order, 16-bit floats; zeros in the last slot, which is the   128, size)
-               position's own
+values_l       order, 16-bit floats; zeros in the last slot, which          128, size)
+               belongs to the position itself
 log_posteriors log posteriors of the states at two frames                   (rows, 2, states)
-keys           keys of this position                                        (rows, layers,
-                                                                            heads, size)
-values         its values                                                   (rows, layers,
+keys, values   keys and values of this position                             (rows, layers,
                                                                             heads, size)
 ============== ============================================================ ===================
 
-There are as many rows as sessions, or two rows of a single session: then both are the same.
+There is one row for each session. A single session has two identical rows.
 
-Products are of 8-bit integers (:mod:`training.neural.onnx_graph`); norms and attention are floats.
+Products use 8-bit integers (:mod:`kouxing.training.neural.onnx_graph`), norms and attention floats.
 """
 
 from __future__ import annotations
@@ -51,20 +49,20 @@ from kouxing.training.neural.onnx_graph import (
 
 
 def onnx_of(network: Network, *, exact: bool = False) -> NDArray[np.uint8]:
-    """Export a network: return the bytes of an ONNX file, its inputs and outputs as above.
+    """Export a network as the bytes of an ONNX file with the inputs and outputs above.
 
     Parameters
     ----------
     network
-        A network.
+        The network.
     exact
-        Keep the weights as floats: the file is four times as large, and slower.
+        Keep the weights as floats. The file is then four times as large, and slower.
     """
     return _NetworkGraph(network, exact=exact).file_of_network()
 
 
 def network_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> Network:
-    """Read the network in an ONNX file of :func:`onnx_of`, to train it further.
+    """Read the network from an ONNX file of :func:`onnx_of`, to train it further.
 
     Parameters
     ----------
@@ -76,7 +74,7 @@ def network_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> Network:
     Raises
     ------
     KeyError
-        If :func:`onnx_of` has not made the file.
+        If :func:`onnx_of` did not write the file.
     """
     stored = tensors_in(file)
     biases = {name: array for name, array in stored.items() if name.endswith(".bias")}
@@ -134,26 +132,23 @@ class _NetworkGraph(Graph):
         return self.file("transformer acoustic model", inputs, outputs)
 
     def _layer(self, name: str, hidden: str, number: int) -> str:
-        parameters, heads = self._parameters, self._shape.heads
+        heads = self._shape.heads
         size = self._shape.width // heads
-        normed = self.norm(hidden, parameters, f"{name}.attention_norm")
-        joint = self.product(normed, parameters, f"{name}.query_key_value")
-        joint = self.node("Reshape", [joint, self.integers("by_head", -1, 3 * heads, 1, size)])
-        query, key, value = self.split(
-            joint, [f"{name}.{part}" for part in ("query", "key", "value")], axis=1
-        )
-        seen = self._attention(query, key, value, number)
-        seen = self.node("Reshape", [seen, self.integers("in_a_row", -1, heads * size)])
-        hidden = self.node("Add", [hidden, self.product(seen, parameters, f"{name}.attended")])
-        for kind, own in (("keys", key), ("values", value)):
-            of_layer = self.integers("of_layer", -1, 1, heads, size)
-            self.node("Reshape", [own, of_layer], f"{kind}_{number}_own")
-        normed = self.norm(hidden, parameters, f"{name}.inner_norm")
-        inner = self.node("Gelu", [self.product(normed, parameters, f"{name}.inner")])
-        return self.node("Add", [hidden, self.product(inner, parameters, f"{name}.outer")])
+
+        def attend(joint: str) -> str:
+            joint = self.node("Reshape", [joint, self.integers("by_head", -1, 3 * heads, 1, size)])
+            parts = [f"{name}.{part}" for part in ("query", "key", "value")]
+            query, key, value = self.split(joint, parts, axis=1)
+            for kind, own in (("keys", key), ("values", value)):
+                of_layer = self.integers("of_layer", -1, 1, heads, size)
+                self.node("Reshape", [own, of_layer], f"{kind}_{number}_own")
+            attended = self._attention(query, key, value, number)
+            return self.node("Reshape", [attended, self.integers("in_a_row", -1, heads * size)])
+
+        return self.layer(hidden, self._parameters, name, attend)
 
     def _attention(self, query: str, key: str, value: str, number: int) -> str:
-        """Attend to the past and to the position itself, (rows, heads, 1, size)."""
+        """Attend to the past and to the position itself: (rows, heads, 1, size)."""
         last = self.integers("last_axis", -1)
         scale = (self._shape.width // self._shape.heads) ** -0.5
         keys, values = (self.floats_of(f"{kind}_{number}") for kind in ("keys", "values"))
@@ -169,33 +164,33 @@ class _NetworkGraph(Graph):
         return self.node("Add", [seen, self.node("Mul", [own, value])])
 
     def _outputs(self, hidden: str, number: int) -> str:
-        """Compute the requested output layer, if its number is at least ``number``."""
+        """Compute the selected output layer, if its number is at least ``number``."""
         shape = self._shape
         if number == len(shape.look_aheads):
             nothing = numpy_helper.from_array(np.zeros((0, 2, shape.num_states), np.float32))
             return self.node("Constant", [], value=nothing)
-        asked = self.node(
+        is_selected = self.node(
             "Equal", ["output_layer", self.constant(f"number_{number}", np.array(number))]
         )
 
-        def this() -> str:
+        def write_output() -> str:
             logits = self.product(hidden, self._parameters, f"outputs.{number}")
             by_frame = self.integers("by_frame", -1, 2, shape.num_states)
             return self.node("LogSoftmax", [self.node("Reshape", [logits, by_frame])], axis=-1)
 
         shape_of_rows = ("some_rows", 2, shape.num_states)
         branches = {
-            "then_branch": self.branch(f"output_{number}", this, *shape_of_rows),
+            "then_branch": self.branch(f"output_{number}", write_output, *shape_of_rows),
             "else_branch": self.branch(
                 f"not_{number}", lambda: self._outputs(hidden, number + 1), *shape_of_rows
             ),
         }
-        return self.node("If", [asked], **branches)
+        return self.node("If", [is_selected], **branches)
 
     def product(
         self, inputs: str, parameters: Mapping[str, Floats], name: str, rows: str = "positions"
     ) -> str:
-        """Multiply rows with a weight and add a bias."""
+        """Multiply rows with a weight, and add a bias."""
         if not self._exact:
             return super().product(inputs, parameters, name, rows)
         weight = self.constant(f"{name}.turned", in_rows(parameters[f"{name}.weight"]).T)

@@ -1,14 +1,13 @@
-"""What the exports of networks to ONNX share.
+"""Shared parts of the ONNX exports.
 
-Products with weights are of 8-bit integers. A weight ``W`` has a scale ``s`` for each output, its
+Products with weights use 8-bit integers. A weight ``W`` has a scale ``s`` for each output, its
 input ``x`` a scale ``r`` for each row:
 
     y[i, j] = r[i] s[j] sum_k round(x[i, k] / r[i]) round(W[k, j] / s[j]) + b[j]
     r[i] = max_k |x[i, k]| / 127,   s[j] = max_k |W[k, j]| / 127
 
-So a row's values do not depend on the other rows of a product. Convolutions are products too: a row
-has the inputs of all places. Large weights that are no integers are stored as 16-bit floats, and
-widened when the file is opened.
+The values of a row therefore do not depend on other rows. Convolutions are products too. Other
+large weights are stored as 16-bit floats, and widened when the file is opened.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ Floats = NDArray[np.float32]
 
 
 class Graph:
-    """The nodes and constants of a network, in the order of computation."""
+    """Collects the nodes and constants of a network in the order of computation."""
 
     def __init__(self) -> None:
         self._nodes: list[onnx.NodeProto] = []
-        self._num_nodes = 0  # those of branches too
+        self._num_nodes = 0  # including those of branches
         self._tensors: dict[str, onnx.TensorProto] = {}
-        self._zero_points: dict[str, str] = {}  # by what the rows of a product are
+        self._zero_points: dict[str, str] = {}  # by the kind of rows
 
     def file(
         self,
@@ -69,7 +68,7 @@ class Graph:
     def split(
         self, inputs: str, names: Sequence[str], *sizes: int, axis: int = -1
     ) -> Sequence[str]:
-        """Split an axis into equal parts, or into parts of these sizes; return the names."""
+        """Split an axis into parts, of these sizes or equal; return their names."""
         if sizes:
             lengths = self.integers(f"{names[0]}.lengths", *sizes)
             node = helper.make_node("Split", [inputs, lengths], names, axis=axis)
@@ -79,7 +78,7 @@ class Graph:
         return names
 
     def branch(self, name: str, write: Callable[[], str], *shape: int | str) -> onnx.GraphProto:
-        """Write nodes as a graph of their own; its constants stay in the outer graph."""
+        """Write nodes as a subgraph; its constants stay in the outer graph."""
         outside, self._nodes = self._nodes, []
         output = write()
         graph = helper.make_graph(self._nodes, name, [], [floats(output, *shape)])
@@ -93,7 +92,7 @@ class Graph:
         return name
 
     def integers(self, name: str, *values: int) -> str:
-        """Store integers, of a shape or axes."""
+        """Store integers, such as a shape or axes."""
         return self.constant(name, np.array(values, np.int64))
 
     def number(self, name: str, value: float) -> str:
@@ -109,7 +108,7 @@ class Graph:
         return self.node("Cast", [halves], to=TensorProto.FLOAT)
 
     def norm(self, inputs: str, parameters: Mapping[str, Floats], name: str) -> str:
-        """Normalise rows."""
+        """Normalize rows."""
         names = [
             self.constant(f"{name}.{kind}", parameters[f"{name}.{kind}"])
             for kind in ("weight", "bias")
@@ -119,9 +118,9 @@ class Graph:
     def product(
         self, inputs: str, parameters: Mapping[str, Floats], name: str, rows: str = "positions"
     ) -> str:
-        """Multiply rows, (rows, inputs), with a weight in 8 bits and add a bias.
+        """Multiply rows, (rows, inputs), with an 8-bit weight, and add a bias.
 
-        ``rows`` names what they are; there are always as many of a name.
+        ``rows`` names the kind of rows; all products of one kind have the same number of rows.
         """
         last = self.integers("last_axis", -1)
         highest = self.node("ReduceMax", [self.node("Abs", [inputs]), last], keepdims=0)
@@ -142,7 +141,7 @@ class Graph:
         return self.node("Add", [by_row, self.constant(f"{name}.bias", parameters[f"{name}.bias"])])
 
     def weight(self, parameters: Mapping[str, Floats], name: str) -> tuple[str, str]:
-        """Store a weight: integers, (inputs, outputs), and the scales of its outputs."""
+        """Store a weight as integers, (inputs, outputs), and scales of its outputs."""
         weight = in_rows(parameters[f"{name}.weight"])
         scale = np.maximum(np.abs(weight).max(axis=1) / _MAX_INTEGER, _MIN_SCALE)
         integers = np.rint(weight / scale[:, None]).astype(np.int8).T
@@ -151,8 +150,24 @@ class Graph:
             self.constant(f"{name}.scales", scale.astype(np.float32)),
         )
 
+    def layer(
+        self,
+        hidden: str,
+        parameters: Mapping[str, Floats],
+        name: str,
+        attend: Callable[[str], str],
+    ) -> str:
+        """Run a transformer layer; ``attend`` maps query, key and value to the attended values."""
+        normed = self.norm(hidden, parameters, f"{name}.attention_norm")
+        attended = attend(self.product(normed, parameters, f"{name}.query_key_value"))
+        attended = self.product(attended, parameters, f"{name}.attended")
+        hidden = self.node("Add", [hidden, attended])
+        normed = self.norm(hidden, parameters, f"{name}.inner_norm")
+        inner = self.node("Gelu", [self.product(normed, parameters, f"{name}.inner")])
+        return self.node("Add", [hidden, self.product(inner, parameters, f"{name}.outer")])
+
     def convolutions(self, frames: str, parameters: Mapping[str, Floats], length: int) -> str:
-        """Run both: (batch, 2 length + 3, 80) to (batch * length, width)."""
+        """Run both convolutions: (batch, 2 length + 3, 80) to (batch * length, width)."""
         places = self._places(frames, 2 * length + 1, 1, NUM_MELS)
         hidden = self.node("Gelu", [self.product(places, parameters, "first", "frames")])
         width = len(parameters["first.bias"])
@@ -161,7 +176,7 @@ class Graph:
         return self.node("Gelu", [self.product(places, parameters, "second")])
 
     def _places(self, inputs: str, number: int, stride: int, size: int) -> str:
-        """Join three neighbours each: (batch, n, size) to (batch * number, 3 size)."""
+        """Concatenate groups of three neighbors: (batch, n, size) to (batch * number, 3 size)."""
         one, step = self.integers("axis_1", 1), self.integers(f"stride_{stride}", stride)
         pieces = []
         for place in range(3):
@@ -175,12 +190,12 @@ class Graph:
 
 
 def arrays_of(module: nn.Module, prefix: str = "") -> dict[str, Floats]:
-    """Return a module's parameters and buffers; their names begin with ``prefix``."""
+    """Return a module's parameters and buffers, with ``prefix`` before their names."""
     return {prefix + name: tensor.cpu().numpy() for name, tensor in module.state_dict().items()}
 
 
 def in_rows(weight: Floats) -> Floats:
-    """Return a weight as (outputs, inputs); the inputs of a convolution are place by place."""
+    """Reshape a weight to (outputs, inputs), for a convolution place by place."""
     if weight.ndim == 3:
         weight = weight.transpose(0, 2, 1)
     return weight.reshape(len(weight), -1)

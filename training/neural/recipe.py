@@ -1,17 +1,16 @@
 """From corpora to the neural recognizer: alignment, teacher, training, search weights, model card.
 
-The network starts with the weights of Whisper's encoder, or with those of a model made here, and
-learns the states of a forced alignment. The model it starts with aligns; or another model aligns
-first, and after half of the steps the network itself. It aligns with an output layer that looks
-30 ms ahead, because the onset of a phone is clearer with some of what follows.
+The network starts with the weights of Whisper's encoder or of an earlier model, and learns the
+states of a forced alignment. The earlier model aligns the recordings. Otherwise another model
+aligns at first, and the network itself after half of the steps. The network aligns with an output
+layer of 30 ms look-ahead, because the onset of a phone is clearer with some of its continuation.
 
-With Whisper there is a teacher too (:mod:`kouxing.training.neural.teacher`), trained on the first
-alignment, which sees whole recordings. The targets are then the average of alignment and teacher,
-and the teacher's alone in recordings without text.
+With Whisper there is also a teacher (:mod:`kouxing.training.neural.teacher`), trained on the first
+alignment, which sees whole recordings. The targets are the average of alignment and teacher, or
+only the teacher's labels for recordings without text.
 
-The recognizer emits phones early and corrects them. So acoustic scale and phone penalty are those
-with the fewest errors on dev, counted in the first hypothesis and in offline decoding (full
-traceback).
+The recognizer emits phones early and corrects them. Acoustic scale and phone penalty therefore
+minimize the errors on dev of both the first hypothesis and offline decoding (full traceback).
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from kouxing.corpora.speech_corpus import RowErrors, is_synthetic
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.acoustic_model import Topology
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
@@ -84,7 +83,7 @@ class TeacherLabels:
 
 @dataclass(slots=True, kw_only=True)
 class _Monitor:
-    """Watches the training: realigns once, and tests on dev now and then."""
+    """Watches the training: realigns once, and tests on dev regularly."""
 
     trainer: Trainer
     examples: Sequence[Example]
@@ -150,36 +149,36 @@ def train_neural(
     Parameters
     ----------
     corpora
-        Folders that :func:`corpora.speech_corpus.read_corpus` reads; splits ``train`` and ``dev``.
+        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads; splits ``train`` and
+        ``dev``.
     output
-        The ``.npz`` file to write; the card is written beside it as ``.md``, the curves as
-        ``.png``.
+        The ``.npz`` file to write; the card gets the suffix ``.md``, the curves ``.png``.
     aligner
-        A model that aligns until the network does, such as :func:`training.gmm.recipe.train_gmm`
-        writes. Without it ``start`` aligns.
+        Model that aligns until the network does, such as a Gaussian mixture model. Without it,
+        ``start`` aligns.
     whisper
-        Folder with Whisper base, see :func:`training.neural.whisper_weights.load_whisper`, for the
-        teacher. Without it the network learns the alignment alone.
+        Folder with Whisper base, see :mod:`kouxing.training.neural.whisper_weights`, for the
+        teacher. Without it, the network learns only the alignment.
     start
-        A model of this function, whose network is trained further, such as on one's own speakers.
-        Without it the network starts with Whisper's weights.
+        Model of this function to train further, for example on your own speakers. Without it, the
+        network starts with Whisper's weights.
     untranscribed
-        Folders of recordings in any language, which the teacher labels. Their licences are
-        unknown: name only folders that may be used.
+        Folders of recordings in any language, which the teacher labels. Their licenses are
+        unknown, so name only folders that may be used.
     phone_lm
-        A file of :func:`training.phone_lm.recipe.train_phone_lm`; without it the phone language
-        model is estimated from the corpora's texts.
+        File with a phone language model. Without it, the model is estimated from the corpora's
+        texts.
     look_ahead_ms
-        Look-ahead of the main output layer, the one in use, in whole frames of 10 ms.
+        Look-ahead of the main output layer, a multiple of 10 ms.
     seed
         Seed of new weights, order and augmentation. The same seed and number of threads give the
         same model on the same kind of processor.
     num_steps
-        Number of batches of 30 s of sound.
+        Number of batches of 30 s of audio.
     num_threads
-        Threads to compute with; None takes all cores.
+        Number of threads; None uses all cores.
     shipping
-        Leave out rows whose licence forbids giving the model away.
+        Exclude rows whose license does not allow distributing the model.
     report
         Receives lines of progress.
 
@@ -190,13 +189,13 @@ def train_neural(
         recordings without text, or a file cannot be read.
     """
     if untranscribed and whisper is None:
-        raise UserError("only a teacher can label what --untranscribed names: give --whisper too")
+        raise UserError("recordings without text need a teacher; also give --whisper")
     torch.set_num_threads(num_threads or os.cpu_count() or 1)
     torch.manual_seed(seed)
     before = load_model(start) if start else None
     first = load_model(aligner) if aligner else before
     if first is None:
-        raise UserError("nothing aligns the recordings: give --aligner or --start-from")
+        raise UserError("no model aligns the recordings; give --aligner or --start-from")
     inventory = first.inventory
     network = init_network(whisper, before, inventory, all_look_aheads(look_ahead_ms))
     encoder = init_encoder(whisper, network.shape.num_states) if whisper else None
@@ -254,7 +253,7 @@ def train_neural(
         output,
         title=f"Neural recognizer, a causal transformer of {network.shape.layers} layers",
         details=f"started with {source}, seed {seed}, {num_steps} steps of {BATCH_S} s of sound, "
-        f"aligned {f'first by `{aligner.name}`' if aligner else 'by the same'}"
+        f"aligned by {f'`{aligner.name}` at first' if aligner else 'the same model'}"
         + _teacher_details(labels),
         examples=examples,
         errors=errors,
@@ -269,7 +268,7 @@ def sample_teacher_set(aligned: Sequence[AlignedExample], seed: int) -> list[Ali
     rng = np.random.default_rng(seed)
     sampled = []
     for kind in _MIX:
-        of_kind = [one for one in aligned if _kind(one.example) == kind]
+        of_kind = [one for one in aligned if one.example.kind == kind]
         sampled += [of_kind[place] for place in rng.permutation(len(of_kind))[:_TEACHER_SET]]
     return sampled
 
@@ -282,7 +281,7 @@ def _label(
 ) -> TeacherLabels:
     """Let the teacher label all recordings."""
     recordings = [*map(samples_of, examples), *sounds]
-    targets = process_all(teacher.targets_of, recordings, "labelled by the teacher", report)
+    targets = process_all(teacher.targets_of, recordings, "labeled by the teacher", report)
     untranscribed = targets[len(examples) :]
     num_frames = sum(map(len, untranscribed))
     return TeacherLabels(
@@ -295,10 +294,10 @@ def _label(
 
 
 def _teacher_details(labels: TeacherLabels) -> str:
-    """Tell the card about the teacher, and how much it labelled without text."""
+    """Describe the teacher for the card, and how much it labeled without text."""
     if not labels.examples:
         return ""
-    details = ", taught by a readout of Whisper's whole encoder"
+    details = ", with a readout of Whisper's whole encoder as the teacher"
     if labels.untranscribed:
         minutes = sum(len(recording.targets) for recording in labels.untranscribed) * HOP_S / 60
         details += f", also on {minutes:.1f} minutes without text"
@@ -319,7 +318,7 @@ def _recordings(aligned: Sequence[AlignedExample], labels: TeacherLabels) -> lis
 
 def _weights(aligned: Sequence[AlignedExample]) -> list[float]:
     """Weight each recording: kinds of speech have fixed fractions, rare speakers count more."""
-    kinds = [_kind(one.example) for one in aligned]
+    kinds = [one.example.kind for one in aligned]
     frames = dict.fromkeys(_MIX, 0.0)
     for kind, one in zip(kinds, aligned, strict=True):
         frames[kind] += one.example.weight * len(one.states)
@@ -329,14 +328,8 @@ def _weights(aligned: Sequence[AlignedExample]) -> list[float]:
     ]
 
 
-def _kind(example: Example) -> str:
-    if is_synthetic(example.licence):
-        return "synthetic"
-    return "word" if example.is_word else "sentence"
-
-
 def _model(trainer: Trainer, statistics: Statistics) -> NeuralModel:
-    """Make the recognizer's model of the running mean of the weights, with acoustic scale 1."""
+    """Make the recognizer's model from the running mean of the weights; acoustic scale 1."""
     return NeuralModel(
         topology=statistics.topology,
         network=onnx_of(trainer.mean),

@@ -2,18 +2,12 @@
 
 Sources: Hinton et al. 2012, "Deep neural networks for acoustic modeling in speech recognition"
 (cross-entropy on the states of a forced alignment); Hinton, Vinyals and Dean 2015, "Distilling the
-knowledge in a neural network" (soft targets); Loshchilov and Hutter 2019, "Decoupled weight decay
-regularization" (AdamW); Shamir and Zhang 2013, "Stochastic gradient descent for non-smooth
-optimization: convergence results and optimal averaging schemes" (the running mean of the weights,
-in which late ones weigh more).
+knowledge in a neural network" (soft targets).
 
-Pretrained layers have a low learning rate, new layers a higher one, and the convolutions are
-frozen. The learning rate rises and then stays: the running mean, which is the result, is better the
-more the averaged weights differ.
+Pretrained layers have a low learning rate, new layers a higher one. The convolutions are frozen.
+The learning rate rises and then stays constant. Varied weights make the running mean better.
 
     rate(n) = rate * min(1, (n + 1) / min(60, 0.2 N))
-
-    m(0) = v(0),  m(n) = m(n - 1) + 3 / (n + 4) * (v(n) - m(n - 1))
 
     H = - sum_t sum_j q[t, j] log y[t, s[t, j]] / sum_t sum_j q[t, j]
 
@@ -23,9 +17,8 @@ more the averaged weights differ.
 symbol   meaning                                                       shape
 ======== ============================================================= ================
 n, N     number of a step, and of all steps                            1
-v, m     weights after a step, and their running mean                  as the weights
 s, q     target states of a frame and their probabilities, which sum   (frames, k)
-         to one, or to zero where no target is known
+         to 1, or to 0 if no target is known
 y        posteriors of the states, of an output layer                  (frames, states)
 H        mean cross-entropy of an output layer, nats a frame           1
 ======== ============================================================= ================
@@ -34,16 +27,14 @@ H        mean cross-entropy of an output layer, nats a frame           1
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
 
 import numpy as np
-import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 
 from kouxing.training.neural.augmentation import mask
 from kouxing.training.neural.batches import Recording, Sample, augment, batches_of, sampling_probs
 from kouxing.training.neural.network import Network, mixed_precision, output_frames
+from kouxing.training.neural.optimizer import Optimizer, cross_entropy
 
 BATCH_S = 30
 _BATCH_FRAMES = 100 * BATCH_S
@@ -68,11 +59,11 @@ class Trainer:
     network
         The network; trained in place.
     recordings
-        With the targets of their frames.
+        Recordings with the targets of their frames.
     main_output
         Output layer that is trained in every step; another one is trained in turn.
     seed
-        Of order and augmentation. The network's dropout draws from PyTorch's own generator.
+        Seed of order and augmentation. Dropout draws from PyTorch's own generator.
     """
 
     def __init__(
@@ -85,8 +76,6 @@ class Trainer:
     ) -> None:
         self.network = network
         self.main_output = main_output
-        self._averaged = AveragedModel(network, avg_fn=late_mean(_MEAN_EXPONENT))
-        self._averaged.eval()
         self._rng = np.random.default_rng(seed)
         self.replace_recordings(recordings)
         pretrained: list[nn.Parameter] = []
@@ -96,18 +85,21 @@ class Trainer:
                 parameter.requires_grad_(False)
             else:
                 (new if name.startswith(_NEW) else pretrained).append(parameter)
-        self._rates = (_RATE, _NEW_RATE)
-        self._optimizer = torch.optim.AdamW(
-            [{"params": pretrained}, {"params": new}], weight_decay=_WEIGHT_DECAY
+        self._optimizer = Optimizer(
+            network,
+            [{"params": pretrained, "lr": _RATE}, {"params": new, "lr": _NEW_RATE}],
+            weight_decay=_WEIGHT_DECAY,
+            max_gradient_norm=_MAX_GRADIENT_NORM,
+            mean_exponent=_MEAN_EXPONENT,
         )
 
     @property
     def mean(self) -> Network:
         """The network with the running mean of the weights."""
-        return cast(Network, self._averaged.module)
+        return self._optimizer.mean
 
     def replace_recordings(self, recordings: Sequence[Recording]) -> None:
-        """Continue with other recordings, or other targets of the same."""
+        """Continue with these recordings, or with other targets of the same ones."""
         probs = sampling_probs(recordings)
 
         def draw() -> Sample:
@@ -142,9 +134,7 @@ class Trainer:
             if others:
                 other = others[number % len(others)]
                 loss = loss + _OTHER_OUTPUT_WEIGHT * self._loss(hidden, states, probs, other)
-        for group, rate in zip(self._optimizer.param_groups, self._rates, strict=True):
-            group["lr"] = rate_factor * rate
-        take_step(loss, self._optimizer, self.network, self._averaged, _MAX_GRADIENT_NORM)
+        self._optimizer.step(loss, rate_factor)
         return main_loss
 
     def _loss(self, hidden: Tensor, states: Tensor, probs: Tensor, output: int) -> Tensor:
@@ -152,34 +142,6 @@ class Trainer:
         look_ahead = self.network.shape.look_aheads[output]
         shifted = shift_targets(states, probs, hidden.shape[1], look_ahead)
         return cross_entropy(self.network.log_posteriors(hidden, output), *shifted)
-
-
-def take_step(
-    loss: Tensor,
-    optimizer: torch.optim.Optimizer,
-    network: nn.Module,
-    averaged: AveragedModel,
-    max_norm: float,
-) -> None:
-    """Step along the gradient, clipped to ``max_norm``, and update the running mean."""
-    optimizer.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
-    nn.utils.clip_grad_norm_(network.parameters(), max_norm)
-    optimizer.step()
-    averaged.update_parameters(network)
-
-
-def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tensor:
-    """Mean cross-entropy over the frames with targets, in nats.
-
-    Parameters
-    ----------
-    log_posteriors
-        Output of the network, shape (..., states).
-    states, probs
-        Targets, shape (..., k).
-    """
-    return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
 
 
 def shift_targets(
@@ -207,13 +169,3 @@ def shift_targets(
     inside = (frames >= 0) & (frames < num_frames)
     at = frames.clamp(0, num_frames - 1)
     return states[:, at], probs[:, at] * inside[..., None]
-
-
-def late_mean(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
-    """Make a running mean in which the n-th weights weigh about n ** exponent."""
-
-    def updated(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
-        factor = (exponent + 1) / (int(num_before) + exponent + 2)
-        return mean + factor * (weights - mean)
-
-    return updated

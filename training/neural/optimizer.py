@@ -1,0 +1,115 @@
+"""AdamW with clipped gradients; the result is a running mean of the weights.
+
+Sources: Loshchilov and Hutter 2019, "Decoupled weight decay regularization" (AdamW); Shamir and
+Zhang 2013, "Stochastic gradient descent for non-smooth optimization: convergence results and
+optimal averaging schemes" (the mean, in which late weights count more).
+
+    m(0) = v(0),  m(n) = m(n - 1) + (e + 1) / (n + e + 2) * (v(n) - m(n - 1))
+
+v are the weights after a step, m their mean, and e is its exponent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+
+N = TypeVar("N", bound=nn.Module)
+
+
+class Optimizer(Generic[N]):
+    """Trains a network in place.
+
+    Parameters
+    ----------
+    network
+        The network.
+    groups
+        Parameter groups with their learning rates, as for ``torch.optim``.
+    weight_decay, max_gradient_norm
+        Settings of each step.
+    mean_exponent
+        e of the running mean.
+    """
+
+    def __init__(
+        self,
+        network: N,
+        groups: Sequence[dict[str, Any]],
+        *,
+        weight_decay: float,
+        max_gradient_norm: float,
+        mean_exponent: int,
+    ) -> None:
+        self._network = network
+        self._averaged = AveragedModel(network, avg_fn=_late_mean(mean_exponent))
+        self._averaged.eval()
+        self._adam = torch.optim.AdamW(groups, weight_decay=weight_decay)
+        self._rates = [group["lr"] for group in self._adam.param_groups]
+        self._max_gradient_norm = max_gradient_norm
+
+    @property
+    def mean(self) -> N:
+        """The network with the running mean of the weights."""
+        return cast(N, self._averaged.module)
+
+    def step(self, loss: Tensor, rate_factor: float) -> None:
+        """Step along the gradient of a loss, with the learning rates times a factor."""
+        for group, rate in zip(self._adam.param_groups, self._rates, strict=True):
+            group["lr"] = rate_factor * rate
+        self._adam.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self._network.parameters(), self._max_gradient_norm)
+        self._adam.step()
+        self._averaged.update_parameters(self._network)
+
+    def save(self, checkpoint: Path, num_steps: int) -> None:
+        """Write the state after some steps to a file."""
+        state = {name: part.state_dict() for name, part in self._parts().items()}
+        unfinished = checkpoint.with_suffix(".part")
+        torch.save(state | {"num_steps": num_steps}, unfinished)
+        unfinished.replace(checkpoint)
+
+    def load(self, checkpoint: Path) -> int:
+        """Restore the state from a file, if it exists; return the number of steps taken."""
+        if not checkpoint.exists():
+            return 0
+        state = torch.load(checkpoint, weights_only=True)
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        return int(state["num_steps"])
+
+    def _parts(self) -> dict[str, Any]:
+        return {"network": self._network, "averaged": self._averaged, "optimizer": self._adam}
+
+
+def rise_and_fall(step: int, num_steps: int, warm_up_steps: int, falling: float) -> float:
+    """Learning-rate factor: a linear rise, and a fall to 0 in the last fraction of the steps."""
+    rise = min(1.0, (step + 1) / warm_up_steps)
+    return rise * min(1.0, (num_steps - step) / (falling * num_steps))
+
+
+def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tensor:
+    """Mean cross-entropy over the frames with targets, nats.
+
+    Parameters
+    ----------
+    log_posteriors
+        Output of a network, shape (..., states).
+    states, probs
+        Target states and their probabilities, shape (..., k).
+    """
+    return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
+
+
+def _late_mean(exponent: int) -> Callable[[Tensor, Tensor, Tensor | int], Tensor]:
+    def updated(mean: Tensor, weights: Tensor, num_before: Tensor | int) -> Tensor:
+        factor = (exponent + 1) / (int(num_before) + exponent + 2)
+        return mean + factor * (weights - mean)
+
+    return updated
