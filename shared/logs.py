@@ -1,4 +1,4 @@
-"""Logs as JSON lines on standard error, with the session concerned; never speech content."""
+"""Logs as JSON lines on standard error. A line names its session, but has no speech content."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ class _JsonFormatter(logging.Formatter):
             "service": self._service,
             "message": record.getMessage(),
         }
-        session = getattr(record, "session", "")
-        if session:
+        if session := getattr(record, "session", ""):
             line["session"] = session
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
@@ -31,14 +30,14 @@ class _JsonFormatter(logging.Formatter):
 
 
 class RateLimit:
-    """Allows a warning of one kind at most once in ``period_s``."""
+    """Allows each kind of warning once per ``period_s``."""
 
     def __init__(self, period_s: float = 5.0) -> None:
         self._period_s = period_s
         self._last_s: dict[str, float] = {}
 
     def allows(self, name: str) -> bool:
-        """Return whether a warning of this kind may be written now."""
+        """Return whether a warning of this kind may be logged now."""
         now_s = time.monotonic()
         if now_s - self._last_s.get(name, -self._period_s) < self._period_s:
             return False
@@ -47,7 +46,7 @@ class RateLimit:
 
 
 def configure(service: str, level: str) -> None:
-    """Send this process's log to standard error as JSON lines."""
+    """Send the log of this process to standard error as JSON lines."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_JsonFormatter(service))
     LOG.handlers[:] = [handler]

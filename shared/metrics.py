@@ -1,6 +1,6 @@
-"""Counts, present values and latencies of a service, small enough to be in every heartbeat.
+"""Counters, gauges and latencies of a service, small enough for every heartbeat.
 
-The same figures are in the heartbeats and on the page for Prometheus (``shared.prometheus``).
+Heartbeats and the Prometheus page (``shared.prometheus``) have the same values.
 """
 
 from __future__ import annotations
@@ -16,38 +16,38 @@ from pathlib import Path
 
 import numpy as np
 
-WINDOW = 1000  # newest values, of which the percentiles are taken
+WINDOW = 1000  # number of newest values that percentiles are computed from
 PERCENTS = (50, 95, 99)
-BUCKETS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits, ms
-_ARENA_MAX = -8  # number of this parameter of glibc's mallopt
+BUCKETS_MS = (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # upper limits
+_ARENA_MAX = -8  # glibc's M_ARENA_MAX, a parameter of mallopt
 
 
 class Distribution:
-    """Values of a latency in ms: the newest ones, and how many there ever were of which size."""
+    """Values of a latency in ms: the newest values, and a histogram of all values."""
 
     def __init__(self) -> None:
         self.newest: deque[float] = deque(maxlen=WINDOW)
-        self.bucket_counts = [0] * (len(BUCKETS) + 1)  # the last one above all limits
-        self.total = 0.0  # of all values
+        self.bucket_counts = [0] * (len(BUCKETS_MS) + 1)  # the last bucket has no upper limit
+        self.total = 0.0
 
-    def add(self, value: float) -> None:
+    def add(self, value_ms: float) -> None:
         """Add a value."""
-        self.newest.append(value)
-        self.bucket_counts[bisect_left(BUCKETS, value)] += 1
-        self.total += value
+        self.newest.append(value_ms)
+        self.bucket_counts[bisect_left(BUCKETS_MS, value_ms)] += 1
+        self.total += value_ms
 
 
 class Metrics:
-    """Counters and present values by name, and distributions of latencies.
+    """Metrics of a service by name.
 
     Attributes
     ----------
     counts
-        What ``count`` has added up, by name.
+        Counters.
     values
-        What was ``set`` last, by name.
+        Gauges.
     distributions
-        What was observed, by name.
+        Latencies.
     """
 
     def __init__(self) -> None:
@@ -62,20 +62,20 @@ class Metrics:
         self.counts[name] += amount
 
     def set(self, name: str, value: float) -> None:
-        """Note what a value is now."""
+        """Set a gauge."""
         self.values[name] = value
 
     def observe(self, name: str, value_ms: float) -> None:
-        """Add one value in ms to a distribution; the name carries the unit, as in ``chunk_ms``."""
+        """Add a value to a latency. Its name has the unit, for example ``chunk_ms``."""
         if name not in self.distributions:
             self.distributions[name] = Distribution()
         self.distributions[name].add(value_ms)
 
     def snapshot(self, now_s: float) -> dict[str, float]:
-        """Return all figures.
+        """Return all metrics.
 
-        Each value; each counter, and as ``<name>_per_s`` its rate since the last snapshot;
-        ``<name>_p50``, ``_p95`` and ``_p99`` of each distribution's newest values.
+        A counter also has its rate since the last snapshot, as ``<name>_per_s``. A latency has the
+        percentiles of its newest values, as ``<name>_p50``, ``_p95`` and ``_p99``.
         """
         result = dict(self.values)
         passed_s = max(1e-3, now_s - self._last_s)
@@ -83,17 +83,15 @@ class Metrics:
             result[name] = float(value)
             result[f"{name}_per_s"] = (value - self._last_counts[name]) / passed_s
         self._last_s, self._last_counts = now_s, self.counts.copy()
-        for name, each in self.distributions.items():
-            for percent, value in zip(PERCENTS, np.percentile(each.newest, PERCENTS), strict=True):
-                result[f"{name}_p{percent}"] = float(value)
+        for name, latency in self.distributions.items():
+            percentiles = np.percentile(latency.newest, PERCENTS).tolist()
+            for percent, value in zip(PERCENTS, percentiles, strict=True):
+                result[f"{name}_p{percent}"] = value
         return result
 
 
 def memory_mb() -> float:
-    """Return the memory that this process takes, in MB of 2^20 bytes.
-
-    Elsewhere than on Linux it is the most that it has taken.
-    """
+    """Return the memory of this process in MiB; on systems other than Linux, its maximum so far."""
     try:
         pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
     except OSError:
@@ -103,50 +101,50 @@ def memory_mb() -> float:
 
 
 def keep_one_arena() -> None:
-    """Let all threads take memory from the same place; to be called before there are others.
+    """Let all threads share one glibc arena. Call this before starting threads.
 
-    Of the places that glibc makes for further threads, such as ZeroMQ's, ``give_back_memory`` does
-    not give back what is free at the end.
+    ``give_back_memory`` cannot release memory at the end of further arenas, such as those of
+    ZeroMQ's threads.
     """
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_ARENA_MAX, 1)
 
 
 def give_back_memory() -> None:
-    """Give the system what the C library keeps of freed memory; only glibc keeps so much."""
+    """Return freed memory to the system. Only glibc keeps a relevant amount."""
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 class BusyShare:
-    """Share of the last seconds in which a loop worked rather than waited for messages.
+    """Measures how much of the recent time a loop worked, rather than waited for messages.
 
     Parameters
     ----------
     period_s
-        How far it looks back, at least.
+        Minimum length of the measured time.
     now_s
-        The present; the loop does not work yet.
+        Present time. The loop does not work yet.
     """
 
     def __init__(self, period_s: float, now_s: float) -> None:
         self._period_s = period_s
-        self._busy_s = 0.0  # in all, up to when it last began to work or to wait
-        self._since_s = now_s  # when that was
+        self._busy_s = 0.0  # total, up to the last change between work and waiting
+        self._changed_s = now_s
         self._works = False
-        self._marks = deque([(now_s, 0.0)])  # times, and how long it had worked by then
+        self._marks = deque([(now_s, 0.0)])  # times, and the total of working time until then
 
     def works(self, now_s: float) -> None:
-        """Note that the loop begins to work."""
-        self._since_s, self._works = now_s, True
+        """Note that the loop starts to work."""
+        self._changed_s, self._works = now_s, True
 
     def waits(self, now_s: float) -> None:
-        """Note that the loop begins to wait."""
+        """Note that the loop starts to wait."""
         self._busy_s = self._busy_at(now_s)
-        self._since_s, self._works = now_s, False
+        self._changed_s, self._works = now_s, False
 
     def share(self, now_s: float) -> float:
-        """Return the share, 0 to 1; called every now and then, it looks back to earlier calls."""
+        """Return the share of time, 0 to 1, since an earlier call. Call this regularly."""
         busy_s = self._busy_at(now_s)
         self._marks.append((now_s, busy_s))
         while len(self._marks) > 2 and self._marks[1][0] <= now_s - self._period_s:
@@ -155,4 +153,4 @@ class BusyShare:
         return min(1.0, (busy_s - busy_then_s) / max(1e-3, now_s - then_s))
 
     def _busy_at(self, now_s: float) -> float:
-        return self._busy_s + (now_s - self._since_s if self._works else 0.0)
+        return self._busy_s + (now_s - self._changed_s if self._works else 0.0)

@@ -1,8 +1,8 @@
-"""A service's figures for Prometheus, and whether it is alive, over HTTP.
+"""The metrics of a service for Prometheus, and its health check, over HTTP.
 
-``/metrics`` has what ``shared.metrics`` counts, in Prometheus' text format, under names by its
-conventions; docs/metrics.md lists them. ``/healthz`` answers 200 while the service's loop runs and
-503 when it hangs. No session is named, so whoever may read this learns nothing of who speaks.
+``/metrics`` has the metrics of ``shared.metrics`` under names by Prometheus' conventions;
+docs/metrics.md lists them. ``/healthz`` answers 200 while the service's loop runs, and 503 if it
+hangs. Neither names a session, so readers do not learn who speaks.
 """
 
 from __future__ import annotations
@@ -11,35 +11,34 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 from itertools import accumulate
 
-from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from prometheus_client import CollectorRegistry, MetricsHandler, ProcessCollector
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
     HistogramMetricFamily,
     Metric,
 )
-from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 
 from kouxing.shared.errors import UserError
-from kouxing.shared.metrics import BUCKETS, Distribution, Metrics
+from kouxing.shared.metrics import BUCKETS_MS, Distribution, Metrics
 
-REQUEST_LIMIT_S = 5.0  # for a peer to send its request and take the answer
-MAX_REQUESTS = 16  # answered at the same time; further connections are closed
-# Counters whose names begin so are one metric with a label: its name, its label, what it counts.
-LABELLED = {
+REQUEST_LIMIT_S = 5.0  # for a peer to send its request and read the answer
+MAX_REQUESTS = 16  # at the same time; the server closes further connections
+# Counters with these prefixes become one metric with a label: name, label and help text.
+LABELED = {
     "in_": ("messages_received", "kind", "Messages received."),
     "out_": ("messages_published", "kind", "Messages published."),
     "dropped_": ("messages_dropped", "reason", "Messages dropped."),
-    "refused_": ("requests_refused", "code", "Requests refused, by code of the error."),
+    "refused_": ("requests_refused", "code", "Requests refused, by error code."),
     "event_": ("events", "event", "Events published by control."),
 }
 
 
 class MetricsCollector:
-    """Gives Prometheus' client a service's figures, each with the label ``service``."""
+    """Converts a service's metrics for prometheus_client. Each has the label ``service``."""
 
     def __init__(self, metrics: Metrics, service: str) -> None:
         self._metrics = metrics
@@ -47,65 +46,65 @@ class MetricsCollector:
         self._process = ProcessCollector(registry=CollectorRegistry())
 
     def collect(self) -> Iterator[Metric]:
-        """Yield all figures; called in another thread than those that count."""
+        """Yield all metrics. The service's own thread may change them at the same time."""
         yield from self._counters()
         for name, value in self._metrics.values.copy().items():
             gauge = GaugeMetricFamily(f"kouxing_{name}", "", labels=["service"])
             gauge.add_metric([self._service], value)
             yield gauge
-        for name, each in self._metrics.distributions.copy().items():
-            yield self._histogram(name, each)
+        for name, distribution in self._metrics.distributions.copy().items():
+            yield self._histogram(name, distribution)
         for metric in self._process.collect():
-            metric.samples = [
-                sample._replace(labels={"service": self._service}) for sample in metric.samples
-            ]
+            labels = {"service": self._service}
+            metric.samples = [sample._replace(labels=labels) for sample in metric.samples]
             yield metric
 
     def _counters(self) -> Iterator[Metric]:
-        labelled = {
+        labeled = {
             prefix: CounterMetricFamily(f"kouxing_{name}", text, labels=["service", label])
-            for prefix, (name, label, text) in LABELLED.items()
+            for prefix, (name, label, text) in LABELED.items()
         }
         for name, value in self._metrics.counts.copy().items():
-            for prefix, counter in labelled.items():
-                if name.startswith(prefix):
-                    label = name.removeprefix(prefix).replace("_", "-")
-                    counter.add_metric([self._service, label], value)
-                    break
+            prefix = next(filter(name.startswith, labeled), None)
+            if prefix is not None:
+                label = name.removeprefix(prefix).replace("_", "-")
+                labeled[prefix].add_metric([self._service, label], value)
             else:
-                counter = CounterMetricFamily(f"kouxing_{_base(name)}", "", labels=["service"])
-                counter.add_metric([self._service], value / 1e3 if name != _base(name) else value)
+                base, scale = _in_seconds(name)
+                counter = CounterMetricFamily(f"kouxing_{base}", "", labels=["service"])
+                counter.add_metric([self._service], value / scale)
                 yield counter
-        yield from labelled.values()
+        yield from labeled.values()
 
-    def _histogram(self, name: str, each: Distribution) -> Metric:
-        limits = [*(str(limit_ms / 1e3) for limit_ms in BUCKETS), "+Inf"]
-        histogram = HistogramMetricFamily(f"kouxing_{_base(name)}", "", labels=["service"])
-        counts = accumulate(each.bucket_counts)
-        histogram.add_metric(
-            [self._service], list(zip(limits, counts, strict=True)), each.total / 1e3
-        )
+    def _histogram(self, name: str, distribution: Distribution) -> Metric:
+        base, scale = _in_seconds(name)
+        limits = [*(str(limit_ms / scale) for limit_ms in BUCKETS_MS), "+Inf"]
+        buckets = list(zip(limits, accumulate(distribution.bucket_counts), strict=True))
+        histogram = HistogramMetricFamily(f"kouxing_{base}", "", labels=["service"])
+        histogram.add_metric([self._service], buckets, distribution.total / scale)
         return histogram
 
 
-def _base(name: str) -> str:
-    """Return a name with Prometheus' unit: seconds where it is ms."""
-    return f"{name.removesuffix('_ms')}_seconds" if name.endswith("_ms") else name
+def _in_seconds(name: str) -> tuple[str, float]:
+    """Return a metric's name with Prometheus' unit, and the divisor of its values."""
+    return (f"{name.removesuffix('_ms')}_seconds", 1e3) if name.endswith("_ms") else (name, 1.0)
 
 
-class MetricsServer:
-    """Serves a service's figures and its health, in threads of its own.
+class MetricsServer(ThreadingHTTPServer):
+    """Serves a service's metrics and health in separate threads.
+
+    prometheus_client's own server has no health check and no limits.
 
     Parameters
     ----------
     host, port
-        Where.
+        Address to bind.
     metrics
-        The figures.
+        The service's metrics.
     service
-        Their label.
+        Value of their label.
     is_alive
-        Whether the service's loop runs; called in another thread.
+        Whether the service's loop runs. It is called in other threads.
 
     Raises
     ------
@@ -113,76 +112,67 @@ class MetricsServer:
         If the address cannot be bound.
     """
 
+    daemon_threads = True
+    block_on_close = False
+
     def __init__(
         self, host: str, port: int, metrics: Metrics, service: str, is_alive: Callable[[], bool]
     ) -> None:
-        registry = CollectorRegistry()
-        registry.register(MetricsCollector(metrics, service))
-
-        class Handler(BaseHTTPRequestHandler):
-            timeout = REQUEST_LIMIT_S
-
-            def do_GET(self) -> None:
-                if self.path == "/metrics":
-                    self._answer(HTTPStatus.OK, generate_latest(registry), CONTENT_TYPE_PLAIN_0_0_4)
-                elif self.path == "/healthz":
-                    alive = is_alive()
-                    status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
-                    self._answer(status, b"alive\n" if alive else b"the loop hangs\n")
-                else:
-                    self._answer(HTTPStatus.NOT_FOUND, b"there are /metrics and /healthz\n")
-
-            def _answer(
-                self, status: HTTPStatus, body: bytes, content_type: str = "text/plain"
-            ) -> None:
-                self.send_response(status)
-                self.send_header("Content-Type", content_type)
-                self.send_header("Content-Length", str(len(body)))
-                self.end_headers()
-                self.wfile.write(body)
-
-            def log_message(self, *_arguments: object) -> None:
-                """Leave requests out of the log."""
-
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self.registry = CollectorRegistry()
+        self.registry.register(MetricsCollector(metrics, service))
+        self.is_alive = is_alive
+        self._free_slots = threading.BoundedSemaphore(MAX_REQUESTS)
         try:
-            self._server = _Server(host, port, Handler)
+            super().__init__((host, port), _Handler)
         except OSError as error:
             raise UserError(
                 f"metrics_port: cannot bind {host} port {port}: {error.strerror}"
             ) from None
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-
-    @property
-    def port(self) -> int:
-        """The port that was bound."""
-        return int(self._server.server_address[1])
+        threading.Thread(target=self.serve_forever, daemon=True).start()
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def __init__(self, host: str, port: int, handler: type[BaseHTTPRequestHandler]) -> None:
-        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._free = threading.BoundedSemaphore(MAX_REQUESTS)
-        super().__init__((host, port), handler)
+        self.shutdown()
+        self.server_close()
 
     def process_request(self, request: socket.socket, client_address: object) -> None:  # type: ignore[override]
-        if self._free.acquire(blocking=False):
+        """Answer a request in a thread, or close the connection if there are too many."""
+        if self._free_slots.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: socket.socket, client_address: object) -> None:  # type: ignore[override]
+        """Answer a request."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self._free_slots.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Say nothing about peers that go away."""
+        """Ignore peers that disconnect."""
+
+
+class _Handler(MetricsHandler):
+    timeout = REQUEST_LIMIT_S
+    server: MetricsServer
+
+    def do_GET(self) -> None:  # noqa: N802 - a name of http.server
+        if self.path == "/metrics":
+            self.registry = self.server.registry
+            super().do_GET()
+        elif self.path == "/healthz":
+            alive = self.server.is_alive()
+            status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
+            self._send(status, "alive" if alive else "the loop hangs")
+        else:
+            self._send(HTTPStatus.NOT_FOUND, "use /metrics or /healthz")
+
+    def _send(self, status: HTTPStatus, text: str) -> None:
+        body = f"{text}\n".encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "text/plain")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)

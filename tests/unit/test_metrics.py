@@ -1,3 +1,5 @@
+"""Snapshots of metrics, and the busy share of a loop."""
+
 from __future__ import annotations
 
 import pytest
@@ -11,18 +13,12 @@ def test_counts_and_percentiles() -> None:
     metrics = Metrics()
     metrics.count("in_audio")
     metrics.count("in_audio", 2)
-    for value in range(101):
-        metrics.observe("chunk_ms", float(value))
+    for value_ms in [1e9] * 10 + [*range(101)] * (WINDOW // 100):  # the first ones are too old
+        metrics.observe("chunk_ms", float(value_ms))
     snapshot = metrics.snapshot(0.0)
     assert snapshot["in_audio"] == 3
-    assert (snapshot["chunk_ms_p50"], snapshot["chunk_ms_p95"]) == (50.0, 95.0)
-
-
-def test_only_the_newest_values_count() -> None:
-    metrics = Metrics()
-    for value in [1e9] * 10 + [1.0] * WINDOW:
-        metrics.observe("chunk_ms", value)
-    assert metrics.snapshot(0.0)["chunk_ms_p99"] == 1.0
+    assert snapshot["chunk_ms_p50"] == pytest.approx(50.0, abs=1.0)
+    assert snapshot["chunk_ms_p99"] <= 100.0
 
 
 def test_rates_are_taken_between_snapshots() -> None:
@@ -35,7 +31,7 @@ def test_rates_are_taken_between_snapshots() -> None:
 
 
 def busy_share(until_s: float, work_s: float) -> BusyShare:
-    """Return the share of a loop that works for some time of each second, asked every 0.25 s."""
+    """Return the share of a loop that works at the start of each second, read every 0.25 s."""
     busy = BusyShare(2.0, 0.0)
     for quarter in range(int(4 * until_s)):
         if quarter % 4 == 0:
@@ -50,7 +46,7 @@ def test_the_busy_share_is_that_of_the_work(work_s: float) -> None:
     assert busy_share(6.0, work_s).share(6.0) == pytest.approx(work_s, abs=0.03)
 
 
-def test_the_busy_share_forgets_what_was_long_ago_and_sees_work_under_way() -> None:
+def test_the_busy_share_forgets_old_work_and_includes_work_in_progress() -> None:
     busy = busy_share(4.0, 0.2)
     for quarter in range(1, 13):
         last = busy.share(4.0 + quarter / 4)
