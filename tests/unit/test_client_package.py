@@ -26,9 +26,9 @@ from kouxing_client import (
     Refused,
     Session,
     find_key,
-    resend,
-    session_link,
-    subscription,
+    audio_stream,
+    follower,
+    session_core,
 )
 from kouxing_client.audio import to_pcm
 
@@ -212,7 +212,7 @@ def test_the_key_is_the_one_that_commands_use(
         Client()
     (tmp_path / "kouxing").mkdir()
     (tmp_path / "kouxing" / "client.key").write_text('{"public": "short"}')
-    with pytest.raises(KouxingError, match="is no key file"):
+    with pytest.raises(KouxingError, match="is not a key file"):
         Client()
 
 
@@ -248,7 +248,7 @@ def test_a_moved_session_sends_again_what_the_new_recognizer_needs(stage: Stage)
 def test_what_is_not_acknowledged_is_sent_again_over_a_new_connection(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(resend, "ANSWER_S", (0.1, 10.0))
+    monkeypatch.setattr(audio_stream, "ANSWER_S", (0.1, 10.0))
     session = stage.open()
     for _ in range(3):
         session.push(CHUNK)
@@ -305,14 +305,14 @@ def test_what_waited_while_the_process_was_stopped_is_left_but_for_the_newest(
 ) -> None:
     session = stage.open()
     results = stage.call(session.frames)
-    sockets = stage.client._link._sockets
-    sockets.went_on_s = time.monotonic() + 1.0  # as if it were stopped until then
+    sockets = stage.client._thread._sockets
+    sockets.resumed_at_s = time.monotonic() + 1.0  # as if it were stopped until then
     for number in range(1, 31):
         stage.faps.send(frame(number))
     assert results.get(1.5) is None
     stage.faps.send(frame(31))
-    numbers = [results.get(10.0).sequence for _ in range(subscription.MAX_OLD + 1)]  # type: ignore[union-attr]
-    assert numbers == list(range(31 - subscription.MAX_OLD, 32))
+    numbers = [results.get(10.0).sequence for _ in range(follower.MAX_OLD + 1)]  # type: ignore[union-attr]
+    assert numbers == list(range(31 - follower.MAX_OLD, 32))
 
 
 def test_shapes_have_the_names_of_the_protocol() -> None:
@@ -369,10 +369,10 @@ def test_errors_of_audio_are_raised_once_and_an_unknown_session_ends(
     stage.audio[0].send(Error(session="s", code="bad-voice", text="x"), to=sender)
     with pytest.raises(Refused, match="bad-voice"):
         push_on(session)
-    taken = speech.Acknowledge(session="s", sequence=session._session.num_added)
+    taken = speech.Acknowledge(session="s", sequence=session._num_added)
     stage.audio[0].send(taken, to=sender)  # there may be no room else
     session.push(CHUNK)
-    monkeypatch.setattr(session_link, "MOVE_LIMIT_S", 0.0)
+    monkeypatch.setattr(session_core, "MOVE_LIMIT_S", 0.0)
     stage.audio[0].send(Error(session="s", code="unknown-session", text="x"), to=sender)
     with pytest.raises(Refused, match="unknown-session"):
         push_on(session)

@@ -1,14 +1,26 @@
-"""A client of kouxing: speech to a running system; phones, FAP frames and blend shapes back.
+"""A client of kouxing: send speech to a running system, receive phones, faces and blend shapes.
 
-``Client`` is for plain programs, ``AsyncClient`` for asyncio; both do the same. A thread of their
-own sends what has to be sent again, and follows sessions that move.
+``Client`` is for programs without an event loop, ``AsyncClient`` for asyncio. Both do the same. A
+thread in the background sends lost messages again, and follows sessions that move.
 """
 
 from kouxing_client.aio import AsyncClient, AsyncResults, AsyncSession
 from kouxing_client.client import Client, Results, Session
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.keys import Key, find_key, read_key
-from kouxing_client.messages import SHAPE_NAMES, FapFrame, Phone, Result, Shapes, Sound, Speech
+from kouxing_client.messages import (
+    SHAPE_NAMES,
+    Event,
+    FapFrame,
+    Phone,
+    Result,
+    ServiceState,
+    SessionState,
+    Shapes,
+    Sound,
+    Speech,
+    Status,
+)
 
 __all__ = [
     "SHAPE_NAMES",
@@ -16,6 +28,7 @@ __all__ = [
     "AsyncResults",
     "AsyncSession",
     "Client",
+    "Event",
     "FapFrame",
     "Key",
     "KouxingError",
@@ -23,10 +36,13 @@ __all__ = [
     "Refused",
     "Result",
     "Results",
+    "ServiceState",
     "Session",
+    "SessionState",
     "Shapes",
     "Sound",
     "Speech",
+    "Status",
     "find_key",
     "read_key",
 ]

@@ -1,32 +1,41 @@
-"""The client for asyncio: as ``client``, and calls that wait there are awaited here."""
+"""The client for asyncio: like ``client``, but calls that block there are awaited here."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from kouxing_client.base import BaseClient, BaseResults, BaseSession, open_fields
-from kouxing_client.client import LAST_ANSWER_S
+from kouxing_client.base import (
+    LAST_ANSWER_S,
+    BaseClient,
+    BaseResults,
+    BaseSession,
+    FaceSettings,
+    face_requests,
+    open_fields,
+)
 from kouxing_client.errors import Refused
-from kouxing_client.link import Link
-from kouxing_client.messages import FapFrame, Fields, Phone, Result, Shapes
-from kouxing_client.session_link import SessionLink
-from kouxing_client.subscription import Subscription
+from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
+from kouxing_client.session_core import Inbox, SessionCore
+from kouxing_client.thread import ClientThread
 
-Kind = TypeVar("Kind", bound=Result)
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+T = TypeVar("T", bound=Result | Event)
 
 
 class AsyncSignal:
-    """Wakes tasks of the event loop in which it is waited for first."""
+    """Wakes tasks of the event loop that waits first."""
 
     def __init__(self) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._event = asyncio.Event()
 
     def notify(self) -> None:
-        """Wake all who wait."""
+        """Wake all waiting tasks; any thread may call this."""
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the event loop is closed
                 self._loop.call_soon_threadsafe(self._event.set)
@@ -41,7 +50,7 @@ class AsyncSignal:
 
 
 class AsyncClient(BaseClient):
-    """A connection to a running system; ``BaseClient`` has the parameters."""
+    """A connection to a running system; ``BaseClient`` describes the parameters."""
 
     _make_signal = AsyncSignal
 
@@ -53,7 +62,7 @@ class AsyncClient(BaseClient):
 
     async def close(self) -> None:
         """Close all connections, as ``Client.close``."""
-        await asyncio.to_thread(self._link.close)
+        await asyncio.to_thread(self._thread.close)
 
     async def open_session(
         self,
@@ -67,25 +76,36 @@ class AsyncClient(BaseClient):
     ) -> AsyncSession:
         """Open a session, as ``Client.open_session``."""
         fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
-        session = await asyncio.wrap_future(self._link.open(fields))
-        return AsyncSession(self._link, session, fields)
+        opened = self._thread.submit(lambda: self._thread.core.open_session(fields))
+        return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
 
     async def follow(self, name: str = "") -> AsyncSession:
         """Follow another program's session, as ``Client.follow``."""
-        session = await asyncio.wrap_future(self._link.follow(name))
-        return AsyncSession(self._link, session, None)
+        followed = self._thread.submit(lambda: self._thread.core.follow(name))
+        return AsyncSession(self._thread, await asyncio.wrap_future(followed), None)
+
+    async def status(self, session: str = "") -> Status:
+        """Return the state of services and sessions, as ``Client.status``."""
+        return await asyncio.wrap_future(
+            self._thread.submit(lambda: self._thread.core.status(session))
+        )
+
+    async def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
+        """Change the face of any session, as ``Client.set_face``."""
+        for kind, fields in face_requests("", settings):
+            await self.request(kind, session, **fields)
 
     async def request(self, kind: str, session: str = "", **fields: object) -> Fields:
         """Send any request, as ``Client.request``."""
-        return await asyncio.wrap_future(self._link.request(kind, session, **fields))
+        return await asyncio.wrap_future(self._request(kind, session, fields))
 
 
 class AsyncSession(BaseSession):
-    """One session; ``BaseSession`` says what it does by itself."""
+    """One session; ``BaseSession`` describes what it does by itself."""
 
-    def __init__(self, link: Link, session: SessionLink, options: Fields | None) -> None:
-        super().__init__(link, session, options)
-        self._signal = cast(AsyncSignal, session.signal)
+    def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
+        super().__init__(thread, core, options)
+        self._signal = cast(AsyncSignal, core.signal)
 
     async def __aenter__(self) -> AsyncSession:
         return self
@@ -96,65 +116,75 @@ class AsyncSession(BaseSession):
     async def push(self, audio: Any) -> None:
         """Send audio, as ``Session.push``."""
         for pcm, num_frames in self._chunks(audio):
-            await self._signal.wait(self._has_room)
+            await self._signal.wait(self._can_push)
             self._add(pcm, num_frames)
 
     async def finish(self) -> None:
-        """Say that no more audio comes, as ``Session.finish``."""
+        """End the audio, as ``Session.finish``."""
         self._finish()
 
     async def flush(self) -> None:
         """Interrupt, as ``Session.flush``."""
         await asyncio.wrap_future(self._flush())
 
+    async def set_face(self, **settings: Unpack[FaceSettings]) -> None:
+        """Change the face, as ``Client.set_face``."""
+        for kind, fields in face_requests(self._core.token, settings):
+            await asyncio.wrap_future(self._request(kind, fields))
+
     async def close(self) -> None:
         """Close the session, as ``Session.close``."""
-        if not self._session.is_over and self._options is not None:
+        if not self._core.is_over and self._options is not None:
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._signal.wait(self._is_delivered), LAST_ANSWER_S)
             with contextlib.suppress(Refused):  # it is closed already
                 await asyncio.wrap_future(self._close())
-        await asyncio.wrap_future(self._link.forget(self._session))
+        await asyncio.wrap_future(self._thread.forget(self._core))
 
     async def frames(self) -> AsyncResults[FapFrame]:
-        """Return the FAP frames from here on, as ``Session.frames``."""
-        return await self._subscribe((FapFrame,))
+        """Return the FAP frames from now on, as ``Session.frames``."""
+        return await self._join((FapFrame,))
 
     async def phones(self) -> AsyncResults[Phone]:
-        """Return the phones from here on, as ``Session.phones``."""
-        return await self._subscribe((Phone,))
+        """Return the phones from now on, as ``Session.phones``."""
+        return await self._join((Phone,))
 
     async def shapes(self, name: str) -> AsyncResults[Shapes]:
-        """Return weights of blend shapes from here on, as ``Session.shapes``."""
-        return await self._subscribe((Shapes,), name)
+        """Return weights of blend shapes from now on, as ``Session.shapes``."""
+        return await self._join((Shapes,), name)
 
-    async def results(self, *kinds: type[Result], shapes: str = "") -> AsyncResults[Result]:
-        """Return results of several kinds from here on, as ``Session.results``."""
-        return await self._subscribe(kinds, shapes)
+    async def results(self, *classes: type[Result], shapes: str = "") -> AsyncResults[Result]:
+        """Return results of several classes from now on, as ``Session.results``."""
+        return await self._join(classes, shapes)
 
-    async def _subscribe(
-        self, kinds: tuple[type[Result], ...], shapes: str = ""
+    def events(self) -> AsyncResults[Event]:
+        """Return control's events about the session, as ``Session.events``."""
+        inbox = self._read_events()
+        return AsyncResults(inbox, self._stop_events(inbox))
+
+    async def _join(
+        self, classes: tuple[type[Result], ...], shape_set: str = ""
     ) -> AsyncResults[Any]:
-        subscription = self._session.subscribe(kinds, shapes)
-        await asyncio.wrap_future(subscription.joined)
-        if added := self._add_shapes(shapes):
+        subscription, joined = self._subscribe(classes, shape_set)
+        await asyncio.wrap_future(joined)
+        if added := self._add_shapes(shape_set):
             await asyncio.wrap_future(added)
-        return AsyncResults(self._session, subscription)
+        return AsyncResults(subscription.inbox, self._unsubscribe(subscription))
 
 
-class AsyncResults(BaseResults, Generic[Kind]):
+class AsyncResults(BaseResults, Generic[T]):
     """Results of one session; iteration ends with the session's last face."""
 
-    def __init__(self, session: SessionLink, subscription: Subscription) -> None:
-        super().__init__(session, subscription)
-        self._signal = cast(AsyncSignal, subscription.signal)
+    def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
+        super().__init__(inbox, close)
+        self._signal = cast(AsyncSignal, inbox.signal)
 
-    def __aiter__(self) -> AsyncResults[Kind]:
+    def __aiter__(self) -> AsyncResults[T]:
         return self
 
-    async def __anext__(self) -> Kind:
+    async def __anext__(self) -> T:
         await self._signal.wait(self._has_news)
-        found = self._take()
-        if found is None:
+        result = self._take()
+        if result is None:
             raise StopAsyncIteration
-        return cast(Kind, found)
+        return cast(T, result)

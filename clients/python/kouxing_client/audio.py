@@ -1,4 +1,4 @@
-"""Audio as a program has it, to PCM as it goes over the wire."""
+"""Converts audio to PCM as it is sent."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _FULL_SCALE = 32767
 
 
 def to_pcm(audio: Any, encoding: str) -> bytes:
-    """Return PCM, interleaved.
+    """Convert audio to interleaved PCM.
 
     Parameters
     ----------
     audio
-        Bytes that are PCM in the encoding already, or numbers (integers of 16 bits, or floats
-        within ±1) in an iterable or a buffer, of shape ``(n,)`` or ``(n, channels)``.
+        Bytes of PCM in the encoding, or numbers (16-bit integers, or floats within ±1) in an
+        iterable or a buffer, of shape ``(n,)`` or ``(n, channels)``.
     encoding
         ``s16le`` or ``f32le``.
     """
@@ -46,7 +46,7 @@ def _pack(numbers: memoryview[Any] | array[float], encoding: str) -> bytes:
     return packed.tobytes()
 
 
-def pieces(pcm: bytes, num_bytes: int) -> Iterator[bytes]:
-    """Yield PCM in pieces of at most some length."""
+def split(pcm: bytes, num_bytes: int) -> Iterator[bytes]:
+    """Split PCM into pieces of at most ``num_bytes``."""
     for begin in range(0, len(pcm), num_bytes):
         yield pcm[begin : begin + num_bytes]

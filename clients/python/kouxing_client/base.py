@@ -1,25 +1,42 @@
-"""What plain and asynchronous clients share: arguments, formats, and when to go on."""
+"""What ``Client`` and ``AsyncClient`` share: arguments, audio formats, and when to wait."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from typing import Any
+from typing import Any, TypedDict
 
-from kouxing_client.audio import SAMPLE_BYTES, pieces, to_pcm
-from kouxing_client.errors import KouxingError
+from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
+from kouxing_client.audio_stream import END_OF_AUDIO
+from kouxing_client.core import new_future
+from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.keys import Key, find_key
-from kouxing_client.link import Link
 from kouxing_client.messages import Fields, Result
-from kouxing_client.resend import END_OF_AUDIO
-from kouxing_client.session_link import SessionLink
-from kouxing_client.sockets import Signal
-from kouxing_client.subscription import Subscription
+from kouxing_client.session_core import Inbox, SessionCore, Signal, Subscription
+from kouxing_client.thread import ClientThread
 
 CONTROL = "tcp://127.0.0.1:5550"
-CHUNK_BYTES = 32_000  # of one message at most
-MAX_UNACKNOWLEDGED = 1000  # messages; then whoever sends waits
+CHUNK_BYTES = 32_000  # largest chunk in one message
+MAX_LIVE = 100  # unread results of a live session
+MAX_EVENTS = 1000  # unread events of a session
+MAX_UNACKNOWLEDGED = 1000  # messages; then the sender waits
+LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before a session closes
+
+
+class FaceSettings(TypedDict, total=False):
+    """How a face moves; a setting that is absent stays as it is."""
+
+    lips: str
+    """lip model that moves the mouth"""
+    expressions: Mapping[str, float]
+    """strengths from 0 to 1 by name, in place of those before; ``{}`` fades them now"""
+    hold_s: float
+    """how long the expressions stay before they fade"""
+    expressiveness: float
+    """scale of the mouth's motion, 0.5 to 2"""
+    shapes: Sequence[str]
+    """sets of blend shapes to publish as well"""
 
 
 class BaseClient:
@@ -28,18 +45,19 @@ class BaseClient:
     Parameters
     ----------
     control
-        Address of control; else ``$KOUXING_CONTROL``, else ``tcp://127.0.0.1:5550``.
+        Address of control; default ``$KOUXING_CONTROL``, else ``tcp://127.0.0.1:5550``. Control's
+        public key may follow after a space.
     key
-        Who asks; else the user's own (``find_key``).
+        Key of this program; default: the user's own key (``find_key``).
     insecure
-        The system is one with ``insecure = true``: nothing is encrypted.
+        Whether the system has ``insecure = true``, so that nothing is encrypted.
     timeout_s
-        Time for an answer.
+        Time limit for an answer.
 
     Raises
     ------
     KouxingError
-        If there is no key, or the address is none.
+        If no key is found, or the address is invalid.
     """
 
     _make_signal: Callable[[], Signal]
@@ -53,113 +71,223 @@ class BaseClient:
         timeout_s: float = 10.0,
     ) -> None:
         control = control or os.environ.get("KOUXING_CONTROL") or CONTROL
-        self._link = Link(
-            control, None if insecure else key or find_key(), timeout_s, type(self)._make_signal
-        )
+        key = None if insecure else key or find_key()
+        self._thread = ClientThread(control, key, timeout_s, type(self)._make_signal)
+
+    def _request(self, kind: str, session: str, fields: Fields) -> Future[Fields]:
+        return self._thread.submit(lambda: self._thread.core.request(kind, session, **fields))
 
 
 class BaseSession:
-    """One session: audio goes in, if this program opened it, and results come out.
+    """One session: this program may send audio if it opened the session, and receives results.
 
-    What is lost on the way is sent again, and the results follow when the session moves to another
-    process. To leave it as a context manager closes it.
+    Lost messages are sent again, and results follow when the session moves to another process.
+    Leaving the session as a context manager closes it.
     """
 
-    def __init__(self, link: Link, session: SessionLink, options: Fields | None) -> None:
-        self._link = link
-        self._session = session
+    def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
+        self._thread = thread
+        self._core = core
         self._options = options
+        self._num_added = 0  # audio messages
         self._has_finished = False
 
     @property
     def name(self) -> str:
-        """Its name."""
-        return self._session.name
+        """Name of the session."""
+        return self._core.name
 
-    def _add_shapes(self, name: str) -> Future[Fields] | None:
-        """Ask for a set of blend shapes, unless it is there already."""
-        if not name or name in self._session.endpoints.get("shapes", {}):
-            return None
-        return self._link.request("add-shapes", self.name, shapes=[name])
+    @property
+    def endpoints(self) -> Fields:
+        """Control's answer to ``open-session`` or ``status-request``, with current endpoints."""
+        return {**self._core.endpoints, "epoch": self._core.epoch}
 
-    def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
-        """Yield messages of PCM, and how many samples of each channel they have."""
-        options = self._opened()
-        pcm = to_pcm(audio, options["encoding"])
-        frame_bytes = SAMPLE_BYTES[options["encoding"]] * options["num_channels"]
+    @property
+    def media_time(self) -> int:
+        """Media time of the next chunk, samples at 16 kHz."""
+        return 0 if self._core.stream is None else self._core.stream.media_time
+
+    def try_push(self, pcm: bytes) -> bool:
+        """Send one chunk of PCM without waiting; return False if too much audio is on its way.
+
+        Raises
+        ------
+        KouxingError
+            If the session is over or another program opened it, or the chunk is too large.
+        """
+        num_frames = self._num_frames(pcm)
+        if len(pcm) > CHUNK_BYTES:
+            raise KouxingError(f"a chunk has at most {CHUNK_BYTES} bytes, this one {len(pcm)}")
+        self._check_open()
+        if not self._has_room():
+            return False
+        self._add(pcm, num_frames)
+        return True
+
+    def skip(self, num_frames: int) -> None:
+        """Leave out audio of ``num_frames`` samples per channel: media time advances."""
+
+        def skip() -> None:
+            if self._core.stream is not None:
+                self._core.stream.skip(num_frames)
+
+        self._thread.call(skip)
+
+    def take_errors(self) -> list[Refused]:
+        """Return the recognizer's complaints about audio since the last call, of this or ``push``.
+
+        Raises
+        ------
+        KouxingError
+            If the session is over.
+        """
+        self._check_open()
+        errors = []
+        while self._core.errors:
+            errors.append(self._core.errors.popleft())
+        return errors
+
+    def _num_frames(self, pcm: bytes) -> int:
+        if self._options is None:
+            raise KouxingError("another program opened this session, and sends its audio")
+        frame_bytes: int = SAMPLE_BYTES[self._options["encoding"]] * self._options["num_channels"]
         if len(pcm) % frame_bytes:
             raise KouxingError(f"{len(pcm)} bytes are not whole samples of {frame_bytes} bytes")
-        for piece in pieces(pcm, CHUNK_BYTES):
-            yield piece, len(piece) // frame_bytes
+        return len(pcm) // frame_bytes
 
-    def _opened(self) -> Fields:
-        if self._options is None:
-            raise KouxingError("another program speaks in this session")
-        return self._options
+    def _chunks(self, audio: Any) -> Iterator[tuple[bytes, int]]:
+        """Yield messages of PCM and their number of samples per channel."""
+        pcm = to_pcm(audio, (self._options or {}).get("encoding", "s16le"))
+        self._num_frames(pcm)
+        self._check()
+        for chunk in split(pcm, CHUNK_BYTES):
+            yield chunk, self._num_frames(chunk)
 
     def _add(self, pcm: bytes, num_frames: int) -> None:
-        self._check()
-        self._session.add("audio-chunk", num_frames, pcm=pcm)
+        if not self._has_room():
+            self._check()
+        self._check_open()
+        self._num_added += 1
+        self._thread.call(lambda: self._core.add_audio("audio-chunk", num_frames, {"pcm": pcm}))
 
     def _finish(self) -> None:
-        self._opened()
+        self._num_frames(b"")
         self._check()
-        self._has_finished = True
-        self._session.add(END_OF_AUDIO)
+        if not self._has_finished:
+            self._has_finished = True
+            self._num_added += 1
+            self._thread.call(lambda: self._core.add_audio(END_OF_AUDIO, 0, {}))
+
+    def _request(self, kind: str, fields: Fields) -> Future[Fields]:
+        return self._thread.submit(lambda: self._thread.core.request(kind, self.name, **fields))
 
     def _flush(self) -> Future[Fields]:
-        self._opened()
-        self._session.flush()
-        return self._link.request("flush-session", self.name, token=self._session.token)
+        self._num_frames(b"")
+
+        def flush() -> Future[Fields]:
+            if self._core.stream is not None:
+                self._core.stream.flush()
+            return self._thread.core.request("flush-session", self.name, token=self._core.token)
+
+        return self._thread.submit(flush)
 
     def _close(self) -> Future[Fields]:
-        return self._link.request("close-session", self.name, token=self._session.token)
+        return self._request("close-session", {"token": self._core.token})
+
+    def _subscribe(
+        self,
+        classes: tuple[type[Result], ...],
+        shape_set: str,
+        on_result: Callable[[Any], None] | None = None,
+    ) -> tuple[Subscription, Future[None]]:
+        """Start a subscription; the future is done once it is in effect."""
+        joined = new_future()
+
+        def on_joined(failure: KouxingError | None) -> None:
+            if failure is None:
+                joined.set_result(None)
+            else:
+                joined.set_exception(failure)
+
+        inbox = Inbox(self._thread.make_signal(), MAX_LIVE if self._core.is_live else None)
+        subscription = Subscription(self._core, classes, shape_set, inbox, on_joined, on_result)
+        self._thread.call(lambda: self._core.subscribe(subscription))
+        return subscription, joined
+
+    def _unsubscribe(self, subscription: Subscription) -> Callable[[], None]:
+        return lambda: self._thread.call(lambda: self._core.unsubscribe(subscription))
+
+    def _stop_events(self, inbox: Inbox) -> Callable[[], None]:
+        core = self._thread.core
+        return lambda: self._thread.call(lambda: core.remove_inbox(self.name, inbox))
+
+    def _add_shapes(self, name: str) -> Future[Fields] | None:
+        """Request a set of blend shapes, unless the session has it already."""
+        if not name or name in self._core.endpoints.get("shapes", {}):
+            return None
+        return self._request("add-shapes", {"shapes": [name]})
+
+    def _read_events(self) -> Inbox:
+        inbox = Inbox(self._thread.make_signal(), MAX_EVENTS)
+        self._thread.call(lambda: self._thread.core.add_inbox(self.name, inbox))
+        return inbox
 
     def _check(self) -> None:
-        """Raise what has gone wrong since the last call."""
-        if self._session.is_over:
-            raise self._session.failure or KouxingError("the session is closed")
-        if self._session.errors:
-            raise self._session.errors.popleft()
+        """Raise an error that has occurred since the last call."""
+        self._check_open()
+        if self._core.errors:
+            raise self._core.errors.popleft()
+
+    def _check_open(self) -> None:
+        if self._core.is_over:
+            raise self._core.failure or KouxingError("the session is closed")
 
     def _has_room(self) -> bool:
-        has_news = self._session.is_over or bool(self._session.errors)  # which are raised then
-        return has_news or self._num_waiting() < MAX_UNACKNOWLEDGED
+        return self._num_unacknowledged() < MAX_UNACKNOWLEDGED
+
+    def _can_push(self) -> bool:
+        return self._core.is_over or bool(self._core.errors) or self._has_room()
 
     def _is_delivered(self) -> bool:
-        return self._session.is_over or not self._has_finished or self._num_waiting() == 0
+        return self._core.is_over or not self._has_finished or self._num_unacknowledged() == 0
 
-    def _num_waiting(self) -> int:
-        line = self._session.line
-        return 0 if line is None else self._session.num_added - line.acknowledged
+    def _num_unacknowledged(self) -> int:
+        stream = self._core.stream
+        return 0 if stream is None else self._num_added - stream.acknowledged
 
 
 class BaseResults:
-    """Results of one session."""
+    """Results of one session, or its events."""
 
-    def __init__(self, session: SessionLink, subscription: Subscription) -> None:
-        self._session = session
-        self._subscription = subscription
+    def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
+        self._inbox = inbox
+        self._close = close
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the session's last face has arrived, or the session is closed."""
+        return self._inbox.is_over
 
     def close(self) -> None:
-        """Take no more."""
-        self._session.unsubscribe(self._subscription)
+        """Receive no more results."""
+        self._close()
 
     def _has_news(self) -> bool:
-        return self._subscription.is_over or self._subscription.has_results
+        return self._inbox.is_over or bool(self._inbox.messages)
 
-    def _take(self) -> Result | None:
-        """Return the next result; None if none is there.
+    def _take(self) -> Any:
+        """Return the next result; None if there is none.
 
         Raises
         ------
         KouxingError
             If the session failed before its last face.
         """
-        found = self._subscription.take()
-        if found is None and self._subscription.is_over and self._subscription.failure:
-            raise self._subscription.failure
-        return found
+        if self._inbox.messages:
+            return self._inbox.messages.popleft()
+        if self._inbox.failure is not None:
+            raise self._inbox.failure
+        return None
 
 
 def open_fields(
@@ -181,3 +309,16 @@ def open_fields(
         **({"shapes": list(shapes)} if shapes else {}),
         **options,
     }
+
+
+def face_requests(token: str, settings: FaceSettings) -> Iterator[tuple[str, Fields]]:
+    """Yield the requests that change a face."""
+    if "lips" in settings:
+        yield "choose-lips", {"lips": settings["lips"], "token": token}
+    if "expressions" in settings:
+        hold = {"hold_s": settings["hold_s"]} if "hold_s" in settings else {}
+        yield "express", {"expressions": dict(settings["expressions"]), **hold}
+    if "expressiveness" in settings:
+        yield "choose-expressiveness", {"expressiveness": settings["expressiveness"]}
+    if "shapes" in settings:
+        yield "add-shapes", {"shapes": list(settings["shapes"])}

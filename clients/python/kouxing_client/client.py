@@ -1,31 +1,40 @@
-"""The client for plain programs: calls wait."""
+"""The client for programs without an event loop: calls block."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from kouxing_client.base import BaseClient, BaseResults, BaseSession, open_fields
-from kouxing_client.errors import Refused
-from kouxing_client.link import Link
-from kouxing_client.messages import FapFrame, Fields, Phone, Result, Shapes
-from kouxing_client.session_link import SessionLink
-from kouxing_client.subscription import Subscription
+from kouxing_client.base import (
+    LAST_ANSWER_S,
+    BaseClient,
+    BaseResults,
+    BaseSession,
+    FaceSettings,
+    face_requests,
+    open_fields,
+)
+from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
+from kouxing_client.session_core import Inbox, SessionCore
+from kouxing_client.thread import ClientThread
 
-LAST_ANSWER_S = 2.0  # for the end of the audio to be acknowledged before a session is closed
-Kind = TypeVar("Kind", bound=Result)
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+T = TypeVar("T", bound=Result | Event)
 
 
-class PlainSignal:
+class ThreadSignal:
     """Wakes threads."""
 
     def __init__(self) -> None:
         self._condition = threading.Condition()
 
     def notify(self) -> None:
-        """Wake all who wait."""
+        """Wake all waiting threads."""
         with self._condition:
             self._condition.notify_all()
 
@@ -36,9 +45,9 @@ class PlainSignal:
 
 
 class Client(BaseClient):
-    """A connection to a running system; ``BaseClient`` has the parameters."""
+    """A connection to a running system; ``BaseClient`` describes the parameters."""
 
-    _make_signal = PlainSignal
+    _make_signal = ThreadSignal
 
     def __enter__(self) -> Client:
         return self
@@ -48,7 +57,7 @@ class Client(BaseClient):
 
     def close(self) -> None:
         """Close all connections; control closes sessions that are left open a minute later."""
-        self._link.close()
+        self._thread.close()
 
     def open_session(
         self,
@@ -60,35 +69,35 @@ class Client(BaseClient):
         shapes: Sequence[str] = (),
         **options: object,
     ) -> Session:
-        """Open a session, to send audio to it.
+        """Open a session to send audio to.
 
         Parameters
         ----------
         name
-            Of the session; empty: control chooses one.
+            Session name. If empty, control chooses one.
         sample_rate_hz, num_channels
-            Of the audio: 8000 to 48000, and 1 or 2.
+            Format of the audio: 8000 to 48000 Hz, 1 or 2 channels.
         encoding
-            ``s16le`` or ``f32le``: of bytes that are pushed, and what goes over the wire.
+            ``s16le`` or ``f32le``, of bytes that are pushed and on the wire.
         shapes
-            Sets of blend shapes that are wanted from the first frame on: ``arkit``, ``oculus``,
-            ``vrm``. (Others may be asked for later.)
+            Sets of blend shapes to publish from the first frame on: ``arkit``, ``oculus``, ``vrm``.
         options
-            Other fields of ``open-session``, such as ``paced=False``: audio does not come in real
-            time, but as fast as it is taken.
+            Other fields of ``open-session``, such as ``paced=False`` for audio that arrives faster
+            than real time.
 
         Raises
         ------
         Refused
             If control refuses.
         KouxingError
-            If it does not answer.
+            If control does not answer.
         """
         fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
-        return Session(self._link, self._link.open(fields).result(), fields)
+        core = self._thread.submit(lambda: self._thread.core.open_session(fields)).result()
+        return Session(self._thread, core, fields)
 
     def follow(self, name: str = "") -> Session:
-        """Follow a session that another program has opened; an empty name: the newest.
+        """Follow a session that another program opened; if the name is empty, the newest.
 
         Raises
         ------
@@ -97,27 +106,53 @@ class Client(BaseClient):
         KouxingError
             If there is no session at all, or control does not answer.
         """
-        return Session(self._link, self._link.follow(name).result(), None)
+        core = self._thread.submit(lambda: self._thread.core.follow(name)).result()
+        return Session(self._thread, core, None)
 
-    def request(self, kind: str, session: str = "", **fields: object) -> Fields:
-        """Send any request of PROTOCOL.md, such as ``express``; return the answer's fields.
+    def status(self, session: str = "") -> Status:
+        """Return the state of all services and sessions, or of one session and its services.
+
+        Raises
+        ------
+        Refused
+            If there is no session of this name.
+        KouxingError
+            If control does not answer.
+        """
+        return self._thread.submit(lambda: self._thread.core.status(session)).result()
+
+    def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
+        """Change the face of any session; the keywords are those of ``FaceSettings``.
 
         Raises
         ------
         Refused
             If control refuses.
         KouxingError
-            If it does not answer.
+            If control does not answer.
         """
-        return self._link.request(kind, session, **fields).result()
+        for kind, fields in face_requests("", settings):
+            self.request(kind, session, **fields)
+
+    def request(self, kind: str, session: str = "", **fields: object) -> Fields:
+        """Send any request of PROTOCOL.md; return the fields of the answer.
+
+        Raises
+        ------
+        Refused
+            If control refuses.
+        KouxingError
+            If control does not answer.
+        """
+        return self._request(kind, session, fields).result()
 
 
 class Session(BaseSession):
-    """One session; ``BaseSession`` says what it does by itself."""
+    """One session; ``BaseSession`` describes what it does by itself."""
 
-    def __init__(self, link: Link, session: SessionLink, options: Fields | None) -> None:
-        super().__init__(link, session, options)
-        self._signal = cast(PlainSignal, session.signal)
+    def __init__(self, thread: ClientThread, core: SessionCore, options: Fields | None) -> None:
+        super().__init__(thread, core, options)
+        self._signal = cast(ThreadSignal, core.signal)
 
     def __enter__(self) -> Session:
         return self
@@ -125,84 +160,112 @@ class Session(BaseSession):
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def push(self, audio: Any) -> None:
-        """Send audio; it waits while much is on its way.
+    def push(self, audio: Any, timeout_s: float | None = None) -> None:
+        """Send audio, and wait while too much of it is on its way.
 
         Parameters
         ----------
         audio
-            Bytes of PCM in the session's encoding, or numbers (integers of 16 bits, or floats
-            within ±1): a list, an ``array``, a NumPy array; of shape ``(n,)`` or ``(n, channels)``.
+            Bytes of PCM in the session's encoding, or numbers (16-bit integers, or floats within
+            ±1): a list, an ``array`` or a NumPy array of shape ``(n,)`` or ``(n, channels)``.
+        timeout_s
+            How long to wait until the recognizer takes more audio; None: without limit.
 
         Raises
         ------
         Refused
-            If the recognizer could not use audio that was sent before; the session goes on.
+            If the recognizer rejected earlier audio; the session continues.
         KouxingError
-            If the session is over, or another program's.
+            If the session is over, another program opened it, or the time limit has passed.
         """
         for pcm, num_frames in self._chunks(audio):
-            self._signal.wait(self._has_room)
+            if not self._signal.wait(self._can_push, timeout_s):
+                raise KouxingError(
+                    f"the recognizer has taken no audio for {timeout_s:g} s; is it running?"
+                )
             self._add(pcm, num_frames)
 
     def finish(self) -> None:
-        """Say that no more audio comes; the results go on to the last face. Raises as ``push``."""
+        """End the audio; results continue until the last face. Raises as ``push``."""
         self._finish()
 
     def flush(self) -> None:
         """Interrupt: audio not yet shown is dropped, and the face returns to rest."""
         self._flush().result()
 
+    def set_face(self, **settings: Unpack[FaceSettings]) -> None:
+        """Change the face, as ``Client.set_face``."""
+        for kind, fields in face_requests(self._core.token, settings):
+            self._request(kind, fields).result()
+
     def close(self) -> None:
-        """Close the session, if this program opened it, and all that is connected to it."""
-        if not self._session.is_over and self._options is not None:
+        """Close the session if this program opened it, and all its connections."""
+        if not self._core.is_over and self._options is not None:
             self._signal.wait(self._is_delivered, LAST_ANSWER_S)
             with contextlib.suppress(Refused):  # it is closed already
                 self._close().result()
-        self._link.forget(self._session).result()
+        self._thread.forget(self._core).result()
 
     def frames(self) -> Results[FapFrame]:
-        """Return the FAP frames from here on; raises ``KouxingError`` if the session is over."""
-        return self._subscribe((FapFrame,))
+        """Return the FAP frames from now on; raises ``KouxingError`` if the session is over."""
+        return self._join((FapFrame,))
 
     def phones(self) -> Results[Phone]:
-        """Return the phones from here on, as ``frames``; each comes at least twice."""
-        return self._subscribe((Phone,))
+        """Return the phones from now on; each arrives at least twice. Raises as ``frames``."""
+        return self._join((Phone,))
 
     def shapes(self, name: str) -> Results[Shapes]:
-        """Return the weights of a set of blend shapes from here on, as ``frames``."""
-        return self._subscribe((Shapes,), name)
+        """Return the weights of a set of blend shapes from now on; raises as ``frames``."""
+        return self._join((Shapes,), name)
 
-    def results(self, *kinds: type[Result], shapes: str = "") -> Results[Result]:
-        """Return results of several kinds from here on, as ``frames``."""
-        return self._subscribe(kinds, shapes)
+    def results(
+        self,
+        *classes: type[Result],
+        shapes: str = "",
+        on_result: Callable[[Any], None] | None = None,
+    ) -> Results[Result]:
+        """Return results of several classes from now on; raises as ``frames``.
 
-    def _subscribe(self, kinds: tuple[type[Result], ...], shapes: str = "") -> Results[Any]:
-        subscription = self._session.subscribe(kinds, shapes)
-        subscription.joined.result()
-        if added := self._add_shapes(shapes):
+        If ``on_result`` is given, the client's thread calls it with each result instead.
+        """
+        return self._join(classes, shapes, on_result)
+
+    def events(self) -> Results[Event]:
+        """Return control's events about the session from now on, even after it is closed."""
+        inbox = self._read_events()
+        return Results(inbox, self._stop_events(inbox))
+
+    def _join(
+        self,
+        classes: tuple[type[Result], ...],
+        shape_set: str = "",
+        on_result: Callable[[Any], None] | None = None,
+    ) -> Results[Any]:
+        subscription, joined = self._subscribe(classes, shape_set, on_result)
+        joined.result()
+        if added := self._add_shapes(shape_set):
             added.result()
-        return Results(self._session, subscription)
+        return Results(subscription.inbox, self._unsubscribe(subscription))
 
 
-class Results(BaseResults, Generic[Kind]):
+class Results(BaseResults, Generic[T]):
     """Results of one session; iteration ends with the session's last face."""
 
-    def __init__(self, session: SessionLink, subscription: Subscription) -> None:
-        super().__init__(session, subscription)
-        self._signal = cast(PlainSignal, subscription.signal)
+    def __init__(self, inbox: Inbox, close: Callable[[], None]) -> None:
+        super().__init__(inbox, close)
+        self._signal = cast(ThreadSignal, inbox.signal)
 
-    def __iter__(self) -> Results[Kind]:
+    def __iter__(self) -> Results[T]:
         return self
 
-    def __next__(self) -> Kind:
-        found = self.get()
-        if found is None:
+    def __next__(self) -> T:
+        result = self.get()
+        if result is None:
             raise StopIteration
-        return found
+        return result
 
-    def get(self, timeout_s: float | None = None) -> Kind | None:
-        """Return the next result; None at the end, or if none came in time.
+    def get(self, timeout_s: float | None = None) -> T | None:
+        """Return the next result; None at the end, or if none arrives in time.
 
         Raises
         ------
@@ -210,4 +273,4 @@ class Results(BaseResults, Generic[Kind]):
             If the session failed before its last face.
         """
         self._signal.wait(self._has_news, timeout_s)
-        return cast("Kind | None", self._take())
+        return cast("T | None", self._take())

@@ -1,17 +1,20 @@
-"""What comes back, and the two ZeroMQ parts of every message; see kouxing's PROTOCOL.md."""
+"""The messages that a client reads and writes; PROTOCOL.md describes them."""
 
 from __future__ import annotations
 
-import struct
 import sys
 from array import array
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-import msgpack
+import msgspec
+
+if TYPE_CHECKING:
+    Floats = array[float]
+else:
+    Floats = array  # what msgspec can evaluate
 
 VERSION = 2
+MEDIA_RATE_HZ = 16000
 NUM_FAPS = 68
 Fields = dict[str, Any]
 SHAPE_NAMES: dict[str, tuple[str, ...]] = {
@@ -36,52 +39,69 @@ SHAPE_NAMES: dict[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class Result:
-    """Something about a session at a time of its sound."""
+class Message(msgspec.Struct, frozen=True, kw_only=True):
+    """Fields that every message has."""
 
-    epoch: int
-    """counts the placements of the session; a greater one begins when it moves"""
-    sequence: int
-    """counts the messages of this publisher"""
-    media_time: int
+    kind: ClassVar[str]  # first part of the topic
+
+    version: int = VERSION
+    session: str = ""
+    epoch: int = 0
+    """placement of the session; it grows each time the session moves to another process"""
+    sequence: int = 0
+    """number of the message among those of its publisher"""
+    media_time: int = 0
     """samples at 16 kHz since the session's first sample"""
+
+
+class Result(Message, frozen=True, kw_only=True):
+    """A message about the session at ``media_time``.
+
+    Subclasses name other kinds of message of PROTOCOL.md and can be passed to ``results``.
+    """
 
     @property
     def time_s(self) -> float:
         """Seconds since the session's first sample."""
-        return self.media_time / 16000
+        return self.media_time / MEDIA_RATE_HZ
 
 
-@dataclass(frozen=True)
-class FapFrame(Result):
+class FapFrame(Result, frozen=True, kw_only=True):
     """The face at ``media_time``."""
 
-    values: array[float]
+    kind: ClassVar[str] = "fap-frame"
+
+    values: Floats
     """68 values in FAP units, FAP 1 first"""
 
+    def __post_init__(self) -> None:
+        if len(self.values) != NUM_FAPS:
+            raise ValueError(f"expected {NUM_FAPS} values, got {len(self.values)}")
 
-@dataclass(frozen=True)
-class Shapes(Result):
+
+class Shapes(Result, frozen=True, kw_only=True):
     """The face at ``media_time`` as weights of blend shapes."""
+
+    kind: ClassVar[str] = "shapes"
 
     set: str
     """``arkit``, ``oculus`` or ``vrm``"""
-    weights: array[float]
+    weights: Floats
     """0 to 1, in the order of ``SHAPE_NAMES``"""
 
     @property
     def by_name(self) -> dict[str, float]:
-        """The weights by the shapes' names."""
+        """The weights by shape name."""
         return dict(zip(SHAPE_NAMES[self.set], self.weights, strict=True))
 
 
-@dataclass(frozen=True)
-class Phone(Result):
-    """A recognised phone, whose onset is ``media_time``; the same ``index`` again revises it."""
+class Phone(Result, frozen=True, kw_only=True):
+    """A recognized phone with its onset at ``media_time``; the same ``index`` revises it."""
+
+    kind: ClassVar[str] = "phone"
 
     index: int
-    """counts the phones of an epoch"""
+    """number of the phone within its epoch"""
     symbol: str
     """a phone of the session's language"""
     duration: int
@@ -89,91 +109,144 @@ class Phone(Result):
     confidence: float
     """0 to 1"""
     final: bool
-    """onset and duration are measured; else the duration is an estimate"""
+    """whether onset and duration are measured; otherwise the duration is an estimate"""
 
 
-@dataclass(frozen=True)
-class Speech(Result):
-    """Somebody began to speak, or stopped."""
+class Speech(Result, frozen=True, kw_only=True):
+    """Speech starts or stops."""
+
+    kind: ClassVar[str] = "speech"
 
     active: bool
 
 
-@dataclass(frozen=True)
-class Sound(Result):
-    """The session's audio, from ``media_time`` on."""
+class Sound(Result, frozen=True, kw_only=True):
+    """The session's audio from ``media_time`` on."""
+
+    kind: ClassVar[str] = "sound"
 
     pcm: bytes
     """16-bit integers, little-endian, 16 kHz, mono"""
 
 
-# Kind of message, publisher and how its own fields are read, by class.
-_READERS: dict[type[Result], tuple[str, str, Callable[[Fields], Fields]]] = {
-    FapFrame: ("fap-frame", "faps", lambda body: {"values": floats(body["values"], NUM_FAPS)}),
-    Shapes: (
-        "shapes",
-        "faps",
-        lambda body: {"set": body["set"], "weights": floats(body["weights"])},
-    ),
-    Phone: (
-        "phone",
-        "phones",
-        lambda body: {
-            name: body[name] for name in ("index", "symbol", "duration", "confidence", "final")
-        },
-    ),
-    Speech: ("speech", "phones", lambda body: {"active": body["active"]}),
-    Sound: ("sound", "phones", lambda body: {"pcm": body["pcm"]}),
-}
-END = "end-of-faps"
-KIND_OF = {cls: kind for cls, (kind, _, _) in _READERS.items()}
-PUBLISHER_OF = {END: "faps", **{kind: publisher for kind, publisher, _ in _READERS.values()}}
-_CLASS_OF = {kind: cls for cls, kind in KIND_OF.items()}
+class EndOfFaps(Message, frozen=True, kw_only=True):
+    """The session's last FAP frame has been published."""
+
+    kind: ClassVar[str] = "end-of-faps"
 
 
-def encode(kind: str, session: str, fields: Fields) -> list[bytes]:
-    """Return the parts of a message."""
-    body = {"version": VERSION, "session": session, **fields}
-    return [topic(kind, session), msgpack.packb(body)]
+class Joined(Message, frozen=True, kw_only=True):
+    """A publisher confirms that the subscriptions before this one are in effect."""
+
+    kind: ClassVar[str] = "joined"
+
+    publisher: str
 
 
-def topic(kind: str, session: str) -> bytes:
-    """Return the first part of a message; subscriptions are to these."""
-    return f"{kind}/{session}/".encode()
+class Event(Message, frozen=True, kw_only=True):
+    """Control reports a change, such as ``session-closed`` or ``recorded``."""
+
+    kind: ClassVar[str] = "event"
+
+    name: str
+    detail: str = ""
 
 
-def decode(parts: list[bytes]) -> tuple[str, Fields] | None:
-    """Return kind and fields of a message; None if it is none of this version."""
-    try:
-        name, body = parts
-        fields = {
-            "session": "", "epoch": 0, "sequence": 0, "media_time": 0, **msgpack.unpackb(body)
-        }  # fmt: skip
-        return (name.decode().partition("/")[0], fields) if fields["version"] == VERSION else None
-    except (ValueError, TypeError, KeyError, msgpack.UnpackException):
-        return None
+class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
+    """One service, as its last heartbeat described it."""
+
+    service: str
+    """``recognizer``, ``synthesizer``, ..."""
+    instance: str
+    state: str
+    """``ready`` or ``draining``"""
+    age_s: float
+    """seconds since its last heartbeat"""
+    clock_offset_ms: float
+    """its clock minus control's"""
+    endpoints: dict[str, str]
+    metrics: dict[str, float]
 
 
-def result(kind: str, fields: Fields) -> Result | None:
-    """Return what a publisher's message says; None if a field is missing or wrong."""
-    cls = _CLASS_OF[kind]
-    common = {name: fields[name] for name in ("epoch", "sequence", "media_time")}
-    try:
-        return cls(**common, **_READERS[cls][2](fields))
-    except (KeyError, TypeError, ValueError, struct.error):
-        return None
+class SessionState(msgspec.Struct, frozen=True, kw_only=True):
+    """One session, as control knows it."""
+
+    session: str
+    state: str
+    """``starting`` or ``open``"""
+    age_s: float
+    speaking: bool
+    endpoints: dict[str, str]
+    """addresses of its recognizer and synthesizer: ``audio``, ``phones``, ``faps``, ..."""
+    workers: dict[str, str]
+    """instance at each endpoint"""
+    language: str = ""
+    """language of the phones"""
 
 
-def floats(data: bytes, count: int | None = None) -> array[float]:
-    """Return little-endian float32."""
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """The state of a system."""
+
+    services: list[ServiceState]
+    sessions: list[SessionState]
+
+
+M = TypeVar("M", bound=Message)
+_ENCODER = msgspec.msgpack.Encoder()
+_FIELDS_DECODER = msgspec.msgpack.Decoder(dict[str, Any])
+
+
+def _to_floats(_type: object, data: object) -> array[float]:
+    """Convert little-endian float32 to numbers."""
+    if not isinstance(data, bytes):
+        raise TypeError("expected bytes")
     values = array("f", data)
-    if count not in (None, len(values)):
-        raise ValueError(f"expected {count} values, got {len(values)}")
     if sys.byteorder == "big":
         values.byteswap()
     return values
 
 
-def kinds_of(classes: Iterable[type[Result]]) -> set[str]:
-    """Return the kinds of messages that bring some results, and the end."""
-    return {END, *(KIND_OF[cls] for cls in classes)}
+def topic(kind: str, session: str) -> bytes:
+    """Return the first part of a message, to which clients subscribe."""
+    return f"{kind}/{session}/".encode()
+
+
+def encode(kind: str, session: str, fields: Fields) -> list[bytes]:
+    """Return the two parts of a message."""
+    body = {"version": VERSION, "session": session, **fields}
+    return [topic(kind, session), _ENCODER.encode(body)]
+
+
+def kind_of(parts: list[bytes]) -> str:
+    """Return the kind of a message."""
+    return parts[0].partition(b"/")[0].decode("ascii", "replace")
+
+
+def decode(parts: list[bytes]) -> tuple[str, Fields] | None:
+    """Return the kind and the fields of a message; None if it is not a message of this version."""
+    try:
+        _, body = parts
+        fields = {"session": "", "epoch": 0, "sequence": 0, **_FIELDS_DECODER.decode(body)}
+    except (msgspec.MsgspecError, ValueError):
+        return None
+    return (kind_of(parts), fields) if fields.get("version") == VERSION else None
+
+
+class Decoders:
+    """Decodes messages of some classes."""
+
+    def __init__(self, *classes: type[Message]) -> None:
+        self._decoders = {
+            cls.kind: msgspec.msgpack.Decoder(cls, dec_hook=_to_floats) for cls in classes
+        }
+
+    def decode(self, parts: list[bytes]) -> Message | None:
+        """Return a message; None for other kinds, other versions and malformed messages."""
+        decoder = self._decoders.get(kind_of(parts))
+        if decoder is None or len(parts) != 2:
+            return None
+        try:
+            message = decoder.decode(parts[1])
+        except (msgspec.MsgspecError, ValueError):
+            return None
+        return message if message.version == VERSION else None

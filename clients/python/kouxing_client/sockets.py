@@ -1,4 +1,4 @@
-"""The sockets of one client, which one thread uses, and how other threads reach that thread."""
+"""The ZeroMQ sockets of one client. One thread uses them; other threads hand it functions."""
 
 from __future__ import annotations
 
@@ -8,64 +8,80 @@ import secrets
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
-from concurrent.futures import Future
-from typing import Any, Protocol
+from collections.abc import Callable, Collection
 
 import zmq
+from zmq.utils.monitor import parse_monitor_message
 
 from kouxing_client.errors import KouxingError
 from kouxing_client.keys import Key
+from kouxing_client.messages import Decoders, Joined, Message, topic
 
 QUEUE = 20_000  # messages
-RECONNECT_MS = (50, 100)  # between attempts to connect, at first and later
+LIVE_BUFFER = 65_536  # bytes in the kernel: some seconds of FAP frames, over any distance
+RECONNECT_MS = (20, 50)  # first and longest pause between attempts to connect
+CONNECT_MS = 300  # limit for one attempt; a lost packet costs the whole limit
 HANDSHAKE_MS = 2000
-STOPPED_S = 0.5  # a wait that is so much longer than asked for: this process was stopped
+SUSPENDED_S = 0.5  # a wait that takes this much longer than requested: the process was suspended
+_MONITORED = (
+    zmq.EVENT_CONNECTED,
+    zmq.EVENT_HANDSHAKE_SUCCEEDED,
+    zmq.EVENT_CONNECT_RETRIED,
+)
 
-
-class Signal(Protocol):
-    """Wakes who waits for a change."""
-
-    def notify(self) -> None:
-        """Something changed; for any thread."""
+Connection = zmq.Socket[bytes]
 
 
 class Sockets:
-    """All but ``call`` and ``make_signal`` is for the thread that calls ``step`` alone.
+    """Opens sockets and passes on what they receive.
+
+    Only ``call`` may be used by any thread. All other methods are for the thread that calls
+    ``step``, and for the constructor's thread before that.
 
     Parameters
     ----------
     key
-        Who this program is; None: nothing is encrypted.
-    make_signal
-        Makes what wakes who waits for a session or for results.
+        The key of this program; None if nothing is encrypted.
+
+    Attributes
+    ----------
+    connect_ms
+        Limit for one attempt to connect, of sockets that are opened from now on.
+    resumed_at_s
+        When this process last resumed after it was suspended; minus infinity if never.
     """
 
-    def __init__(self, key: Key | None, make_signal: Callable[[], Signal]) -> None:
-        self.make_signal = make_signal
-        self.went_on_s = -math.inf  # when it went on after this process had been stopped
+    def __init__(self, key: Key | None) -> None:
+        self.connect_ms = CONNECT_MS
+        self.resumed_at_s = -math.inf
         self._key = key
         self._context = zmq.Context()
         self._poller = zmq.Poller()
-        self._handlers: dict[zmq.Socket[bytes], Callable[[list[bytes]], None]] = {}
+        self._handlers: dict[Connection, Callable[[list[bytes]], None]] = {}
+        self._monitors: dict[Connection, Connection] = {}
         self._calls: deque[Callable[[], None]] = deque()
         self._woken, self._waker = socket.socketpair()
         self._woken.setblocking(False)
         self._waker.setblocking(False)
         self._poller.register(self._woken, zmq.POLLIN)
 
+    @property
+    def now_s(self) -> float:
+        """Monotonic time."""
+        return time.monotonic()
+
     def call(self, function: Callable[[], None]) -> None:
-        """Let the thread call something; for any thread."""
+        """Let the thread call a function soon."""
         self._calls.append(function)
-        with contextlib.suppress(OSError):  # full, so that it is awake; or closed
+        with contextlib.suppress(OSError):  # full, so the thread wakes anyway; or closed
             self._waker.send(b"\0")
 
     def step(self, timeout_s: float) -> None:
-        """Handle what has arrived and what is to be called, waiting up to the timeout for it."""
+        """Wait up to the timeout, then handle received messages and requested calls."""
         begin_s = time.monotonic()
-        ready = self._poller.poll(round(1000 * timeout_s))
-        if time.monotonic() > begin_s + timeout_s + STOPPED_S:
-            self.went_on_s = time.monotonic()
+        ready = self._poller.poll(math.ceil(1000 * timeout_s))
+        if time.monotonic() > begin_s + timeout_s + SUSPENDED_S:
+            self.resumed_at_s = time.monotonic()
         for raw, _ in ready:
             if isinstance(raw, zmq.Socket):
                 self.drain(raw)
@@ -76,95 +92,147 @@ class Sockets:
 
     def connect(
         self,
-        kind: int,
-        endpoints: Iterable[str],
-        handler: Callable[[list[bytes]], None],
+        endpoint: str,
+        on_message: Callable[[list[bytes]], None],
         *,
         queue: int = QUEUE,
-        buffer: int = -1,
-    ) -> zmq.Socket[bytes]:
-        """Connect a socket.
+        on_refused: Callable[[bool], None] | None = None,
+    ) -> Connection:
+        """Connect to a ROUTER socket.
 
         Parameters
         ----------
-        kind
-            ``zmq.DEALER`` or ``zmq.SUB``.
-        endpoints
-            An address each and, unless all is plain, a space and a public key.
-        handler
-            What to call with the parts of each message.
+        endpoint
+            Address and, if traffic is encrypted, a space and the server's public key.
+        on_message
+            Called with the parts of each message.
         queue
-            Messages that may wait.
-        buffer
-            Bytes that the kernel may hold of what comes; -1: as it likes.
+            How many messages may wait.
+        on_refused
+            Called when an attempt to connect shows whether the server refuses this key.
 
         Raises
         ------
         KouxingError
-            If an endpoint is none.
+            If the endpoint is invalid.
         """
-        raw: zmq.Socket[bytes] = self._context.socket(kind)
-        raw.linger, raw.sndhwm, raw.rcvhwm = 0, queue, queue
-        raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
-        raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
-        raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
-        raw.setsockopt(zmq.RCVBUF, buffer)
-        if kind == zmq.DEALER:  # a router knows this peer again after a reconnect
-            raw.setsockopt(zmq.ROUTING_ID, b"\1" + secrets.token_bytes(15))
-        try:
-            for endpoint in endpoints:
-                self._connect(raw, endpoint)
-        except KouxingError:
-            raw.close()
-            raise
-        self._handlers[raw] = handler
-        self._poller.register(raw, zmq.POLLIN)
+        raw = self._open(zmq.DEALER, queue, on_message)
+        raw.setsockopt(zmq.ROUTING_ID, b"\1" + secrets.token_bytes(15))  # the same on reconnection
+        if on_refused is not None:
+            self._monitor(raw, on_refused)
+        self._connect(raw, endpoint)
         return raw
 
-    def drain(self, raw: zmq.Socket[bytes]) -> None:
-        """Handle what has arrived at a socket, until it is dropped."""
-        with contextlib.suppress(zmq.Again):
-            while (handler := self._handlers.get(raw)) is not None:
-                handler(raw.recv_multipart(zmq.DONTWAIT))
+    def subscribe(
+        self,
+        session: str,
+        classes: Collection[type[Message]],
+        addresses: Collection[str],
+        live_addresses: Collection[str],
+        on_message: Callable[[Message], None],
+    ) -> Connection:
+        """Subscribe to a session's messages, as ``Transport.subscribe`` describes."""
+        decoders = Decoders(*classes, Joined)
 
-    def drop(self, raw: zmq.Socket[bytes]) -> None:
-        """Close a socket."""
-        self._poller.unregister(raw)
-        del self._handlers[raw]
-        raw.close()
+        def decode(parts: list[bytes]) -> None:
+            if (message := decoders.decode(parts)) is not None:
+                on_message(message)
+
+        raw = self._open(zmq.SUB, QUEUE, decode)
+        for endpoint in sorted(addresses):
+            self._connect(raw, endpoint)
+        raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
+        for endpoint in sorted(live_addresses):
+            self._connect(raw, endpoint)
+        for kind in (*(cls.kind for cls in classes), Joined.kind):
+            raw.setsockopt(zmq.SUBSCRIBE, topic(kind, session))
+        return raw
+
+    def connect_events(
+        self, endpoint: str, on_message: Callable[[list[bytes]], None]
+    ) -> Connection:
+        """Connect to the socket where control publishes events."""
+        raw = self._open(zmq.SUB, QUEUE, on_message)
+        self._connect(raw, endpoint)
+        return raw
+
+    def set_topics(self, connection: Connection, topics: list[bytes], *, on: bool) -> None:
+        """Subscribe to topics, or unsubscribe."""
+        for name in topics:
+            connection.setsockopt(zmq.SUBSCRIBE if on else zmq.UNSUBSCRIBE, name)
+
+    def send(self, connection: Connection, parts: list[bytes]) -> bool:
+        """Send a message; return whether the socket took it."""
+        try:
+            connection.send_multipart(parts, zmq.DONTWAIT)
+        except zmq.Again:
+            return False
+        return True
+
+    def drain(self, connection: Connection) -> None:
+        """Handle what has arrived, until the connection is closed."""
+        with contextlib.suppress(zmq.Again):
+            while (handler := self._handlers.get(connection)) is not None:
+                handler(connection.recv_multipart(zmq.DONTWAIT))
+
+    def close_connection(self, connection: Connection) -> None:
+        """Close a connection."""
+        if (monitor := self._monitors.pop(connection, None)) is not None:
+            connection.disable_monitor()
+            self.close_connection(monitor)
+        self._poller.unregister(connection)
+        del self._handlers[connection]
+        connection.close()
 
     def close(self) -> None:
-        """Close all."""
+        """Close all connections."""
         self._context.destroy(linger=0)
         self._woken.close()
         self._waker.close()
 
-    def _connect(self, raw: zmq.Socket[bytes], endpoint: str) -> None:
+    def _open(self, kind: int, queue: int, on_message: Callable[[list[bytes]], None]) -> Connection:
+        raw: Connection = self._context.socket(kind)
+        raw.linger, raw.sndhwm, raw.rcvhwm = 0, queue, queue
+        raw.setsockopt(zmq.RECONNECT_IVL, RECONNECT_MS[0])
+        raw.setsockopt(zmq.RECONNECT_IVL_MAX, RECONNECT_MS[1])
+        raw.setsockopt(zmq.CONNECT_TIMEOUT, self.connect_ms)
+        raw.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+        self._handlers[raw] = on_message
+        self._poller.register(raw, zmq.POLLIN)
+        return raw
+
+    def _connect(self, raw: Connection, endpoint: str) -> None:
         address, _, server = endpoint.partition(" ")
-        if bool(server) != (self._key is not None):
-            raise KouxingError(f"{address}: one end is encrypted, the other is 'insecure'")
-        if self._key is not None:
-            raw.setsockopt_string(zmq.CURVE_SERVERKEY, server)
-            raw.setsockopt_string(zmq.CURVE_PUBLICKEY, self._key.public)
-            raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
-        raw.setsockopt(zmq.IPV6, "[" in address)
         try:
+            if bool(server) != (self._key is not None):
+                raise KouxingError(
+                    f"{address}: one end has 'insecure = true', the other encrypts; set it at both"
+                )
+            if self._key is not None:
+                raw.setsockopt_string(zmq.CURVE_SERVERKEY, server)
+                raw.setsockopt_string(zmq.CURVE_PUBLICKEY, self._key.public)
+                raw.setsockopt_string(zmq.CURVE_SECRETKEY, self._key.secret)
+            raw.setsockopt(zmq.IPV6, "[" in address)
             raw.connect(address)
-        except zmq.ZMQError as error:
+        except (KouxingError, zmq.ZMQError) as error:
+            self.close_connection(raw)
+            if isinstance(error, KouxingError):
+                raise
             raise KouxingError(f"cannot connect to {address!r}: {error.strerror}") from None
 
+    def _monitor(self, raw: Connection, on_refused: Callable[[bool], None]) -> None:
+        """Report refusals: a server that refuses a key accepts the connection, then closes it."""
+        monitor = raw.get_monitor_socket(sum(_MONITORED))
+        state = {"connected": False}
 
-def send(raw: zmq.Socket[bytes], parts: list[bytes]) -> bool:
-    """Return whether a socket took a message."""
-    try:
-        raw.send_multipart(parts, zmq.DONTWAIT)
-    except zmq.Again:
-        return False
-    return True
+        def on_event(parts: list[bytes]) -> None:
+            event = parse_monitor_message(parts)["event"]
+            if event == zmq.EVENT_CONNECTED:
+                state["connected"] = True
+                return
+            on_refused(event == zmq.EVENT_CONNECT_RETRIED and state["connected"])
+            state["connected"] = False
 
-
-def new_future() -> Future[Any]:
-    """Return a future that who waits for it cannot cancel."""
-    future: Future[Any] = Future()
-    future.set_running_or_notify_cancel()
-    return future
+        self._monitors[raw] = monitor
+        self._handlers[monitor] = on_event
+        self._poller.register(monitor, zmq.POLLIN)

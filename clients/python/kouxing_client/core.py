@@ -1,0 +1,310 @@
+"""What all clients do: requests to control, sessions, and events; no I/O of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
+
+from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.messages import (
+    Decoders,
+    Event,
+    Fields,
+    ServiceState,
+    SessionState,
+    Status,
+    decode,
+    encode,
+    kind_of,
+    topic,
+)
+from kouxing_client.session_core import (
+    SILENT_S,
+    Inbox,
+    SessionCore,
+    Signal,
+    refused,
+)
+
+if TYPE_CHECKING:
+    from kouxing_client.sockets import Connection, Sockets
+
+RETRY_S = 1.0  # between attempts of a request that is not answered
+WATCHED = ("event", "session-moved")  # what control publishes about a session
+EVENTS = Decoders(Event)
+T = TypeVar("T")
+U = TypeVar("U")
+
+
+@dataclass
+class _Request:
+    parts: list[bytes]
+    answer: Future[Fields]
+    end_s: float
+    retry_s: float = 0.0
+
+
+class ClientCore:
+    """Sends requests to control, and passes its messages to the sessions.
+
+    Parameters
+    ----------
+    sockets
+        The client's connections.
+    control
+        Address of control and, if traffic is encrypted, a space and its public key.
+    timeout_s
+        Time limit for an answer.
+    make_signal
+        Creates what wakes the threads that wait for a session.
+    """
+
+    def __init__(
+        self,
+        sockets: Sockets,
+        control: str,
+        timeout_s: float,
+        make_signal: Callable[[], Signal],
+    ) -> None:
+        self.sessions: dict[str, SessionCore] = {}
+        self._sockets = sockets
+        self._control = control
+        self._timeout_s = timeout_s
+        self._make_signal = make_signal
+        self._requests: dict[str, _Request] = {}
+        self._is_refused = False
+        self._inboxes: dict[str, list[Inbox]] = {}  # by session
+        self._asked_s: dict[str, float] = {}  # when control was asked about a silent session
+        self._events: Connection | None = None
+        self._commands = self._connect()
+
+    def request(self, kind: str, session: str = "", **fields: object) -> Future[Fields]:
+        """Send a request to control; the future gets the answer's fields, or ``Refused``."""
+        name = secrets.token_hex(8)
+        parts = encode(kind, session, {**fields, "request": name})
+        end_s = self._sockets.now_s + self._timeout_s
+        request = self._requests[name] = _Request(parts, new_future(), end_s)
+        self._send(request)
+        return request.answer
+
+    def status(self, session: str) -> Future[Status]:
+        """Request the state of the system, or of one session and its services."""
+        status, answer = Status(services=[], sessions=[]), new_future()
+
+        def add_page(page: Future[Fields]) -> None:
+            with forward_errors(answer):
+                fields = page.result()
+                status.services.extend(msgspec.convert(fields["services"], list[ServiceState]))
+                status.sessions.extend(msgspec.convert(fields["sessions"], list[SessionState]))
+                if fields.get("next"):
+                    request_page(fields["next"])
+                else:
+                    answer.set_result(status)
+
+        def request_page(after: int) -> None:
+            self.request("status-request", session, after=after).add_done_callback(add_page)
+
+        request_page(0)
+        return answer
+
+    def open_session(self, options: Fields) -> Future[SessionCore]:
+        """Open a session; the options are the fields of ``open-session``."""
+        return then(
+            self.request("open-session", **options), lambda opened: self._add(opened, options)
+        )
+
+    def follow(self, name: str) -> Future[SessionCore]:
+        """Follow a session that another program opened; if the name is empty, the newest."""
+        return then(self.status(name), lambda status: self._add(newest_session(status), None))
+
+    def add_inbox(self, session: str, inbox: Inbox) -> None:
+        """Pass a session's events to an inbox, even after the session has ended."""
+        self._inboxes.setdefault(session, []).append(inbox)
+        self._watch(session, on=True)
+
+    def remove_inbox(self, session: str, inbox: Inbox) -> None:
+        """Pass no more events to an inbox."""
+        self._inboxes[session].remove(inbox)
+        self._watch(session, on=False)
+        inbox.end(None)
+
+    def tick(self) -> None:
+        """Repeat requests and ask about silent sessions; call this regularly."""
+        now_s = self._sockets.now_s
+        for name, request in list(self._requests.items()):
+            if now_s > request.end_s:
+                self._requests.pop(name).answer.set_exception(KouxingError(self._no_answer()))
+            elif now_s >= request.retry_s:
+                self._send(request)
+        for session in list(self.sessions.values()):
+            session.tick()
+            if session.is_over:
+                self._remove(session)
+            elif session.is_silent():
+                self._find(session)
+
+    def close(self, failure: KouxingError) -> None:
+        """End all sessions, and answer all requests with a failure."""
+        for request in self._requests.values():
+            request.answer.set_exception(failure)
+        for session in self.sessions.values():
+            session.end(failure)
+        for inboxes in self._inboxes.values():
+            for inbox in inboxes:
+                inbox.end(failure)
+
+    def _connect(self) -> Connection:
+        def set_refused(is_refused: bool) -> None:
+            self._is_refused = is_refused
+
+        return self._sockets.connect(self._control, self._on_command, on_refused=set_refused)
+
+    def _send(self, request: _Request) -> None:
+        request.retry_s = self._sockets.now_s + RETRY_S
+        if not self._sockets.send(self._commands, request.parts):
+            # Another program was at control's address: libzmq never reconnects that socket.
+            self._sockets.close_connection(self._commands)
+            self._commands = self._connect()
+            self._sockets.send(self._commands, request.parts)
+
+    def _no_answer(self) -> str:
+        address, _, key = self._control.partition(" ")
+        if not self._is_refused:
+            return f"control at {address} does not answer. Is it running? Start it: kouxing run"
+        if not key:
+            return (
+                f"control at {address} refuses this client: insecure = true is set here, but not"
+                " there; or see control's log"
+            )
+        return (
+            f"control at {address} does not accept this key. If it runs on this machine, restart"
+            " it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here"
+        )
+
+    def _add(self, opened: Fields, options: Fields | None) -> SessionCore:
+        session = SessionCore(self._sockets, opened, options, self._make_signal())
+        if self._events is None:
+            self._events = self._sockets.connect_events(opened["events"], self._on_event)
+        self.sessions[session.name] = session
+        self._watch(session.name, on=True)
+        session.connect()
+        return session
+
+    def _remove(self, session: SessionCore) -> None:
+        del self.sessions[session.name]
+        self._asked_s.pop(session.name, None)
+        self._watch(session.name, on=False)
+
+    def _watch(self, session: str, *, on: bool) -> None:
+        if self._events is not None:
+            topics = [topic(kind, session) for kind in WATCHED]
+            self._sockets.set_topics(self._events, topics, on=on)
+
+    def _find(self, session: SessionCore) -> None:
+        """Ask control where a silent session is: its ``session-moved`` may be lost."""
+        now_s = self._sockets.now_s
+        if now_s < self._asked_s.get(session.name, 0.0) + SILENT_S:
+            return
+        self._asked_s[session.name] = now_s
+
+        def place(answer: Future[Status]) -> None:
+            try:
+                state = newest_session(answer.result())
+            except Refused as refusal:
+                if refusal.code == "unknown-session":
+                    session.end(None)
+            except KouxingError:
+                return  # control may restart
+            else:
+                session.place({name: state[name] for name in ("phones", "faps")})
+
+        self.status(session.name).add_done_callback(place)
+
+    def _on_command(self, parts: list[bytes]) -> None:
+        if (message := decode(parts)) is None:
+            return
+        kind, fields = message
+        if kind == "session-moved":
+            self._on_moved(fields)
+        elif kind == "error" and fields.get("code") == "bad-message":  # names no request
+            for request in self._requests.values():
+                request.answer.set_exception(refused(fields))
+            self._requests.clear()
+        elif asked := self._requests.pop(str(fields.get("request")), None):
+            if kind == "error":
+                asked.answer.set_exception(refused(fields))
+            else:
+                asked.answer.set_result(fields)
+
+    def _on_event(self, parts: list[bytes]) -> None:
+        if kind_of(parts) == "session-moved" and (message := decode(parts)) is not None:
+            self._on_moved(message[1])
+        event = EVENTS.decode(parts)
+        if not isinstance(event, Event):
+            return
+        for inbox in self._inboxes.get(event.session, ()):
+            inbox.add(event)
+        if event.name == "session-closed" and event.session in self.sessions:
+            self.sessions[event.session].close_soon(event.detail)
+
+    def _on_moved(self, fields: Fields) -> None:
+        if session := self.sessions.get(fields["session"]):
+            session.move(fields)
+
+
+def newest_session(status: Status) -> Fields:
+    """Return name and endpoints of the newest session that is published.
+
+    Raises
+    ------
+    KouxingError
+        If there is no such session.
+    """
+    sessions = [state for state in status.sessions if "faps" in state.endpoints]
+    if not sessions:
+        raise KouxingError("there is no session to follow")
+    newest = min(sessions, key=lambda state: state.age_s)
+    endpoints: dict[str, str] = {}
+    for service in status.services:
+        endpoints.update(service.endpoints)
+    return {
+        **newest.endpoints,
+        "events": endpoints.get("events", ""),
+        "session": newest.session,
+        "epoch": 0,
+        "language": newest.language,
+    }
+
+
+def new_future() -> Future[Any]:
+    """Return a future that the waiting thread cannot cancel."""
+    future: Future[Any] = Future()
+    future.set_running_or_notify_cancel()
+    return future
+
+
+@contextlib.contextmanager
+def forward_errors(future: Future[Any]) -> Iterator[None]:
+    """Pass errors to a future."""
+    try:
+        yield
+    except Exception as error:
+        future.set_exception(error)
+
+
+def then(asked: Future[T], make: Callable[[T], U]) -> Future[U]:
+    """Return the future of what a function makes of an answer."""
+    made = new_future()
+
+    def pass_on(answer: Future[T]) -> None:
+        with forward_errors(made):
+            made.set_result(make(answer.result()))
+
+    asked.add_done_callback(pass_on)
+    return made

@@ -1,0 +1,297 @@
+"""Follows the messages of one session through moves and reconnections; no I/O of its own."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Protocol
+
+from kouxing_client.errors import KouxingError
+
+RETRY_S = 3.0  # until an unconfirmed subscription is made again
+KEEP_S = 3.0  # how long a connection that may be dead stays open for what TCP still delivers
+CATCH_UP_S = 0.1  # after this process was suspended: time in which queued messages arrive
+MAX_OLD = 8  # how many of these live frames are kept
+END = "end-of-faps"
+_PUBLISHER_OF = {  # name of the endpoint by kind of message; all other kinds are at "phones"
+    "fap-frame": "faps",
+    "shapes": "faps",
+    END: "faps",
+}
+_FRAMES = ("fap-frame", "shapes")
+_Number = tuple[int, int]  # epoch and sequence, or media time and sequence
+_NONE = (-1, -1)
+
+
+class Transport(Protocol):
+    """What a follower needs of its surroundings. A connection is any object."""
+
+    @property
+    def now_s(self) -> float:
+        """Monotonic time."""
+
+    @property
+    def resumed_at_s(self) -> float:
+        """When this process last resumed after it was suspended; minus infinity if never."""
+
+    def subscribe(
+        self,
+        session: str,
+        classes: Collection[type[Any]],
+        addresses: Collection[str],
+        live_addresses: Collection[str],
+        on_message: Callable[[Any], None],
+    ) -> object:
+        """Connect and subscribe to classes of messages of a session, with ``joined`` as the last.
+
+        The kernel buffers only a little of what ``live_addresses`` publish.
+        """
+
+    def drain(self, connection: Any) -> None:
+        """Pass on the messages that have arrived, until the connection is closed."""
+
+    def close_connection(self, connection: Any) -> None:
+        """Close a connection."""
+
+
+class Follower:
+    """Receives chosen classes of messages of one session, in order and each message once.
+
+    After a move, the old connection stays open until the new subscriptions are in effect, and
+    ``KEEP_S`` longer if one of the publishers stays the same. If a publisher does not confirm, the
+    follower subscribes again: libzmq never reconnects a socket to an address where another program
+    answered before.
+
+    Parameters
+    ----------
+    transport
+        Opens connections, and passes messages on.
+    session
+        Name of the session.
+    classes
+        Classes of messages to subscribe to. They have the attribute ``kind``, and their instances
+        ``epoch``, ``sequence`` and ``media_time``.
+    on_message
+        Called with each message.
+    live
+        Whether late frames are worthless. If so, only the newest ``MAX_OLD`` of the frames that
+        queued while this process was suspended are passed on.
+    on_complete
+        Called when every publisher has confirmed: no later message is missed. Called again after
+        each ``start``.
+    on_new_epoch
+        Called when the session continues in a new epoch, before the first message of that epoch.
+
+    Attributes
+    ----------
+    epoch
+        Highest epoch of any message or of the first ``start``; 0 if unknown.
+    is_complete
+        Whether every publisher has confirmed.
+    has_ended
+        Whether the last FAP frame has arrived; requires ``EndOfFaps`` among the classes.
+    num_missed
+        Published FAP frames that did not arrive, by gaps in their sequence numbers.
+    num_outdated
+        Messages that were dropped because their epoch is over.
+    received_at_s
+        When the last message or confirmation arrived.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        session: str,
+        classes: Collection[type[Any]],
+        on_message: Callable[[Any], None],
+        *,
+        live: bool = True,
+        on_complete: Callable[[], None] = lambda: None,
+        on_new_epoch: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.session = session
+        self.epoch = 0
+        self.is_complete = False
+        self.has_ended = False
+        self.num_missed = self.num_outdated = 0
+        self.received_at_s = transport.now_s
+        self._transport = transport
+        self._classes = classes
+        self._on_message = on_message
+        self._live = live
+        self._on_complete = on_complete
+        self._on_new_epoch = on_new_epoch
+        self._connection: object | None = None
+        self._old_connection: object | None = None  # open until the new one is complete, or longer
+        self._close_old_s = math.inf
+        self._retry_s = math.inf
+        self._addresses: set[str] = set()
+        self._live_addresses: set[str] = set()
+        self._stays = False  # one of the addresses was also among those before
+        self._confirmed: set[str] = set()  # publishers
+        self._first_epoch = 0
+        self._epochs: dict[str, int] = {}  # of the newest message, by publisher
+        # Numbers of the newest message by stream: a publisher, or a set of shapes.
+        self._newest: dict[str, _Number] = {}
+        self._newest_before: dict[str, _Number] = {}  # when it subscribed again
+        self._seen: set[tuple[str, _Number]] = set()  # since then
+        self._last_frames: dict[str, _Number] = {}  # media time and sequence
+        self._last_sequence: int | None = None
+        self._held_frames: deque[Any] = deque(maxlen=MAX_OLD)
+
+    def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
+        """Subscribe. When called again, subscribe where the session is published now.
+
+        Parameters
+        ----------
+        epoch
+            Epoch when the session is first followed; 0 if unknown. Messages report later epochs.
+        endpoints
+            Addresses of the session's publishers, by name (``phones``, ``faps``).
+
+        Raises
+        ------
+        KouxingError
+            If an endpoint is missing or malformed.
+        """
+        names = {_PUBLISHER_OF.get(cls.kind, "phones") for cls in self._classes}
+        if missing := sorted(names - endpoints.keys()):
+            raise KouxingError(f"session {self.session} has no endpoint {missing[0]!r}")
+        addresses = {endpoints[name] for name in names}
+        stays = bool(addresses & self._addresses)
+        has_incomplete = self._old_connection is not None and not self.is_complete
+        replaced, self._live_addresses = self._connection, set()
+        if self._live and "faps" in names:
+            self._live_addresses = {endpoints["faps"]}
+        self._addresses = addresses
+        if has_incomplete and replaced is not None:
+            self._transport.close_connection(replaced)  # so far, only the old one works
+            self._stays = self._stays and stays
+        else:
+            self._close_old()
+            self._old_connection, self._stays = replaced, stays
+            self._newest_before, self._seen = dict(self._newest), set()
+        self._close_old_s = math.inf
+        self._first_epoch = self._first_epoch or epoch
+        self.epoch = self.epoch or epoch
+        self._subscribe()
+
+    def tick(self) -> None:
+        """Subscribe again, or close the old connection, if it is time; call this regularly."""
+        now_s = self._transport.now_s
+        if now_s >= self._close_old_s:
+            self._close_old()
+        if self._connection is not None and now_s >= self._retry_s:
+            self._transport.close_connection(self._connection)
+            self._subscribe()
+
+    def drain(self) -> None:
+        """Pass on all messages that have arrived."""
+        self._close_old()
+        if self._connection is not None:
+            self._transport.drain(self._connection)
+        self._release_held()
+
+    def close(self) -> None:
+        """Unsubscribe; no message is passed on any more."""
+        for connection in (self._connection, self._old_connection):
+            if connection is not None:
+                self._transport.close_connection(connection)
+        self._connection = self._old_connection = None
+        self.is_complete = False
+        self._retry_s = self._close_old_s = math.inf
+
+    def _subscribe(self) -> None:
+        confirmed = self._confirmed = set()
+        self.is_complete = False
+        self._retry_s = self._transport.now_s + RETRY_S
+        self._connection = self._transport.subscribe(
+            self.session,
+            self._classes,
+            self._addresses - self._live_addresses,
+            self._live_addresses,
+            lambda message: self._on_arrival(message, confirmed),
+        )
+
+    def _close_old(self) -> None:
+        """Take what the old connection has received, and close it."""
+        self._close_old_s = math.inf
+        if (connection := self._old_connection) is None:
+            return
+        self._transport.drain(connection)
+        if self._old_connection is connection:  # no handler has closed it
+            self._transport.close_connection(connection)
+            self._old_connection = None
+
+    def _on_arrival(self, message: Any, confirmed: set[str]) -> None:
+        self.received_at_s = self._transport.now_s
+        if message.kind == "joined":
+            self._on_joined(message.publisher, confirmed)
+        elif self._live and message.kind in _FRAMES and self._is_catching_up():
+            self._held_frames.append(message)
+        else:
+            self._release_held()
+            self._accept(message)
+
+    def _is_catching_up(self) -> bool:
+        return self._transport.now_s < self._transport.resumed_at_s + CATCH_UP_S
+
+    def _release_held(self) -> None:
+        while self._held_frames:
+            self._accept(self._held_frames.popleft())
+
+    def _on_joined(self, publisher: str, confirmed: set[str]) -> None:
+        confirmed.add(publisher)
+        if confirmed is not self._confirmed or self.is_complete:
+            return
+        # A publisher that restarted confirms once more, under a new name.
+        if len(confirmed) >= len(self._addresses):
+            self.is_complete = True
+            self._retry_s = math.inf
+            self._close_old_s = self._transport.now_s + (KEEP_S if self._stays else 0.0)
+            self.tick()
+            self._on_complete()
+
+    def _accept(self, message: Any) -> None:
+        publisher = _PUBLISHER_OF.get(message.kind, "phones")
+        known_epoch = self._epochs.get(publisher, self._first_epoch)
+        if message.epoch < known_epoch or (message.kind == END and message.epoch < self.epoch):
+            self.num_outdated += 1
+            return
+        if message.epoch > self.epoch:
+            self._enter_epoch(message.epoch)
+        if self._is_repeated(message, publisher):
+            return
+        if message.kind == "fap-frame":
+            if self._last_sequence is not None:
+                self.num_missed += max(0, message.sequence - self._last_sequence - 1)
+            self._last_sequence = message.sequence
+        elif message.kind == END:
+            self.has_ended = True
+        self._on_message(message)
+
+    def _is_repeated(self, message: Any, publisher: str) -> bool:
+        """Return whether the message arrived before, on the other connection or in an epoch."""
+        number = (message.epoch, message.sequence)
+        stream = f"{message.kind} {message.set}" if message.kind == "shapes" else publisher
+        if number <= self._newest_before.get(stream, _NONE) or (stream, number) in self._seen:
+            return True
+        if self._old_connection is not None:
+            self._seen.add((stream, number))
+        self._epochs[publisher] = message.epoch
+        self._newest[stream] = max(number, self._newest.get(stream, number))
+        if message.kind in _FRAMES:
+            place = (message.media_time, message.sequence)
+            if place <= self._last_frames.get(stream, _NONE):
+                return True
+            self._last_frames[stream] = place
+        return False
+
+    def _enter_epoch(self, epoch: int) -> None:
+        is_new = self.epoch > 0
+        self.epoch = epoch
+        if is_new:
+            self.has_ended = False
+            self._last_sequence = None
+            self._on_new_epoch()

@@ -1,0 +1,297 @@
+"""One session: its audio, its subscriptions and its moves; no I/O of its own."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from kouxing_client.audio_stream import AudioStream
+from kouxing_client.errors import KouxingError, Refused
+from kouxing_client.follower import Follower
+from kouxing_client.messages import EndOfFaps, Fields, Result, Shapes, decode, encode
+
+if TYPE_CHECKING:
+    from kouxing_client.sockets import Connection, Sockets
+
+REJOIN_S = 1.0  # how long audio waits until subscriptions are in effect again
+MOVE_LIMIT_S = 5.0  # how long a session that its recognizer does not know may take to move
+LAST_S = 0.5  # for the last results of a session that control has closed
+AUDIO_QUEUE = 500  # messages
+MAX_LIVE = 100  # unread results of a live session
+SILENT_S = 2.0  # without results, a followed session may have moved or ended unnoticed
+
+
+class Signal(Protocol):
+    """Wakes threads or tasks that wait for a change."""
+
+    def notify(self) -> None:
+        """Report a change; any thread may call this."""
+
+
+class Inbox:
+    """Messages that wait for the program; any thread may use it.
+
+    Attributes
+    ----------
+    is_over
+        Whether no more messages arrive.
+    failure
+        Why; None if that was requested, or the session has ended.
+    """
+
+    def __init__(self, signal: Signal, capacity: int | None) -> None:
+        self.messages: deque[Any] = deque(maxlen=capacity)
+        self.is_over = False
+        self.failure: KouxingError | None = None
+        self.signal = signal
+
+    def add(self, message: Any) -> None:
+        """Add a message."""
+        self.messages.append(message)
+        self.signal.notify()
+
+    def end(self, failure: KouxingError | None) -> None:
+        """Add no more messages."""
+        self.is_over, self.failure = True, self.failure or failure
+        self.signal.notify()
+
+
+class Subscription:
+    """Passes on the results of one session, in order of arrival.
+
+    Parameters
+    ----------
+    session
+        The session.
+    classes
+        Results to subscribe to.
+    shape_set
+        Name of the set of blend shapes, if ``classes`` has ``Shapes``.
+    inbox
+        Ends with the session.
+    on_joined
+        Called once: with None when the subscription is in effect, with an error when it fails.
+    on_result
+        Called with each result; None: ``inbox`` gets it.
+    """
+
+    def __init__(
+        self,
+        session: SessionCore,
+        classes: tuple[type[Result], ...],
+        shape_set: str,
+        inbox: Inbox,
+        on_joined: Callable[[KouxingError | None], None],
+        on_result: Callable[[Any], None] | None = None,
+    ) -> None:
+        self.inbox = inbox
+        self._session = session
+        self._shape_set = shape_set
+        self._on_joined: Callable[[KouxingError | None], None] | None = on_joined
+        self._on_result = on_result or inbox.add
+        self.follower = Follower(
+            session.sockets,
+            session.name,
+            (*classes, EndOfFaps),
+            self._on_message,
+            live=session.is_live,
+            on_complete=lambda: self._join(None),
+        )
+
+    def start(self) -> None:
+        """Subscribe where the session is published now."""
+        self.follower.start(self._session.epoch, self._session.endpoints)
+
+    def end(self, failure: KouxingError | None) -> None:
+        """Stop; a failure says why the session is over."""
+        self.follower.drain()
+        self.follower.close()
+        self.inbox.end(failure)
+        self._join(failure or KouxingError("the subscription is closed"))
+
+    def _join(self, failure: KouxingError | None) -> None:
+        if self._on_joined is not None:
+            on_joined, self._on_joined = self._on_joined, None
+            on_joined(failure)
+
+    def _on_message(self, message: Any) -> None:
+        if isinstance(message, EndOfFaps):
+            self.inbox.end(None)
+        elif not isinstance(message, Shapes) or message.set == self._shape_set:
+            self._on_result(message)
+
+
+class SessionCore:
+    """One session: its audio, if this client opened it, and its subscriptions.
+
+    Any thread may use ``name``, ``token``, ``signal``, ``errors``, ``failure`` and ``is_over``.
+
+    Parameters
+    ----------
+    sockets
+        The client's connections.
+    opened
+        Control's answer: ``session``, ``epoch``, and endpoints by name.
+    options
+        Fields of ``open-session``; None if another program opened the session.
+    signal
+        Notified of changes.
+    """
+
+    def __init__(
+        self, sockets: Sockets, opened: Fields, options: Fields | None, signal: Signal
+    ) -> None:
+        self.sockets = sockets
+        self.endpoints = opened
+        self.name: str = opened["session"]
+        self.epoch: int = opened["epoch"]
+        self.token: str = opened.get("token", "")
+        self.is_live = options is None or bool(options.get("paced", True))
+        self.stream: AudioStream | None = None
+        if options is not None:
+            self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_live)
+        self.signal = signal
+        self.errors: deque[Refused] = deque()  # of audio
+        self.failure: KouxingError | None = None  # why the session is over; None: it was closed
+        self.is_over = False
+        self.is_blocked = False  # the audio socket takes no more
+        self._audio: Connection | None = None
+        self._subscriptions: list[Subscription] = []
+        self._rejoin_end_s = 0.0  # until then audio waits for subscriptions
+        self._unknown: tuple[float, Refused] | None = None  # its recognizer does not know it
+        self._closing: tuple[float, str] | None = None  # deadline and reason of control
+
+    def connect(self) -> None:
+        """Connect to the recognizer, if this client sends audio."""
+        if self.stream is not None:
+            if self._audio is not None:
+                self.sockets.close_connection(self._audio)
+            self._audio = self.sockets.connect(
+                self.endpoints["audio"], self._on_answer, queue=AUDIO_QUEUE
+            )
+
+    def add_audio(self, kind: str, num_frames: int, fields: Fields) -> None:
+        """Send a chunk of ``num_frames`` samples per channel, or the end of the audio."""
+        if self.stream is not None and not self.is_over:
+            fields = {"token": self.token, **fields}
+            self.stream.add(kind, fields, num_frames, self.sockets.now_s)
+            self.send_audio()
+
+    def send_audio(self) -> None:
+        """Give the socket as much audio as it takes, unless audio waits for subscriptions."""
+        self.is_blocked = False
+        if self.stream is None or self._audio is None or self._is_rejoining():
+            return
+        for message in self.stream.unsent():
+            parts = encode(message.kind, self.name, {**message.fields, "epoch": self.epoch})
+            if not self.sockets.send(self._audio, parts):
+                self.is_blocked = True
+                return
+
+    def subscribe(self, subscription: Subscription) -> None:
+        """Start a subscription."""
+        if self.is_over:
+            subscription.end(self.failure or KouxingError("the session is closed"))
+            return
+        self._subscriptions.append(subscription)
+        subscription.start()
+
+    def unsubscribe(self, subscription: Subscription) -> None:
+        """End a subscription."""
+        if subscription in self._subscriptions:
+            self._subscriptions.remove(subscription)
+            subscription.end(None)
+
+    def move(self, moved: Fields) -> None:
+        """Continue where control has placed the session; repeated messages have no effect."""
+        if moved["epoch"] <= self.epoch:
+            return
+        self.epoch = moved["epoch"]
+        self.place({name: moved[name] for name in ("audio", "phones", "faps")})
+        if self.stream is not None and moved["next_sequence"]:
+            self._unknown = None
+            self.stream.move(moved["next_sequence"], self.sockets.now_s)
+            self.connect()
+
+    def place(self, endpoints: Fields) -> None:
+        """Subscribe again if the session is published somewhere else now."""
+        old, self.endpoints = self.endpoints, {**self.endpoints, **endpoints}
+        if any(old[name] != self.endpoints[name] for name in ("phones", "faps")):
+            self._subscribe_again()
+
+    def is_silent(self) -> bool:
+        """Return whether a session of another program has published nothing for a while."""
+        arrivals = [sub.follower.received_at_s for sub in self._subscriptions]
+        is_followed = self.stream is None and bool(arrivals)
+        return is_followed and self.sockets.now_s > max(arrivals) + SILENT_S
+
+    def tick(self) -> None:
+        """Send audio that waits; notice missing answers and deadlines that have passed."""
+        now_s = self.sockets.now_s
+        for subscription in self._subscriptions:
+            subscription.follower.tick()
+        if self._closing and now_s > self._closing[0]:
+            self.end(KouxingError(f"control has closed the session: {self._closing[1]}"))
+        elif self._unknown and now_s > self._unknown[0] + MOVE_LIMIT_S:
+            self.end(self._unknown[1])
+        elif self.stream is not None:
+            if self.stream.is_stuck(now_s):
+                self._reconnect(self.stream)
+            self.send_audio()
+
+    def close_soon(self, reason: str) -> None:
+        """End after the last results have arrived: control has closed the session."""
+        self._closing = self._closing or (self.sockets.now_s + LAST_S, reason)
+
+    def end(self, failure: KouxingError | None) -> None:
+        """Close all connections; a failure says why the session is over."""
+        self.is_over, self.failure = True, failure
+        for subscription in self._subscriptions:
+            subscription.end(failure)
+        self._subscriptions.clear()
+        if self._audio is not None:
+            self.sockets.close_connection(self._audio)
+            self._audio = None
+        self.signal.notify()
+
+    def _reconnect(self, stream: AudioStream) -> None:
+        """Replace connections over which nothing arrives; TCP may take long to report that."""
+        stream.resend(self.sockets.now_s)
+        usual_ms = self.sockets.connect_ms
+        self.sockets.connect_ms = stream.connect_ms(usual_ms)
+        self._subscribe_again()
+        self.connect()
+        self.sockets.connect_ms = usual_ms
+
+    def _subscribe_again(self) -> None:
+        self._rejoin_end_s = self.sockets.now_s + REJOIN_S
+        for subscription in self._subscriptions:
+            subscription.start()
+
+    def _is_rejoining(self) -> bool:
+        """Return whether audio waits for subscriptions, so that no frame of it is missed."""
+        return self.sockets.now_s < self._rejoin_end_s and not all(
+            subscription.follower.is_complete for subscription in self._subscriptions
+        )
+
+    def _on_answer(self, parts: list[bytes]) -> None:
+        if (message := decode(parts)) is None or self.stream is None:
+            return
+        kind, fields = message
+        if kind == "acknowledge":
+            self.stream.acknowledge(fields["sequence"], self.sockets.now_s)
+        elif kind == "error":
+            error = refused(fields)
+            if error.code == "unknown-session":  # a recognizer that restarted; control moves it
+                self._unknown = self._unknown or (self.sockets.now_s, error)
+            else:
+                self.errors.append(error)
+        self.signal.notify()
+
+
+def refused(fields: Fields) -> Refused:
+    """Convert an ``error`` message."""
+    return Refused(
+        str(fields.get("code")), str(fields.get("text")), float(fields.get("retry_after_s", 0.0))
+    )

@@ -1,0 +1,112 @@
+"""The thread that does a client's I/O."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+from kouxing_client.core import ClientCore, new_future
+from kouxing_client.errors import KouxingError
+from kouxing_client.keys import Key
+from kouxing_client.session_core import SessionCore, Signal
+from kouxing_client.sockets import Sockets
+
+TICK_S = 0.05
+BUSY_TICK_S = 0.005  # while a socket takes no more audio
+T = TypeVar("T")
+
+
+class ClientThread:
+    """Runs a ``ClientCore``; any thread may use it.
+
+    Parameters
+    ----------
+    control
+        Address of control, ``tcp://HOST:PORT``; its public key may follow after a space.
+    key
+        The key of this program; None if nothing is encrypted.
+    timeout_s
+        Time limit for an answer.
+    make_signal
+        Creates what wakes the threads or tasks that wait for a session.
+
+    Raises
+    ------
+    KouxingError
+        If the address is invalid.
+    """
+
+    def __init__(
+        self, control: str, key: Key | None, timeout_s: float, make_signal: Callable[[], Signal]
+    ) -> None:
+        if key is not None and " " not in control:
+            control = f"{control} {key.control}"
+        self._sockets = Sockets(key)
+        self._tick_s = 0.0
+        self._is_stopping = False
+        self.make_signal = make_signal
+        self.core = ClientCore(self._sockets, control, timeout_s, make_signal)
+        self._thread = threading.Thread(target=self._run, name="kouxing-client", daemon=True)
+        self._thread.start()
+
+    def call(self, function: Callable[[], None]) -> None:
+        """Let the thread call a function soon."""
+        self._sockets.call(function)
+
+    def submit(self, function: Callable[[], Future[T]]) -> Future[T]:
+        """Let the thread call a function; return the future that this function returns."""
+        answer = new_future()
+
+        def pass_on(asked: Future[T]) -> None:
+            if error := asked.exception():
+                answer.set_exception(error)
+            else:
+                answer.set_result(asked.result())
+
+        self._sockets.call(lambda: function().add_done_callback(pass_on))
+        return answer
+
+    def forget(self, session: SessionCore) -> Future[None]:
+        """Close all connections of a session."""
+        closed = new_future()
+
+        def end() -> None:
+            session.end(None)
+            closed.set_result(None)
+
+        self._sockets.call(end)
+        return closed
+
+    def close(self) -> None:
+        """End the thread and close all connections."""
+
+        def stop() -> None:
+            self._is_stopping = True
+
+        self._sockets.call(stop)
+        self._thread.join()
+
+    def _run(self) -> None:
+        failure = KouxingError("the client is closed")
+        try:
+            while not self._is_stopping:
+                self._step()
+        except Exception as error:
+            failure = KouxingError(f"the client failed: {error!r}")  # no thread may wait forever
+            failure.__cause__ = error
+            raise
+        finally:
+            self.core.close(failure)
+            self._sockets.close()
+
+    def _step(self) -> None:
+        is_busy = any(session.is_blocked for session in self.core.sessions.values())
+        period_s = BUSY_TICK_S if is_busy else TICK_S
+        now_s = self._sockets.now_s
+        self._tick_s = min(self._tick_s, now_s + period_s)
+        self._sockets.step(max(0.0, self._tick_s - now_s))
+        if (now_s := self._sockets.now_s) >= self._tick_s:
+            self._tick_s = now_s + period_s
+            self.core.tick()
