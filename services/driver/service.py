@@ -21,9 +21,9 @@ from kouxing.services.driver.recordings import Recordings
 from kouxing.services.driver.video.recording import Recording
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
-from kouxing.shared.follower import SessionFollower
 from kouxing.shared.logs import LOG
 from kouxing.shared.service import Service
+from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import Recorded, SessionInput, StartSession
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
@@ -39,7 +39,7 @@ class _Session:
     """One session that the driver follows."""
 
     start: StartSession
-    follower: SessionFollower
+    follower: ServiceFollower
     leave_by_s: float | None = None  # the session is closed; the last frames are on their way
 
 
@@ -125,7 +125,7 @@ class DriverService(Service):
         }
         if start.record:
             handlers[Sound] = self._on_sound
-        follower = SessionFollower(
+        follower = ServiceFollower(
             self,
             start.session,
             handlers,

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 
 from aiohttp import WSMessage, WSMsgType, web
 
-from kouxing.services.gateway.own_sessions import OwnSession
+from kouxing.services.gateway.audio_sessions import AudioSession
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
 
@@ -32,7 +32,7 @@ class AudioInput:
         queued here and passed on in real time, and an interruption drops the queue.
     """
 
-    def __init__(self, session: OwnSession, pcm_format: PcmFormat, *, is_ahead: bool) -> None:
+    def __init__(self, session: AudioSession, pcm_format: PcmFormat, *, is_ahead: bool) -> None:
         self._session = session
         self._format = pcm_format
         self._is_first = True
@@ -101,7 +101,7 @@ class AudioInput:
 class RealTimeQueue:
     """Audio that arrived early. It is passed on in real time."""
 
-    def __init__(self, session: OwnSession, pcm_format: PcmFormat) -> None:
+    def __init__(self, session: AudioSession, pcm_format: PcmFormat) -> None:
         self._session = session
         self._format = pcm_format
         self._piece_bytes = round(PIECE_S * pcm_format.sample_rate_hz) * pcm_format.frame_bytes

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 
 from aiohttp import WSMsgType, web
+from kouxing_client import KouxingError
 
 from kouxing.services.gateway import wire
 from kouxing.services.gateway.audio_input import AudioInput
+from kouxing.services.gateway.audio_sessions import AudioSession, AudioSessions, error_text
 from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.services.gateway.http import WebSockets
-from kouxing.services.gateway.own_sessions import OwnSession, OwnSessions, error_text
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
 
@@ -27,16 +28,16 @@ class Microphones:
         Opens the browsers' WebSockets.
     address_share
         Maximum fraction of the microphones for one address.
-    own_sessions
+    audio_sessions
         Opens the sessions.
     """
 
     def __init__(
-        self, web_sockets: WebSockets, address_share: float, own_sessions: OwnSessions
+        self, web_sockets: WebSockets, address_share: float, audio_sessions: AudioSessions
     ) -> None:
         self._web_sockets = web_sockets
         self._quota = ConnectionQuota(MAX_MICROPHONES, "microphones", address_share)
-        self._own_sessions = own_sessions
+        self._audio_sessions = audio_sessions
         self._session_names: dict[web.WebSocketResponse, str] = {}
 
     async def serve(self, request: web.Request) -> web.StreamResponse:
@@ -45,7 +46,7 @@ class Microphones:
             self._session_names[browser] = ""
             try:
                 await self._stream(browser)
-            except UserError as error:
+            except (UserError, KouxingError) as error:
                 with contextlib.suppress(ConnectionError):
                     await browser.send_str(error_text(error))
             finally:
@@ -69,7 +70,7 @@ class Microphones:
         if first.type is not WSMsgType.TEXT:
             raise UserError("the first message must be a JSON object that describes the audio")
         hello = wire.parse_hello(first.data)
-        async with self._own_sessions.open(
+        async with self._audio_sessions.open(
             encoding=hello.pcm_format.encoding,
             sample_rate_hz=hello.pcm_format.sample_rate_hz,
             num_channels=hello.pcm_format.num_channels,
@@ -86,7 +87,7 @@ class Microphones:
                 self._session_names[browser] = ""
 
     async def _forward_audio(
-        self, browser: web.WebSocketResponse, session: OwnSession, audio_input: AudioInput
+        self, browser: web.WebSocketResponse, session: AudioSession, audio_input: AudioInput
     ) -> None:
         async for message in audio_input.messages(browser):
             if message.type is WSMsgType.BINARY:
@@ -97,7 +98,7 @@ class Microphones:
                 if command.flush:
                     await audio_input.flush()
                 if command.lips:
-                    await session.choose_lips(command.lips)
+                    await session.set_lips(command.lips)
                 if command.eof:
                     audio_input.end()
             for error in session.errors():

@@ -7,7 +7,7 @@ import secrets
 from importlib import resources
 from pathlib import Path
 
-from kouxing.services.gateway.own_sessions import OwnSessions
+from kouxing.services.gateway.audio_sessions import AudioSessions
 from kouxing.shared.audio_file import open_audio
 
 SAMPLE_FILE = Path(str(resources.files("kouxing.shared") / "demo" / "hello-female.wav"))
@@ -19,28 +19,28 @@ class Sample:
 
     Parameters
     ----------
-    own_sessions
+    audio_sessions
         Opens the session.
     lips
         Name of the lip model; empty for the system's default. It can be changed during playback.
     """
 
-    def __init__(self, own_sessions: OwnSessions, lips: str) -> None:
+    def __init__(self, audio_sessions: AudioSessions, lips: str) -> None:
         self.session = f"sample-{secrets.token_hex(4)}"
         self.lips = lips
-        self._own_sessions = own_sessions
+        self._audio_sessions = audio_sessions
 
     async def speak(self) -> None:
         """Speak the sentence in real time.
 
         Raises
         ------
-        UserError
+        KouxingError
             If no session can be opened.
         """
         loop = asyncio.get_running_loop()
         source = open_audio(SAMPLE_FILE)
-        async with self._own_sessions.open(
+        async with self._audio_sessions.open(
             session=self.session,
             sample_rate_hz=source.sample_rate_hz,
             num_channels=source.num_channels,
@@ -52,7 +52,7 @@ class Sample:
                     break
                 if lips != self.lips:
                     lips = self.lips
-                    await session.choose_lips(lips)
+                    await session.set_lips(lips)
                 session.send((block * 32767).astype("<i2").tobytes(), len(block))
                 due_s += len(block) / source.sample_rate_hz
                 await asyncio.sleep(due_s - loop.time())

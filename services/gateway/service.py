@@ -19,10 +19,10 @@ from dataclasses import dataclass, replace
 from aiohttp import web
 
 from kouxing.services.gateway import http, wire
+from kouxing.services.gateway.audio_sessions import AudioSessions, error_text
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.gateway.learn_mouth import MouthLearner
 from kouxing.services.gateway.microphone import Microphones
-from kouxing.services.gateway.own_sessions import OwnSessions, error_text
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
 from kouxing.services.gateway.sample import SAMPLE_TEXT, Sample
 from kouxing.services.gateway.senders_api import SendersApi
@@ -34,11 +34,11 @@ from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import REST_RATE_HZ, RestingFace
-from kouxing.shared.follower import SessionFollower
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.known_text import Characters, characters_of
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.service import Handler, Service
+from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession, StatusReport, StatusRequest
 from kouxing.shared.wire.events import phone_of
@@ -58,7 +58,7 @@ class _Session:
     """A session that the gateway subscribes to."""
 
     start: StartSession
-    follower: SessionFollower
+    follower: ServiceFollower
     syllables: SyllableTrack
 
 
@@ -93,11 +93,11 @@ class GatewayService(Service):
             self._choose_sample_lips,
             self._set_face,
         )
-        self._own_sessions = OwnSessions(self.control_endpoint, self.key, self.warn)
-        self._microphones = Microphones(self._web_sockets, share, self._own_sessions)
+        self._audio_sessions = AudioSessions(self.control_endpoint, self.key, self.warn)
+        self._microphones = Microphones(self._web_sockets, share, self._audio_sessions)
         self._whip_clients = WhipClients(
             share,
-            self._own_sessions,
+            self._audio_sessions,
             self._viewers,
             [] if ipaddress.ip_address(host).is_unspecified else [host],
         )
@@ -180,6 +180,7 @@ class GatewayService(Service):
         """Stop HTTP and the senders."""
         self._senders.close()
         self._loop.run_until_complete(self._server.stop())
+        self._loop.run_until_complete(self._audio_sessions.close())
         self._runner.close()
 
     def _on_input(self) -> None:
@@ -210,7 +211,7 @@ class GatewayService(Service):
         if stopped is not None:
             stopped.follower.close()
         self._viewers.remove_session(session)
-        self._own_sessions.on_closed(session)
+        self._audio_sessions.on_closed(session)
         self._create_task(self._microphones.close_session(session))
         self._create_task(self._whip_clients.close_session(session))
 
@@ -270,7 +271,7 @@ class GatewayService(Service):
     # --- from the publishers ---------------------------------------------------------------------
 
     def _make_session(self, start: StartSession) -> _Session:
-        follower = SessionFollower(
+        follower = ServiceFollower(
             self,
             start.session,
             {
@@ -282,7 +283,7 @@ class GatewayService(Service):
             },
             live=start.paced,
             on_complete=lambda: self.session_started(session.start),
-            on_restart=lambda: self._restart(session),
+            on_new_epoch=lambda: self._restart(session),
         )
         is_sample = self._sample is not None and self._sample[0].session == start.session
         characters = self._sample_characters if is_sample else ()
@@ -338,7 +339,7 @@ class GatewayService(Service):
         self._viewers.forward(speech.session, MessageKind.TEXT, message)
 
     def _on_end(self, end: EndOfFaps) -> None:
-        self._own_sessions.on_last_frame(end.session)
+        self._audio_sessions.on_last_frame(end.session)
         message = wire.text("end", media_time=end.media_time)
         self._viewers.forward(end.session, MessageKind.TEXT, message)
 
@@ -347,7 +348,7 @@ class GatewayService(Service):
     def _play_sample(self, lips: str) -> str:
         """Start the sample sentence, unless it is playing; return its session."""
         if self._sample is None:
-            sample = Sample(self._own_sessions, lips)
+            sample = Sample(self._audio_sessions, lips)
             self._sample = sample, self._create_task(self._speak(sample))
         return self._sample[0].session
 

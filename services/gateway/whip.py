@@ -16,15 +16,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from aiohttp import web
+from kouxing_client import KouxingError
 
 from kouxing.services.gateway import wire
-from kouxing.services.gateway.connection_quota import ConnectionQuota
-from kouxing.services.gateway.own_sessions import (
-    OwnSession,
-    OwnSessions,
+from kouxing.services.gateway.audio_sessions import (
+    AudioSession,
+    AudioSessions,
     error_text,
     retry_after_s,
 )
+from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind
@@ -52,7 +53,7 @@ class _Client:
     shape_encoder: ShapeEncoder | None  # for frames as blend shapes, in addition to FAPs
     quota: contextlib.ExitStack  # closing it releases the client's share of the quota
     peer: Peer | None = None
-    session: OwnSession | None = None
+    session: AudioSession | None = None
     is_ending: bool = False  # the gateway itself closes the session
     tasks: set[asyncio.Task[None]] = field(default_factory=set)  # of the data channel
 
@@ -64,7 +65,7 @@ class WhipClients:
     ----------
     address_share
         Maximum fraction of the clients for one address.
-    own_sessions
+    audio_sessions
         Opens the sessions.
     viewers
         Provides the messages for the data channels.
@@ -75,12 +76,12 @@ class WhipClients:
     def __init__(
         self,
         address_share: float,
-        own_sessions: OwnSessions,
+        audio_sessions: AudioSessions,
         viewers: Viewers,
         addresses: Sequence[str],
     ) -> None:
         self._quota = ConnectionQuota(MAX_CLIENTS, "WebRTC clients", address_share)
-        self._own_sessions = own_sessions
+        self._audio_sessions = audio_sessions
         self._viewers = viewers
         self._addresses = addresses
         self._clients: dict[str, _Client] = {}  # by the names of their resources
@@ -120,7 +121,7 @@ class WhipClients:
         task.add_done_callback(self._tasks.discard)
         try:
             await opened
-        except UserError as error:
+        except KouxingError as error:
             wait_s = retry_after_s(error)
             headers = {"Retry-After": str(math.ceil(wait_s))} if wait_s else {}
             raise web.HTTPServiceUnavailable(text=f"{error}\n", headers=headers) from None
@@ -164,7 +165,7 @@ class WhipClients:
     ) -> None:
         """Open a session for a client and stream its sound until it disconnects."""
         try:
-            async with self._own_sessions.open(
+            async with self._audio_sessions.open(
                 encoding="s16le", sample_rate_hz=peer.rate_hz, num_channels=peer.num_channels
             ) as session:
                 client.session = session
@@ -208,7 +209,7 @@ class WhipClients:
         }
 
     async def _send_messages(
-        self, session: OwnSession, shape_encoder: ShapeEncoder | None, channel: RTCDataChannel
+        self, session: AudioSession, shape_encoder: ShapeEncoder | None, channel: RTCDataChannel
     ) -> None:
         """Send the messages of a viewer of the session, except the sound."""
         with self._viewers.connected(session.name, shape_encoder) as viewer:
@@ -223,7 +224,7 @@ class WhipClients:
                     await asyncio.sleep(BUFFER_CHECK_S)
 
     async def _handle_commands(
-        self, session: OwnSession, channel: RTCDataChannel, commands: asyncio.Queue[str | bytes]
+        self, session: AudioSession, channel: RTCDataChannel, commands: asyncio.Queue[str | bytes]
     ) -> None:
         rate_limit = RateLimit()
         while True:
@@ -235,8 +236,8 @@ class WhipClients:
                 if command.flush:
                     await session.flush()
                 if command.lips:
-                    await session.choose_lips(command.lips)
-            except UserError as error:
+                    await session.set_lips(command.lips)
+            except (UserError, KouxingError) as error:
                 if channel.readyState == "open":
                     channel.send(error_text(error))
             await rate_limit.wait(COMMAND_S)

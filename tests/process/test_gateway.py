@@ -58,7 +58,7 @@ from kouxing.shared.wire.session import (
     OpenSession,
     SessionOpened,
 )
-from kouxing.shared.wire.speech import Phone, Speech
+from kouxing.shared.wire.speech import Acknowledge, Phone, Speech
 from tests.system import DEMO, free_port
 
 pytestmark = pytest.mark.process
@@ -68,9 +68,9 @@ LOCAL = "tcp://127.0.0.1:*"
 TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls so
 EPOCH = 3
 PATIENT = """
-from kouxing.services.gateway import own_sessions
+from kouxing.services.gateway import audio_sessions
 from kouxing.services.process import run_module
-own_sessions.LAST_FRAME_LIMIT_S = 600
+audio_sessions.LAST_FRAME_TIMEOUT_S = 600
 run_module("gateway")
 """
 FACE = struct.pack(f"<{NUM_FAPS}f", *range(NUM_FAPS))
@@ -183,6 +183,10 @@ class ScriptedSystem:
                         self._on_command(received.message, received.sender)
                     elif isinstance(received.message, Message):
                         self.audio_messages.append(received.message)
+                        taken = Acknowledge(
+                            session=received.message.session, sequence=received.message.sequence
+                        )
+                        self.audio.send(taken, to=received.sender)
 
     def _on_command(self, message: object, sender: Peer) -> None:
         answer: Message | None = None
@@ -743,7 +747,7 @@ def test_without_control_browsers_are_told_to_start_it() -> None:
         process.terminate()
         process.communicate(timeout=60)
     assert missing == ["control"]
-    assert "does not answer; is it running? to start it: kouxing run" in text
+    assert "does not answer. Start it with 'kouxing run'" in text
     assert process.returncode == 0
 
 

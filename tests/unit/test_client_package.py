@@ -27,6 +27,7 @@ from kouxing_client import (
     Session,
     find_key,
     audio_stream,
+    core,
     follower,
     session_core,
 )
@@ -438,3 +439,35 @@ def test_asyncio_does_the_same(stage: Stage) -> None:
         stage.faps.send(frame(sequence))
     stage.faps.send(face.EndOfFaps(session="s", epoch=1, sequence=3))
     assert running.result() == [1.0, 2.0]
+
+
+def test_requests_are_answered_at_once_while_audio_streams(stage: Stage) -> None:
+    """Requests and audio use one thread, so that neither takes the other's messages."""
+    num_flushes = 20
+
+    async def run() -> list[float]:
+        async with AsyncClient(stage.commands.endpoint, insecure=True) as client:
+            session = await client.open_session()
+            times_s = []
+
+            async def stream() -> None:
+                while len(times_s) < num_flushes:
+                    session.try_push(CHUNK)
+                    session.take_errors()
+                    await asyncio.sleep(0.0005)
+
+            streaming = asyncio.create_task(stream())
+            for _ in range(num_flushes):
+                begin_s = time.monotonic()
+                await session.flush()
+                times_s.append(time.monotonic() - begin_s)
+            await streaming
+            return times_s
+
+    running = stage.pool.submit(asyncio.run, run())
+    stage.answer_open()
+    while not running.done():
+        if stage.commands.wait(0.002):
+            request, peer = next_of(FlushSession, stage.commands)
+            stage.commands.send(Done(session="s", request=request.request), to=peer)
+    assert max(running.result()) < core.RETRY_S, "no answer was lost"

@@ -117,6 +117,8 @@ class AsyncSession(BaseSession):
         """Send audio, as ``Session.push``."""
         for pcm, num_frames in self._chunks(audio):
             await self._signal.wait(self._can_push)
+            if not self._has_room():
+                self._check()
             self._add(pcm, num_frames)
 
     async def finish(self) -> None:

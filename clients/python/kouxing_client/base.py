@@ -20,7 +20,7 @@ CONTROL = "tcp://127.0.0.1:5550"
 CHUNK_BYTES = 32_000  # largest chunk in one message
 MAX_LIVE = 100  # unread results of a live session
 MAX_EVENTS = 1000  # unread events of a session
-MAX_UNACKNOWLEDGED = 1000  # messages; then the sender waits
+MAX_UNACKNOWLEDGED = 500  # messages; then the sender waits
 LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before a session closes
 
 
@@ -108,20 +108,19 @@ class BaseSession:
         return 0 if self._core.stream is None else self._core.stream.media_time
 
     def try_push(self, pcm: bytes) -> bool:
-        """Send one chunk of PCM without waiting; return False if too much audio is on its way.
+        """Send PCM without waiting; return False if too much audio is on its way.
 
         Raises
         ------
         KouxingError
-            If the session is over or another program opened it, or the chunk is too large.
+            If the session is over, or another program opened it.
         """
-        num_frames = self._num_frames(pcm)
-        if len(pcm) > CHUNK_BYTES:
-            raise KouxingError(f"a chunk has at most {CHUNK_BYTES} bytes, this one {len(pcm)}")
+        self._num_frames(pcm)
         self._check_open()
         if not self._has_room():
             return False
-        self._add(pcm, num_frames)
+        for chunk in split(pcm, CHUNK_BYTES):
+            self._add(chunk, self._num_frames(chunk))
         return True
 
     def skip(self, num_frames: int) -> None:
@@ -164,8 +163,6 @@ class BaseSession:
             yield chunk, self._num_frames(chunk)
 
     def _add(self, pcm: bytes, num_frames: int) -> None:
-        if not self._has_room():
-            self._check()
         self._check_open()
         self._num_added += 1
         self._thread.call(lambda: self._core.add_audio("audio-chunk", num_frames, {"pcm": pcm}))

@@ -183,6 +183,8 @@ class Session(BaseSession):
                 raise KouxingError(
                     f"the recognizer has taken no audio for {timeout_s:g} s; is it running?"
                 )
+            if not self._has_room():
+                self._check()
             self._add(pcm, num_frames)
 
     def finish(self) -> None:

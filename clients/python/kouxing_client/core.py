@@ -176,7 +176,7 @@ class ClientCore:
     def _no_answer(self) -> str:
         address, _, key = self._control.partition(" ")
         if not self._is_refused:
-            return f"control at {address} does not answer. Is it running? Start it: kouxing run"
+            return f"control at {address} does not answer. Start it with 'kouxing run'"
         if not key:
             return (
                 f"control at {address} refuses this client: insecure = true is set here, but not"

@@ -1,0 +1,165 @@
+"""The sessions that the gateway opens for audio from microphones, WebRTC and the sample.
+
+Audio arrives in real time and cannot wait. If the recognizer is too slow, audio is dropped. Media
+time continues.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from dataclasses import asdict
+
+from kouxing_client import AsyncClient, AsyncSession, KouxingError, Refused
+from kouxing_client import Key as ClientKey
+
+from kouxing.services.gateway import wire
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Key
+
+LAST_FRAME_TIMEOUT_S = 1.5  # after the end of the audio
+LAST_PHONES_S = 0.2  # the last phones take another way than the last frame
+CONTROL_TIMEOUT_S = 3.0
+
+Warn = Callable[[str, str, str], None]  # reason, text, session
+
+
+class AudioSession:
+    """One session that the gateway has opened."""
+
+    def __init__(self, session: AsyncSession, warn: Warn) -> None:
+        self.name = session.name
+        self.is_closed = False  # by control
+        self._session = session
+        self._warn = warn
+        self._frames_ended = asyncio.Event()
+
+    def send(self, pcm: bytes, num_frames: int) -> None:
+        """Send ``num_frames`` samples per channel; drop them if the recognizer is too slow.
+
+        Raises
+        ------
+        KouxingError
+            If the session is over.
+        """
+        if not self.is_closed and not self._session.try_push(pcm):
+            self.skip(num_frames)
+            self._warn("slow_recognizer", "dropped audio: the recognizer is too slow", self.name)
+
+    def skip(self, num_frames: int) -> None:
+        """Leave out audio: media time advances."""
+        self._session.skip(num_frames)
+
+    async def flush(self) -> None:
+        """Interrupt: drop audio whose face is not shown yet."""
+        await self._session.flush()
+
+    async def set_lips(self, lips: str) -> None:
+        """Let another lip model move the mouth."""
+        await self._session.set_face(lips=lips)
+
+    def errors(self) -> list[Refused]:
+        """Return the recognizer's errors since the last call.
+
+        Raises
+        ------
+        KouxingError
+            If the session is over.
+        """
+        return [] if self.is_closed else self._session.take_errors()
+
+    def on_last_frame(self) -> None:
+        """Record that no more frames will arrive."""
+        self._frames_ended.set()
+
+    async def finish(self, timeout_s: float) -> None:
+        """Stop sending, wait up to ``timeout_s`` for the last frame, then close the session."""
+        try:
+            if not self.is_closed:
+                await self._session.finish()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._frames_ended.wait(), timeout_s)
+                await asyncio.sleep(LAST_PHONES_S)
+        except KouxingError as error:
+            self._warn("close", str(error), self.name)
+        try:
+            await self._session.close()
+        except KouxingError as error:
+            self._warn("close", str(error), self.name)
+
+
+class AudioSessions:
+    """Opens sessions as a client of control.
+
+    Parameters
+    ----------
+    control
+        Where control takes commands.
+    key
+        The gateway's key; None if nothing is encrypted.
+    warn
+        Counts and logs a problem.
+    """
+
+    def __init__(self, control: str, key: Key | None, warn: Warn) -> None:
+        self._control = control
+        self._key = key
+        self._warn = warn
+        self._client: AsyncClient | None = None
+        self._open: dict[str, AudioSession] = {}
+
+    @contextlib.asynccontextmanager
+    async def open(self, session: str = "", **options: object) -> AsyncIterator[AudioSession]:
+        """Open a session; on leaving, wait for its last frame and close it.
+
+        Raises
+        ------
+        KouxingError
+            If control refuses or does not answer.
+        """
+        if self._client is None:
+            self._client = AsyncClient(
+                self._control,
+                key=None if self._key is None else ClientKey(**asdict(self._key)),
+                insecure=self._key is None,
+                timeout_s=CONTROL_TIMEOUT_S,
+            )
+        opened = AudioSession(
+            await self._client.open_session(session, **options),  # type: ignore[arg-type]
+            self._warn,
+        )
+        self._open[opened.name] = opened
+        try:
+            yield opened
+        finally:
+            await opened.finish(LAST_FRAME_TIMEOUT_S)
+            del self._open[opened.name]
+
+    async def close(self) -> None:
+        """Disconnect from control."""
+        if self._client is not None:
+            await self._client.close()
+
+    def on_last_frame(self, session: str) -> None:
+        """Record that the last frame of a session has arrived."""
+        if session in self._open:
+            self._open[session].on_last_frame()
+
+    def on_closed(self, session: str) -> None:
+        """Record that control has closed a session."""
+        if session in self._open:
+            self._open[session].is_closed = True
+            self._open[session].on_last_frame()
+
+
+def error_text(error: UserError | KouxingError) -> str:
+    """Return the message about an error for a browser."""
+    if isinstance(error, Refused):
+        return wire.error_text(error.text, error.code, error.retry_after_s)
+    return wire.error_text(str(error))
+
+
+def retry_after_s(error: UserError | KouxingError) -> float:
+    """Return when to try again, in seconds; 0 if unknown."""
+    return error.retry_after_s if isinstance(error, Refused) else 0.0

@@ -1,0 +1,112 @@
+"""Follows a session inside the loop of a service."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+from kouxing_client.follower import Follower
+
+from kouxing.shared.bus import Socket
+from kouxing.shared.service import Service
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import Joined
+
+
+class ServiceFollower(Follower):
+    """Passes a session's messages to handlers; counts missed frames in the service's metrics.
+
+    Parameters
+    ----------
+    service
+        Reads the sockets.
+    session
+        Name of the session.
+    handlers
+        Functions by class of message; these classes are subscribed to.
+    live, on_complete, on_new_epoch
+        As for ``Follower``.
+    """
+
+    def __init__(
+        self,
+        service: Service,
+        session: str,
+        handlers: Mapping[type[Message], Callable[[Any], None]],
+        *,
+        live: bool = True,
+        on_complete: Callable[[], None] = lambda: None,
+        on_new_epoch: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(
+            _ServiceTransport(service),
+            session,
+            handlers.keys(),
+            lambda message: handlers[type(message)](message),
+            live=live,
+            on_complete=on_complete,
+            on_new_epoch=on_new_epoch,
+        )
+        self._service = service
+        self._counted = {"frames_missed": 0, "dropped_old_epoch": 0}
+
+    def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
+        """Subscribe, as ``Follower.start``."""
+        super().start(epoch, endpoints)
+        self._service.at_each_step.add(self.tick)
+
+    def tick(self) -> None:
+        """Do what is due, and count."""
+        super().tick()
+        counts = {"frames_missed": self.num_missed, "dropped_old_epoch": self.num_outdated}
+        for name, count in counts.items():
+            if count > self._counted[name]:
+                self._service.metrics.count(name, count - self._counted[name])
+        self._counted = counts
+
+    def close(self) -> None:
+        """Unsubscribe, as ``Follower.close``."""
+        super().close()
+        self._service.at_each_step.discard(self.tick)
+
+
+class _ServiceTransport:
+    """Subscribes with the sockets of a service."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+        self._on_message: dict[Socket, Callable[[Any], None]] = {}
+
+    @property
+    def now_s(self) -> float:
+        return time.monotonic()
+
+    @property
+    def resumed_at_s(self) -> float:
+        return self._service.stall.resumed_at_s
+
+    def subscribe(
+        self,
+        session: str,
+        classes: Collection[type[Message]],
+        addresses: Collection[str],
+        live_addresses: Collection[str],
+        on_message: Callable[[Any], None],
+    ) -> Socket:
+        socket = self._service.bus.connect_subscriber(*sorted(addresses), live=live_addresses)
+        handlers = dict.fromkeys((*classes, Joined), lambda message, _: on_message(message))
+        self._service.register(socket, handlers)
+        self._on_message[socket] = on_message
+        socket.subscribe_session(classes, session)
+        return socket
+
+    def drain(self, connection: Socket) -> None:
+        while connection in self._on_message and (received := list(connection.receive())):
+            for item in received:
+                if isinstance(item.message, Message) and connection in self._on_message:
+                    self._on_message[connection](item.message)
+
+    def close_connection(self, connection: Socket) -> None:
+        del self._on_message[connection]
+        self._service.unregister(connection)
