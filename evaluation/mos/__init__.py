@@ -1,1 +1,1 @@
-"""Listening tests: people judge videos of talking heads, and what their scores say."""
+"""A listening test: people judge videos of talking heads in a browser."""

@@ -1,4 +1,4 @@
-"""A listening test over HTTP: crashes, double submits, and scripted judges in a real browser."""
+"""A listening test over HTTP: crashes, repeated requests, and judges in a real browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from kouxing.evaluation.mos.commands import app
 from kouxing.evaluation.mos.order import places_of_judge
-from kouxing.evaluation.mos.store import Store, read_answers
+from kouxing.evaluation.mos.store import read_answers
 from kouxing.evaluation.mos.study import load_study, new_study
 from kouxing.evaluation.system.chromium import Chromium
 from tests.system import ROOT, free_port
@@ -79,20 +79,9 @@ class Served:
         state: dict[str, Any] = json.loads(content)
         return state
 
-    def hearing_judge(self) -> str:
-        """Return the token of a judge who has passed the sound check."""
+    def add_judge(self) -> str:
         token: str = self.state("/judges", {})["judge"]
-        beeps = self.beeps(token)
-        assert not self.state(f"/beeps?judge={token}", {"beeps": beeps - 1})["hears"]
-        assert self.state(f"/beeps?judge={token}", {"beeps": self.beeps(token)})["hears"]
         return token
-
-    def beeps(self, token: str) -> int:
-        store = Store(self.folder)
-        judge = store.find_judge(token)
-        store.close()
-        assert judge is not None
-        return judge.beeps
 
 
 @pytest.fixture
@@ -101,7 +90,7 @@ def folder(tmp_path: Path, video: Path) -> Path:
     for sentence, condition in product(SENTENCES, CONDITIONS):
         (folder / condition).mkdir(parents=True, exist_ok=True)
         shutil.copy(video, folder / condition / f"{sentence}.mp4")
-    new_study(folder, title="Faces", reference="good", anchor="bad", languages=("zh", "en"))
+    new_study(folder, title="Faces", reference="good", anchor="bad")
     return folder
 
 
@@ -113,7 +102,7 @@ def served(folder: Path, request: pytest.FixtureRequest) -> Iterator[Served]:
 
 
 def test_answers_survive_a_crash_and_count_once(served: Served, video: Path) -> None:
-    token = served.hearing_judge()
+    token = served.add_judge()
     for place in range(-2, 2):
         assert served.ask(f"/stimulus/{place}?judge={token}") == (200, video.read_bytes())
         answer = {"place": place, "sync": 4, "realism": 3 + place, "language": "en"}
@@ -133,27 +122,22 @@ def test_answers_survive_a_crash_and_count_once(served: Served, video: Path) -> 
     assert scores == expected
 
 
-def test_nothing_but_the_next_video_is_given_and_no_nonsense_kept(served: Served) -> None:
-    deaf = served.state("/judges", {})["judge"]
+def test_sends_only_the_next_video_and_rejects_invalid_answers(served: Served) -> None:
     good = {"place": -2, "sync": 3, "realism": 3, "language": "zh"}
-    assert served.state(f"/state?judge={deaf}") == {"hears": False, "place": None}
-    assert served.ask(f"/stimulus/-2?judge={deaf}")[0] == 404
-    assert served.ask(f"/answers?judge={deaf}", good)[0] == 409
-    token = served.hearing_judge()
+    token = served.add_judge()
     for path in (
         f"/stimulus/-1?judge={token}",
         f"/stimulus/0?judge={token}",
         f"/stimulus/..%2fstudy.json?judge={token}",
         "/stimulus/-2?judge=nobody",
         "/study.json",
-        "/answers.sqlite",
+        "/answers.jsonl",
         "/..%2f..%2fserver.py",
         "/server.py",
         "/good/one.mp4",
     ):
         assert served.ask(path)[0] in (403, 404), path
     answers = f"/answers?judge={token}"
-    assert served.ask(answers, good)[0] == 409, "its video was never fetched"
     assert served.ask(f"/stimulus/-2?judge={token}")[0] == 200
     bodies: list[object] = [
         {**good, "sync": 6},
@@ -162,7 +146,6 @@ def test_nothing_but_the_next_video_is_given_and_no_nonsense_kept(served: Served
         {**good, "sync": "3"},
         {**good, "language": "fr"},
         {**good, "language": ["zh"]},
-        {**good, "place": 10**30},
         {"place": -2, "sync": 3},
         {"place": -2, "sync": 3, "realism": 3},
         [],
@@ -170,7 +153,7 @@ def test_nothing_but_the_next_video_is_given_and_no_nonsense_kept(served: Served
     ]
     for body in bodies:
         assert served.ask(answers, body)[0] == 400, body
-    for place in (-3, -1, 0, 1):
+    for place in (-1, 0, 1, 10**30):
         assert served.ask(answers, {**good, "place": place})[0] == 409
     assert served.ask(answers, raw=b"[" * 1000)[0] == 400
     assert served.ask(answers, raw=b"x" * 5000)[0] == 413
@@ -181,19 +164,14 @@ def test_nothing_but_the_next_video_is_given_and_no_nonsense_kept(served: Served
 
 
 @pytest.mark.parametrize("served", [("--set", "gateway.token=secret")], indirect=True)
-def test_the_gateways_token_guards_everything_but_the_page(served: Served) -> None:
+def test_the_gateways_token_protects_everything_but_the_page(served: Served) -> None:
     assert served.line.endswith("/#token=secret\n")
     assert served.ask("/")[0] == served.ask("/main.js")[0] == 200
-    for path in ("/study", "/state", "/beeps", "/stimulus/-2"):
+    for path in ("/state", "/stimulus/-2"):
         assert served.ask(path)[0] == 403
-    for path in ("/judges", "/beeps", "/answers"):
+    for path in ("/judges", "/answers", "/judges?token=wrong"):
         assert served.ask(path, {})[0] == 403
-    assert served.ask("/judges?token=wrong", {})[0] == 403
-    assert json.loads(served.ask("/study?token=secret")[1]) == {
-        "title": "Faces",
-        "languages": ["zh", "en"],
-        "videos": 4,
-    }
+    assert served.state("/state?token=secret") == {"title": "Faces", "videos": 4}
     assert served.ask("/judges?token=secret", {})[0] == 200
 
 
@@ -207,7 +185,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
     browser.close()
 
 
-def test_scripted_judges_in_a_browser_and_their_report(browser: Chromium, served: Served) -> None:
+def test_judges_score_every_video_in_a_browser(browser: Chromium, served: Served) -> None:
     english = Page(browser, served, "en-GB")
     english.judge_everything({"good": 5, "bad": 2}, interruptions=True)
     chinese = Page(browser, served, "en-GB")
@@ -216,16 +194,16 @@ def test_scripted_judges_in_a_browser_and_their_report(browser: Chromium, served
     study = load_study(served.folder)
     answers = [each for each in read_answers(served.folder) if each.place >= 0]
     for number, language in enumerate(("en", "zh")):
-        own = [each for each in answers if each.judge == number]
-        assert {(each.sentence, each.condition) for each in own} == set(study.files)
-        assert len(own) == 2 * len(study.files)
-        assert {each.language for each in own} == {language}
+        given = [each for each in answers if each.judge == number]
+        assert {(each.sentence, each.condition) for each in given} == set(study.files)
+        assert len(given) == 2 * len(study.files)
+        assert {each.language for each in given} == {language}
     figures = served.folder.parent / "figures.json"
     command = ["report", str(served.folder), "--json", str(figures)]
     result = CliRunner().invoke(app, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     report = json.loads(figures.read_text())
-    assert (report["num_judges"], report["num_finished"], report["unsure"]) == (2, 2, [])
+    assert (report["num_judges"], report["num_finished"]) == (2, 2)
     means = {
         (each["scale"], each["condition"]): each["of_all"]["value"] for each in report["opinions"]
     }
@@ -238,10 +216,10 @@ def test_scripted_judges_in_a_browser_and_their_report(browser: Chromium, served
     }
 
 
-def test_a_page_without_its_server_waits_for_it(browser: Chromium, served: Served) -> None:
+def test_the_page_retries_until_the_server_answers(browser: Chromium, served: Served) -> None:
     page = Page(browser, served, "zh-CN")
     page.open()
-    browser.command("Network.setBlockedURLs", urls=["*/study*"])
+    browser.command("Network.setBlockedURLs", urls=["*/state*"])
     browser.command("Page.reload")
     browser.wait_for("document.getElementById('notice')?.checkVisibility()")
     assert "未能送达" in browser.evaluate("document.getElementById('notice').textContent")
@@ -254,25 +232,6 @@ def test_a_page_without_its_server_waits_for_it(browser: Chromium, served: Serve
     browser.wait_for(f"{IS_WELCOME} && document.getElementById('notice').checkVisibility()")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_main_button_is_seen_in_any_browser(
-    browser: Chromium, served: Served, scheme: str
-) -> None:
-    features = [{"name": "prefers-color-scheme", "value": scheme}]
-    browser.command("Emulation.setEmulatedMedia", features=features)
-    Page(browser, served, "en-GB").open()
-    ground, page = browser.evaluate(
-        "['begin', ''].map((name) => getComputedStyle(document.getElementById(name) ??"
-        " document.body).backgroundColor)"
-    )
-    assert (ground, page) == BACKGROUNDS[scheme]
-    assert b"light-dark(" not in served.ask("/style.css")[1], "browsers of 2023 do not know it"
-
-
-BACKGROUNDS = {
-    "light": ("rgb(178, 60, 48)", "rgb(244, 242, 239)"),
-    "dark": ("rgb(184, 68, 58)", "rgb(27, 28, 35)"),
-}
 IS_WELCOME = "document.getElementById('welcome')?.checkVisibility()"
 
 
@@ -312,18 +271,12 @@ class Page:
             "zh" if by_language_button else "en"
         )
         browser.evaluate("for (let n = 0; n < 2; n++) document.getElementById('begin').click()")
-        browser.evaluate("document.getElementById('sound').defaultPlaybackRate = 4")
-        self.press("play-beeps")
-        token = browser.evaluate("new URLSearchParams(location.hash.slice(1)).get('judge')")
-        self.press(f"heard-{self._served.beeps(token)}")
         browser.wait_for("document.getElementById('task').checkVisibility()")
+        token = browser.evaluate("new URLSearchParams(location.hash.slice(1)).get('judge')")
         self._check_width()
-        store = Store(self._served.folder)
-        judge = store.find_judge(token)
-        store.close()
-        assert judge is not None
-        assert judge.number is not None
-        places = places_of_judge(judge.number, load_study(self._served.folder))
+        lines = (self._served.folder / "answers.jsonl").read_text("utf-8").splitlines()
+        (judge,) = [json.loads(line)["judge"] for line in lines if token in line]
+        places = places_of_judge(judge, load_study(self._served.folder))
         for place, (_, condition) in places.items():
             self._wait_for_place(place)
             assert not browser.evaluate("document.getElementById('sync-4').matches(':enabled')")
@@ -349,7 +302,7 @@ class Page:
         hint = "document.getElementById('practice')"
         shown = self._browser.evaluate(f"{hint}.checkVisibility() ? {hint}.innerText : ''")
         language = self._browser.evaluate("document.documentElement.lang")
-        mark = {"en": "Practice: this one does not count.", "zh": "练习：此题不计入结果。"}
+        mark = {"en": "Practice: this video does not count.", "zh": "练习：此题不计入结果。"}
         assert shown == (mark[language] if place < 0 else "")
         progress = self._browser.evaluate("document.getElementById('progress').value")
         assert progress == max(place, 0)
