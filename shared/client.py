@@ -6,7 +6,7 @@ import dataclasses
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Self
 
 import numpy as np
@@ -15,27 +15,23 @@ from numpy.typing import NDArray
 from kouxing.shared.bus import AUDIO_QUEUE_LENGTH, CONNECT_MS, Bus, Received
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.expressions import DEFAULT_HOLD_S
 from kouxing.shared.follower import PollingLoop, SessionFollower
 from kouxing.shared.keys import CLIENT, Key, refusal, user_key
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.codec import BadMessage
-from kouxing.shared.wire.control import StatusReport, StatusRequest
+from kouxing.shared.wire.face import FaceSettings, SetFace
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import (
-    AddShapes,
-    ChooseExpressiveness,
-    ChooseLips,
     CloseSession,
     Error,
     ErrorCode,
-    Express,
     FlushSession,
     OpenSession,
     SessionMoved,
     SessionOpened,
+    StatusReport,
+    StatusRequest,
 )
-from kouxing.shared.wire.speech import Acknowledge
 
 RETRY_S = 1.0
 RESEND_S = 10.0  # audio kept for a recognizer that takes the place of a lost one
@@ -116,67 +112,23 @@ class Client:
         """Drop audio not yet shown and let the face return to rest."""
         self._ask(FlushSession(session=session, token=token, request=_request_id()))
 
-    def choose_lips(self, session: str, token: str, lips: str) -> None:
-        """Let another lip model move the mouth.
-
-        Raises
-        ------
-        Refused
-            If there is no such lip model.
-        """
-        self._ask(ChooseLips(session=session, token=token, request=_request_id(), lips=lips))
-
-    def express(
-        self, session: str, expressions: Mapping[str, float], hold_s: float = DEFAULT_HOLD_S
-    ) -> None:
-        """Let the face of a session, anybody's, show expressions for a while.
+    def set_face(self, session: str, **settings: object) -> None:
+        """Change the face of a session, even of another program's.
 
         Parameters
         ----------
         session
-            Its name.
-        expressions
-            Strengths, 0 to 1, by name, in place of those before; none: they fade now.
-        hold_s
-            How long they stay before they fade.
+            Name of the session.
+        settings
+            Fields of ``FaceSettings``.
 
         Raises
         ------
         Refused
-            If there is no such session or expression, or a number is out of range.
+            If there is no such session, or a number is out of range.
         """
-        self._ask(
-            Express(
-                session=session,
-                request=_request_id(),
-                expressions=dict(expressions),
-                hold_s=hold_s,
-            )
-        )
-
-    def choose_expressiveness(self, session: str, expressiveness: float) -> None:
-        """Let the mouth of a session, anybody's, move more or less: 0.5 to 2.
-
-        Raises
-        ------
-        Refused
-            If there is no such session, or the number is out of range.
-        """
-        self._ask(
-            ChooseExpressiveness(
-                session=session, request=_request_id(), expressiveness=expressiveness
-            )
-        )
-
-    def add_shapes(self, session: str, shapes: Iterable[str]) -> None:
-        """Let a session, anybody's, publish sets of shapes beside its FAP frames.
-
-        Raises
-        ------
-        Refused
-            If there is no such session or set.
-        """
-        self._ask(AddShapes(session=session, request=_request_id(), shapes=list(shapes)))
+        face = FaceSettings(**settings)  # type: ignore[arg-type]
+        self._ask(SetFace(session=session, request=_request_id(), face=face))
 
     def status(self, session: str = "") -> StatusReport:
         """Return the state of all services and sessions, or of one session and its services.
@@ -188,7 +140,7 @@ class Client:
         """
         pages: list[StatusReport] = []
         while not pages or pages[-1].next:
-            after = pages[-1].next if pages else 0
+            after = (pages[-1].next or 0) if pages else 0
             page = self._ask(StatusRequest(session=session, request=_request_id(), after=after))
             if not isinstance(page, StatusReport):
                 raise UserError(f"control answered {page.kind} to status")
@@ -210,14 +162,7 @@ class Client:
 
     def _ask(
         self,
-        message: OpenSession
-        | CloseSession
-        | FlushSession
-        | ChooseLips
-        | Express
-        | ChooseExpressiveness
-        | AddShapes
-        | StatusRequest,
+        message: OpenSession | CloseSession | FlushSession | SetFace | StatusRequest,
     ) -> Message:
         deadline_s = time.monotonic() + self._deadline_s
         # Only the last try counts: an address that is shut out for a while is let in again.
@@ -238,7 +183,7 @@ class Client:
                     if getattr(answer, "request", None) != message.request:
                         continue
                     if isinstance(answer, Error):
-                        raise Refused(answer.code, answer.text, answer.retry_after_s)
+                        raise Refused(answer.code, answer.text, answer.retry_after_s or 0.0)
                     if isinstance(answer, Message):
                         return answer
             is_refused = self.bus.is_refused(self._control)
@@ -272,7 +217,7 @@ class Session:
         self._sequence = 0
         self._num_frames_sent = 0
         self._has_finished = False
-        self._kept: deque[AudioChunk | EndOfAudio] = deque(maxlen=MAX_KEPT)
+        self._kept: deque[AudioChunk] = deque(maxlen=MAX_KEPT)
         self._next = 1  # number of the next message for the socket
         self._acknowledged = 0  # number of the newest message that the recognizer has
         self._progress_s = 0.0  # when something was acknowledged, or the first message waited
@@ -333,12 +278,13 @@ class Session:
         """Say that no more audio comes; False if the queue is full, as in ``send``."""
         if not self._has_finished:
             self._has_finished = self._send(
-                EndOfAudio(
+                AudioChunk(
                     session=self.name,
                     epoch=self.opened.epoch,
                     token=self.opened.token,
                     sequence=self._sequence + 1,
                     media_time=self.media_time,
+                    last=True,
                     acknowledge=True,
                 )
             )
@@ -395,17 +341,11 @@ class Session:
     def flush(self) -> None:
         """Interrupt: drop audio not yet shown; none of it is sent again."""
         self._client.flush_session(self.name, self.opened.token)
-        self._kept = deque(
-            (each for each in self._kept if isinstance(each, EndOfAudio)), maxlen=MAX_KEPT
-        )
+        self._kept = deque((each for each in self._kept if each.last), maxlen=MAX_KEPT)
 
-    def choose_lips(self, lips: str) -> None:
-        """Let another lip model move the mouth: "dynamic-visemes" or "learnt"."""
-        self._client.choose_lips(self.name, self.opened.token, lips)
-
-    def express(self, expressions: Mapping[str, float], hold_s: float = DEFAULT_HOLD_S) -> None:
-        """Let the face show expressions for a while, as in ``Client.express``."""
-        self._client.express(self.name, expressions, hold_s)
+    def set_face(self, **settings: object) -> None:
+        """Change the session's face, as ``Client.set_face``."""
+        self._client.set_face(self.name, **settings)
 
     def close(self) -> None:
         """Close the session; after ``finish`` once the recognizer has told all its results."""
@@ -417,7 +357,7 @@ class Session:
                 break
         self._client.close_session(self.name, self.opened.token)
 
-    def _send(self, message: AudioChunk | EndOfAudio) -> bool:
+    def _send(self, message: AudioChunk) -> bool:
         """Send a new message; return False if the queue is full.
 
         While subscriptions are renewed, it may wait behind others.
@@ -460,7 +400,7 @@ class Session:
                 return
             self._next += 1
 
-    def _give(self, message: AudioChunk | EndOfAudio) -> bool:
+    def _give(self, message: AudioChunk) -> bool:
         """Give the socket a message; return whether it took it."""
         return self._audio.send(dataclasses.replace(message, epoch=self.opened.epoch))
 
@@ -476,7 +416,7 @@ class Session:
             message = received.message
             if isinstance(message, Error):
                 self._errors.append(message)
-            elif isinstance(message, Acknowledge) and message.sequence > self._acknowledged:
+            elif isinstance(message, AcknowledgeAudio) and message.sequence > self._acknowledged:
                 now_s = time.monotonic()
                 while self._sent_s and self._sent_s[0][0] <= message.sequence:
                     number, sent_s = self._sent_s.popleft()

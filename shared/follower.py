@@ -18,7 +18,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Peer
 from kouxing.shared.metrics import Metrics
 from kouxing.shared.wire.codec import BadMessage
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.kinds import PUBLISHER_OF
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Joined
@@ -114,13 +114,12 @@ class SessionFollower:
         self._confirmed: set[str] = set()
         self._first_epoch = 0  # that of the first start
         self._epochs: dict[str, int] = {}  # of the newest message, by publisher
-        # epoch and sequence of it, by publisher; of shapes by their set, as frames share theirs
-        self._newest: dict[str, tuple[int, int]] = {}
+        self._newest: dict[str, tuple[int, int]] = {}  # epoch and sequence of it, by publisher
         self._newest_before: dict[str, tuple[int, int]] = {}  # when it subscribed again
         self._taken: set[tuple[str, tuple[int, int]]] = set()  # since then
-        self._last_frames: dict[str, tuple[int, int]] = {}  # media time and sequence
+        self._last_frame = (-1, -1)  # media time and sequence
         self._last_sequence: int | None = None
-        self._waiting: deque[FapFrame | Shapes] = deque(maxlen=MAX_OLD)
+        self._waiting: deque[FapFrame] = deque(maxlen=MAX_OLD)
 
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
         """Subscribe; when called again, subscribe where the session is published now.
@@ -223,7 +222,7 @@ class SessionFollower:
 
     def _on_message(self, message: Any) -> None:
         is_catching_up = time.monotonic() < self._loop.stall.resumed_at_s + CATCH_UP_S
-        if self._live and is_catching_up and isinstance(message, FapFrame | Shapes):
+        if self._live and is_catching_up and isinstance(message, FapFrame):
             self._waiting.append(message)
             return
         while self._waiting:
@@ -250,19 +249,18 @@ class SessionFollower:
     def _is_repeated(self, message: Message) -> bool:
         """Return whether the message came before, through the other socket or in another epoch."""
         publisher, number = PUBLISHER_OF[type(message)], (message.epoch, message.sequence)
-        stream = message.set if isinstance(message, Shapes) else publisher
-        is_older = number <= self._newest_before.get(stream, (-1, -1))
-        if is_older or (stream, number) in self._taken:
+        is_older = number <= self._newest_before.get(publisher, (-1, -1))
+        if is_older or (publisher, number) in self._taken:
             return True
         if self._socket_before is not None:
-            self._taken.add((stream, number))
+            self._taken.add((publisher, number))
         self._epochs[publisher] = message.epoch
-        self._newest[stream] = max(number, self._newest.get(stream, number))
-        if isinstance(message, FapFrame | Shapes):
+        self._newest[publisher] = max(number, self._newest.get(publisher, number))
+        if isinstance(message, FapFrame):
             place = (message.media_time, message.sequence)
-            if place <= self._last_frames.get(stream, (-1, -1)):
+            if place <= self._last_frame:
                 return True
-            self._last_frames[stream] = place
+            self._last_frame = place
         return False
 
     def _enter_epoch(self, epoch: int) -> None:

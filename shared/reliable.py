@@ -13,7 +13,7 @@ from collections.abc import Callable
 from kouxing.shared.bus import Socket
 from kouxing.shared.keys import NOBODY, Peer
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge
+from kouxing.shared.wire.speech import AcknowledgePhones
 
 RESEND_AFTER_S = 0.5
 ACKNOWLEDGE_EVERY = 32  # messages; each tick acknowledges the rest
@@ -84,7 +84,10 @@ class ReliableReceiver:
     """
 
     def __init__(
-        self, socket: Socket, session: str, answer: Callable[[], Acknowledge] = Acknowledge
+        self,
+        socket: Socket,
+        session: str,
+        answer: Callable[[], AcknowledgePhones] = AcknowledgePhones,
     ) -> None:
         self._socket = socket
         self._session = session

@@ -16,8 +16,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 from kouxing.shared.bus import Bus, Received, Socket
@@ -32,25 +31,18 @@ from kouxing.shared.metrics import BusyShare, Metrics, give_back_memory, keep_on
 from kouxing.shared.prometheus import MetricsServer
 from kouxing.shared.wire.codec import BadMessage
 from kouxing.shared.wire.control import (
-    AllowedKeys,
-    FlushNow,
+    AllowedKey,
+    Event,
+    EventName,
     Heartbeat,
-    HeartbeatSeen,
+    HeartbeatReply,
     SessionInput,
+    SessionStarted,
     StartSession,
-    StatusReport,
     StopSession,
-    UseLips,
 )
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import (
-    AddShapes,
-    ChooseExpressiveness,
-    Done,
-    Error,
-    ErrorCode,
-    Express,
-)
+from kouxing.shared.wire.session import Error, ErrorCode, FlushSession, SessionFacts
 
 HEARTBEAT_S = 0.25
 SESSIONS_A_BEAT = 16  # of a worker, in turn: a heartbeat costs the same however many it serves
@@ -70,25 +62,13 @@ PULSE_VARIABLE = "_KOUXING_PULSE"  # file descriptor of a pipe that tells it of 
 Handler = Callable[[Any, Peer], None]
 
 
-@dataclass(slots=True)
-class _Served:
-    """A session as control last described it, with what was chosen since."""
-
-    start: StartSession
-    expressions_end_s: float
-
-    def present_start(self, now_s: float) -> StartSession:
-        """Return what another service would have to be told now."""
-        return replace(self.start, hold_s=max(0.0, self.expressions_end_s - now_s))
-
-
 class Service:
     """What all services share; subclasses add their sockets and handlers.
 
     A subclass says its role and the endpoints it needs, fills in ``endpoints`` with those it
-    provides, calls ``register`` for its own sockets, and overrides ``start_session``,
-    ``stop_session``, ``flush_session``, ``use_lips``, ``express``, ``choose_expressiveness``,
-    ``add_shapes``, ``session_inputs``, ``gauges``, ``on_tick``, ``on_drain``.
+    provides, calls ``register`` for its own sockets, and overrides ``control_handlers``,
+    ``start_session``, ``stop_session``, ``flush_session``, ``served_sessions``,
+    ``session_inputs``, ``gauges``, ``on_tick``, ``on_drain``.
     """
 
     name: ClassVar[str]
@@ -109,10 +89,7 @@ class Service:
         self.stall = StallDetector(time.monotonic())
         self.clock_offset = ClockOffset()
         self.endpoints: dict[str, str] = {}  # what it provides, by name
-        self.language = ""  # of the phones that it recognises
-        self.frame_rate_hz = 0.0  # of the FAP frames that it makes
-        self.delay_ms = 0.0  # how much later than its sound it makes a FAP frame
-        self.lips = ""  # the lip model that it uses until a client chooses one
+        self.facts = SessionFacts()  # about the sessions that it serves
         self.warnings = RateLimit()
         self._poller = self.bus.poller()
         self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
@@ -125,7 +102,6 @@ class Service:
         self._sent_ns = self._answered_ns = 0  # newest heartbeat, and the newest that was answered
         self._answered_s = time.monotonic()
         self._control_instance = ""  # that answered last
-        self._served: dict[str, _Served] = {}
         self._tick_due_s = 0.0
         self._busy = BusyShare(LOAD_PERIOD_S, time.monotonic())
         self.session_at_work = ""  # whose message is being handled; a crash is its
@@ -144,20 +120,19 @@ class Service:
     def flush_session(self, session: str) -> None:
         """Drop audio of a session that is not yet shown."""
 
-    def use_lips(self, session: str, lips: str) -> None:
-        """Let another lip model move the mouth of a session, if that is made here."""
+    def served_sessions(self) -> Iterable[StartSession]:
+        """Return the sessions that a restarted control learns from this service."""
+        return ()
 
-    def express(self, message: Express) -> None:
-        """Let the face of a session show expressions, if it is made here."""
-
-    def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
-        """Let the mouth of a session move more or less, if it is made here."""
-
-    def add_shapes(self, message: AddShapes) -> None:
-        """Publish sets of shapes of a session, if its face is made here."""
-
-    def on_status(self, report: StatusReport) -> None:
-        """Take what control answers to a request for its status."""
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        """Return the handlers of control's messages; subclasses add theirs."""
+        return {
+            HeartbeatReply: self._on_heartbeat_reply,
+            StartSession: self._on_start,
+            StopSession: lambda message, _: self.stop_session(message.session),
+            FlushSession: lambda message, _: self.flush_session(message.session),
+            Error: self._on_error,
+        }
 
     def on_start(self) -> None:
         """Begin what needs the loop; called once, before the service says that it is ready."""
@@ -215,7 +190,13 @@ class Service:
 
         ``media_time`` is up to where its phones are final here, in samples at 16 kHz.
         """
-        self.tell_control(Done(session=start.session, request=start.request, media_time=media_time))
+        self.tell_control(
+            SessionStarted(session=start.session, request=start.request, media_time=media_time)
+        )
+
+    def publish_event(self, name: EventName, session: str, detail: str) -> None:
+        """Let control publish an event about a session."""
+        self.tell_control(Event(session=session, name=name, detail=detail[:2000]))
 
     def tell_control(self, message: Message) -> None:
         """Send a message to control, unless this is control."""
@@ -317,23 +298,7 @@ class Service:
 
     def _connect_to_control(self) -> Socket:
         socket = self.bus.connect_dealer(self.control_endpoint)
-        self.register(
-            socket,
-            {
-                HeartbeatSeen: self._on_heartbeat_seen,
-                AllowedKeys: self._on_allowed_keys,
-                StartSession: self._on_start,
-                StopSession: self._on_stop,
-                FlushNow: lambda message, _: self.flush_session(message.session),
-                UseLips: self._on_use_lips,
-                Express: self._on_express,
-                ChooseExpressiveness: self._on_choose_expressiveness,
-                AddShapes: self._on_add_shapes,
-                StatusReport: lambda report, _: self.on_status(report),
-                Error: self._on_error,
-                Done: lambda _message, _sender: None,
-            },
-        )
+        self.register(socket, self.control_handlers())
         return socket
 
     def _ask_what_changed(self) -> None:
@@ -423,10 +388,7 @@ class Service:
                 instance=self.instance,
                 role=self.role,
                 needs=list(self.needs),
-                language=self.language,
-                frame_rate_hz=self.frame_rate_hz,
-                delay_ms=self.delay_ms,
-                lips=self.lips,
+                facts=self.facts,
                 state="draining" if self._stop_requested else "ready",
                 sent_ns=self._sent_ns,
                 endpoints=self.endpoints,
@@ -465,18 +427,23 @@ class Service:
             if bus.is_refused(self.control_endpoint):
                 LOG.warning(refusal(self.control_endpoint, self.name, self.roles))
 
-    def _on_heartbeat_seen(self, seen: HeartbeatSeen, _sender: Peer) -> None:
+    def _on_heartbeat_reply(self, reply: HeartbeatReply, _sender: Peer) -> None:
         self._answered_s = time.monotonic()
-        self._answered_ns = seen.sent_ns
-        self.clock_offset.update(seen.sent_ns, seen.received_ns, seen.replied_ns, now_ns())
-        is_another = self._control_instance not in ("", seen.control)
-        self._control_instance = seen.control
-        if is_another and "audio" in self.endpoints:
-            for served in self._served.values():  # which it does not know yet
-                self.tell_control(served.present_start(time.monotonic()))
+        self._answered_ns = reply.sent_ns
+        self.clock_offset.update(reply.sent_ns, reply.received_ns, reply.replied_ns, now_ns())
+        has_restarted = self._control_instance not in ("", reply.control)
+        self._control_instance = reply.control
+        if reply.keys is not None:
+            self._allow(reply.keys)
+        if has_restarted:
+            for start in self.served_sessions():
+                self.tell_control(
+                    SessionStarted(session=start.session, request=start.request, start=start)
+                )
 
-    def _on_allowed_keys(self, allowed: AllowedKeys, _sender: Peer) -> None:
-        guests = {key: Guest(each.name, tuple(each.roles)) for key, each in allowed.keys.items()}
+    def _allow(self, keys: Mapping[str, AllowedKey]) -> None:
+        """Let these keys connect, and no others."""
+        guests = {key: Guest(allowed.name, tuple(allowed.roles)) for key, allowed in keys.items()}
         if self.bus.zap is None:
             return
         try:
@@ -490,37 +457,11 @@ class Service:
         if self._stop_requested:
             return
         try:
-            self._served[start.session] = _Served(start, time.monotonic() + start.hold_s)
             if self.start_session(start):
                 self.session_started(start)
         except UserError as error:
             self.warn("start", str(error), start.session)
-            self.tell_control(Error(session=start.session, code=ErrorCode.TIMEOUT, text=str(error)))
-
-    def _on_stop(self, stop: StopSession, _sender: Peer) -> None:
-        self._served.pop(stop.session, None)
-        self.stop_session(stop.session)
-
-    def _on_use_lips(self, use: UseLips, _sender: Peer) -> None:
-        if served := self._served.get(use.session):
-            served.start = replace(served.start, lips=use.lips)
-        self.use_lips(use.session, use.lips)
-
-    def _on_express(self, message: Express, _sender: Peer) -> None:
-        if served := self._served.get(message.session):
-            served.start = replace(served.start, expressions=message.expressions)
-            served.expressions_end_s = time.monotonic() + message.hold_s
-        self.express(message)
-
-    def _on_choose_expressiveness(self, message: ChooseExpressiveness, _sender: Peer) -> None:
-        if served := self._served.get(message.session):
-            served.start = replace(served.start, expressiveness=message.expressiveness)
-        self.choose_expressiveness(message)
-
-    def _on_add_shapes(self, message: AddShapes, _sender: Peer) -> None:
-        if served := self._served.get(message.session):
-            served.start = replace(served.start, shapes=message.shapes)
-        self.add_shapes(message)
+            self.publish_event(EventName.ERROR, start.session, f"{ErrorCode.TIMEOUT}: {error}")
 
     def _on_error(self, error: Error, _sender: Peer) -> None:
         self.warn(error.code, f"control: {error.text}", error.session)

@@ -14,9 +14,9 @@ from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.endpoints import key_of, with_key
 from kouxing.shared.keys import Key, own_key
 from kouxing.shared.wire.codec import decode, encode
-from kouxing.shared.wire.control import Heartbeat, StartSession
+from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Done, OpenSession
+from kouxing.shared.wire.session import OpenSession
 
 LOCAL = "tcp://127.0.0.1:*"
 PROVIDED = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
@@ -90,4 +90,4 @@ class Stage:
     def _start(self, service: Socket) -> None:
         for received in service.receive():
             if isinstance(start := received.message, StartSession):
-                service.send(Done(session=start.session, request=start.request))
+                service.send(SessionStarted(session=start.session, request=start.request))

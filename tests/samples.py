@@ -4,57 +4,78 @@ from __future__ import annotations
 
 import numpy as np
 
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
 from kouxing.shared.wire.control import (
     AllowedKey,
-    AllowedKeys,
     Event,
-    FlushNow,
     Heartbeat,
-    HeartbeatSeen,
-    Recorded,
-    ServiceState,
+    HeartbeatReply,
     SessionInput,
-    SessionState,
+    SessionStarted,
     StartSession,
-    StatusReport,
-    StatusRequest,
     StopSession,
-    UseLips,
 )
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
-    AddShapes,
-    ChooseExpressiveness,
-    ChooseLips,
     CloseSession,
     Done,
     Error,
-    Express,
     FlushSession,
     Joined,
     OpenSession,
+    ServiceState,
+    SessionFacts,
     SessionMoved,
     SessionOpened,
+    SessionState,
+    StatusReport,
+    StatusRequest,
 )
 from kouxing.shared.wire.speech import (
-    Acknowledge,
-    EndOfPhones,
+    AcknowledgePhones,
     Lips,
+    NewestFrame,
     Phone,
     Progress,
     ResumeFace,
     Speech,
-    Stalled,
 )
 
 COMMON = {"session": "demo", "epoch": 1, "sequence": 7, "media_time": 16000}
 FAPS = np.arange(68, dtype="<f4").tobytes()
 MOUTH = np.arange(28, dtype="<f4").tobytes()
+FACTS = SessionFacts(language="mandarin", frame_rate_hz=50.0, delay_ms=160.0, lips="learnt")
+FACE = FaceSettings(
+    lips="learnt",
+    expressiveness=1.25,
+    expressions={"joy": 0.5, "squint": 1.0},
+    hold_s=2.5,
+    shapes=["arkit", "vrm"],
+)
+FRAME = NewestFrame(sequence=50, media_time=16000, values=FAPS)
+START = StartSession(
+    session="demo",
+    epoch=1,
+    request="start-demo-1",
+    token="t",
+    encoding="s16le",
+    sample_rate_hz=16000,
+    num_channels=1,
+    record=False,
+    paced=True,
+    facts=FACTS,
+    endpoints={"phone_input": "tcp://127.0.0.1:5570"},
+    face=FACE,
+    speech_time=8000,
+    client=b"\x01client",
+    client_request="r1",
+)
 
 SAMPLES: tuple[Message, ...] = (
-    OpenSession(session="demo", request="r1", sample_rate_hz=48000, num_channels=2, record=True),
+    OpenSession(
+        session="demo", request="r1", sample_rate_hz=48000, num_channels=2, record=True, face=FACE
+    ),
     SessionOpened(
         session="demo",
         request="r1",
@@ -63,8 +84,7 @@ SAMPLES: tuple[Message, ...] = (
         phones="tcp://127.0.0.1:5561",
         faps="tcp://127.0.0.1:5571",
         events="tcp://127.0.0.1:5551",
-        language="mandarin",
-        frame_rate_hz=50.0,
+        facts=FACTS,
     ),
     SessionMoved(
         session="demo",
@@ -76,7 +96,7 @@ SAMPLES: tuple[Message, ...] = (
     ),
     CloseSession(session="demo", request="r2", token="t"),
     FlushSession(session="demo", request="r3", token="t"),
-    ChooseLips(session="demo", request="r3", token="t", lips="learnt"),
+    SetFace(session="demo", request="r5", face=FACE),
     StatusRequest(request="r4"),
     StatusReport(
         request="r4",
@@ -100,45 +120,15 @@ SAMPLES: tuple[Message, ...] = (
                 speaking=True,
                 endpoints={"audio": "tcp://127.0.0.1:5560"},
                 workers={"audio": "recognizer-1"},
+                facts=FACTS,
             )
         ],
+        next=2,
     ),
     Done(session="demo", request="r2"),
-    Error(session="demo", code="unknown-session", text="there is no session", request="r2"),
-    Heartbeat(
-        service="recognizer",
-        instance="recognizer-1",
-        role="worker",
-        state="ready",
-        sent_ns=1_700_000_000_000_000_000,
-        endpoints={"audio": "tcp://127.0.0.1:5560"},
-        needs=["phone_input"],
-        language="mandarin",
-        metrics={"in_audio_chunk": 3.0},
-        sessions={"demo": SessionInput(idle_s=0.5, sequence=100)},
-    ),
-    HeartbeatSeen(sent_ns=1, received_ns=2, replied_ns=3),
-    StartSession(
-        session="demo",
-        epoch=1,
-        request="start-demo-1",
-        token="t",
-        encoding="s16le",
-        sample_rate_hz=16000,
-        num_channels=1,
-        record=False,
-        paced=True,
-        language="mandarin",
-        endpoints={"phone_input": "tcp://127.0.0.1:5570"},
-        delay_ms=160.0,
-    ),
-    StopSession(session="demo", epoch=1),
-    FlushNow(session="demo", epoch=1),
-    UseLips(session="demo", epoch=1, lips="learnt"),
-    Recorded(session="demo", path="out/demo.mp4", num_images=150, duration_s=6.0),
-    Event(session="demo", number=4, sequence=4, name="recorded", detail="out/demo.mp4"),
-    AudioChunk(**COMMON, token="t", pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
-    EndOfAudio(**COMMON, token="t"),  # type: ignore[arg-type]
+    Error(session="demo", code="busy", text="no worker has room", request="r2", retry_after_s=5.0),
+    AudioChunk(**COMMON, token="t", pcm=b"\x00\x01\xff\x7f", last=True),  # type: ignore[arg-type]
+    AcknowledgeAudio(**COMMON),  # type: ignore[arg-type]
     Sound(**COMMON, pcm=b"\x00\x01\xff\x7f"),  # type: ignore[arg-type]
     Speech(**COMMON, active=True),  # type: ignore[arg-type]
     Phone(
@@ -150,21 +140,41 @@ SAMPLES: tuple[Message, ...] = (
         final=False,
     ),
     Lips(**COMMON, values=MOUTH, delay=960, closure=0.75, lip_to_teeth=0.125),  # type: ignore[arg-type]
-    Progress(**COMMON, level_db=-20.5),  # type: ignore[arg-type]
-    EndOfPhones(**COMMON),  # type: ignore[arg-type]
-    Acknowledge(**COMMON),  # type: ignore[arg-type]
-    FapFrame(**COMMON, values=FAPS, mask=bytes([252] + [255] * 7 + [15])),  # type: ignore[arg-type]
+    FapFrame(
+        **COMMON,  # type: ignore[arg-type]
+        values=FAPS,
+        mask=bytes([252] + [255] * 7 + [15]),
+        shapes={"vrm": np.arange(12, dtype="<f4").tobytes()},
+    ),
     EndOfFaps(**COMMON),  # type: ignore[arg-type]
     Joined(session="demo", publisher="p1"),
-    Express(session="demo", request="r5", expressions={"joy": 0.5, "squint": 1.0}, hold_s=2.5),
-    ChooseExpressiveness(session="demo", request="r6", expressiveness=1.25),
-    AllowedKeys(
+    Event(session="demo", sequence=4, name="recorded", detail="out/demo.mp4"),
+    Progress(**COMMON, level_db=-20.5, zero_crossing_rate=0.25, pitch_hz=220.0),  # type: ignore[arg-type]
+    ResumeFace(**COMMON, newest_frame=FRAME),  # type: ignore[arg-type]
+    AcknowledgePhones(**COMMON, newest_frame=FRAME),  # type: ignore[arg-type]
+    Heartbeat(
+        service="recognizer",
+        instance="recognizer-1",
+        role="worker",
+        state="ready",
+        sent_ns=1_700_000_000_000_000_000,
+        endpoints={"audio": "tcp://127.0.0.1:5560"},
+        needs=["phone_input"],
+        facts=SessionFacts(language="mandarin"),
+        load=0.5,
+        metrics={"in_audio_chunk": 3.0},
+        sessions={"demo": SessionInput(idle_s=0.5, sequence=100, media_time=16000)},
+    ),
+    HeartbeatReply(
+        sent_ns=1,
+        received_ns=2,
+        replied_ns=3,
+        control="control-1",
         keys={
             "D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs": AllowedKey(name="laptop", roles=["client"])
-        }
+        },
     ),
-    Stalled(**COMMON),  # type: ignore[arg-type]
-    ResumeFace(**COMMON, frame=50, faps=FAPS),  # type: ignore[arg-type]
-    Shapes(**COMMON, set="vrm", weights=np.arange(12, dtype="<f4").tobytes()),  # type: ignore[arg-type]
-    AddShapes(session="demo", request="r7", shapes=["arkit", "vrm"]),
+    START,
+    SessionStarted(session="demo", request="start-demo-1", media_time=16000, start=START),
+    StopSession(session="demo", epoch=1),
 )

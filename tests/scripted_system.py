@@ -19,11 +19,12 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import variable
 from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
 from kouxing.shared.keys import Peer
-from kouxing.shared.service import Service
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.service import Handler, Service
+from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.session import ChooseExpressiveness, Express
+from kouxing.shared.wire.face import FaceSettings, FapFrame, SetFace
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import Phone
 from tests.system import ROOT
 
@@ -49,24 +50,23 @@ class ScriptedRecognizer(Service):
         self.starts: dict[str, StartSession] = {}
         self.finished: set[str] = set()
         self.flushed: list[str] = []
-        self.register(
-            self.audio,
-            {
-                AudioChunk: self._on_audio,
-                EndOfAudio: lambda end, _: self.finished.add(end.session),
-            },
-        )
+        self.register(self.audio, {AudioChunk: self._on_audio})
         self.register(self.phones, {})
 
     def start_session(self, start: StartSession) -> bool:
         self.starts[start.session] = start
         return True
 
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        return super().control_handlers() | {SetFace: lambda _message, _sender: None}
+
     def flush_session(self, session: str) -> None:
         self.flushed.append(session)
 
     def _on_audio(self, chunk: AudioChunk, _sender: Peer) -> None:
         self.pcm[chunk.session] = self.pcm.get(chunk.session, b"") + chunk.pcm
+        if chunk.last:
+            self.finished.add(chunk.session)
 
 
 class ScriptedSynthesizer(Service):
@@ -81,21 +81,16 @@ class ScriptedSynthesizer(Service):
         self.input = self.bus.bind_router(local, "synthesizer.phones")
         self.faps = self.bus.bind_publisher(local, "synthesizer.faps")
         self.endpoints = {"phone_input": self.input.endpoint, "faps": self.faps.endpoint}
-        self.lips = "dynamic-visemes"
-        self.chosen: list[tuple[str, str]] = []  # session, lip model
-        self.amounts: list[tuple[str, float]] = []  # session, expressiveness
-        self.expressions: list[dict[str, float]] = []
+        self.facts = SessionFacts(lips="dynamic-visemes")
+        self.changes: list[tuple[str, FaceSettings]] = []  # by session
         self.register(self.input, {})
         self.register(self.faps, {})
 
-    def express(self, message: Express) -> None:
-        self.expressions.append(message.expressions)
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        return super().control_handlers() | {SetFace: self._on_set_face}
 
-    def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
-        self.amounts.append((message.session, message.expressiveness))
-
-    def use_lips(self, session: str, lips: str) -> None:
-        self.chosen.append((session, lips))
+    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+        self.changes.append((message.session, message.face))
 
 
 class System:

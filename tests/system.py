@@ -19,7 +19,7 @@ from kouxing.shared.client import Client
 from kouxing.shared.config import variable
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import control_endpoint
-from kouxing.shared.wire.control import StatusReport
+from kouxing.shared.wire.session import StatusReport
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"

@@ -19,7 +19,7 @@ from kouxing.shared.client import Client
 from kouxing.shared.config import variable
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT, Key, control_endpoint, read_key, user_key
-from kouxing.shared.wire.control import StatusReport
+from kouxing.shared.wire.session import StatusReport
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 60.0

@@ -181,7 +181,7 @@ static Bytes ask(void *control, const char *kind, const char *session, const cha
   snprintf(topic, sizeof topic, "%s/%s/", kind, session);
   snprintf(request, sizeof request, "%d", ++number);
   /* a map: an integer, two strings with their lengths before them, and the rest */
-  int size = snprintf(body, sizeof body, "%c\xa7version\x02\xa7session\xd9%c%s\xa7request%c%s%s",
+  int size = snprintf(body, sizeof body, "%c\xa7version\x03\xa7session\xd9%c%s\xa7request%c%s%s",
                       *rest ? 0x84 : 0x83, (int)strlen(session), session,
                       0xa0 + (int)strlen(request), request, rest);
   zmq_send(control, topic, strlen(topic), ZMQ_SNDMORE);
@@ -247,7 +247,7 @@ int main(int num_arguments, char **arguments) {
   void *face = zmq_socket(context, ZMQ_SUB);
   connect_to(face, endpoint, &key);
   choose(face, ZMQ_SUBSCRIBE, "session-moved", name);
-  choose(face, ZMQ_SUBSCRIBE, "shapes", name);
+  choose(face, ZMQ_SUBSCRIBE, "fap-frame", name);
   choose(face, ZMQ_SUBSCRIBE, "end-of-faps", name);
   choose(face, ZMQ_SUBSCRIBE, "joined", name); /* last: no frame is missed from then on */
 
@@ -256,15 +256,16 @@ int main(int num_arguments, char **arguments) {
   zmq_msg_t body;
   zmq_msg_init(&body);
   for (;;) {
-    char topic[MAX_NAME + 32], set[16];
-    Bytes message = receive(face, topic, sizeof topic, &body), at;
+    char topic[MAX_NAME + 32];
+    Bytes message = receive(face, topic, sizeof topic, &body), shapes, at;
     double time = find_number(message, "media_time"), number = find_number(message, "sequence");
     if (!strncmp(topic, "end-of-faps/", 12) && find_number(message, "epoch") >= epoch) break;
     if (!strncmp(topic, "joined/", 7) && !following) { /* it comes again whenever anybody joins */
       following = true;
       zmq_msg_t answer;
       zmq_msg_init(&answer);
-      ask(control, "add-shapes", name, "\xa6shapes\x91\xa5" "arkit", &answer); /* a list of one */
+      /* face: a map of one, shapes: a list of one */
+      ask(control, "set-face", name, "\xa4" "face\x81\xa6shapes\x91\xa5" "arkit", &answer);
       zmq_msg_close(&answer);
       connect_to(face, events, &key); /* control tells there when the face is made elsewhere */
       printf("following %s\n", name);
@@ -274,8 +275,7 @@ int main(int num_arguments, char **arguments) {
       connect_to(face, endpoint, &key);
       choose(face, ZMQ_UNSUBSCRIBE, "joined", name);
       choose(face, ZMQ_SUBSCRIBE, "joined", name); /* a moved face's newest frames come again */
-    } else if (find_text(message, "set", set, sizeof set) && !strcmp(set, "arkit") &&
-               find(message, "weights", &at) && /* others may have asked for other sets */
+    } else if (find(message, "shapes", &shapes) && find(shapes, "arkit", &at) &&
                (time > newest || (time == newest && number > newest_number))) {
       newest = time, newest_number = number;
       Value values = read_value(&at);

@@ -36,7 +36,7 @@ function read([topic, body]) {
 
 /** Send a request, and return the answer. */
 async function ask(control, kind, session, fields = {}) {
-  const body = { version: 2, session, request: String(++numRequests), ...fields };
+  const body = { version: 3, session, request: String(++numRequests), ...fields };
   await control.send([`${kind}/${session}/`, encode(body)]);
   return read(await control.receive())[1];
 }
@@ -60,19 +60,19 @@ async function find(control) {
 /** Print a session's frames from one publisher, to the end. */
 async function follow(endpoint) {
   const face = connect(Subscriber, endpoint);
-  for (const kind of ["shapes", "end-of-faps", "joined"]) { // joined, last: none is missed from then on
+  for (const kind of ["fap-frame", "end-of-faps", "joined"]) { // joined last: none is missed from then on
     face.subscribe(`${kind}/${session}/`);
   }
   for await (const message of face) {
     const [kind, body] = read(message);
     if (kind === "end-of-faps" && body.epoch >= epoch) process.exit();
     if (kind === "joined" && newest.media_time < 0) {
-      await ask(control, "add-shapes", session, { shapes: ["arkit"] });
+      await ask(control, "set-face", session, { face: { shapes: ["arkit"] } });
       console.log("following", session);
       face.unsubscribe(`joined/${session}/`); // it comes whenever anybody joins
-    } else if (body.set === "arkit" && isAfter(body, newest)) { // others may have asked for other sets
+    } else if (body.shapes?.arkit && isAfter(body, newest)) {
       newest = body;
-      const weights = new Float32Array(new Uint8Array(body.weights).buffer); // 52
+      const weights = new Float32Array(new Uint8Array(body.shapes.arkit).buffer); // 52
       console.log((body.media_time / 16000).toFixed(3), weights[JAW_OPEN].toFixed(2));
     }
   }

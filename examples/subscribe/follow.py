@@ -41,7 +41,7 @@ def receive(socket):
 
 def ask(control, kind, session, **fields):
     """Send a request, and return the kind of the answer and its fields."""
-    body = {"version": 2, "session": session, "request": str(next(numbers)), **fields}
+    body = {"version": 3, "session": session, "request": str(next(numbers)), **fields}
     control.send_multipart([f"{kind}/{session}/".encode(), msgpack.packb(body)])
     return receive(control)
 
@@ -68,7 +68,7 @@ events = next(
 
 face = context.socket(zmq.SUB)
 connect(face, session["endpoints"]["faps"])
-for kind in ("session-moved", "shapes", "end-of-faps", "joined"):  # joined, last: none is missed
+for kind in ("session-moved", "fap-frame", "end-of-faps", "joined"):  # joined last: none is missed
     face.subscribe(f"{kind}/{name}/")
 
 epoch, newest, following = 0, (-1, 0), False
@@ -76,7 +76,7 @@ while True:
     kind, body = receive(face)
     if kind == "joined" and not following:  # it comes again whenever anybody joins
         following = True
-        ask(control, "add-shapes", name, shapes=["arkit"])
+        ask(control, "set-face", name, face={"shapes": ["arkit"]})
         connect(face, events)  # control tells there when the face is made elsewhere
         print("following", name, flush=True)
     elif kind == "session-moved":
@@ -86,9 +86,9 @@ while True:
         face.subscribe(f"joined/{name}/")  # who joins a moved face gets its newest frames again
     elif kind == "end-of-faps" and body["epoch"] >= epoch:
         break
-    elif kind == "shapes" and body["set"] == "arkit":  # others may have asked for other sets
+    elif kind == "fap-frame" and "arkit" in body["shapes"]:
         place = body["media_time"], body["sequence"]
         if place > newest:
             newest = place
-            weights = struct.unpack("<52f", body["weights"])
+            weights = struct.unpack("<52f", body["shapes"]["arkit"])
             print(f"{body['media_time'] / 16000:.3f} {weights[JAW_OPEN]:.2f}", flush=True)

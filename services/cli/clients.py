@@ -169,7 +169,7 @@ def express(
     strengths = dict(map(_strength, expressions or ()))
     check_expressions(strengths, hold)
     with Client(control_address(control)) as client:
-        client.express(_session_name(session), strengths, hold)
+        client.set_face(_session_name(session), expressions=strengths, hold_s=hold)
 
 
 def _strength(text: str) -> tuple[str, float]:

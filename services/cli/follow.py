@@ -24,11 +24,10 @@ from kouxing.shared.phones import events
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.terminal import CONSOLE, check_output, print_message
-from kouxing.shared.wire.control import SessionState
 from kouxing.shared.wire.events import phone_of
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.session import ErrorCode, SessionState
 from kouxing.shared.wire.speech import Phone
 
 OPEN_POLL_S = 0.2
@@ -62,7 +61,7 @@ def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, con
         session = state.session
         try:
             if shown is not Shown.FAPS:
-                inventory = load_inventory(state.language or DEFAULT_LANGUAGE)
+                inventory = load_inventory(state.facts.language or DEFAULT_LANGUAGE)
                 num_lines = _print(_phone_rows(_messages(Phone, state, client), shown, inventory))
             else:
                 num_lines = _take_frames(_messages(FapFrame, state, client), session, output, form)

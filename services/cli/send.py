@@ -17,8 +17,8 @@ from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.follower import PollingLoop, SessionFollower
 from kouxing.shared.terminal import print_message
-from kouxing.shared.wire.control import SessionState
 from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.session import SessionState
 
 STEP_S = 0.05
 SEARCH_LIMIT_S = 1.0

@@ -17,7 +17,7 @@ from kouxing.shared.bus import Socket
 from kouxing.shared.client import Client, Session, Subscription
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.wire.control import Event
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.speech import Phone
@@ -69,7 +69,7 @@ def stream(
             num_channels=source.num_channels,
             record=record,
             paced=paced,
-            voice=mouth_profile,
+            mouth_profile=mouth_profile or None,
         )
         output = opened.subscribe(EndOfFaps, FapFrame)
         phones = opened.subscribe(Phone)
@@ -83,7 +83,9 @@ def stream(
                 )
                 _send_with_retry(opened.finish)
                 _wait_for_end(face, opened, events, console, client)
-            num_phones = _count_phones(phones, load_inventory(opened.opened.language).silence)
+            num_phones = _count_phones(
+                phones, load_inventory(opened.opened.facts.language or DEFAULT_LANGUAGE).silence
+            )
         finally:
             with contextlib.suppress(UserError):  # closed already, or control is gone
                 opened.close()

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from operator import itemgetter
 
 from kouxing.services.control.load import RETRY_AFTER_S, SAME_LOAD, WorkerLoad
 from kouxing.shared.endpoints import with_key
 from kouxing.shared.keys import NOBODY, Peer
 from kouxing.shared.wire.control import Heartbeat
-from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
 CLIENT_NEEDS = ("audio", "phones", "faps")  # the endpoints that a client is told
 UNPACED_AUDIO = "unpaced_audio"  # instead of "audio", where a recognizer has it
@@ -240,7 +240,12 @@ class Registry:
         return set(self._observers)
 
     def place(
-        self, kept: Mapping[str, str], now_s: float, language: str = "", *, may_refuse: bool = False
+        self,
+        kept: Mapping[str, str],
+        now_s: float,
+        language: str | None = None,
+        *,
+        may_refuse: bool = False,
     ) -> dict[str, str]:
         """Choose a worker for every endpoint that a client needs, or that a chosen worker needs.
 
@@ -290,28 +295,24 @@ class Registry:
             for endpoint, instance in workers.items()
         }
 
-    def language(self, instances: Iterable[str]) -> str:
-        """Return the language that one of these services recognises; empty if none does."""
-        languages = (self._services[instance].heartbeat.language for instance in instances)
-        return next(filter(None, languages), "")
-
-    def frame_rate_hz(self, instances: Iterable[str]) -> float:
-        """Return the rate of the FAP frames that one of these services makes; 0 if none does."""
-        rates = (self._services[instance].heartbeat.frame_rate_hz for instance in instances)
-        return next(filter(None, rates), 0.0)
-
-    def delay_ms(self, instances: Iterable[str]) -> float:
-        """Return how much later than its sound one of these services makes a FAP frame."""
-        delays = (self._services[instance].heartbeat.delay_ms for instance in instances)
-        return next(filter(None, delays), 0.0)
-
-    def lips(self, instances: Iterable[str]) -> str:
-        """Return the lip model that one of these services uses at first; empty if none does."""
-        models = (self._services[instance].heartbeat.lips for instance in instances)
-        return next(filter(None, models), "")
+    def facts(self, instances: Iterable[str]) -> SessionFacts:
+        """Return what these services together state about their sessions."""
+        stated = [asdict(self._services[instance].heartbeat.facts) for instance in instances]
+        return SessionFacts(
+            **{
+                name: next((facts[name] for facts in stated if facts[name] is not None), None)
+                for name in asdict(SessionFacts())
+            }
+        )
 
     def _choose(
-        self, endpoint: str, placed: set[str], now_s: float, language: str, *, may_refuse: bool
+        self,
+        endpoint: str,
+        placed: set[str],
+        now_s: float,
+        language: str | None,
+        *,
+        may_refuse: bool,
     ) -> str:
         providers = self._providers.get(endpoint, {})
         for instance in sorted(placed & providers.keys()):
@@ -360,5 +361,7 @@ def _keyed(heartbeat: Heartbeat, peer: Peer) -> dict[str, str]:
     return {name: with_key(each, peer.key) for name, each in heartbeat.endpoints.items()}
 
 
-def _may_serve(record: ServiceRecord, language: str) -> bool:
-    return record.state == "ready" and (not language or record.heartbeat.language in ("", language))
+def _may_serve(record: ServiceRecord, language: str | None) -> bool:
+    return record.state == "ready" and (
+        language is None or record.heartbeat.facts.language in (None, language)
+    )

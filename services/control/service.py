@@ -5,12 +5,10 @@ and keeps them in step. Audio, phones and FAPs never pass through it.
 
 A control that starts again asks nobody: services tell it the sessions that they serve.
 
-Reacts to: open-session, close-session, flush-session, choose-lips, express,
-choose-expressiveness, add-shapes, status-request (clients), heartbeat, done, start-session, speech,
-recorded, error (services).
-Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-seen,
-allowed-keys, start-session, stop-session, flush-now, use-lips, express, choose-expressiveness,
-add-shapes (services), event, session-moved (subscribers).
+Reacts to: open-session, close-session, flush-session, set-face, status-request (clients),
+heartbeat, session-started, speech, event (services).
+Emits: session-opened, session-moved, status-report, done, error (clients), heartbeat-reply,
+start-session, stop-session, flush-session, set-face (services), event, session-moved (subscribers).
 """
 
 from __future__ import annotations
@@ -36,37 +34,30 @@ from kouxing.shared.service import Handler, Service
 from kouxing.shared.wire.codec import encoded_size
 from kouxing.shared.wire.control import (
     AllowedKey,
-    AllowedKeys,
     Event,
     EventName,
-    FlushNow,
     Heartbeat,
-    HeartbeatSeen,
-    Recorded,
-    ServiceState,
-    SessionState,
+    HeartbeatReply,
+    SessionStarted,
     StartSession,
-    StatusReport,
-    StatusRequest,
     StopSession,
-    UseLips,
 )
+from kouxing.shared.wire.face import SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
-    AddShapes,
-    ChooseExpressiveness,
-    ChooseLips,
     CloseSession,
     Done,
     Error,
     ErrorCode,
-    Express,
     FlushSession,
     OpenSession,
+    ServiceState,
     SessionMoved,
+    SessionState,
+    StatusReport,
+    StatusRequest,
 )
 from kouxing.shared.wire.speech import Speech
-from kouxing.shared.zap import Zap
 
 STOPPED = "stopped"  # why a service that shut down in order is gone
 START_LIMIT_S = 5.0  # for the services to start a session
@@ -79,16 +70,8 @@ MAX_DEFERRED = 1000  # requests that wait for that
 PAGE_BYTES = 512 * 1024  # of a status report, whose largest state leaves it within a message
 FIRST_SESSION = 2**32  # number of the first session in the pages of a status report
 MAY_BE_EARLY = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)
-Request = (
-    OpenSession
-    | CloseSession
-    | FlushSession
-    | ChooseLips
-    | Express
-    | ChooseExpressiveness
-    | AddShapes
-    | StatusRequest
-)
+FROM_SERVICES = (EventName.ERROR, EventName.RECORDED)  # events that a service may publish
+Request = OpenSession | CloseSession | FlushSession | SetFace | StatusRequest
 
 
 class ControlService(Service):
@@ -102,7 +85,7 @@ class ControlService(Service):
         self._registry = Registry(config.lost_after_s, config.max_load)
         self._sessions = Sessions(self._registry, config.max_sessions)
         self._idle_limit_s = config.idle_limit_s
-        self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
+        self._answers: OrderedDict[tuple[Peer, int, str | None], Message] = OrderedDict()
         self._num_events = 0
         self._ticked_s = time.monotonic()
         self._to_tell_again: list[tuple[float, str, SessionMoved]] = []  # a heap, by time
@@ -111,7 +94,7 @@ class ControlService(Service):
         self._returning: dict[str, StartSession] = {}  # sessions that miss a service still
         self._observed: dict[str, Collection[str]] = {}  # sessions that observers follow meanwhile
         self._deferred: list[tuple[Handler, Request, Peer]] = []
-        self._told_version = (0, 0)  # of the allowed keys
+        self._told_keys: dict[str, tuple[int, int]] = {}  # version of the list, by worker
         self._commands = self.bus.bind_router(config.bound_control, "control.control", COMMANDS)
         self._events = self.bus.bind_publisher(config.events, "control.events")
         own = self.key.public if self.key else ""
@@ -125,19 +108,12 @@ class ControlService(Service):
                 OpenSession: self._request_handler(self._open, "client"),
                 CloseSession: self._request_handler(self._close, "client"),
                 FlushSession: self._request_handler(self._flush, "client"),
-                ChooseLips: self._request_handler(self._choose_lips, "client"),
-                Express: self._request_handler(self._express, "client", "operator"),
-                ChooseExpressiveness: self._request_handler(
-                    self._choose_expressiveness, "client", "operator"
-                ),
-                AddShapes: self._request_handler(self._add_shapes, "client", "operator"),
+                SetFace: self._request_handler(self._set_face, "client", "operator"),
                 StatusRequest: self._request_handler(self._status),
                 Heartbeat: self._on_heartbeat,
-                Done: self._service_handler(self._on_started),
-                StartSession: self._service_handler(self._on_served),
+                SessionStarted: self._service_handler(self._on_started),
                 Speech: self._service_handler(self._on_speech),
-                Recorded: self._service_handler(self._on_recorded),
-                Error: self._service_handler(self._on_service_error),
+                Event: self._service_handler(self._on_service_event),
             },
         )
         self.register(self._events, {})
@@ -156,7 +132,7 @@ class ControlService(Service):
         if pause_s > EXCUSED_S:  # their heartbeats wait to be read
             self._registry.excuse(pause_s)
         if self.bus.zap is not None:
-            self._tell_new_keys(self.bus.zap)
+            self.bus.zap.refresh()
         if self._takes_over and now_s > self._takeover_end_s:
             self._end_takeover()
         for connection in self._commands.ended():
@@ -182,21 +158,18 @@ class ControlService(Service):
             self._end(record, "control stops")
         return True
 
-    def _tell_new_keys(self, zap: Zap) -> None:
-        """Tell every service who may connect, when that has changed."""
-        zap.refresh()
-        if zap.version != self._told_version:
-            self._told_version = zap.version
-            for record in self._registry.sorted():
-                if record.heartbeat.role == "worker":
-                    self._tell_keys(zap, record.peer)
-
-    def _tell_keys(self, zap: Zap, service: Peer) -> None:
-        keys = {
+    def _new_keys(self, heartbeat: Heartbeat) -> dict[str, AllowedKey] | None:
+        """Return the keys that may connect to a worker, if it does not have the newest list."""
+        zap = self.bus.zap
+        if zap is None or heartbeat.role != "worker":
+            return None
+        if self._told_keys.get(heartbeat.instance) == zap.version:
+            return None
+        self._told_keys[heartbeat.instance] = zap.version
+        return {
             public: AllowedKey(name=guest.name, roles=list(guest.roles))
             for public, guest in zap.guests.items()
         }
-        self._commands.send(AllowedKeys(keys=keys), to=service)
 
     # --- requests ------------------------------------------------------------------------------
 
@@ -209,7 +182,7 @@ class ControlService(Service):
         """
 
         def on_request(message: Request, sender: Peer) -> None:
-            remembered = self._answers.get(_asker(sender, message.request))
+            remembered = self._answers.get((sender, sender.connection, message.request))
             if remembered is not None:
                 self._commands.send(remembered, to=sender)
                 return
@@ -226,7 +199,7 @@ class ControlService(Service):
                     code=refusal.code,
                     text=refusal.text,
                     request=message.request,
-                    retry_after_s=refusal.retry_after_s,
+                    retry_after_s=refusal.retry_after_s or None,
                 )
             if reply is not None:
                 self._reply(sender, message.request, reply)
@@ -242,9 +215,9 @@ class ControlService(Service):
             text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
             raise Refusal(ErrorCode.NOT_ALLOWED, text)
 
-    def _reply(self, sender: Peer, request: str, reply: Message) -> None:
-        if not isinstance(reply, StatusReport):
-            self._answers[_asker(sender, request)] = reply
+    def _reply(self, sender: Peer, request: str | None, reply: Message) -> None:
+        if request is not None and not isinstance(reply, StatusReport):
+            self._answers[sender, sender.connection, request] = reply
             if len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
         self._commands.send(reply, to=sender)
@@ -271,34 +244,16 @@ class ControlService(Service):
 
     def _flush(self, message: FlushSession, _sender: Peer) -> Message:
         record = self._sessions.owned(message.session, message.token)
-        self._send_to_participants(record, FlushNow(session=record.name, epoch=record.epoch))
+        self._send_to_participants(record, replace(message, epoch=record.epoch))
         self._publish(EventName.SESSION_FLUSHED, record.name)
         return Done(session=message.session, request=message.request)
 
-    def _choose_lips(self, message: ChooseLips, _sender: Peer) -> Message:
-        record = self._sessions.owned(message.session, message.token)
-        record.lips = message.lips
-        use = UseLips(session=record.name, epoch=record.epoch, lips=message.lips)
-        self._send_to_participants(record, use)
-        return Done(session=message.session, request=message.request)
-
-    def _express(self, message: Express, _sender: Peer) -> Message:
+    def _set_face(self, message: SetFace, _sender: Peer) -> Message | None:
         record = self._sessions.find(message.session)
-        record.expressions = message.expressions
-        record.expressions_end_s = time.monotonic() + message.hold_s
-        self._send_to_participants(record, message)
-        return Done(session=message.session, request=message.request)
-
-    def _choose_expressiveness(self, message: ChooseExpressiveness, _sender: Peer) -> Message:
-        record = self._sessions.find(message.session)
-        record.expressiveness = message.expressiveness
-        self._send_to_participants(record, message)
-        return Done(session=message.session, request=message.request)
-
-    def _add_shapes(self, message: AddShapes, _sender: Peer) -> Message:
-        record = self._sessions.find(message.session)
-        record.shapes = list(dict.fromkeys([*record.shapes, *message.shapes]))
-        self._send_to_participants(record, replace(message, shapes=record.shapes))
+        record.face.change(message.face, time.monotonic())
+        self._send_to_participants(record, replace(message, epoch=record.epoch, request=None))
+        if message.request is None:
+            return None
         return Done(session=message.session, request=message.request)
 
     def _status(self, message: StatusRequest, sender: Peer) -> Message:
@@ -409,18 +364,17 @@ class ControlService(Service):
         if self._takes_over and heartbeat.role == "observer":
             self._observed[heartbeat.instance] = heartbeat.sessions.keys()
         if is_new:
-            if self.bus.zap is not None and heartbeat.role == "worker":
-                self._tell_keys(self.bus.zap, sender)
             is_back = self._registry.is_back(heartbeat.instance, sender) and not is_other
             self._on_new_service(heartbeat, sender, displaced, is_back=is_back)
         for session in heartbeat.sessions:
             self._check_session(session, heartbeat, sender)
         self._commands.send(  # last: a service that stood still has learnt by then what changed
-            HeartbeatSeen(
+            HeartbeatReply(
                 sent_ns=heartbeat.sent_ns,
                 received_ns=received_ns,
                 replied_ns=now_ns(),
                 control=self.instance,
+                keys=self._new_keys(heartbeat),
             ),
             to=sender,
         )
@@ -462,10 +416,13 @@ class ControlService(Service):
         elif self._sessions.take_input(record, heartbeat) > self._idle_limit_s:
             self._end(record, f"no audio for {self._idle_limit_s:g} s")
 
-    def _on_started(self, done: Done, instance: str) -> None:
-        record = self._sessions.get(done.session)
-        if record is not None and done.request == record.start_request:
-            self._start(record, self._sessions.take_started(record, instance, done.media_time))
+    def _on_started(self, started: SessionStarted, instance: str) -> None:
+        if started.start is not None:
+            self._on_served(started.start, instance)
+            return
+        record = self._sessions.get(started.session)
+        if record is not None and started.request == record.start_request:
+            self._start(record, self._sessions.take_started(record, instance, started.media_time))
             self._announce_if_started(record)
 
     def _on_speech(self, speech: Speech, instance: str) -> None:
@@ -478,11 +435,11 @@ class ControlService(Service):
         name = EventName.SPEECH_START if speech.active else EventName.SPEECH_STOP
         self._publish(name, record.name, media_time=speech.media_time)
 
-    def _on_recorded(self, recorded: Recorded, _instance: str) -> None:
-        self._publish(EventName.RECORDED, recorded.session, detail=recorded.path)
-
-    def _on_service_error(self, error: Error, _instance: str) -> None:
-        self._publish(EventName.ERROR, error.session, detail=f"{error.code}: {error.text}")
+    def _on_service_event(self, event: Event, instance: str) -> None:
+        if event.name in FROM_SERVICES:
+            self._publish(EventName(event.name), event.session, detail=event.detail)
+        else:
+            self.warn("event", f"{instance} may not publish {event.name!r}", event.session)
 
     # --- sessions of an earlier control --------------------------------------------------------
 
@@ -598,6 +555,7 @@ class ControlService(Service):
 
     def _service_lost(self, instance: str, reason: str) -> None:
         self._registry.remove(instance)
+        self._told_keys.pop(instance, None)
         LOG.log(
             logging.INFO if reason == STOPPED else logging.WARNING, "lost %s: %s", instance, reason
         )
@@ -620,17 +578,11 @@ class ControlService(Service):
             Event(
                 session=session,
                 sequence=self._num_events,
-                number=self._num_events,
                 media_time=media_time,
                 name=name,
                 detail=detail[:2000],
             )
         )
-
-
-def _asker(sender: Peer, request: str) -> tuple[Peer, int, str]:
-    """Return who may have the answer to a request again: its sender, on the same connection."""
-    return sender, sender.connection, request
 
 
 def _check_endpoints(heartbeat: Heartbeat) -> None:

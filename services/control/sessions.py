@@ -12,10 +12,17 @@ from itertools import count
 from operator import attrgetter
 
 from kouxing.services.control.registry import UNPACED_AUDIO, Refusal, Registry
-from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.control import Heartbeat, SessionState, StartSession
-from kouxing.shared.wire.session import ErrorCode, OpenSession, SessionMoved, SessionOpened
+from kouxing.shared.wire.control import Heartbeat, StartSession
+from kouxing.shared.wire.face import CurrentFace, FaceSettings
+from kouxing.shared.wire.session import (
+    ErrorCode,
+    OpenSession,
+    SessionFacts,
+    SessionMoved,
+    SessionOpened,
+    SessionState,
+)
 
 KEY_SHARE = 0.75  # of the sessions that one key may have open
 
@@ -33,9 +40,8 @@ class SessionRecord:
     started_s: float  # when its services were last told to start it, or one was lost
     workers: dict[str, str]  # instance by endpoint; one that is lost, too
     endpoints: dict[str, str]  # address by endpoint
-    language: str  # of the phones; empty if no worker states one
-    delay_ms: float  # how much later than its sound a FAP frame is made
-    lips: str  # the lip model that moves the mouth; empty if no worker states one
+    facts: SessionFacts  # that its workers state
+    face: CurrentFace
     waiting_for: set[str]  # instances that have not started it yet
     held_back: set[str] = field(default_factory=set)  # of them, those to be told after the others
     lost: set[str] = field(default_factory=set)  # of its workers
@@ -45,12 +51,8 @@ class SessionRecord:
     restored: bool = False  # it was opened at an earlier control
     speaking: bool = False
     speech_time: int = 0  # media time at which that began
-    expressiveness: float = 0.0  # that was chosen; 0: none was
-    expressions: dict[str, float] = field(default_factory=dict)  # that the face shows
-    expressions_end_s: float = 0.0  # when these begin to fade
-    shapes: list[str] = field(default_factory=list)  # sets that are published
     next_sequence: int = 1  # of the first audio message that a new recognizer would need
-    resume_sequence: int = 0  # where a new recognizer begins; 0: it is the old one
+    resume_sequence: int | None = None  # where a new recognizer starts; None: the old one stays
     media_time: int = 0  # up to where its phones are known to be final
 
     @property
@@ -130,6 +132,7 @@ class Sessions:
                 f"{of_key} sessions of your key are open already; the rest is for other keys",
             )
         workers = self._registry.place({}, now_s, may_refuse=opening.paced)
+        facts = self._registry.facts(workers.values())
         record = SessionRecord(
             name=name,
             number=next(self._numbers),
@@ -140,11 +143,9 @@ class Sessions:
             started_s=now_s,
             workers=workers,
             endpoints=self._registry.endpoints(workers),
-            language=self._registry.language(workers.values()),
-            delay_ms=self._registry.delay_ms(workers.values()),
-            lips=self._registry.lips(workers.values()),
+            facts=facts,
+            face=CurrentFace(FaceSettings(lips=facts.lips).updated(opening.face), now_s),
             waiting_for={*workers.values()} | self._registry.observers(),
-            shapes=list(dict.fromkeys(opening.shapes)),
         )
         self._add(record, now_s)
         return record
@@ -163,32 +164,26 @@ class Sessions:
             token=start.token,
             opening=OpenSession(
                 session=start.session,
-                request=start.client_request,
+                request=start.client_request or "",
                 encoding=start.encoding,
                 sample_rate_hz=start.sample_rate_hz,
                 num_channels=start.num_channels,
                 record=start.record,
                 paced=start.paced,
-                voice=start.voice,
-                shapes=start.shapes,
+                mouth_profile=start.mouth_profile,
             ),
-            client=Peer(start.client, start.client_key),
+            client=Peer(start.client, start.client_key or ""),
             opened_s=now_s,
             started_s=now_s,
             workers=workers,
             endpoints=start.endpoints,
-            language=start.language,
-            delay_ms=start.delay_ms,
-            lips=start.lips,
+            facts=start.facts,
+            face=CurrentFace(start.face, now_s),
             waiting_for=running,
             lost={*workers.values()} - running,
             epoch=start.epoch,
             announced=True,
             restored=True,
-            expressiveness=start.expressiveness,
-            expressions=start.expressions,
-            expressions_end_s=now_s + start.hold_s,
-            shapes=start.shapes,
             media_time=start.media_time,
         )
         self._add(record, now_s)
@@ -297,7 +292,7 @@ class Sessions:
         """
         kept = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:
-            workers = self._registry.place(kept, now_s, record.language)
+            workers = self._registry.place(kept, now_s, record.facts.language)
         except Refusal:
             return False
         record.held_back = {workers["audio"]}
@@ -306,7 +301,9 @@ class Sessions:
         record.lost = set()
         self._set_workers(record, workers, now_s)
         record.endpoints = self._registry.endpoints(workers)
-        record.delay_ms = self._registry.delay_ms(workers.values())
+        record.facts = replace(
+            self._registry.facts(workers.values()), language=record.facts.language
+        )
         record.epoch += 1
         record.moved = True
         record.started_s = now_s
@@ -317,7 +314,6 @@ class Sessions:
 
     def start_message(self, record: SessionRecord, now_s: float) -> StartSession:
         """Return what the services of a session are told."""
-        hold_s = record.expressions_end_s - now_s
         return StartSession(
             session=record.name,
             epoch=record.epoch,
@@ -328,20 +324,15 @@ class Sessions:
             num_channels=record.opening.num_channels,
             record=record.opening.record,
             paced=record.opening.paced,
-            language=record.language,
+            facts=record.facts,
             endpoints=record.endpoints,
-            delay_ms=record.delay_ms,
-            lips=record.lips,
-            voice=record.opening.voice,
-            expressiveness=record.expressiveness,
-            expressions=record.expressions if hold_s > 0 else {},
-            hold_s=max(0.0, hold_s),
-            shapes=record.shapes,
+            face=record.face.at(now_s),
+            mouth_profile=record.opening.mouth_profile,
             client=record.client.address,
-            client_key=record.client.key,
-            client_request=record.opening.request,
+            client_key=record.client.key or None,
+            client_request=record.opening.request or None,
             media_time=record.media_time,
-            speech_time=record.speech_time if record.speaking else 0,
+            speech_time=record.speech_time if record.speaking else None,
         )
 
     def opened_message(self, record: SessionRecord, events: str) -> SessionOpened:
@@ -352,9 +343,7 @@ class Sessions:
             request=record.opening.request,
             token=record.token,
             events=events,
-            language=record.language,
-            frame_rate_hz=self._registry.frame_rate_hz(record.workers.values()),
-            shapes={name: list(SHAPE_SETS[name].names) for name in record.shapes},
+            facts=record.facts,
             audio=record.audio,
             phones=record.endpoints["phones"],
             faps=record.endpoints["faps"],
@@ -380,7 +369,7 @@ class Sessions:
             speaking=record.speaking,
             endpoints=record.endpoints,
             workers=record.workers,
-            language=record.language,
+            facts=record.facts,
         )
 
     # --- inside --------------------------------------------------------------------------------

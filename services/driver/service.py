@@ -22,13 +22,13 @@ from kouxing.services.driver.video.recording import Recording
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.logs import LOG
-from kouxing.shared.service import Service
+from kouxing.shared.service import Handler, Service
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.control import Recorded, SessionInput, StartSession
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.control import EventName, SessionInput, StartSession
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, ErrorCode
+from kouxing.shared.wire.session import ErrorCode
 
 DRAW_BUDGET_S = 0.2  # for videos in one turn of the loop, so that heartbeats go on
 LAST_FRAME_LIMIT_S = 10.0  # for a closed session's last frames to arrive
@@ -63,6 +63,10 @@ class DriverService(Service):
             on_failed=self._report_failure,
             on_image=lambda: self.metrics.count("video_ms", round(1000 / config.frame_rate_hz)),
         )
+
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        """Return the handlers of control's messages; frames already have a face's settings."""
+        return super().control_handlers() | {SetFace: lambda _message, _sender: None}
 
     def start_session(self, start: StartSession) -> bool:
         """Follow a session's frames; confirm once the subscriptions are in effect."""
@@ -179,15 +183,8 @@ class DriverService(Service):
     def _report_written(self, session: str, recording: Recording) -> None:
         self.metrics.count("videos")
         LOG.info("wrote %s", recording.path, extra={"session": session})
-        self.tell_control(
-            Recorded(
-                session=session,
-                path=str(recording.path),
-                num_images=recording.num_images,
-                duration_s=recording.duration_s,
-            )
-        )
+        self.publish_event(EventName.RECORDED, session, str(recording.path))
 
     def _report_failure(self, session: str, reason: str) -> None:
         LOG.error(reason, extra={"session": session})
-        self.tell_control(Error(session=session, code=ErrorCode.NO_VIDEO, text=reason))
+        self.publish_event(EventName.ERROR, session, f"{ErrorCode.NO_VIDEO}: {reason}")

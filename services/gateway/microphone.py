@@ -74,7 +74,7 @@ class Microphones:
             encoding=hello.pcm_format.encoding,
             sample_rate_hz=hello.pcm_format.sample_rate_hz,
             num_channels=hello.pcm_format.num_channels,
-            voice=hello.mouth_profile,
+            mouth_profile=hello.mouth_profile or None,
         ) as session:
             self._session_names[browser] = session.name
             LOG.info("a microphone is streaming", extra={"session": session.name})

@@ -1,8 +1,8 @@
 """The gateway service: it shows sessions in browsers and streams microphones into sessions.
 
-Receives start-session, stop-session, use-lips and status-report from control, fap-frame and
-end-of-faps from synthesizers, sound, phone and speech from recognizers, and the browsers' messages.
-Sends status-request, express and choose-expressiveness to control, messages to browsers, and
+Receives start-session, stop-session, flush-session, set-face and status-report from control,
+fap-frame and end-of-faps from synthesizers, sound, phone and speech from recognizers, and the
+browsers' messages. Sends status-request and set-face to control, messages to browsers, and
 audio-chunk to recognizers, as any client does.
 """
 
@@ -34,17 +34,18 @@ from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import REST_RATE_HZ, RestingFace
+from kouxing.shared.keys import Peer
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.known_text import Characters, characters_of
 from kouxing.shared.phones.syllables import SyllableTrack
 from kouxing.shared.service import Handler, Service
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.control import SessionInput, StartSession, StatusReport, StatusRequest
+from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import phone_of
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import ChooseExpressiveness, Express
+from kouxing.shared.wire.session import StatusReport, StatusRequest
 from kouxing.shared.wire.speech import Phone, Speech
 
 STATUS_INTERVAL_S = 1.0
@@ -202,7 +203,7 @@ class GatewayService(Service):
             session = self._sessions[start.session] = self._make_session(start)
         session.start = start
         session.follower.start(start.epoch, start.endpoints)
-        self._viewers.add_session(start.session, start.epoch, start.lips)
+        self._viewers.add_session(start.session, start.epoch, start.face.lips or "")
         return False
 
     def stop_session(self, session: str) -> None:
@@ -215,12 +216,19 @@ class GatewayService(Service):
         self._create_task(self._microphones.close_session(session))
         self._create_task(self._whip_clients.close_session(session))
 
-    def use_lips(self, session: str, lips: str) -> None:
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        """Return the handlers of control's messages."""
+        return super().control_handlers() | {
+            SetFace: self._on_set_face,
+            StatusReport: self._on_status,
+        }
+
+    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
         """Notify a session's viewers that its lip model has changed."""
-        if session in self._sessions:
-            state = self._sessions[session]
-            state.start = replace(state.start, lips=lips)
-            self._viewers.set_lips(session, lips)
+        session = self._sessions.get(message.session)
+        if session is not None and message.face.lips is not None:
+            session.start = replace(session.start, face=session.start.face.updated(message.face))
+            self._viewers.set_lips(message.session, message.face.lips)
 
     def session_inputs(self) -> dict[str, SessionInput]:
         """Name the subscribed sessions, so that control can report which have ended."""
@@ -238,7 +246,7 @@ class GatewayService(Service):
         if now_s - self._report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
 
-    def on_status(self, report: StatusReport) -> None:
+    def _on_status(self, report: StatusReport, _sender: Peer) -> None:
         """Announce missing services to the viewers."""
         self._report_s = time.monotonic()
         running = {state.service for state in report.services if state.state == "ready"}
@@ -250,23 +258,13 @@ class GatewayService(Service):
             self._viewers.set_missing(missing)
 
     def _set_face(self, session: str, settings: wire.FaceSettings) -> None:
-        if settings.expressions is not None:
-            self.tell_control(
-                Express(
-                    session=session,
-                    request=secrets.token_hex(8),
-                    expressions=dict(settings.expressions),
-                    hold_s=settings.hold_s,
-                )
-            )
-        if settings.expressiveness is not None:
-            self.tell_control(
-                ChooseExpressiveness(
-                    session=session,
-                    request=secrets.token_hex(8),
-                    expressiveness=settings.expressiveness,
-                )
-            )
+        expressions = None if settings.expressions is None else dict(settings.expressions)
+        face = FaceSettings(
+            expressions=expressions,
+            hold_s=settings.hold_s,
+            expressiveness=settings.expressiveness,
+        )
+        self.tell_control(SetFace(session=session, face=face))
 
     # --- from the publishers ---------------------------------------------------------------------
 
@@ -293,7 +291,7 @@ class GatewayService(Service):
 
     def _inventory(self, start: StartSession) -> PhoneInventory:
         try:
-            return load_inventory(start.language or DEFAULT_LANGUAGE)
+            return load_inventory(start.facts.language or DEFAULT_LANGUAGE)
         except UserError as error:  # only the captions depend on the inventory
             self.warn("language", str(error), start.session)
             return load_inventory()
@@ -301,7 +299,8 @@ class GatewayService(Service):
     def _restart(self, session: _Session) -> None:
         """Restart a session for its viewers. It continues in a new epoch."""
         session.syllables.reset()
-        self._viewers.add_session(session.start.session, session.follower.epoch, session.start.lips)
+        start = session.start
+        self._viewers.add_session(start.session, session.follower.epoch, start.face.lips or "")
 
     def _on_frame(self, frame: FapFrame) -> None:
         self._viewers.show_frame(frame.session, frame.epoch, frame.media_time, frame.values)

@@ -6,13 +6,11 @@ that again; what has come meanwhile is held until then, for a while.
 
 from __future__ import annotations
 
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.audio import AudioChunk
 
 WAIT_S = 1.0  # for messages that are missing
 MAX_HELD = 2**20  # bytes held meanwhile
 _MESSAGE_BYTES = 500  # that a message takes without its PCM
-
-AudioMessage = AudioChunk | EndOfAudio
 
 
 class AudioOrder:
@@ -26,11 +24,11 @@ class AudioOrder:
 
     def __init__(self) -> None:
         self.last = 0
-        self._held: dict[int, AudioMessage] = {}  # those behind the hole
+        self._held: dict[int, AudioChunk] = {}  # those behind the hole
         self._num_bytes = 0  # of them
         self._hole_since_s = 0.0
 
-    def accept(self, message: AudioMessage, now_s: float) -> list[AudioMessage]:
+    def accept(self, message: AudioChunk, now_s: float) -> list[AudioChunk]:
         """Take a message that is newer than the last; return those that are in order now."""
         if not self._held:
             self._hole_since_s = now_s
@@ -41,14 +39,14 @@ class AudioOrder:
             self.last = min(self._held) - 1
         return self._next(now_s)
 
-    def tick(self, now_s: float) -> list[AudioMessage]:
+    def tick(self, now_s: float) -> list[AudioChunk]:
         """Return what goes on behind a hole that nobody has filled for too long."""
         if not self._held or now_s - self._hole_since_s < WAIT_S:
             return []
         self.last = min(self._held) - 1
         return self._next(now_s)
 
-    def _next(self, now_s: float) -> list[AudioMessage]:
+    def _next(self, now_s: float) -> list[AudioChunk]:
         """Return the messages up to the next hole, which begins to wait."""
         ready = []
         while self.last + 1 in self._held:
@@ -61,5 +59,5 @@ class AudioOrder:
         return ready
 
 
-def _num_bytes(message: AudioMessage) -> int:
-    return _MESSAGE_BYTES + (len(message.pcm) if isinstance(message, AudioChunk) else 0)
+def _num_bytes(message: AudioChunk) -> int:
+    return _MESSAGE_BYTES + len(message.pcm)

@@ -12,7 +12,7 @@ from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, ResumeFace, Speech
+from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, ResumeFace, Speech
 
 KEPT = to_samples(3.0)  # samples of media time whose messages a new synthesizer is told
 
@@ -24,7 +24,7 @@ class SynthesizerLink:
         self._sender: ReliableSender | None = None
         self._kept: deque[Message] = deque()  # acknowledged ones of the last KEPT samples
         self._speech: Speech | None = None  # the newest one before them
-        self._shown: Acknowledge | None = None  # tells the newest frame
+        self._newest_frame: NewestFrame | None = None  # that the synthesizer has published
 
     @property
     def backlog(self) -> int:
@@ -36,10 +36,8 @@ class SynthesizerLink:
         messages = [*self._kept, *(self._sender.waiting if self._sender is not None else ())]
         self._kept.clear()
         self._sender = ReliableSender(socket, session, epoch)
-        if self._shown is not None:
-            shown = self._shown
-            resume = ResumeFace(media_time=shown.media_time, frame=shown.frame, faps=shown.faps)
-            self._sender.send(resume, now_s)
+        if (frame := self._newest_frame) is not None:
+            self._sender.send(ResumeFace(media_time=frame.media_time, newest_frame=frame), now_s)
         if self._speech is not None:
             self._sender.send(self._speech, now_s)
         for message in messages:
@@ -56,12 +54,11 @@ class SynthesizerLink:
         if self._sender is not None:
             self._sender.send(message, now_s)
 
-    def acknowledge(self, ack: Acknowledge, now_s: float) -> list[Message]:
+    def acknowledge(self, ack: AcknowledgePhones, now_s: float) -> list[Message]:
         """Return the messages that the synthesizer has now."""
         if self._sender is None or ack.epoch != self._sender.epoch:
             return []
-        if ack.frame:
-            self._shown = ack
+        self._newest_frame = ack.newest_frame or self._newest_frame
         known = self._sender.acknowledge(ack.sequence, now_s)
         self._kept.extend(each for each in known if not isinstance(each, ResumeFace))
         while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:

@@ -1,10 +1,9 @@
 """The recognizer as a service: audio chunks in, phones and speech events out.
 
-Reacts to: audio-chunk, end-of-audio (clients), start-session, stop-session, flush-now (control),
-acknowledge (synthesizer).
-Emits: phone, lips, speech, progress, stalled, resume-face, end-of-phones (synthesizer,
-acknowledged), the same phones, lips and speech with the sound itself (followers), speech (control),
-acknowledge, error (clients).
+Reacts to: audio-chunk (clients), start-session, stop-session, flush-session, set-face (control),
+acknowledge-phones (synthesizer).
+Emits: phone, lips, speech, progress, resume-face (synthesizer, acknowledged), the same phones, lips
+and speech with the sound itself (followers), speech (control), acknowledge-audio, error (clients).
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.audio_order import AudioMessage, AudioOrder
+from kouxing.services.recognizer.audio_order import AudioOrder
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
 from kouxing.services.recognizer.link import SynthesizerLink
@@ -36,13 +35,14 @@ from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import give_back_memory
 from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange
 from kouxing.shared.phones.final_time import FinalTime
-from kouxing.shared.service import Service
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.service import Handler, Service
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
+from kouxing.shared.wire.face import CurrentFace, SetFace
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Error, ErrorCode
-from kouxing.shared.wire.speech import Acknowledge, EndOfPhones, Stalled
+from kouxing.shared.wire.session import Error, ErrorCode, SessionFacts
+from kouxing.shared.wire.speech import AcknowledgePhones, AudioState, Progress
 
 MAX_MEDIA_TIME = 2**40  # two years of samples; more is no sample index
 MAX_BACKLOG = 2000  # messages the synthesizer may owe acknowledgement for before audio waits
@@ -64,6 +64,7 @@ class _Session:
 
     def __init__(self, start: StartSession, stream: SpeechStream, socket: Socket) -> None:
         self.start = start
+        self.face = CurrentFace(start.face, time.monotonic())
         self.socket = socket  # where its audio comes in
         self.first_epoch = start.epoch  # when this recognizer took the session
         self.stream = stream
@@ -82,7 +83,7 @@ class _Session:
         self.last_audio_s = time.monotonic()
         self.silent_s = 0.0  # for how long this process listened and no audio came
         self.mouth_profile_error = ""  # why the profile is not used; empty once reported
-        self.end: EndOfAudio | None = None  # has come
+        self.end: AudioChunk | None = None  # the last chunk, if it has come
         self.finished = False  # all audio up to the end is processed
         self.num_gaps = 0  # of the stream's, counted
         self.late_since_s: float | None = None  # since when the synthesizer owes too much
@@ -143,7 +144,7 @@ class RecognizerService(Service):
             "unpaced_audio": config.reachable(self._unpaced_audio.endpoint),
         }
         self._model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
-        self.language = self._model.inventory.language
+        self.facts = SessionFacts(language=self._model.inventory.language)
         self._lips = lips or lips_for(self._model)
         if self._lips is None:
             LOG.warning(
@@ -153,7 +154,7 @@ class RecognizerService(Service):
         warm_up(self._model)
         for socket in (self._audio, self._unpaced_audio):
             on_audio = partial(self._on_audio, socket)
-            self.register(socket, {AudioChunk: on_audio, EndOfAudio: on_audio})
+            self.register(socket, {AudioChunk: on_audio})
         self.register(self._phones, {})
 
     def step(self, timeout_s: float) -> None:
@@ -167,6 +168,21 @@ class RecognizerService(Service):
         is_live_waiting = not self._late[True] and self._audio.wait(0.0)
         if not self._late[False] and not is_live_waiting:
             self._process_unpaced()
+
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        """Return the handlers of control's messages."""
+        return super().control_handlers() | {SetFace: self._on_set_face}
+
+    def served_sessions(self) -> Iterable[StartSession]:
+        """Return the sessions that a restarted control learns from here, as they are now."""
+        now_s = time.monotonic()
+        for session in self._sessions.values():
+            yield dataclasses.replace(session.start, face=session.face.at(now_s))
+
+    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+        session = self._sessions.get(message.session)
+        if session is not None:
+            session.face.change(message.face, time.monotonic())
 
     def start_session(self, start: StartSession) -> bool:
         """Make a stream, or after a crash of the synthesizer give the old one a new link."""
@@ -193,12 +209,12 @@ class RecognizerService(Service):
 
     def _lips_of(self, start: StartSession) -> tuple[LipsFromSound | None, str]:
         """Return the lip model for a session, and why its mouth profile is not used, if so."""
-        if not start.voice:
+        if start.mouth_profile is None:
             return self._lips, ""
         if self._lips is None:
             return None, "the mouth profile is not used: this recognizer has no lip model"
         try:
-            return self._lips.with_mouth_profile(start.voice), ""
+            return self._lips.with_mouth_profile(start.mouth_profile), ""
         except UserError as error:
             return self._lips, f"the mouth profile is not used: {error}"
 
@@ -210,8 +226,8 @@ class RecognizerService(Service):
             num_stable_frames=self._config.num_stable_frames,
             min_confidence=self._config.min_confidence,
             lips=lips,
-            face_delay_s=start.delay_ms / 1e3,
-            speech_time=start.speech_time,
+            face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
+            speech_time=start.speech_time or 0,
         )
 
     def stop_session(self, session: str) -> None:
@@ -273,7 +289,8 @@ class RecognizerService(Service):
             has_stalled = before_s <= STALL_S < session.silent_s
             if has_stalled and session.start.paced and not session.finished:
                 media_time = max(session.stream.media_time, session.start.media_time)
-                session.link.send(Stalled(media_time=media_time), now_s)
+                stalled = Progress(media_time=media_time, state=AudioState.STALLED)
+                session.link.send(stalled, now_s)
 
     def on_drain(self) -> bool:
         """Let others take the sessions; finish those that nobody takes, to the last message."""
@@ -314,7 +331,7 @@ class RecognizerService(Service):
 
     # --- from clients ----------------------------------------------------------------------------
 
-    def _on_audio(self, socket: Socket, message: AudioMessage, sender: Peer) -> None:
+    def _on_audio(self, socket: Socket, message: AudioChunk, sender: Peer) -> None:
         session = self._admit(socket, message, sender)
         if session is None:
             return
@@ -333,7 +350,7 @@ class RecognizerService(Service):
             session.acknowledge_s = min(session.acknowledge_s or due_s, due_s)
 
     def _take_in_order(
-        self, session: _Session, messages: Sequence[AudioMessage], sender: Peer
+        self, session: _Session, messages: Sequence[AudioChunk], sender: Peer
     ) -> None:
         """Take what is in order; what is refused counts as taken."""
         for message in messages:
@@ -343,9 +360,11 @@ class RecognizerService(Service):
             elif session.end is not None:
                 text = f"session {message.session!r} has ended; open another"
                 self._refuse(session.socket, message, sender, ErrorCode.FINISHED, text)
-            elif isinstance(message, AudioChunk):
-                self._take_chunk(session, message, sender)
             else:
+                if message.pcm or not message.last:
+                    self._take_chunk(session, message, sender)
+                if not message.last:
+                    continue
                 session.end = message
                 if session.start.paced:
                     self._process_queued()
@@ -357,7 +376,7 @@ class RecognizerService(Service):
         """Tell the client which audio it need not send again."""
         session.acknowledge_s, session.acknowledged_s = None, now_s
         session.socket.send(
-            Acknowledge(
+            AcknowledgeAudio(
                 session=session.start.session,
                 epoch=session.start.epoch,
                 sequence=session.num_taken,
@@ -366,16 +385,14 @@ class RecognizerService(Service):
         )
 
     def _take_chunk(self, session: _Session, chunk: AudioChunk, sender: Peer) -> None:
-        if session.mouth_profile_error:
-            self._refuse(
-                session.socket, chunk, sender, ErrorCode.BAD_VOICE, session.mouth_profile_error
-            )
+        if error := session.mouth_profile_error:
+            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_MOUTH_PROFILE, error)
             session.mouth_profile_error = ""
         start = session.start
         try:
             samples = samples_of(chunk.pcm, start.encoding, start.num_channels)
-        except BadAudio as error:
-            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_AUDIO, str(error))
+        except BadAudio as bad_audio:
+            self._refuse(session.socket, chunk, sender, ErrorCode.BAD_AUDIO, str(bad_audio))
             return
         rate_hz, media_time = start.sample_rate_hz, chunk.media_time
         begin_s, duration_s = to_seconds(media_time), len(samples) / rate_hz
@@ -469,7 +486,7 @@ class RecognizerService(Service):
             session.num_gaps = session.stream.num_gaps
         self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
 
-    def _admit(self, socket: Socket, message: AudioMessage, sender: Peer) -> _Session | None:
+    def _admit(self, socket: Socket, message: AudioChunk, sender: Peer) -> _Session | None:
         """Return the session if the sender may write to it."""
         session = self._sessions.get(message.session)
         if session is None:
@@ -525,7 +542,7 @@ class RecognizerService(Service):
         if endpoint not in self._synthesizers:
             socket = self.bus.connect_dealer(endpoint)
             self._synthesizers[endpoint] = socket
-            self.register(socket, {Acknowledge: self._on_acknowledge, Error: self._on_error})
+            self.register(socket, {AcknowledgePhones: self._on_acknowledge, Error: self._on_error})
         return self._synthesizers[endpoint]
 
     def _leave_synthesizers(self) -> None:
@@ -534,7 +551,7 @@ class RecognizerService(Service):
         for endpoint in self._synthesizers.keys() - used:
             self.unregister(self._synthesizers.pop(endpoint))
 
-    def _on_acknowledge(self, ack: Acknowledge, _sender: Peer) -> None:
+    def _on_acknowledge(self, ack: AcknowledgePhones, _sender: Peer) -> None:
         session = self._sessions.get(ack.session)
         if session is not None:
             for message in session.link.acknowledge(ack, time.monotonic()):
@@ -543,8 +560,9 @@ class RecognizerService(Service):
 
 def _note_known(session: _Session, message: Message) -> None:
     """Note what the synthesizer knows, and which audio is needless therefore."""
-    if isinstance(message, EndOfPhones):
-        session.num_needless = session.order.last
+    if isinstance(message, Progress) and message.state != AudioState.RUNNING:
+        if message.state == AudioState.ENDED:
+            session.num_needless = session.order.last
     elif isinstance(message, SpeechMessage):
         session.final.accept(event_of(message))
         needed_from = to_samples(max(0.0, session.final.time_s - WARM_UP_S))

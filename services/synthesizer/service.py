@@ -1,8 +1,8 @@
 """The synthesizer as a service: phones and lips in, FAP frames out.
 
-Reacts to: phone, lips, speech, progress, stalled, resume-face, end-of-phones (recognizer),
-start-session, stop-session, flush-now, use-lips, express, choose-expressiveness, add-shapes
-(control). Emits: fap-frame, shapes, end-of-faps (followers), acknowledge (recognizer).
+Reacts to: phone, lips, speech, progress, resume-face (recognizer), start-session, stop-session,
+flush-session, set-face (control).
+Emits: fap-frame, end-of-faps (followers), acknowledge-phones (recognizer).
 
 Frames are clocked by the audio that was processed, so a system under load is late, never wrong, and
 audio faster than real time gives the same frames. Only when a live stream stalls does the wall
@@ -23,30 +23,40 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face import REST_S, Face, Frame
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.load import LIP_MODELS, load_lip_model
 from kouxing.shared.bus import PHONES, Socket
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
+from kouxing.shared.face.expressions import ExpressionName
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
-from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, Progress, SoundEvent
+from kouxing.shared.phones import events
+from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent
 from kouxing.shared.phones.final_time import FinalTime
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.reliable import ReliableReceiver
-from kouxing.shared.service import Service
-from kouxing.shared.wire.control import SessionInput, StartSession
+from kouxing.shared.service import Handler, Service
+from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
-from kouxing.shared.wire.session import AddShapes, ChooseExpressiveness, Express
-from kouxing.shared.wire.speech import Acknowledge, ResumeFace, Stalled
+from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import ErrorCode, SessionFacts
+from kouxing.shared.wire.speech import (
+    AcknowledgePhones,
+    AudioState,
+    NewestFrame,
+    Progress,
+    ResumeFace,
+)
 
 LOST_S = 20.0  # without a word from a recognizer, which would tell that its client is silent
 AGAIN_S = 3.0  # for which followers of a session that has moved here may still be on their way
 MAX_AT_ONCE_S = 0.06  # of frames of a session: those of a gap must not hold others up
 MAX_WAITING = 200  # messages while they are made; the recognizer sends the next ones again
 MADE_UP_S = 0.2  # of frames without sound, when they are late
+EXPRESSIONS = frozenset(ExpressionName)
 LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
@@ -67,7 +77,8 @@ class _Session:
         self.frames: Iterator[Frame] | None = None  # of that, not made yet
         self.finished = False
         self._resumed_s = -math.inf  # when it took another synthesizer's place
-        self.since_then: list[FapFrame | Shapes | EndOfFaps] = []  # published of late
+        self.shapes: list[str] = []  # sets that are published
+        self.since_then: list[FapFrame | EndOfFaps] = []  # published of late
 
     def resume(self, media_time: int, frame: int, faps: NDArray[np.float32] | None) -> None:
         """Go on behind the newest frame of another synthesizer."""
@@ -85,12 +96,15 @@ class _Session:
         """Media time of the newest frame, samples at 16 kHz."""
         return self.shown.media_time if self.shown is not None else 0
 
-    def _acknowledge(self) -> Acknowledge:
+    def _acknowledge(self) -> AcknowledgePhones:
         if self.shown is None:
-            return Acknowledge()
-        return Acknowledge(
-            media_time=self.media_time, frame=self.shown.sequence, faps=self.shown.values
+            return AcknowledgePhones()
+        frame = NewestFrame(
+            sequence=self.shown.sequence,
+            media_time=self.shown.media_time,
+            values=self.shown.values,
         )
+        return AcknowledgePhones(newest_frame=frame)
 
 
 class SynthesizerService(Service):
@@ -103,8 +117,9 @@ class SynthesizerService(Service):
         super().__init__(config)
         self._config = config
         self.frame_rate_hz = config.frame_rate_hz
-        self.delay_ms = config.delay_ms
-        self.lips = config.lips
+        self.facts = SessionFacts(
+            frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lips=config.lips
+        )
         self._sessions: dict[str, _Session] = {}
         self._turn = 0  # of sessions with many frames to make
         self._dropped_s = 0.0  # when frames were dropped that nobody takes
@@ -118,26 +133,34 @@ class SynthesizerService(Service):
         self.register(self._input, dict.fromkeys(LINK_MESSAGES, self._on_input))
         self.register(self._faps, {})
 
+    def control_handlers(self) -> dict[type[Message], Handler]:
+        """Return the handlers of control's messages."""
+        return super().control_handlers() | {SetFace: self._on_set_face}
+
     def start_session(self, start: StartSession) -> bool:
         """Make a face at rest; a session that moved here again keeps its own."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
             session = _Session(start, self._new_face(start), self._input)
+            session.shapes = self._known_settings(start.session, start.face).shapes or []
             self._sessions[start.session] = session
         session.start = start
         self.session_started(start, to_samples(session.final.time_s))
         return False
 
     def _new_face(self, start: StartSession) -> Face:
+        settings = self._known_settings(start.session, start.face)
         face = Face(
-            load_lip_model(start.language, start.lips or self._config.lips),
+            load_lip_model(
+                start.facts.language or DEFAULT_LANGUAGE, settings.lips or self._config.lips
+            ),
             frame_rate_hz=self.frame_rate_hz,
             delay_s=self._config.delay_ms / 1e3,
             idle_motion_seed=self._config.idle_motion_seed,
-            expressiveness=start.expressiveness or self._config.expressiveness,
+            expressiveness=settings.expressiveness or self._config.expressiveness,
         )
-        if start.expressions:
-            face.express(start.expressions, start.hold_s)
+        if settings.expressions:
+            face.express(settings.expressions, settings.hold_s)
         return face
 
     def stop_session(self, session: str) -> None:
@@ -155,36 +178,43 @@ class SynthesizerService(Service):
             )
             found.face.flush()
 
-    def use_lips(self, session: str, lips: str) -> None:
-        """Let another lip model move the mouth from where it is."""
-        found = self._sessions.get(session)
-        if found is not None:
-            found.face.use_lips(load_lip_model(found.start.language, lips))
+    def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
+        """Change how a face moves, from where it is."""
+        session = self._sessions.get(message.session)
+        if session is None:
+            return
+        settings = self._known_settings(message.session, message.face)
+        if settings.lips is not None:
+            language = session.start.facts.language or DEFAULT_LANGUAGE
+            session.face.use_lips(load_lip_model(language, settings.lips))
+        if settings.expressiveness is not None:
+            session.face.choose_expressiveness(settings.expressiveness)
+        if settings.expressions is not None:
+            session.face.express(settings.expressions, settings.hold_s)
+        session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
 
-    def express(self, message: Express) -> None:
-        """Let the face show expressions from where it is."""
-        found = self._sessions.get(message.session)
-        if found is not None:
-            found.face.express(message.expressions, message.hold_s)
-
-    def choose_expressiveness(self, message: ChooseExpressiveness) -> None:
-        """Let the mouth move more or less from here on."""
-        found = self._sessions.get(message.session)
-        if found is not None:
-            found.face.choose_expressiveness(message.expressiveness)
-
-    def add_shapes(self, message: AddShapes) -> None:
-        """Publish sets of shapes from the next frame on."""
-        found = self._sessions.get(message.session)
-        if found is not None:
-            found.start = replace(found.start, shapes=message.shapes)
+    def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
+        """Return settings without the names that are unknown here, and report these."""
+        strengths = (settings.expressions or {}).items()
+        known = replace(
+            settings,
+            lips=settings.lips if settings.lips in LIP_MODELS else None,
+            expressions=settings.expressions
+            and {name: strength for name, strength in strengths if name in EXPRESSIONS},
+            shapes=settings.shapes and [name for name in settings.shapes if name in SHAPE_SETS],
+        )
+        if known != settings:
+            text = f"unknown names in {settings}"
+            self.warn(ErrorCode.BAD_FACE, text, session)
+            self.publish_event(EventName.ERROR, session, f"{ErrorCode.BAD_FACE}: {text}")
+        return known
 
     def on_tick(self, now_s: float) -> None:
         """Acknowledge, lead faces to rest whose live stream has stalled, drop what grows old."""
         if now_s > self._dropped_s + 1.0:
             self._dropped_s = now_s
             live = [name for name, session in self._sessions.items() if session.start.paced]
-            self._faps.drop_stopped((FapFrame, Shapes), live)
+            self._faps.drop_stopped((FapFrame,), live)
         for session in self._sessions.values():
             session.receiver.tick()
             if session.start.paced and not session.finished and not session.waiting:
@@ -228,10 +258,11 @@ class SynthesizerService(Service):
         if session is None:
             return
         now_s = time.monotonic()
-        session.relaxes_s = now_s if isinstance(message, Stalled) else now_s + LOST_S
+        has_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED
+        session.relaxes_s = now_s if has_stalled else now_s + LOST_S
         if message.epoch != session.epoch_in:
             self._enter_epoch(session, message)
-        if not isinstance(message, Stalled | ResumeFace):
+        if not has_stalled and not isinstance(message, ResumeFace):
             self._accept(session, message)
 
     def _enter_epoch(self, session: _Session, message: LinkMessage) -> None:
@@ -239,7 +270,8 @@ class SynthesizerService(Service):
         if session.epoch_in:
             session.face.restart()
         elif isinstance(message, ResumeFace):
-            session.resume(message.media_time, message.frame, np.frombuffer(message.faps, "<f4"))
+            frame = message.newest_frame
+            session.resume(frame.media_time, frame.sequence, np.frombuffer(frame.values, "<f4"))
         elif message.epoch > 1:  # both were lost, and nobody knows how far the other face came
             time_s = to_seconds(message.media_time)
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
@@ -266,7 +298,7 @@ class SynthesizerService(Service):
 
     def _accept(self, session: _Session, message: SpeechMessage) -> None:
         event = event_of(message)
-        language = session.start.language
+        language = session.start.facts.language or DEFAULT_LANGUAGE
         if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
             text = f"{event.symbol!r} is no phone of {language}"
             self.warn("unknown-phone", text, message.session)
@@ -286,7 +318,7 @@ class SynthesizerService(Service):
             started_s = time.perf_counter()
             frames = list(itertools.islice(session.frames, num_left))
             self._publish(session, frames)
-            if isinstance(event, Progress):
+            if isinstance(event, events.Progress):
                 self.metrics.observe("progress_ms", (time.perf_counter() - started_s) * 1e3)
             num_left -= len(frames)
             if num_left == 0:
@@ -323,25 +355,14 @@ class SynthesizerService(Service):
                 media_time=to_samples(time_s),
                 values=faps.astype("<f4").tobytes(),
                 mask=MASK,
+                shapes={
+                    name: SHAPE_SETS[name].weights(faps).astype("<f4").tobytes()
+                    for name in session.shapes
+                },
             )
             self._send(session, session.shown)
-            for name in session.start.shapes:
-                self._send_shapes(session, name, faps)
 
-    def _send_shapes(self, session: _Session, name: str, faps: NDArray[np.float32]) -> None:
-        self._send(
-            session,
-            Shapes(
-                session=session.start.session,
-                epoch=session.start.epoch,
-                sequence=session.sequence_out,
-                media_time=session.media_time,
-                set=name,
-                weights=SHAPE_SETS[name].weights(faps).astype("<f4").tobytes(),
-            ),
-        )
-
-    def _send(self, session: _Session, message: FapFrame | Shapes | EndOfFaps) -> None:
+    def _send(self, session: _Session, message: FapFrame | EndOfFaps) -> None:
         self._faps.send(message)
         if session.just_resumed:
             session.since_then.append(message)

@@ -1,4 +1,4 @@
-"""A session's audio: what its client sends, and what the recognizer makes of it."""
+"""A session's audio: from the client to the recognizer, and from there to all subscribers."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ class AudioChunk(Message):
     """PCM in the session's encoding; media_time is that of its first sample."""
 
     token: Name
-    pcm: Annotated[bytes, Meta(max_length=MAX_AUDIO_BYTES)]  # interleaved, little-endian
-    acknowledge: bool = False  # the client reads acknowledgements, and sends again what is lost
+    pcm: Annotated[bytes, Meta(max_length=MAX_AUDIO_BYTES)] = b""  # interleaved, little-endian
+    last: bool = False  # no more audio follows: finish the session
+    acknowledge: bool = False  # the client reads acknowledge-audio and resends lost messages
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EndOfAudio(Message):
-    """No more audio will come; the services finish the session."""
-
-    token: Name
-    acknowledge: bool = False  # as in AudioChunk
+class AcknowledgeAudio(Message):
+    """The recognizer has received every audio message up to ``sequence``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

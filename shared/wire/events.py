@@ -1,4 +1,4 @@
-"""Speech messages from the pure events of a recognizer, and back."""
+"""Converts a recognizer's events to messages, and back."""
 
 from __future__ import annotations
 
@@ -9,23 +9,15 @@ import numpy as np
 from kouxing.shared.clock import duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones import events
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import (
-    EndOfPhones,
-    Lips,
-    Phone,
-    Progress,
-    ResumeFace,
-    Speech,
-    Stalled,
-)
+from kouxing.shared.wire.speech import AudioState, Lips, Phone, Progress, ResumeFace, Speech
 
-SpeechMessage: TypeAlias = Phone | Lips | Speech | Progress | EndOfPhones
-LinkMessage: TypeAlias = SpeechMessage | Stalled | ResumeFace  # from recognizer to synthesizer
+SpeechMessage: TypeAlias = Phone | Lips | Speech | Progress
+LinkMessage: TypeAlias = SpeechMessage | ResumeFace  # from recognizer to synthesizer
 LINK_MESSAGES: tuple[type[Message], ...] = get_args(LinkMessage)
 
 
 def message_of(event: events.SoundEvent) -> SpeechMessage:
-    """Return the message of an event; the sender fills in session, epoch and sequence."""
+    """Return the message of an event; the sender sets session, epoch and sequence."""
     match event:
         case events.Phone():
             return Phone(
@@ -51,10 +43,10 @@ def message_of(event: events.SoundEvent) -> SpeechMessage:
                 media_time=to_samples(event.time_s),
                 level_db=event.level_db,
                 zero_crossing_rate=event.zero_crossing_rate,
-                pitch_hz=event.pitch_hz,
+                pitch_hz=event.pitch_hz or None,
             )
         case events.EndOfSound():
-            return EndOfPhones(media_time=to_samples(event.time_s))
+            return Progress(media_time=to_samples(event.time_s), state=AudioState.ENDED)
 
 
 def phone_of(message: Phone) -> events.Phone:
@@ -85,12 +77,12 @@ def event_of(message: SpeechMessage) -> events.SoundEvent:
             )
         case Speech():
             return events.SpeechChange(active=message.active, time_s=time_s)
+        case Progress(state=AudioState.ENDED):
+            return events.EndOfSound(time_s=time_s)
         case Progress():
             return events.Progress(
                 time_s=time_s,
                 level_db=message.level_db,
                 zero_crossing_rate=message.zero_crossing_rate,
-                pitch_hz=message.pitch_hz,
+                pitch_hz=message.pitch_hz or 0.0,
             )
-        case EndOfPhones():
-            return events.EndOfSound(time_s=time_s)

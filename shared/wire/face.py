@@ -1,28 +1,95 @@
-"""The moving face."""
+"""The moving face, and the settings that change it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Annotated
 
-from kouxing.shared.wire.message import FapMask, FapValues, Message, Name, ShapeWeights
+from msgspec import Meta
+
+from kouxing.shared.face.expressions import (
+    DEFAULT_HOLD_S,
+    MAX_EXPRESSIVENESS,
+    MAX_HOLD_S,
+    MIN_EXPRESSIVENESS,
+)
+from kouxing.shared.face.shape_names import MAX_SHAPES
+from kouxing.shared.wire.message import FapMask, FapValues, Message, Name
+
+Strength = Annotated[float, Meta(ge=0, le=1)]
+ExpressionMap = Annotated[dict[Name, Strength], Meta(max_length=32)]
+ShapeSets = Annotated[list[Name], Meta(max_length=16)]
+ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FaceSettings:
+    """How a session's face moves. A setting that is None stays as it is."""
+
+    lips: Name | None = None  # the lip model
+    expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (
+        None  # scales the mouth's motion; 1: as the lip model moves it
+    )
+    expressions: ExpressionMap | None = None  # strengths by name; {}: fade those shown now
+    hold_s: Annotated[float, Meta(ge=0, le=MAX_HOLD_S)] = DEFAULT_HOLD_S  # until they fade
+    shapes: ShapeSets | None = None  # also publish these sets of shapes
+
+    def updated(self, change: FaceSettings) -> FaceSettings:
+        """Return these settings after a change."""
+        shapes = dict.fromkeys([*(self.shapes or ()), *(change.shapes or ())])
+        expressed = self if change.expressions is None else change
+        return FaceSettings(
+            lips=change.lips or self.lips,
+            expressiveness=change.expressiveness or self.expressiveness,
+            expressions=expressed.expressions,
+            hold_s=expressed.hold_s,
+            shapes=list(shapes) or None,
+        )
+
+    def after(self, elapsed_s: float) -> FaceSettings:
+        """Return these settings some time later; expressions that began to fade are left out."""
+        if self.expressions is None:
+            return self
+        hold_s = self.hold_s - elapsed_s
+        if hold_s <= 0:
+            return replace(self, expressions=None, hold_s=DEFAULT_HOLD_S)
+        return replace(self, hold_s=hold_s)
+
+
+@dataclass(slots=True)
+class CurrentFace:
+    """Face settings in effect, whose expressions fade with time."""
+
+    settings: FaceSettings
+    set_at_s: float
+
+    def change(self, change: FaceSettings, now_s: float) -> None:
+        """Apply a change."""
+        self.settings, self.set_at_s = self.at(now_s).updated(change), now_s
+
+    def at(self, now_s: float) -> FaceSettings:
+        """Return the settings with which a new face would show the same."""
+        return self.settings.after(now_s - self.set_at_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetFace(Message):
+    """Changes a session's face. Sent by a client to control, and by control to the services."""
+
+    face: FaceSettings
+    request: Name | None = None  # None: no answer is needed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FapFrame(Message):
-    """The face that belongs to the sound at media_time."""
+    """The face that belongs to the audio at media_time."""
 
     values: FapValues  # 68 float32, little-endian, in FAP units
     mask: FapMask  # bit i of the little-endian integer: FAP i + 1 is set
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Shapes(Message):
-    """The face of the ``fap-frame`` with the same sequence and media_time, as weights of shapes."""
-
-    set: Name  # a ShapeSetName, or one of a later build
-    weights: ShapeWeights  # float32, little-endian, 0 to 1, in the order of the set's names
+    # The same face as weights of shapes, by set: float32, little-endian, 0 to 1, in the set's order
+    shapes: Annotated[dict[Name, ShapeWeights], Meta(max_length=16)] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EndOfFaps(Message):
-    """The last FAP frame of the session came before this."""
+    """The session has no more FAP frames."""

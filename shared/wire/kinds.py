@@ -2,46 +2,30 @@
 
 from __future__ import annotations
 
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
 from kouxing.shared.wire.control import (
-    AllowedKeys,
     Event,
-    FlushNow,
     Heartbeat,
-    HeartbeatSeen,
-    Recorded,
+    HeartbeatReply,
+    SessionStarted,
     StartSession,
-    StatusReport,
-    StatusRequest,
     StopSession,
-    UseLips,
 )
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
-    AddShapes,
-    ChooseExpressiveness,
-    ChooseLips,
     CloseSession,
     Done,
     Error,
-    Express,
     FlushSession,
     Joined,
     OpenSession,
     SessionMoved,
     SessionOpened,
+    StatusReport,
+    StatusRequest,
 )
-from kouxing.shared.wire.speech import (
-    Acknowledge,
-    EndOfPhones,
-    Lips,
-    Phone,
-    Progress,
-    ResumeFace,
-    Speech,
-    Stalled,
-)
+from kouxing.shared.wire.speech import AcknowledgePhones, Lips, Phone, Progress, ResumeFace, Speech
 
 MESSAGES: dict[str, type[Message]] = {
     cls.kind: cls
@@ -51,43 +35,34 @@ MESSAGES: dict[str, type[Message]] = {
         SessionMoved,
         CloseSession,
         FlushSession,
-        ChooseLips,
+        SetFace,
         StatusRequest,
         StatusReport,
         Done,
         Error,
-        Heartbeat,
-        HeartbeatSeen,
-        StartSession,
-        StopSession,
-        FlushNow,
-        UseLips,
-        Recorded,
-        Event,
         AudioChunk,
-        EndOfAudio,
+        AcknowledgeAudio,
         Sound,
         Speech,
         Phone,
         Lips,
-        Progress,
-        EndOfPhones,
-        Acknowledge,
         FapFrame,
         EndOfFaps,
         Joined,
-        Express,
-        ChooseExpressiveness,
-        AllowedKeys,
-        Stalled,
+        Event,
+        Progress,
         ResumeFace,
-        Shapes,
-        AddShapes,
+        AcknowledgePhones,
+        Heartbeat,
+        HeartbeatReply,
+        StartSession,
+        SessionStarted,
+        StopSession,
     )
 }
 
 # The session's endpoint that publishes each kind.
 PUBLISHER_OF: dict[type[Message], str] = {
     **dict.fromkeys((Phone, Lips, Speech, Sound), "phones"),
-    **dict.fromkeys((FapFrame, Shapes, EndOfFaps), "faps"),
+    **dict.fromkeys((FapFrame, EndOfFaps), "faps"),
 }

@@ -1,4 +1,4 @@
-"""Messages of a client and control about a session, and the confirmation of subscriptions."""
+"""Messages between a client and control, and the confirmation of subscriptions."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from kouxing.shared.face.expressions import DEFAULT_HOLD_S
+from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import (
-    ChosenLips,
     Count,
-    Encoding,
     Endpoint,
-    ExpressionMap,
-    ExpressivenessAmount,
-    FrameRate,
-    HoldTime,
-    LanguageName,
+    EndpointMap,
     Message,
-    MouthProfile,
     Name,
-    NameOrNone,
-    NumChannels,
-    SampleRate,
-    ShapeNameMap,
-    ShapeSets,
+    Seconds,
+    SessionName,
     Text,
 )
+
+Encoding = Annotated[str, Meta(pattern="^(s16le|f32le)$")]
+SampleRate = Annotated[int, Meta(ge=8000, le=48000)]  # Hz
+NumChannels = Annotated[int, Meta(ge=1, le=2)]
+MouthProfile = Annotated[bytes, Meta(max_length=MAX_MOUTH_PROFILE_BYTES)]
+Role = Annotated[str, Meta(pattern="^(control|worker|observer)$")]
+ServiceStatus = Annotated[str, Meta(pattern="^(ready|draining)$")]
+SessionStatus = Annotated[str, Meta(pattern="^(starting|open)$")]
+MetricMap = Annotated[dict[Name, float], Meta(max_length=64)]
 
 
 class ErrorCode(StrEnum):
@@ -36,8 +36,9 @@ class ErrorCode(StrEnum):
 
     BAD_MESSAGE = "bad-message"
     BAD_AUDIO = "bad-audio"
+    BAD_FACE = "bad-face"
+    BAD_MOUTH_PROFILE = "bad-mouth-profile"
     BAD_TOKEN = "bad-token"  # noqa: S105 - no password
-    BAD_VOICE = "bad-voice"
     BUSY = "busy"
     FINISHED = "finished"
     NO_SERVICE = "no-service"
@@ -51,45 +52,53 @@ class ErrorCode(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OpenSession(Message):
-    """A client asks for a session; an empty session name lets control choose one."""
+class SessionFacts:
+    """What a session's workers state about their results; each worker states some of it."""
 
-    request: Name  # echoed in the answer; a repeated request gets the same answer
+    language: Name | None = None  # of the phones
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # of the FAP frames
+    delay_ms: Annotated[float, Meta(ge=0, le=1000)] | None = None  # from audio to its FAP frame
+    lips: Name | None = None  # the lip model of a face whose settings name none
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenSession(Message):
+    """A client asks for a session; if the session name is empty, control chooses one."""
+
+    request: Name  # repeated in the answer
     encoding: Encoding = "s16le"
     sample_rate_hz: SampleRate = 16000
     num_channels: NumChannels = 1
     record: bool = False  # the driver writes a video named after the session
-    paced: bool = True  # audio comes in real time; false: as fast as the services take it
-    voice: MouthProfile = b""  # of the speaker, for the lip model
-    shapes: ShapeSets = field(default_factory=list)  # sets that are published beside FAP frames
+    paced: bool = True  # audio arrives in real time; false: as fast as the services accept it
+    mouth_profile: MouthProfile | None = None  # of the speaker, for a lip model that uses the audio
+    face: FaceSettings = field(default_factory=FaceSettings)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionOpened(Message):
-    """The session exists; these are the sockets to use."""
+    """The session exists; connect to these endpoints."""
 
     request: Name
     token: Name  # proves ownership when the client sends audio, flushes or closes
     audio: Endpoint  # ROUTER for the client's audio
-    phones: Endpoint  # XPUB: phone, speech, sound
-    faps: Endpoint  # XPUB: fap-frame, shapes, end-of-faps
+    phones: Endpoint  # XPUB: phone, lips, speech, sound
+    faps: Endpoint  # XPUB: fap-frame, end-of-faps
     events: Endpoint  # XPUB: event, session-moved
-    language: LanguageName = ""  # of the phones
-    frame_rate_hz: FrameRate = 0.0  # of the FAP frames
-    shapes: ShapeNameMap = field(default_factory=dict)  # names in each set that is published
+    facts: SessionFacts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionMoved(Message):
-    """Another process serves a part of the session from here on; ``epoch`` is the new one.
+    """Other workers serve the session from now on; ``epoch`` is the new one.
 
-    Sent to the client, and published for whoever follows the session.
+    Sent to the client, and published for all followers of the session.
     """
 
     audio: Endpoint
     phones: Endpoint
     faps: Endpoint
-    next_sequence: Count  # first audio message to send to `audio`; 0: audio goes on as before
+    next_sequence: Count | None = None  # first audio message to resend; None: the recognizer stays
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,73 +111,86 @@ class CloseSession(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlushSession(Message):
-    """Interrupts: audio not yet shown is dropped and the face returns to rest."""
+    """Interrupts: audio not yet shown is dropped and the face returns to rest.
+
+    Sent by a client to control, and by control to the services.
+    """
 
     request: Name
     token: Name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ChooseLips(Message):
-    """Lets another lip model move the mouth, while the session goes on."""
+class StatusRequest(Message):
+    """Asks for the state of the whole system, or of one session and its services."""
 
     request: Name
-    token: Name
-    lips: ChosenLips
+    after: Count = 0  # ``next`` of the page before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Express(Message):
-    """Lets the face show expressions for a while; control passes it on to the services."""
+class ServiceState:
+    """One service, from its newest heartbeat."""
 
-    request: Name
-    expressions: ExpressionMap  # strengths by name, in place of those before; empty: they fade now
-    hold_s: HoldTime = DEFAULT_HOLD_S  # that they stay before they fade
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ChooseExpressiveness(Message):
-    """Makes the mouth move more or less; control passes it on to the services."""
-
-    request: Name
-    expressiveness: ExpressivenessAmount  # 1: as the lip model moves it
+    service: Name  # recognizer, driver, ...
+    instance: Name
+    role: Role
+    state: ServiceStatus
+    age_s: float  # since its newest heartbeat
+    clock_offset_ms: float  # its clock minus control's
+    endpoints: EndpointMap
+    metrics: MetricMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AddShapes(Message):
-    """Lets a session publish more sets of shapes; control tells the services all of them."""
+class SessionState:
+    """One session."""
+
+    session: SessionName
+    state: SessionStatus
+    age_s: float
+    speaking: bool
+    endpoints: EndpointMap  # of the session's workers: audio, phones, faps, ...
+    workers: Annotated[dict[Name, Name], Meta(max_length=16)]  # instance behind each endpoint
+    facts: SessionFacts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusReport(Message):
+    """The answer to a status request."""
 
     request: Name
-    shapes: ShapeSets
+    services: Annotated[list[ServiceState], Meta(max_length=10000)]
+    sessions: Annotated[list[SessionState], Meta(max_length=10000)]
+    next: Count | None = None  # ``after`` of the request for the next page; None: the last page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Done(Message):
-    """A request was carried out.
-
-    For a ``start-session``, ``media_time`` says up to where the session's phones are final at this
-    service; 0 where it keeps none.
-    """
+    """Control has carried out a request."""
 
     request: Name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Error(Message):
-    """A request or message was refused, or something failed.
+    """A request or message was refused.
 
-    Every version of the protocol keeps its kind and fields, and a message of another version is
-    answered in that version, so that every client can read why it was refused.
+    The kind and these fields exist in every version of the protocol. A message of another version
+    is answered in that version, so that its sender can read why it was refused.
     """
 
     code: Name  # an ErrorCode, or one of a later build
     text: Text
-    request: NameOrNone = ""
-    retry_after_s: Annotated[float, Meta(ge=0, le=3600)] = 0.0  # 0: not stated
+    request: Name | None = None
+    retry_after_s: Annotated[Seconds, Meta(le=3600)] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Joined(Message):
-    """Answers a subscription to ``joined/<session>/``: that peer's earlier ones are in effect."""
+    """A publisher's answer to a subscription to ``joined/<session>/``.
+
+    The subscriber's earlier subscriptions are in effect.
+    """
 
     publisher: Name  # differs between publishers; wait for as many as you connected to

@@ -1,4 +1,4 @@
-"""PROTOCOL.md, the schema and the code say the same."""
+"""The documents in proto/, the schema and the code agree."""
 
 from __future__ import annotations
 
@@ -17,24 +17,30 @@ from kouxing.services.synthesizer.service import LOW_LEVEL_FAPS
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
-from kouxing.shared.wire.control import (
-    AllowedKey,
-    EventName,
-    ServiceState,
-    SessionInput,
-    SessionState,
-)
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.control import AllowedKey, EventName, SessionInput
 from kouxing.shared.wire.events import LINK_MESSAGES
+from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.kinds import MESSAGES, PUBLISHER_OF
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, MAX_MESSAGE_BYTES, VERSION, Message
 from kouxing.shared.wire.schema import schema
-from kouxing.shared.wire.session import ErrorCode, SessionMoved, SessionOpened
+from kouxing.shared.wire.session import (
+    ErrorCode,
+    ServiceState,
+    SessionFacts,
+    SessionMoved,
+    SessionOpened,
+    SessionState,
+)
+from kouxing.shared.wire.speech import NewestFrame
 from tests.samples import SAMPLES
 
 pytestmark = pytest.mark.contract
 ROOT = Path(__file__).parents[2]
-DOCUMENT = (ROOT / "proto" / "PROTOCOL.md").read_text(encoding="utf-8")
+PROTOCOL, MESSAGES_DOCUMENT, VALUES = (
+    (ROOT / "proto" / name).read_text(encoding="utf-8")
+    for name in ("PROTOCOL.md", "MESSAGES.md", "VALUES.md")
+)
 COMMON = {field.name for field in dataclasses.fields(Message)}
 STRUCTURES: dict[str, type[Any]] = {
     **MESSAGES,
@@ -42,16 +48,19 @@ STRUCTURES: dict[str, type[Any]] = {
     "session-state": SessionState,
     "session-input": SessionInput,
     "allowed-key": AllowedKey,
+    "face-settings": FaceSettings,
+    "newest-frame": NewestFrame,
+    "session-facts": SessionFacts,
 }
 WIRE_NAME = {cls: name for name, cls in STRUCTURES.items()}
 
 
-def section(heading: str) -> str:
-    """Return the document's text between a heading and the next one."""
+def section(heading: str, document: str = PROTOCOL) -> str:
+    """Return a document's text between a heading and the next one."""
     found = re.search(
-        rf"^#+ {re.escape(heading)}\n(.*?)(?=^#+ |\Z)", DOCUMENT, re.DOTALL | re.MULTILINE
+        rf"^#+ {re.escape(heading)}\n(.*?)(?=^#+ |\Z)", document, re.DOTALL | re.MULTILINE
     )
-    assert found, f"PROTOCOL.md has no heading {heading!r}"
+    assert found, f"the document has no heading {heading!r}"
     return found[1]
 
 
@@ -70,7 +79,15 @@ def type_text(kind: msgspec.inspect.Type) -> str:
             return f"list of {type_text(kind.item_type)}"
         case msgspec.inspect.DataclassType():
             return f"`{WIRE_NAME[kind.cls]}`"
+        case msgspec.inspect.UnionType():
+            return f"{type_text(some_type(kind))} or null"
     return type(kind).__name__.removesuffix("Type").lower()
+
+
+def some_type(kind: msgspec.inspect.UnionType) -> msgspec.inspect.Type:
+    """Return the type of an optional field's value, if it has one."""
+    (value_type,) = (one for one in kind.types if not isinstance(one, msgspec.inspect.NoneType))
+    return value_type
 
 
 def number_text(value: float) -> str:
@@ -114,7 +131,13 @@ def range_text(kind: msgspec.inspect.Type) -> str:
         case msgspec.inspect.DictType() | msgspec.inspect.ListType():
             text = size_text(kind.min_length, kind.max_length, "entries")
         case msgspec.inspect.IntType() | msgspec.inspect.FloatType():
-            text = span_text(kind.ge, kind.le)
+            text = (
+                f"above 0, up to {number_text(kind.le)}"
+                if kind.gt == 0 and kind.le
+                else span_text(kind.ge, kind.le)
+            )
+        case msgspec.inspect.UnionType():
+            text = range_text(some_type(kind))
     return text
 
 
@@ -144,7 +167,7 @@ def expected_rows(cls: type[Any]) -> list[list[str]]:
 
 
 def test_the_document_is_that_of_this_version() -> None:
-    assert DOCUMENT.startswith(f"# The kouxing protocol, version {VERSION}\n")
+    assert PROTOCOL.startswith(f"# The kouxing protocol, version {VERSION}\n")
 
 
 def test_the_common_fields_are_those_of_the_class() -> None:
@@ -153,13 +176,13 @@ def test_the_common_fields_are_those_of_the_class() -> None:
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_every_field_is_in_the_document_with_type_range_and_default(name: str) -> None:
-    rows = table(section(f"`{name}`"))
+    rows = table(section(f"`{name}`", MESSAGES_DOCUMENT))
     assert [row[:4] for row in rows] == expected_rows(STRUCTURES[name])
     assert all(row[4] for row in rows), "every field has its meaning"
 
 
 def test_the_document_describes_no_message_that_does_not_exist() -> None:
-    described = re.findall(r"^#### `([a-z-]+)`$", DOCUMENT, re.MULTILINE)
+    described = re.findall(r"^### `([a-z-]+)`$", MESSAGES_DOCUMENT, re.MULTILINE)
     assert sorted(described) == sorted(STRUCTURES)
 
 
@@ -172,18 +195,18 @@ def test_every_answer_is_in_the_document() -> None:
         [set(re.findall(r"`([a-z-]+)`", cell)) for cell in row] for row in table(section("Answers"))
     ]
     asked, answers, errors = (set().union(*column) for column in zip(*rows, strict=True))
-    from_clients = {cls.kind for cls in (*get_args(Request), AudioChunk, EndOfAudio)}
+    from_clients = {cls.kind for cls in (*get_args(Request), AudioChunk)}
     assert asked - {"joined", "request"} == from_clients | {
         "heartbeat",
         "start-session",
         *(cls.kind for cls in LINK_MESSAGES),
     }
     assert answers < set(MESSAGES)
-    assert errors - {"request"} == {*ErrorCode}
+    assert errors - {"request"} < {*ErrorCode}
 
 
 def test_every_fap_is_in_the_document() -> None:
-    assert table(section("FAPs"), -1) == [
+    assert table(section("FAPs", VALUES), -1) == [
         [
             str(fap.number),
             f"`{fap.name}`",
@@ -197,18 +220,20 @@ def test_every_fap_is_in_the_document() -> None:
 
 
 def test_every_unit_of_faps_is_in_the_document() -> None:
-    assert {row[0] for row in table(section("FAPs"))} == {fap.fapu for fap in FAPS if fap.fapu}
+    assert {row[0] for row in table(section("FAPs", VALUES))} == {
+        fap.fapu for fap in FAPS if fap.fapu
+    }
 
 
 def test_every_shape_is_in_the_document() -> None:
-    assert table(section("Sets of shapes")) == [
+    assert table(section("Sets of shapes", VALUES)) == [
         [f"`{name}`", " ".join(shapes.names)] for name, shapes in SHAPE_SETS.items()
     ]
 
 
 def test_every_phone_is_in_the_document_and_its_example_has_it() -> None:
     inventory = load_inventory()
-    rows = table(section("Phones"))
+    rows = table(section("Phones", VALUES))
     assert [[row[0], row[1], row[4]] for row in rows] == [
         [f"`{phone}`", kind, ", ".join(viseme for viseme, _ in inventory.visemes[phone])]
         for phone, kind in zip(inventory.phones, inventory.kinds, strict=True)
@@ -247,7 +272,7 @@ def test_the_order_of_the_mouth_is_in_the_document() -> None:
         f"{each[0]} to {each[-1]}" if len(each) > 2 else ", ".join(map(str, each))
         for each in ranges
     )
-    assert text in section("`lips`")
+    assert text in section("`lips`", MESSAGES_DOCUMENT)
 
 
 def test_the_limits_are_in_the_document() -> None:

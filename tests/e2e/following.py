@@ -14,7 +14,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.bus import Received
 from kouxing.shared.client import Client, Session, Subscription
 from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Lips, Phone, Speech
 
@@ -24,7 +24,6 @@ KINDS: tuple[type[Message], ...] = (FapFrame, EndOfFaps, Phone, Lips, Speech, So
 @dataclass
 class Collected:
     frames: list[FapFrame] = field(default_factory=list)
-    shapes: list[Shapes] = field(default_factory=list)
     phones: list[Phone] = field(default_factory=list)
     lips: list[Lips] = field(default_factory=list)
     speech: list[Speech] = field(default_factory=list)
@@ -36,8 +35,6 @@ class Collected:
             match each.message:
                 case FapFrame() as frame:
                     self.frames.append(frame)
-                case Shapes() as shapes:
-                    self.shapes.append(shapes)
                 case Phone() as phone:
                     self.phones.append(phone)
                 case Lips() as lips:

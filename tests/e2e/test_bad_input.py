@@ -18,12 +18,12 @@ from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.client import Client, Refused, Session
 from kouxing.shared.keys import own_key, user_key
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error, OpenSession
-from kouxing.shared.wire.speech import Acknowledge, Phone, Progress
+from kouxing.shared.wire.speech import Phone, Progress
 from tests.e2e.following import stream
 from tests.system import System
 
@@ -61,15 +61,15 @@ def test_nan_is_refused_and_the_session_goes_on(client: Client, witness: Session
 def test_a_bad_mouth_profile_is_refused_and_the_session_goes_on(
     client: Client, witness: Session
 ) -> None:
-    session = client.open_session(encoding="f32le", voice=b"no profile")
+    session = client.open_session(encoding="f32le", mouth_profile=b"no profile")
     output = session.subscribe(FapFrame)
     session.send(np.zeros(8000, np.float32))
     error = first_error(session)
-    assert (error.code, "not a mouth profile" in error.text) == ("bad-voice", True)
+    assert (error.code, "not a mouth profile" in error.text) == ("bad-mouth-profile", True)
     assert output.wait(60.0)
     session.close()
     with pytest.raises(Refused, match="bad-message"):
-        client.open_session(voice=bytes(70_000))
+        client.open_session(mouth_profile=bytes(70_000))
 
 
 def test_half_a_sample_is_refused(client: Client, witness: Session) -> None:
@@ -113,7 +113,7 @@ def test_an_unknown_session_is_named(system: System, client: Client, witness: Se
 def test_a_foreign_token_is_refused_and_a_replay_dropped(client: Client, witness: Session) -> None:
     thief = client.bus.connect_dealer(witness.opened.audio)
     thief.send(AudioChunk(session=witness.name, token="guess", sequence=1, pcm=b""))
-    thief.send(EndOfAudio(session=witness.name, token="guess", sequence=2))
+    thief.send(AudioChunk(session=witness.name, token="guess", sequence=2, last=True))
     codes = answers(thief)
     assert [next(codes).code, next(codes).code] == ["bad-token", "bad-token"]
     with pytest.raises(Refused) as caught:
@@ -128,7 +128,7 @@ def test_a_foreign_token_is_refused_and_a_replay_dropped(client: Client, witness
     thief.send(replace(replay, acknowledge=True))
     assert thief.wait(60.0)
     (answer,) = thief.receive()
-    assert isinstance(answer.message, Acknowledge)
+    assert isinstance(answer.message, AcknowledgeAudio)
     assert answer.message.sequence == 1
     assert not output.wait(0.2)
 

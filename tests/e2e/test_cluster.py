@@ -9,7 +9,7 @@ import pytest
 from ray.cluster_utils import Cluster
 
 from kouxing.shared.client import Client
-from kouxing.shared.wire.control import StatusReport
+from kouxing.shared.wire.session import StatusReport
 from tests.e2e.following import samples_of_file, stream
 from tests.system import VOWELS_FILE, System, kouxing
 

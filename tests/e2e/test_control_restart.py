@@ -9,7 +9,7 @@ import pytest
 
 from kouxing.shared.client import Client
 from kouxing.shared.face.shapes import ARKIT, VRM
-from kouxing.shared.wire.face import Shapes
+from kouxing.shared.wire.face import FaceSettings
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send
 from tests.system import DEMO, System
 
@@ -20,19 +20,18 @@ SERVICES = ("control", "recognizer", "synthesizer", "driver")
 def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: Path) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")[:64000]
     with System(SERVICES, tmp_path) as system, Client(system.control) as client:
-        session = client.open_session(encoding="f32le", shapes=["vrm"])
+        session = client.open_session(encoding="f32le", face=FaceSettings(shapes=["vrm"]))
         opened = session.opened
-        output = session.subscribe(*KINDS, Shapes)
+        output = session.subscribe(*KINDS)
         collected = Collected()
         send(session, samples[:16000], output, collected, paced=True)
-        client.choose_expressiveness(session.name, 1.8)
-        client.add_shapes(session.name, ["arkit"])
+        client.set_face(session.name, expressiveness=1.8, shapes=["arkit"])
         killed = system.processes.pop("control")
         killed.kill()
         killed.wait()
         send(session, samples[16000:32000], output, collected, paced=True)
         system.start("control")
-        session.express({"joy": 0.5})  # asked before control knows the session
+        session.set_face(expressions={"joy": 0.5})  # asked before control knows the session
         send(session, samples[32000:40000], output, collected, paced=True)
         assert session.opened == opened, "it has not moved"
         (state,) = client.status().sessions
@@ -56,15 +55,14 @@ def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: P
     newest = max(place for place in frames if place[0] == 1)  # of the one that was killed
     for name, shapes in (("vrm", VRM), ("arkit", ARKIT)):
         published = {
-            (each.epoch, each.sequence): each for each in collected.shapes if each.set == name
+            place: frame.shapes[name] for place, frame in frames.items() if name in frame.shapes
         }
         assert {epoch for epoch, _ in published} == {1, 2}
         expected = [place for place in frames if place >= min(published)]
         assert [*published] in (expected, [place for place in expected if place != newest])
-        for place, each in published.items():
-            assert each.media_time == frames[place].media_time
-            found = shapes.weights(np.frombuffer(frames[place].values, "<f4"))
-            np.testing.assert_array_equal(np.frombuffer(each.weights, "<f4"), found)
+        for place, weights in published.items():
+            expected_weights = shapes.weights(np.frombuffer(frames[place].values, "<f4"))
+            np.testing.assert_array_equal(np.frombuffer(weights, "<f4"), expected_weights)
     before = [frame for frame in collected.frames if frame.epoch == 1]
     assert [frame.sequence for frame in before] == [*range(1, len(before) + 1)]
     sounds = [sound for sound in collected.sounds if sound.epoch == 1]

@@ -16,11 +16,11 @@ from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.client import Client, Refused, Session
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_guest, key_folder, own_key, revoke_guest, user_key
-from kouxing.shared.wire.control import Event, Heartbeat, Recorded, SessionInput
+from kouxing.shared.wire.control import Event, Heartbeat, SessionInput
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
-from kouxing.shared.wire.speech import EndOfPhones, Phone, Progress, Speech
+from kouxing.shared.wire.speech import AudioState, Phone, Progress, Speech
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System
 
@@ -105,9 +105,9 @@ def test_only_a_services_own_messages_become_events(
             assert time.monotonic() < end_s
             client.open_session().close()
         for message in (
-            Recorded(session=witness.name, path="/etc/passwd", num_images=1, duration_s=1.0),
+            Event(session=witness.name, name="recorded", detail="/etc/passwd"),
             Speech(session=witness.name, epoch=1, active=True),
-            Error(session=witness.name, code="no-video", text="forged"),
+            Event(session=witness.name, name="error", detail="forged"),
         ):
             stranger.send(message)
         names = set()
@@ -128,7 +128,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
     forged: list[Message] = [
         Phone(index=0, symbol="a", duration=9, confidence=1.0, final=True),
         Progress(level_db=0.0),
-        EndOfPhones(),
+        Progress(state=AudioState.ENDED),
     ]
     endpoint = system.endpoints()["phone_input"]
     with Bus(own_key("driver", ("service:driver",))) as bus:
@@ -172,7 +172,7 @@ def test_a_key_may_do_what_its_roles_say(keyed: Client, client: Client, witness:
     with pytest.raises(Refused, match=r"not-allowed: .* no role client"):
         keyed.open_session()
     with pytest.raises(Refused, match=r"not-allowed: .* no role client or operator"):
-        keyed.express(witness.name, {"joy": 1.0})
+        keyed.set_face(witness.name, expressions={"joy": 1.0})
 
 
 def test_a_revoked_key_is_cut_while_it_follows(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import subprocess
 import sys
@@ -24,7 +23,7 @@ from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System
 
 pytestmark = pytest.mark.e2e
-DOCUMENT = ROOT / "proto" / "PROTOCOL.md"
+EXAMPLES = ROOT / "examples" / "stream"
 NODE = str(Path(sys.executable).with_name("node"))
 KEY_FILE = "~/.local/state/kouxing/client.key"
 HOSTS = {
@@ -59,7 +58,7 @@ class Stranger:
 
 
 def send(socket: zmq.Socket[bytes], kind: str, session: str, **fields: object) -> None:
-    body = {"version": 2, "session": session, **fields}
+    body = {"version": 3, "session": session, **fields}
     socket.send_multipart([f"{kind}/{session}/".encode(), msgpack.packb(body)])
 
 
@@ -95,7 +94,7 @@ def test_a_stranger_streams_audio_and_another_reads_the_faps(spread: System) -> 
             media_time=begin // 2,
             pcm=pcm[begin : begin + 1280],
         )
-    send(audio, "end-of-audio", "stranger", token=opened["token"], sequence=10**6)
+    send(audio, "audio-chunk", "stranger", token=opened["token"], sequence=10**6, last=True)
 
     jaw: list[float] = []
     while (frame := receive(faps))[0] != "end-of-faps":
@@ -153,7 +152,7 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: Sys
         "needs": ["faps"],
     }
     send(lamp, "heartbeat", "", **heartbeat)
-    assert receive(lamp)[0] == "heartbeat-seen"
+    assert receive(lamp)[0] == "heartbeat-reply"
 
     client = stranger.socket(zmq.DEALER, spread.control)
     send(client, "open-session", "lit", request="1", paced=False)
@@ -161,9 +160,10 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: Sys
     assert kind == "start-session"
     assert start["endpoints"]["faps"].startswith(f"tcp://{HOSTS['synthesizer']}:")
     assert not client.poll(300), "the session opens once the lamp is ready for it"
-    send(lamp, "done", "lit", request=start["request"])
+    send(lamp, "session-started", "lit", request=start["request"])
     _, opened = receive(client)
-    assert (opened["language"], opened["frame_rate_hz"]) == ("mandarin", 50.0)
+    facts = opened["facts"]
+    assert (facts["language"], facts["frame_rate_hz"]) == ("mandarin", 50.0)
 
     send(client, "status-request", "", request="2")
     _, report = receive(client)
@@ -174,44 +174,32 @@ def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: Sys
     send(client, "close-session", "lit", request="3", token=opened["token"])
     assert receive(lamp)[0] == "stop-session"
     send(lamp, "heartbeat", "", **{**heartbeat, "state": "draining"})
-    assert receive(lamp)[0] == "heartbeat-seen"
+    assert receive(lamp)[0] == "heartbeat-reply"
     stranger.close()
 
 
-def test_a_client_of_version_1_is_told_in_version_1_what_to_do(spread: System) -> None:
+def test_a_client_of_another_version_is_answered_in_its_version(spread: System) -> None:
     stranger = Stranger()
-    stored = json.loads((ROOT / "proto" / "golden" / "version1.json").read_text("utf-8"))
     control = stranger.socket(zmq.DEALER, spread.control)
-    send(control, "open-session", "", request="now")
-    _, opened = receive(control)
-    audio = stranger.socket(zmq.DEALER, opened["audio"])
-    for socket, kind in ((control, "open"), (audio, "audio")):
-        socket.send_multipart([bytes.fromhex(part) for part in stored[kind]])
-        answer_kind, answer = receive(socket)
-        # What the client of version 1 read, and what made it give up with the text.
-        assert (answer_kind, answer["version"], answer["code"]) == ("error", 1, "bad-message")
-        assert f"'{kind}' is a message of protocol version 1" in answer["text"]
-        assert "upgrade" in answer["text"]
-        assert "proto/PROTOCOL.md" in answer["text"]
-        old_fields = set(msgpack.unpackb(bytes.fromhex(stored["error"][1])))
-        assert old_fields <= set(answer)
-    send(control, "close-session", opened["session"], request="end", token=opened["token"])
-    assert receive(control)[0] == "done"
+    control.send_multipart([b"open//", msgpack.packb({"version": 1, "request": "r"})])
+    kind, answer = receive(control)
+    assert (kind, answer["version"], answer["code"]) == ("error", 1, "bad-message")
+    assert "upgrade" in answer["text"]
     stranger.close()
 
 
-@pytest.mark.parametrize(("language", "program"), [("python", sys.executable), ("js", NODE)])
-def test_the_examples_in_the_document_run(
-    language: str, program: str, spread: System, tmp_path: Path
+@pytest.mark.parametrize(("suffix", "program"), [("py", sys.executable), ("mjs", NODE)])
+def test_the_streaming_examples_run(
+    suffix: str, program: str, spread: System, tmp_path: Path
 ) -> None:
-    (example,) = code_blocks(DOCUMENT, language)
+    example = (EXAMPLES / f"client.{suffix}").read_text(encoding="utf-8")
     address = "tcp://127.0.0.1:5550"
     assert address in example
     assert KEY_FILE in example
-    script = tmp_path / "client.mjs"  # a name that Python takes, too
+    script = tmp_path / f"client.{suffix}"
     example = example.replace(address, spread.control.partition(" ")[0])
     script.write_text(example.replace(KEY_FILE, str(key_folder() / "client.key")), encoding="utf-8")
-    (tmp_path / "node_modules").symlink_to(DOCUMENT.parent / "node" / "node_modules")
+    (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
     result = subprocess.run(
         [program, script, VOWELS_FILE],
         capture_output=True,

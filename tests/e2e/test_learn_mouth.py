@@ -22,6 +22,7 @@ from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.mouth_profiles.landmark_file import landmark_file
 from kouxing.shared.client import Client
+from kouxing.shared.wire.face import FaceSettings
 from tests import heads
 from tests.browser import Browser
 from tests.scripted_system import Gateway, System
@@ -138,8 +139,9 @@ def test_a_mouth_is_learnt_kept_used_and_forgotten(system: System, browser: Brow
     browser.wait_for("window.kouxing.state.microphone")
     assert system.recognizer is not None
     (start,) = system.recognizer.starts.values()
-    assert start.voice == profile
-    wait_until(lambda: system.synthesizer.chosen == [(start.session, "learnt")], 60)
+    assert start.mouth_profile == profile
+    learnt = (start.session, FaceSettings(lips="learnt"))
+    wait_until(lambda: system.synthesizer.changes == [learnt], 60)
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from kouxing.evaluation.system.chromium import wait_until
 from kouxing.shared.client import Client, Session
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.wire.face import FaceSettings
 from tests import sync
 from tests.browser import SIZE_PX, Browser
 from tests.scripted_system import LOOK_AHEAD_MS, Gateway, System
@@ -452,20 +453,24 @@ def choose(page: Browser, name: str, value: object) -> None:
     )
 
 
+def amounts(changes: list[tuple[str, FaceSettings]]) -> list[tuple[str, float]]:
+    return [(name, face.expressiveness) for name, face in changes if face.expressiveness]
+
+
 def test_what_is_chosen_counts_at_once_and_for_sessions_to_come(
     system: System, session: Session, page: Browser, gateway: Gateway
 ) -> None:
-    chosen, amounts = system.synthesizer.chosen, system.synthesizer.amounts
-    chosen.clear()
+    changes = system.synthesizer.changes
+    changes.clear()
     page.click("microphone")
     page.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips")
     assert page.evaluate("window.kouxing.state.lips") == "dynamic-visemes"
     choose(page, "lips", "ferguson")
     page.wait_for("window.kouxing.state.lips === 'ferguson'")
     choose(page, "expressiveness", 0.7)
-    wait_until(lambda: len(amounts) == 1, 60)
+    wait_until(lambda: len(amounts(changes)) == 1, 60)
     page.evaluate("document.querySelector('#expressions [value=surprise]').click()")
-    wait_until(lambda: system.synthesizer.expressions == [{"surprise": 0.8}], 60)
+    wait_until(lambda: changes[-1][1].expressions == {"surprise": 0.8}, 60)
     page.click("microphone")
     page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
 
@@ -473,15 +478,15 @@ def test_what_is_chosen_counts_at_once_and_for_sessions_to_come(
     assert page.evaluate("document.getElementById('lips').value") == "ferguson"
     page.click("microphone")
     page.wait_for("window.kouxing.state.microphone && window.kouxing.state.lips === 'ferguson'")
-    wait_until(lambda: len(amounts) == 2, 60)
+    wait_until(lambda: len(amounts(changes)) == 2, 60)
     choose(page, "lips", "learnt")
     page.wait_for("window.kouxing.state.lips === 'learnt'")
     page.click("microphone")
     page.wait_for("!window.kouxing.state.microphone && window.kouxing.state.session === 'seen'")
-    sessions, lips = zip(*chosen, strict=True)
+    sessions, lips = zip(*[(name, face.lips) for name, face in changes if face.lips], strict=True)
     assert lips == ("ferguson", "ferguson", "learnt")
     assert sessions[0] != sessions[1] == sessions[2]
-    assert amounts == [(sessions[0], 0.7), (sessions[1], 0.7)]
+    assert amounts(changes) == [(sessions[0], 0.7), (sessions[1], 0.7)]
 
 
 def test_another_head_is_shown(system: System, session: Session, page: Browser) -> None:

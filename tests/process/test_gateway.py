@@ -34,31 +34,29 @@ from kouxing.shared.clock import now_ns
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio, Sound
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
 from kouxing.shared.wire.control import (
     Heartbeat,
-    HeartbeatSeen,
-    ServiceState,
+    HeartbeatReply,
+    SessionStarted,
     StartSession,
-    StatusReport,
-    StatusRequest,
     StopSession,
-    UseLips,
 )
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
-    ChooseExpressiveness,
-    ChooseLips,
     CloseSession,
     Done,
     Error,
-    Express,
     FlushSession,
     OpenSession,
+    ServiceState,
+    SessionFacts,
     SessionOpened,
+    StatusReport,
+    StatusRequest,
 )
-from kouxing.shared.wire.speech import Acknowledge, Phone, Speech
+from kouxing.shared.wire.speech import Phone, Speech
 from tests.system import DEMO, free_port
 
 pytestmark = pytest.mark.process
@@ -92,7 +90,7 @@ class ScriptedSystem:
         self.closed: list[str] = []
         self.flushed: list[str] = []
         self.chosen: list[tuple[str, str]] = []  # session, lip model
-        self.expressions: list[Express] = []
+        self.expressions: list[SetFace] = []
         self.amounts: list[tuple[str, float]] = []  # session, expressiveness
         self.voices: list[bytes] = []  # of the sessions opened
         self.audio_messages: list[Message] = []
@@ -141,9 +139,9 @@ class ScriptedSystem:
             num_channels=1,
             record=False,
             paced=True,
-            language="mandarin",
+            facts=SessionFacts(language="mandarin"),
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
-            lips="dynamic-visemes",
+            face=FaceSettings(lips="dynamic-visemes"),
         )
         self.commands.send(message, to=self.gateway)
 
@@ -183,7 +181,7 @@ class ScriptedSystem:
                         self._on_command(received.message, received.sender)
                     elif isinstance(received.message, Message):
                         self.audio_messages.append(received.message)
-                        taken = Acknowledge(
+                        taken = AcknowledgeAudio(
                             session=received.message.session, sequence=received.message.sequence
                         )
                         self.audio.send(taken, to=received.sender)
@@ -195,15 +193,17 @@ class ScriptedSystem:
                 self.gateway = sender
                 self.page = message.endpoints["page"]
                 now = now_ns()
-                answer = HeartbeatSeen(sent_ns=message.sent_ns, received_ns=now, replied_ns=now)
-            case Done():
+                answer = HeartbeatReply(
+                    sent_ns=message.sent_ns, received_ns=now, replied_ns=now, control="control-1"
+                )
+            case SessionStarted():
                 self.started.append(message.session)
                 if message.session in self._openings:
                     self._opened(*self._openings[message.session], message.session)
             case OpenSession() if self.refuse:
                 answer = Error(code="no-service", text="start one", request=message.request)
             case OpenSession():
-                self.voices.append(message.voice)
+                self.voices.append(message.mouth_profile or b"")
                 session = message.session or f"s{len(self._openings)}"
                 self._openings[session] = (message, sender)
                 self.start(session)
@@ -214,17 +214,8 @@ class ScriptedSystem:
             case FlushSession():
                 self.flushed.append(message.session)
                 answer = Done(session=message.session, request=message.request)
-            case ChooseLips():
-                self.chosen.append((message.session, message.lips))
-                use = UseLips(session=message.session, lips=message.lips)
-                self.commands.send(use, to=self.gateway)
-                answer = Done(session=message.session, request=message.request)
-            case ChooseExpressiveness():
-                self.amounts.append((message.session, message.expressiveness))
-                answer = Done(session=message.session, request=message.request)
-            case Express():
-                self.expressions.append(message)
-                answer = Done(session=message.session, request=message.request)
+            case SetFace():
+                answer = self._on_set_face(message)
             case StatusRequest():
                 states = [
                     ServiceState(
@@ -243,6 +234,19 @@ class ScriptedSystem:
         if answer is not None:
             self.commands.send(answer, to=sender)
 
+    def _on_set_face(self, message: SetFace) -> Message | None:
+        face = message.face
+        if face.lips is not None:
+            self.chosen.append((message.session, face.lips))
+        if face.expressiveness is not None:
+            self.amounts.append((message.session, face.expressiveness))
+        if face.expressions is not None:
+            self.expressions.append(message)
+        self.commands.send(message, to=self.gateway)
+        if message.request is None:
+            return None
+        return Done(session=message.session, request=message.request)
+
     def _opened(self, opening: OpenSession, client: Peer, session: str) -> None:
         self.commands.send(
             SessionOpened(
@@ -253,6 +257,7 @@ class ScriptedSystem:
                 phones=self.phones.endpoint,
                 faps=self.faps.endpoint,
                 events=self.faps.endpoint,
+                facts=SessionFacts(),
             ),
             to=client,
         )
@@ -535,7 +540,8 @@ def test_a_microphone_streams_and_says_its_last(own_system: ScriptedSystem) -> N
     *chunks, last = system.audio_messages
     assert [chunk.media_time for chunk in chunks] == [0, 320, 640, 960, 1280]
     assert all(isinstance(chunk, AudioChunk) and len(chunk.pcm) == 1920 for chunk in chunks)
-    assert isinstance(last, EndOfAudio)
+    assert isinstance(last, AudioChunk)
+    assert last.last
 
 
 def test_audio_that_had_to_be_dropped_leaves_a_gap_in_media_time(
@@ -687,12 +693,12 @@ def test_a_viewer_lets_the_face_it_sees_express_something(
 
     asyncio.run(express())
     first, second = system.expressions
-    assert (first.session, first.expressions, first.hold_s) == (
+    assert (first.session, first.face.expressions, first.face.hold_s) == (
         "seen",
         {"joy": 0.5, "squint": 1.0},
         7.0,
     )
-    assert (second.session, second.expressions) == ("seen", {})
+    assert (second.session, second.face.expressions) == ("seen", {})
     assert system.amounts == [("seen", 2.0)]
     system.do(lambda: system.commands.send(StopSession(session="seen"), to=system.gateway))
 

@@ -206,7 +206,10 @@ def test_plain_http_to_a_proxy_needs_a_token_too_which_is_made_and_shown() -> No
         ({"HOST": "0.0.0.0"}, "gateway.certificate=kouxing.pem"),  # noqa: S104
         ({"CERTIFICATE": __file__}, "gateway.certificate: "),
         ({"CERTIFICATE": "/no/such/folder/new.pem"}, "No such file or directory"),
-        ({"SENDERS": "vmc://127.0.0.1 http://127.0.0.1"}, "a list of addresses such as vmc://127.0.0.1:39540"),
+        (
+            {"SENDERS": "vmc://127.0.0.1 http://127.0.0.1"},
+            "a list of addresses such as vmc://127.0.0.1:39540",
+        ),
         ({"FRAME_ANCESTORS": "https://a.example; script-src *"}, "a list of origins"),
     ],
 )

@@ -28,12 +28,11 @@ from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import (
     Heartbeat,
     SessionInput,
+    SessionStarted,
     StartSession,
-    StatusReport,
-    StatusRequest,
 )
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
-from kouxing.shared.wire.session import Done, Error, OpenSession
+from kouxing.shared.wire.session import Error, OpenSession, StatusReport, StatusRequest
 from tests.samples import SAMPLES
 from tests.system import free_port
 
@@ -179,7 +178,7 @@ class PeersOfControl(Peers):
 
     @rule()
     def start_sessions(self) -> None:
-        self.honest.send(Done(session="demo", request="start-demo-1"))
+        self.honest.send(SessionStarted(session="demo", request="start-demo-1"))
 
     @invariant()
     def it_tells_the_status(self) -> None:

@@ -20,13 +20,13 @@ from kouxing.shared.client import Client
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import NOBODY, Guest, Key, add_guest, key_folder, own_key, revoke_guest
+from kouxing.shared.keys import Guest, Key, add_guest, key_folder, own_key, revoke_guest
 from kouxing.shared.service import Service
 from kouxing.shared.wire.codec import encode
-from kouxing.shared.wire.control import AllowedKey, AllowedKeys, StatusRequest
+from kouxing.shared.wire.control import AllowedKey
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.session import Joined
+from kouxing.shared.wire.session import Joined, StatusRequest
 from tests.system import ROOT
 
 pytestmark = pytest.mark.unit
@@ -278,10 +278,10 @@ def test_a_list_that_cannot_be_written_counts_as_long_as_the_service_runs(
         assert bus.is_refused(endpoint)
         key_folder().chmod(0o755)  # nothing is written there
         allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
-        service._on_allowed_keys(AllowedKeys(keys=allowed), NOBODY)
+        service._allow(allowed)
         assert "are not kept: others can read" in caplog.text
         assert not bus.is_refused(endpoint)
-        service._on_allowed_keys(AllowedKeys(keys={}), NOBODY)
+        service._allow({})
         assert bus.is_refused(endpoint)
 
 

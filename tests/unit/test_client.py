@@ -16,7 +16,7 @@ from kouxing.shared import client as client_module
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.client import NEAREST_MS, RESEND_S, Client, Session
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
@@ -25,10 +25,11 @@ from kouxing.shared.wire.session import (
     ErrorCode,
     FlushSession,
     OpenSession,
+    SessionFacts,
     SessionMoved,
     SessionOpened,
 )
-from kouxing.shared.wire.speech import Acknowledge, Phone
+from kouxing.shared.wire.speech import Phone
 from tests.raw_bytes import answer_handshake
 
 pytestmark = pytest.mark.unit
@@ -66,6 +67,7 @@ class Stage:
                 phones=self.phones[0].endpoint,
                 faps=self.phones[0].endpoint,
                 events=self.phones[0].endpoint,
+                facts=SessionFacts(),
             )
             self.commands.send(self.opened, to=self.address)
             self.session: Session = opening.result()
@@ -78,7 +80,7 @@ class Stage:
         for _ in range(num_chunks):
             assert self.session.send(CHUNK)
 
-    def move(self, next_sequence: int) -> None:
+    def move(self, next_sequence: int | None) -> None:
         """Move the session to the second recognizer, and wait until the client has been told."""
         moved = SessionMoved(
             session="s",
@@ -94,7 +96,7 @@ class Stage:
 
     def acknowledge(self, recognizer: int, sequence: int, sender: Peer) -> None:
         """Acknowledge audio, and wait until the client knows."""
-        self.audio[recognizer].send(Acknowledge(session="s", sequence=sequence), to=sender)
+        self.audio[recognizer].send(AcknowledgeAudio(session="s", sequence=sequence), to=sender)
         while self.session._acknowledged < sequence:
             list(self.session.errors())
 
@@ -125,13 +127,13 @@ def test_the_end_is_sent_again_too(stage: Stage) -> None:
     stage.send(1)
     stage.session.finish()
     stage.move(next_sequence=2)
-    end, _ = next_of(EndOfAudio, stage.audio[1])
+    end, _ = next_of(AudioChunk, stage.audio[1])
     assert (end.sequence, end.epoch) == (2, 2)
 
 
 def test_audio_goes_on_as_before_when_the_recognizer_is_the_same(stage: Stage) -> None:
     stage.send(2)
-    stage.move(next_sequence=0)
+    stage.move(next_sequence=None)
     stage.send(1)
     assert [chunk.sequence for chunk in stage.take(0, 3)] == [1, 2, 3]
 
@@ -231,18 +233,18 @@ def test_a_session_that_is_flushed_while_it_moves_has_nothing_to_send(stage: Sta
     stage.move(next_sequence=2)
     assert not stage.audio[1].wait(0.1)
     assert stage.session.finish()
-    assert next_of(EndOfAudio, stage.audio[1])[0].sequence == 4
+    assert next_of(AudioChunk, stage.audio[1])[0].sequence == 4
 
 
 def test_a_session_is_closed_when_its_end_is_acknowledged(stage: Stage) -> None:
     stage.send(1)
     assert stage.session.finish()
     stage.take(0, 1)
-    _, sender = next_of(EndOfAudio, stage.audio[0])
+    _, sender = next_of(AudioChunk, stage.audio[0])
     with ThreadPoolExecutor(1) as pool:
         closing = pool.submit(stage.session.close)
         assert not stage.commands.wait(0.2)
-        stage.audio[0].send(Acknowledge(session="s", sequence=2), to=sender)
+        stage.audio[0].send(AcknowledgeAudio(session="s", sequence=2), to=sender)
         request, client = next_of(CloseSession, stage.commands)
         stage.commands.send(Done(session="s", request=request.request), to=client)
         closing.result()

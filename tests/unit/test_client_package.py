@@ -6,6 +6,7 @@ The services' side is the product's own, so that what the package sends is check
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import itertools
 import time
 from array import array
@@ -25,9 +26,9 @@ from kouxing_client import (
     Phone,
     Refused,
     Session,
-    find_key,
     audio_stream,
     core,
+    find_key,
     follower,
     session_core,
 )
@@ -37,16 +38,16 @@ from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer, user_key
 from kouxing.shared.wire import face, speech
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.control import Event
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
-    AddShapes,
     CloseSession,
     Done,
     Error,
     FlushSession,
     OpenSession,
+    SessionFacts,
     SessionMoved,
     SessionOpened,
 )
@@ -103,7 +104,7 @@ class Stage:
             phones=self.phones[0].endpoint,
             faps=self.faps.endpoint,
             events=self.events.endpoint,
-            shapes={name: list(SHAPE_SETS[name].names) for name in request.shapes},
+            facts=SessionFacts(),
         )
         self.commands.send(opened, to=self.peer)
 
@@ -221,10 +222,9 @@ def test_large_audio_goes_in_several_messages_with_their_times(stage: Stage) -> 
     session = stage.open(sample_rate_hz=48000, num_channels=2)
     session.push(bytes(4 * 12000))
     session.finish()
-    chunks = stage.take(0, 2)
-    end, _ = next_of(EndOfAudio, stage.audio[0])
-    audio: list[AudioChunk | EndOfAudio] = [*chunks, end]
-    assert [len(chunk.pcm) for chunk in chunks] == [32000, 16000]
+    audio = stage.take(0, 3)
+    assert [len(chunk.pcm) for chunk in audio] == [32000, 16000, 0]
+    assert [chunk.last for chunk in audio] == [False, False, True]
     assert [chunk.media_time for chunk in audio] == [0, 2666, 4000]
     assert [chunk.sequence for chunk in audio] == [1, 2, 3]
     assert {(chunk.token, chunk.epoch, chunk.acknowledge) for chunk in audio} == {(TOKEN, 1, True)}
@@ -255,7 +255,7 @@ def test_what_is_not_acknowledged_is_sent_again_over_a_new_connection(
         session.push(CHUNK)
     _, sender = next_of(AudioChunk, stage.audio[0])
     stage.take(0, 2)
-    stage.audio[0].send(speech.Acknowledge(session="s", sequence=1), to=sender)
+    stage.audio[0].send(AcknowledgeAudio(session="s", sequence=1), to=sender)
     again, other = next_of(AudioChunk, stage.audio[0])
     assert again.sequence == 2
     assert other.address != sender.address
@@ -271,7 +271,7 @@ def test_a_sender_waits_for_a_recognizer_that_is_slower(
     stage.take(0, 3)
     assert not stage.audio[0].wait(0.05)
     assert not pushing.done()
-    stage.audio[0].send(speech.Acknowledge(session="s", sequence=1), to=sender)
+    stage.audio[0].send(AcknowledgeAudio(session="s", sequence=1), to=sender)
     assert stage.take(0, 1)[0].sequence == 5
     pushing.result()
 
@@ -323,14 +323,15 @@ def test_shapes_have_the_names_of_the_protocol() -> None:
 def test_shapes_are_asked_for_unless_they_come_already(stage: Stage) -> None:
     session = stage.open(shapes=["vrm"])
     weights = np.array([0.5, *[0] * 11], "<f4").tobytes()
-    shapes = face.Shapes(session="s", epoch=1, sequence=1, media_time=0, set="vrm", weights=weights)
+    shapes = dataclasses.replace(frame(1), shapes={"vrm": weights})
     end = face.EndOfFaps(session="s", epoch=1, sequence=2)
     vrm = stage.call(session.shapes, "vrm")
     asking = stage.pool.submit(session.shapes, "arkit")
     while not stage.commands.wait(0.005):
         list(stage.faps.receive())
-    request, peer = next_of(AddShapes, stage.commands)
-    assert (request.session, request.shapes) == ("s", ["arkit"])
+    request, peer = next_of(face.SetFace, stage.commands)
+    assert (request.session, request.face.shapes) == ("s", ["arkit"])
+    assert request.request is not None
     stage.commands.send(Done(session="s", request=request.request), to=peer)
     arkit = asking.result()
     stage.faps.send(shapes)
@@ -356,8 +357,8 @@ def test_an_error_is_raised_where_audio_waits_for_room(stage: Stage) -> None:
     pushing = stage.pool.submit(push_on, session)
     while session._has_room():
         time.sleep(0.01)
-    stage.audio[0].send(Error(session="s", code="bad-voice", text="x"), to=sender)
-    with pytest.raises(Refused, match="bad-voice"):
+    stage.audio[0].send(Error(session="s", code="bad-mouth-profile", text="x"), to=sender)
+    with pytest.raises(Refused, match="bad-mouth-profile"):
         pushing.result(20)
 
 
@@ -367,10 +368,10 @@ def test_errors_of_audio_are_raised_once_and_an_unknown_session_ends(
     session = stage.open()
     session.push(CHUNK)
     _, sender = next_of(AudioChunk, stage.audio[0])
-    stage.audio[0].send(Error(session="s", code="bad-voice", text="x"), to=sender)
-    with pytest.raises(Refused, match="bad-voice"):
+    stage.audio[0].send(Error(session="s", code="bad-mouth-profile", text="x"), to=sender)
+    with pytest.raises(Refused, match="bad-mouth-profile"):
         push_on(session)
-    taken = speech.Acknowledge(session="s", sequence=session._num_added)
+    taken = AcknowledgeAudio(session="s", sequence=session._num_added)
     stage.audio[0].send(taken, to=sender)  # there may be no room else
     session.push(CHUNK)
     monkeypatch.setattr(session_core, "MOVE_LIMIT_S", 0.0)
@@ -385,7 +386,7 @@ def test_a_session_that_control_closes_ends(stage: Stage) -> None:
     reading = stage.pool.submit(list, frames)
     while not reading.done():
         list(stage.events.receive())  # a subscription
-        stage.events.send(Event(session="s", number=1, name="session-closed", detail="idle"))
+        stage.events.send(Event(session="s", name="session-closed", detail="idle"))
         stage.events.wait(0.01)
     with pytest.raises(KouxingError, match="control has closed the session: idle"):
         reading.result()
@@ -408,10 +409,10 @@ def test_an_interruption_sends_nothing_of_before_again(stage: Stage) -> None:
 def test_closing_waits_until_the_end_has_arrived(stage: Stage) -> None:
     session = stage.open()
     session.finish()
-    _, sender = next_of(EndOfAudio, stage.audio[0])
+    _, sender = next_of(AudioChunk, stage.audio[0])
     closing = stage.pool.submit(session.close)
     assert not stage.commands.wait(0.05)
-    stage.audio[0].send(speech.Acknowledge(session="s", sequence=1), to=sender)
+    stage.audio[0].send(AcknowledgeAudio(session="s", sequence=1), to=sender)
     request, sender = next_of(CloseSession, stage.commands)
     stage.commands.send(Done(session="s", request=request.request), to=sender)
     closing.result()

@@ -13,8 +13,8 @@ from kouxing.services.control import service as control_service
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.endpoints import key_of
 from kouxing.shared.keys import own_key
-from kouxing.shared.wire.control import Heartbeat, StatusReport, StatusRequest
-from kouxing.shared.wire.session import Error
+from kouxing.shared.wire.control import Heartbeat
+from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
 from tests.control_stage import Stage
 
 pytestmark = pytest.mark.unit
@@ -47,7 +47,7 @@ def test_all_pages_together_have_everything_once(
     names = open_sessions(stage, 5)
     whole = ask(stage, client)
     assert isinstance(whole, StatusReport)
-    assert whole.next == 0
+    assert whole.next is None
     monkeypatch.setattr(control_service, "PAGE_BYTES", 700)
     services, sessions, after, num_pages = [], [], 0, 0
     while True:
@@ -56,7 +56,7 @@ def test_all_pages_together_have_everything_once(
         services += [state.instance for state in page.services]
         sessions += [state.session for state in page.sessions]
         num_pages += 1
-        if page.next == 0:
+        if page.next is None:
             break
         assert page.next > after
         after = page.next
@@ -79,7 +79,7 @@ def test_a_session_that_ended_between_two_pages_does_not_hide_another(
         seen += [state.session for state in page.sessions]
         if seen == names[:2]:
             stage.control._end(stage.control._sessions.find(names[0]), "over")
-        after = page.next
+        after = page.next or 0
     assert seen == names
 
 

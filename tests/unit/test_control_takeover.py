@@ -8,13 +8,15 @@ import pytest
 
 from kouxing.services.control import service as control_service
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.wire.control import SessionInput, StartSession, StopSession
+from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession, StopSession
+from kouxing.shared.wire.face import FaceSettings
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
     Done,
     Error,
     OpenSession,
+    SessionFacts,
     SessionMoved,
     SessionOpened,
 )
@@ -37,13 +39,14 @@ def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control_service, "START_LIMIT_S", 60.0)
 
 
-def served(endpoints: dict[str, str] = PLACED, **fields: object) -> StartSession:
+def served(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
     """Return a session that an earlier control has placed at the services of the stage."""
-    return StartSession(
+    start = StartSession(
         session="mine", epoch=4, request="r", token="t", encoding="s16le", sample_rate_hz=16000,
-        num_channels=1, record=False, paced=True, language="mandarin", endpoints=endpoints,
-        **fields,  # type: ignore[arg-type]
+        num_channels=1, record=False, paced=True, endpoints=endpoints,
+        facts=SessionFacts(language="mandarin"), **fields,  # type: ignore[arg-type]
     )  # fmt: skip
+    return SessionStarted(session="mine", request="r", start=start)
 
 
 def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
@@ -61,12 +64,13 @@ def test_a_session_is_taken_over_as_it_was(stage: Stage, client: Socket) -> None
     recognizer, synthesizer = stage.services
     answers(stage, synthesizer)  # its heartbeat is answered
     answers(stage, recognizer)
-    recognizer.send(served(lips="learnt", expressiveness=1.5))
+    face = FaceSettings(lips="learnt", expressiveness=1.5)
+    recognizer.send(served(face=face))
     for service in stage.services:
         (start,) = answers(stage, service)
         assert isinstance(start, StartSession)
         assert (start.session, start.epoch, start.token) == ("mine", 4, "t")
-        assert (start.lips, start.expressiveness) == ("learnt", 1.5)
+        assert start.face == face
     client.send(CloseSession(session="mine", token="t", request="1"))
     assert answers(stage, client) == [Done(session="mine", request="1")]
 
@@ -145,7 +149,7 @@ def test_a_client_is_told_again_that_its_session_moved(
     for service in stage.services:
         _, start = answers(stage, service, 2)
         assert isinstance(start, StartSession)
-        service.send(Done(session="mine", request=start.request))
+        service.send(SessionStarted(session="mine", request=start.request))
     answers(stage, client)
     for media_time in (2840, 5000):  # said again, as one does that goes on
         speech = Speech(session="mine", epoch=1, sequence=1, media_time=media_time, active=True)
@@ -159,7 +163,7 @@ def test_a_client_is_told_again_that_its_session_moved(
             told = answers(stage, service)
             starts = [message for message in told if isinstance(message, StartSession)]
         assert starts[0].speech_time == 2840
-        service.send(Done(session="mine", request=starts[0].request))
+        service.send(SessionStarted(session="mine", request=starts[0].request))
     first, *others = answers(stage, client, 3)
     assert isinstance(first, SessionMoved)
     assert (first.epoch, first.faps) == (2, "tcp://127.0.0.1:9")

@@ -15,9 +15,16 @@ from kouxing.services.driver.service import DriverService
 from kouxing.shared.bus import Bus
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.control import Heartbeat, Recorded, SessionInput, StartSession, StopSession
+from kouxing.shared.wire.control import (
+    Event,
+    Heartbeat,
+    SessionInput,
+    SessionStarted,
+    StartSession,
+    StopSession,
+)
 from kouxing.shared.wire.face import EndOfFaps, FapFrame
-from kouxing.shared.wire.session import Done, Error
+from kouxing.shared.wire.session import SessionFacts
 
 pytestmark = pytest.mark.unit
 
@@ -45,8 +52,8 @@ class Stage:
         )
         self.address = Peer()
         self.started: list[str] = []
-        self.recorded: list[Recorded] = []
-        self.errors: list[Error] = []
+        self.recorded: list[Event] = []
+        self.errors: list[Event] = []
         self.step_until(lambda: bool(self.address.address))
 
     def close(self) -> None:
@@ -64,11 +71,11 @@ class Stage:
                 match received.message:
                     case Heartbeat():
                         self.address = received.sender
-                    case Done() as done:
-                        self.started.append(done.session)
-                    case Recorded() as recorded:
+                    case SessionStarted() as started:
+                        self.started.append(started.session)
+                    case Event(name="recorded") as recorded:
                         self.recorded.append(recorded)
-                    case Error() as error:
+                    case Event(name="error") as error:
                         self.errors.append(error)
 
     def start(self, session: str, *, epoch: int = 1, record: bool = False) -> None:
@@ -82,7 +89,7 @@ class Stage:
             num_channels=1,
             record=record,
             paced=True,
-            language="mandarin",
+            facts=SessionFacts(language="mandarin"),
             endpoints={"phones": self.phones.endpoint, "faps": self.faps.endpoint},
         )
         num_started = len(self.started)
@@ -104,6 +111,10 @@ class Stage:
                 mask=bytes(MASK_BYTES),
             )
         )
+
+    def num_images(self) -> int:
+        """Number of images in all videos so far."""
+        return round(self.driver.metrics.snapshot(time.monotonic())["video_ms"]) // 40
 
     def shown(self) -> float:
         """FAP 1 as shown."""
@@ -136,8 +147,8 @@ def test_one_of_two_sessions_is_shown_and_the_other_goes_on_being_recorded(stage
     stage.stop("filmed")
     stage.step_until(lambda: bool(stage.recorded))
     assert stage.recorded[0].session == "filmed"
-    assert stage.recorded[0].num_images == 26  # of 0 to 1 s at 25 Hz
-    assert Path(stage.recorded[0].path).is_file()
+    assert stage.num_images() == 26  # of 0 to 1 s at 25 Hz
+    assert Path(stage.recorded[0].detail).is_file()
     stage.step_until(lambda: stage.driver.session_inputs() == {"other": SessionInput()})
     assert stage.errors == []
 
@@ -160,7 +171,7 @@ def test_a_video_goes_on_through_a_restart(stage: Stage) -> None:
         stage.publish("film", number, 100.0, epoch=2)
     stage.faps.send(EndOfFaps(session="film", epoch=2))
     stage.step_until(lambda: bool(stage.recorded))
-    assert stage.recorded[0].num_images == 26
+    assert stage.num_images() == 26
 
 
 def test_a_session_name_used_again_overwrites_no_video(stage: Stage) -> None:
@@ -171,7 +182,7 @@ def test_a_session_name_used_again_overwrites_no_video(stage: Stage) -> None:
         stage.faps.send(EndOfFaps(session="film", epoch=epoch))
         stage.stop("film")
         stage.step_until(partial(has_recorded, stage, epoch))
-    paths = [Path(recorded.path) for recorded in stage.recorded]
+    paths = [Path(recorded.detail) for recorded in stage.recorded]
     assert [path.name for path in paths] == ["film.mp4", "film-2.mp4", "film-3.mp4"]
     assert all(path.stat().st_size > 0 for path in paths)
 
@@ -183,4 +194,4 @@ def test_a_video_that_cannot_be_written_is_told_to_control(tmp_path: Path, stage
     stage.step_until(lambda: stage.shown() == 100.0)
     stage.faps.send(EndOfFaps(session="film", epoch=1))
     stage.step_until(lambda: bool(stage.errors))
-    assert stage.errors[0].code == "no-video"
+    assert stage.errors[0].detail.startswith("no-video: ")

@@ -15,7 +15,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.follower import PollingLoop, SessionFollower
 from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
+from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.message import Message
 from tests.raw_bytes import answer_handshake
 
@@ -257,26 +257,6 @@ def test_a_frame_that_is_made_again_in_a_new_epoch_is_taken_once(studio: Studio)
         studio.faps.send(each)
     studio.step_until(lambda: frames[-1] in studio.received)
     assert studio.received == [frames[0], frames[1], frames[3]]
-
-
-def test_shapes_share_the_number_of_their_frame_and_are_taken_once_of_each_set() -> None:
-    studio = Studio(FapFrame, Shapes)
-    studio.start(1)
-    studio.complete()
-    studio.start(1)  # everything comes both ways for a while
-    studio.complete()
-    sent: list[Message] = []
-    for sequence, epoch, media_time in ((1, 1, 0), (2, 1, 320), (2, 2, 320), (3, 2, 640)):
-        of_frame = dataclasses.replace(frame(sequence, epoch), media_time=media_time)
-        fields = {"session": "one", "epoch": epoch, "sequence": sequence, "media_time": media_time}
-        shapes = [Shapes(**fields, set=name, weights=b"") for name in ("arkit", "vrm")]  # type: ignore[arg-type]
-        sent += [of_frame, *shapes]
-    for message in sent:
-        studio.faps.send(message)
-    studio.step_until(lambda: sent[-1] in studio.received)
-    assert studio.received == sent[:6] + sent[9:]
-    studio.follower.close()
-    studio.bus.close()
 
 
 def test_a_publisher_may_tell_of_a_restart_before_control_does(studio: Studio) -> None:

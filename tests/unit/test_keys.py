@@ -26,7 +26,7 @@ from kouxing.shared.keys import (
     user_key,
 )
 from kouxing.shared.wire.codec import decode, encode
-from kouxing.shared.wire.control import AllowedKey, AllowedKeys
+from kouxing.shared.wire.control import AllowedKey, HeartbeatReply
 from kouxing.shared.wire.message import MAX_MESSAGE_BYTES
 
 pytestmark = pytest.mark.unit
@@ -193,11 +193,15 @@ def test_more_keys_than_services_can_be_told_are_refused_and_may_be_revoked(
     allowed = key_folder() / "allowed"
     with allowed.open("a", encoding="ascii") as file:
         file.writelines(lines[:number])
-    told = AllowedKeys(
+    told = HeartbeatReply(
+        sent_ns=0,
+        received_ns=0,
+        replied_ns=0,
+        control="control-1",
         keys={
             public: AllowedKey(name=guest.name, roles=list(guest.roles))
             for public, guest in read_guests().items()
-        }
+        },
     )
     assert decode(encode(told)) == told
     assert sum(map(len, encode(told))) < MAX_MESSAGE_BYTES

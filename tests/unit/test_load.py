@@ -16,14 +16,20 @@ from kouxing.evaluation.system.load import Load, Step, step_sizes
 from kouxing.evaluation.system.speakers import Spoken, voiced
 from kouxing.shared.client import Session
 from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.session import SessionOpened
+from kouxing.shared.wire.session import SessionFacts, SessionOpened
 
 pytestmark = pytest.mark.unit
 
 
 class _Session:
     opened = SessionOpened(
-        request="1", token="t", audio="a", phones="p", faps="f", events="e", frame_rate_hz=50.0
+        request="1",
+        token="t",
+        audio="a",
+        phones="p",
+        faps="f",
+        events="e",
+        facts=SessionFacts(frame_rate_hz=50.0),
     )
 
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
-from kouxing.services.recognizer.audio_order import AudioMessage
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
 from kouxing.services.recognizer.mouth_profile import MouthProfile
@@ -27,10 +26,11 @@ from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.phones.events import LipFrame
 from kouxing.shared.reliable import ReliableSender
-from kouxing.shared.wire.audio import AudioChunk, EndOfAudio
+from kouxing.shared.wire.audio import AudioChunk
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
-from kouxing.shared.wire.speech import Stalled
+from kouxing.shared.wire.session import SessionFacts
+from kouxing.shared.wire.speech import AudioState, Progress
 from tests.e2e.following import samples_of_file
 from tests.system import VOWELS_FILE, free_port
 
@@ -54,7 +54,7 @@ class Watched(RecognizerService):
     def warn(self, reason: str, text: str, session: str = "") -> None:
         self.warnings_given.append((reason, text))
 
-    def take(self, message: AudioMessage) -> None:
+    def take(self, message: AudioChunk) -> None:
         """Take a message of a client."""
         socket = self._sessions[message.session].socket
         self._on_audio(socket, message, Peer())
@@ -77,7 +77,7 @@ def service() -> Iterator[Watched]:
     made.bus.close()
 
 
-def start_of(voice: bytes = b"") -> StartSession:
+def start_of(mouth_profile: bytes | None = None) -> StartSession:
     return StartSession(
         session="s",
         epoch=1,
@@ -88,9 +88,9 @@ def start_of(voice: bytes = b"") -> StartSession:
         num_channels=1,
         record=False,
         paced=False,
-        language="mandarin",
+        facts=SessionFacts(language="mandarin", delay_ms=0.0),
         endpoints={"phone_input": f"tcp://127.0.0.1:{free_port()}"},
-        voice=voice,
+        mouth_profile=mouth_profile,
     )
 
 
@@ -171,7 +171,7 @@ def test_the_end_is_acknowledged_when_all_before_it_is_processed(service: Watche
     service.start_session(start_of())
     session = service._sessions["s"]
     service.take(AudioChunk(session="s", token="t", sequence=1, pcm=bytes(2 * RATE_HZ)))
-    service.take(EndOfAudio(session="s", token="t", sequence=2, acknowledge=True))
+    service.take(AudioChunk(session="s", token="t", sequence=2, last=True, acknowledge=True))
     assert (session.num_taken, session.finished) == (1, False)
     service.work_off()
     assert (session.num_taken, session.finished) == (2, True)
@@ -252,7 +252,7 @@ def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:
 
 
 @pytest.mark.parametrize(
-    "voice",
+    "profile",
     [
         b"not a profile",
         MouthProfile(
@@ -263,13 +263,13 @@ def test_a_session_taken_over_keeps_to_its_media_time(service: Watched) -> None:
     ],
 )
 def test_a_mouth_profile_that_does_not_fit_is_refused_once_and_the_session_goes_on(
-    service: Watched, voice: bytes
+    service: Watched, profile: bytes
 ) -> None:
-    service.start_session(start_of(voice))
+    service.start_session(start_of(profile))
     for sequence in (1, 2):
         service.take(AudioChunk(session="s", token="t", sequence=sequence, pcm=bytes(3200)))
     service.work_off()
-    assert [reason for reason, _ in service.warnings_given] == ["bad-voice"]
+    assert [reason for reason, _ in service.warnings_given] == ["bad-mouth-profile"]
     assert "the mouth profile is not used" in service.warnings_given[0][1]
     assert service.media_times[-1] == pytest.approx(6400, abs=640)
 
@@ -347,7 +347,7 @@ def test_a_face_is_told_of_a_silent_client_once_and_again_when_it_is_another_or_
         for _ in range(num_ticks):
             now_s += 0.01
             service.on_tick(now_s)
-        return sum(isinstance(each, Stalled) for each in told)
+        return sum(isinstance(m, Progress) and m.state == AudioState.STALLED for m in told)
 
     start = replace(start_of(), paced=True)
     service.start_session(start)

@@ -11,7 +11,7 @@ from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.keys import Peer
 from kouxing.shared.reliable import RESEND_AFTER_S, ReliableReceiver, ReliableSender
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, Progress
+from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, Progress
 
 pytestmark = pytest.mark.unit
 
@@ -36,7 +36,7 @@ class Link:
         self.receiver.tick()
         while self.dealer.wait(0.2):
             for received in self.dealer.receive():
-                assert isinstance(received.message, Acknowledge)
+                assert isinstance(received.message, AcknowledgePhones)
                 self.sender.acknowledge(received.message.sequence, now_s)
 
 
@@ -102,7 +102,8 @@ def test_a_greater_epoch_starts_anew_and_an_older_one_is_ignored(link: Link) -> 
 
 
 def test_what_the_receiver_adds_goes_with_every_acknowledgement(link: Link) -> None:
-    told = Acknowledge(media_time=320, frame=2, faps=bytes(272))
+    frame = NewestFrame(sequence=2, media_time=320, values=bytes(272))
+    told = AcknowledgePhones(newest_frame=frame)
     receiver = ReliableReceiver(link.router, "s", lambda: told)
     receiver.acknowledge()  # to nobody yet
     send(link, 1)

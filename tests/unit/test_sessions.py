@@ -8,15 +8,19 @@ import pytest
 
 from kouxing.services.control.registry import UNPACED_AUDIO, Refusal, Registry
 from kouxing.services.control.sessions import SessionRecord, Sessions
-from kouxing.shared.face.shapes import ARKIT, VRM
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import Heartbeat, SessionInput
-from kouxing.shared.wire.session import OpenSession
+from kouxing.shared.wire.face import FaceSettings
+from kouxing.shared.wire.session import OpenSession, SessionFacts
 
 pytestmark = pytest.mark.unit
 
 PEER = Peer(b"somebody")
 PROVIDES = {"recognizer": ("audio", "phones"), "synthesizer": ("phone_input", "faps")}
+FACTS = {
+    "recognizer": SessionFacts(language="mandarin"),
+    "synthesizer": SessionFacts(frame_rate_hz=50.0, delay_ms=100.0, lips="dynamic-visemes"),
+}
 NEEDS = {"recognizer": ["phone_input"], "synthesizer": []}
 
 
@@ -29,10 +33,7 @@ def worker(service: str, instance: str, state: str = "ready") -> Heartbeat:
         sent_ns=0,
         endpoints={name: f"tcp://{instance}:{name}" for name in PROVIDES[service]},
         needs=NEEDS[service],
-        language="mandarin" if service == "recognizer" else "",
-        frame_rate_hz=50.0 if service == "synthesizer" else 0.0,
-        delay_ms=100.0 if service == "synthesizer" else 0.0,
-        lips="dynamic-visemes" if service == "synthesizer" else "",
+        facts=FACTS[service],
     )
 
 
@@ -85,38 +86,30 @@ def test_the_services_are_told_the_delay_of_the_face_and_its_lips(
 ) -> None:
     record = made.open()
     start = made.sessions.start_message(record, 0.0)
-    assert (start.delay_ms, start.lips) == (100.0, "dynamic-visemes")
-    record.lips = "learnt"
+    assert (start.facts.delay_ms, start.face.lips) == (100.0, "dynamic-visemes")
+    record.face.change(FaceSettings(lips="learnt"), 0.0)
     made.lose("synthesizer-1")
-    made.add(dataclasses.replace(worker("synthesizer", "synthesizer-2"), delay_ms=40.0))
+    facts = SessionFacts(delay_ms=40.0)
+    made.add(dataclasses.replace(worker("synthesizer", "synthesizer-2"), facts=facts))
     assert made.sessions.replace(record, 1.0)
     start = made.sessions.start_message(record, 0.0)
-    assert (start.delay_ms, start.lips) == (40.0, "learnt")
+    assert (start.facts.delay_ms, start.face.lips) == (40.0, "learnt")
 
 
 def test_the_services_are_told_the_voice_of_the_speaker(made: Made) -> None:
-    opening = OpenSession(request="r", voice=b"a voice")
+    opening = OpenSession(request="r", mouth_profile=b"a profile")
     record = made.sessions.open(opening, Peer(b"client"), 0.0)
-    assert made.sessions.start_message(record, 0.0).voice == b"a voice"
+    assert made.sessions.start_message(record, 0.0).mouth_profile == b"a profile"
 
 
 def test_what_was_chosen_for_the_face_is_told_to_those_that_take_it_over(made: Made) -> None:
     record = made.open()
-    record.expressiveness = 1.8
-    record.expressions, record.expressions_end_s = {"joy": 0.5}, 10.0
-    record.shapes = ["vrm"]
-    start = made.sessions.start_message(record, 4.0)
-    assert (start.expressiveness, start.expressions, start.hold_s) == (1.8, {"joy": 0.5}, 6.0)
-    assert start.shapes == ["vrm"]
-    later = made.sessions.start_message(record, 11.0)
-    assert (later.expressions, later.hold_s) == ({}, 0.0)
-
-
-def test_the_client_is_told_the_names_of_the_shapes_it_asked_for(made: Made) -> None:
-    opening = OpenSession(request="r", shapes=["vrm", "arkit", "vrm"])
-    record = made.sessions.open(opening, Peer(b"client"), 0.0)
-    opened = made.sessions.opened_message(record, "tcp://control:events")
-    assert opened.shapes == {"vrm": [*VRM.names], "arkit": [*ARKIT.names]}
+    record.face.change(FaceSettings(expressions={"joy": 0.5}, hold_s=10.0), 0.0)
+    record.face.change(FaceSettings(expressiveness=1.8, shapes=["vrm"]), 2.0)
+    face = made.sessions.start_message(record, 4.0).face
+    assert (face.expressiveness, face.expressions, face.hold_s) == (1.8, {"joy": 0.5}, 6.0)
+    assert face.shapes == ["vrm"]
+    assert made.sessions.start_message(record, 11.0).face.expressions is None
 
 
 def test_the_services_know_the_client_for_a_control_that_starts_again(made: Made) -> None:
@@ -132,10 +125,10 @@ def test_the_client_and_the_services_are_told_the_endpoints(made: Made) -> None:
     assert opened.audio == "tcp://recognizer-1:audio"
     assert opened.phones == "tcp://recognizer-1:phones"
     assert opened.faps == "tcp://synthesizer-1:faps"
-    assert (opened.language, opened.frame_rate_hz) == ("mandarin", 50.0)
+    assert (opened.facts.language, opened.facts.frame_rate_hz) == ("mandarin", 50.0)
     start = made.sessions.start_message(record, 0.0)
     assert start.endpoints["phone_input"] == "tcp://synthesizer-1:phone_input"
-    assert start.language == "mandarin"
+    assert start.facts == opened.facts
 
 
 def test_names_and_tokens_differ(made: Made) -> None:
@@ -301,7 +294,11 @@ def test_a_new_recognizer_that_has_no_audio_yet_does_not_set_the_session_back(ma
 def test_a_session_moves_to_no_recognizer_of_another_language(made: Made) -> None:
     record = made.open()
     made.lose("recognizer-1")
-    made.add(dataclasses.replace(worker("recognizer", "elsewhere"), language="english"))
+    made.add(
+        dataclasses.replace(
+            worker("recognizer", "elsewhere"), facts=SessionFacts(language="english")
+        )
+    )
     assert not made.sessions.replace(record, 1.0)
 
 
@@ -312,7 +309,7 @@ def test_audio_goes_on_where_it_was_when_only_the_synthesizer_is_lost(made: Made
     made.add(worker("synthesizer", "synthesizer-2"))
     assert made.sessions.replace(record, 1.0)
     moved = made.sessions.moved_message(record)
-    assert (moved.epoch, moved.next_sequence) == (2, 0)
+    assert (moved.epoch, moved.next_sequence) == (2, None)
     assert moved.faps == "tcp://synthesizer-2:faps"
 
 

@@ -11,7 +11,7 @@ from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import NUM_FAPS
 from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Acknowledge, Progress, ResumeFace, Speech
+from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, Progress, ResumeFace, Speech
 
 pytestmark = pytest.mark.unit
 FAPS = bytes(range(4)) * NUM_FAPS
@@ -35,10 +35,10 @@ class Stage:
             self.link.send(message, 0.0)
 
     def acknowledge(self, sequence: int, frame: int = 0, epoch: int = 1) -> list[Message]:
-        faps = FAPS if frame else b""
+        newest = NewestFrame(sequence=frame, media_time=320 * frame, values=FAPS)
         return self.link.acknowledge(
-            Acknowledge(
-                epoch=epoch, sequence=sequence, media_time=320 * frame, frame=frame, faps=faps
+            AcknowledgePhones(
+                epoch=epoch, sequence=sequence, newest_frame=newest if frame else None
             ),
             0.0,
         )
@@ -69,7 +69,7 @@ def test_a_new_synthesizer_is_told_what_was_shown_and_the_last_messages(stage: S
     resume, speech, *rest = taken(stage.inputs[1], 7)
     assert (type(resume), type(speech)) == (ResumeFace, Speech)
     assert isinstance(resume, ResumeFace)
-    assert (resume.frame, resume.media_time, resume.faps) == (40, 12_800, FAPS)
+    assert resume.newest_frame == NewestFrame(sequence=40, media_time=12_800, values=FAPS)
     times = [each.media_time for each in rest]
     assert times == [to_samples(number) for number in range(3, 8)]
     assert times[-2] - times[0] == KEPT, "of those acknowledged the last 3 s, and the others"

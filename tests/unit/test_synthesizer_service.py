@@ -13,8 +13,8 @@ from kouxing.services.synthesizer.service import MAX_AT_ONCE_S, MAX_WAITING, Syn
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
-from kouxing.shared.wire.face import EndOfFaps, FapFrame, Shapes
-from kouxing.shared.wire.speech import EndOfPhones, Progress
+from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame
+from kouxing.shared.wire.speech import AudioState, Progress
 from tests.samples import SAMPLES
 from tests.system import free_port
 
@@ -30,13 +30,13 @@ class Watched(SynthesizerService):
     """A synthesizer without control that keeps what it publishes."""
 
     def __init__(self) -> None:
-        self.sent: list[FapFrame | Shapes | EndOfFaps] = []
+        self.sent: list[FapFrame | EndOfFaps] = []
         control = f"tcp://127.0.0.1:{free_port()}"
         super().__init__(
             SynthesizerConfig(phone_input=LOCAL, faps=LOCAL, control=control, insecure=True)
         )
 
-    def _send(self, _session: object, message: FapFrame | Shapes | EndOfFaps) -> None:
+    def _send(self, _session: object, message: FapFrame | EndOfFaps) -> None:
         self.sent.append(message)
 
     def take(self, session: str, sequence: int, time_s: float) -> None:
@@ -61,7 +61,7 @@ class Watched(SynthesizerService):
 def service() -> Iterator[Watched]:
     service = Watched()
     for name in ("gap", "other"):
-        service.start_session(replace(START, session=name, shapes=[]))
+        service.start_session(replace(START, session=name, face=FaceSettings()))
     yield service
     service.bus.close()
 
@@ -69,10 +69,11 @@ def service() -> Iterator[Watched]:
 def test_frames_of_a_gap_do_not_hold_others_up(service: Watched) -> None:
     service.take("gap", 1, 9.9)
     assert len(service.frames("gap")) == round(MAX_AT_ONCE_S * RATE_HZ)
-    service.take("other", 1, 0.02 + service.delay_ms / 1e3)
+    service.take("other", 1, 0.02 + SynthesizerConfig().delay_ms / 1e3)
     assert len(service.frames("other")) == 2
     service.take("gap", 2, 9.92)
-    service._on_input(EndOfPhones(session="gap", epoch=1, sequence=3, media_time=158_720), Peer())
+    end = Progress(session="gap", epoch=1, sequence=3, media_time=158_720, state=AudioState.ENDED)
+    service._on_input(end, Peer())
     num_ticks = 0
     while not any(isinstance(each, EndOfFaps) for each in service.sent):
         before = len(service.frames("gap"))
@@ -98,7 +99,7 @@ def test_two_with_gaps_take_turns_and_show_what_others_would(service: Watched) -
         np.array([np.frombuffer(each.values, "<f4") for each in service.frames(name)])
         for name in ("gap", "other")
     )
-    assert len(gap) == 1 + round((3.0 - service.delay_ms / 1e3) * RATE_HZ)
+    assert len(gap) == 1 + round((3.0 - SynthesizerConfig().delay_ms / 1e3) * RATE_HZ)
     assert np.array_equal(gap, other)
 
 
@@ -111,6 +112,6 @@ def test_what_comes_too_early_is_left_to_be_sent_again(service: Watched) -> None
     assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_WAITING * 0.02 + 0.02)
     service.take("gap", MAX_WAITING + 1, 5.0 + (MAX_WAITING + 1) * 0.02)
     assert service.frames("gap")[-1].media_time == to_samples(
-        5.0 + (MAX_WAITING + 1) * 0.02 - service.delay_ms / 1e3
+        5.0 + (MAX_WAITING + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
     )
     assert not service._sessions["gap"].waiting

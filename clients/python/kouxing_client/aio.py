@@ -13,7 +13,6 @@ from kouxing_client.base import (
     BaseResults,
     BaseSession,
     FaceSettings,
-    face_requests,
     open_fields,
 )
 from kouxing_client.errors import Refused
@@ -92,8 +91,7 @@ class AsyncClient(BaseClient):
 
     async def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
         """Change the face of any session, as ``Client.set_face``."""
-        for kind, fields in face_requests("", settings):
-            await self.request(kind, session, **fields)
+        await self.request("set-face", session, face=settings)
 
     async def request(self, kind: str, session: str = "", **fields: object) -> Fields:
         """Send any request, as ``Client.request``."""
@@ -131,8 +129,7 @@ class AsyncSession(BaseSession):
 
     async def set_face(self, **settings: Unpack[FaceSettings]) -> None:
         """Change the face, as ``Client.set_face``."""
-        for kind, fields in face_requests(self._core.token, settings):
-            await asyncio.wrap_future(self._request(kind, fields))
+        await asyncio.wrap_future(self._request("set-face", {"face": settings}))
 
     async def close(self) -> None:
         """Close the session, as ``Session.close``."""

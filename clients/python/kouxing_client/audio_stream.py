@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from kouxing_client.messages import MEDIA_RATE_HZ, Fields
 
-END_OF_AUDIO = "end-of-audio"
 RESEND_S = 10.0  # acknowledged audio that is kept in case another recognizer needs it
 MAX_KEPT = 5000  # messages
 ANSWER_S = (0.6, 10.0)  # shortest and longest wait for an acknowledgement before reconnecting
@@ -16,13 +14,6 @@ UNPACED_ANSWER_S = 5.0  # shortest wait if audio arrives faster than real time a
 NEAREST_MS = 50  # shortest limit for making a connection
 QUICK_ANSWER_S = 2.5  # up to this wait, the round trip measured before limits a new connection
 MAX_TIMED = 200  # messages whose send time is remembered
-
-
-class AudioMessage(NamedTuple):
-    """A chunk, or the end of the audio."""
-
-    kind: str
-    fields: Fields
 
 
 class AudioStream:
@@ -50,7 +41,7 @@ class AudioStream:
         self.round_trip_ms: int | None = None
         self._sample_rate_hz = sample_rate_hz
         self._num_frames = 0  # of all chunks
-        self._kept: deque[AudioMessage] = deque(maxlen=MAX_KEPT)
+        self._kept: deque[Fields] = deque(maxlen=MAX_KEPT)
         self._next = 1  # number of the next message for the socket
         self._sent_s: deque[tuple[int, float]] = deque(maxlen=MAX_TIMED)  # sequence and time
         self._progress_s = 0.0  # time of the last acknowledgement, or of the first open message
@@ -71,18 +62,18 @@ class AudioStream:
             return default
         return min(self.round_trip_ms, default)
 
-    def add(self, kind: str, fields: Fields, num_frames: int, now_s: float) -> None:
-        """Add a chunk of ``num_frames`` samples per channel, or the end of the audio."""
+    def add(self, fields: Fields, num_frames: int, now_s: float) -> None:
+        """Add a chunk of ``num_frames`` samples per channel."""
         if self.acknowledged == self.sequence:
             self._progress_s = now_s
         self.sequence += 1
         numbered = {**fields, "sequence": self.sequence, "media_time": self.media_time}
-        self._kept.append(AudioMessage(kind, {**numbered, "acknowledge": True}))
+        self._kept.append({**numbered, "acknowledge": True})
         self._sent_s.append((self.sequence, now_s))
         self._num_frames += num_frames
         oldest = self.media_time - RESEND_S * MEDIA_RATE_HZ
-        while self._kept[0].fields["sequence"] <= self.acknowledged:
-            if self._kept[0].fields["media_time"] >= oldest:
+        while self._kept[0]["sequence"] <= self.acknowledged:
+            if self._kept[0]["media_time"] >= oldest:
                 break
             self._kept.popleft()
 
@@ -90,10 +81,10 @@ class AudioStream:
         """Advance media time without audio."""
         self._num_frames += num_frames
 
-    def unsent(self) -> Iterator[AudioMessage]:
+    def unsent(self) -> Iterator[Fields]:
         """Yield messages for the socket; requesting the next one marks the last one as sent."""
         while self._kept and self._next <= self.sequence:
-            first = self._kept[0].fields["sequence"]
+            first = self._kept[0]["sequence"]
             self._next = max(self._next, first)
             yield self._kept[self._next - first]
             self._next += 1
@@ -132,5 +123,5 @@ class AudioStream:
     def flush(self) -> None:
         """Forget all audio: none of it is sent, or sent again."""
         self._kept = deque(
-            (message for message in self._kept if message.kind == END_OF_AUDIO), maxlen=MAX_KEPT
+            (message for message in self._kept if "last" in message), maxlen=MAX_KEPT
         )

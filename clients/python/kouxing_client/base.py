@@ -8,7 +8,6 @@ from concurrent.futures import Future
 from typing import Any, TypedDict
 
 from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
-from kouxing_client.audio_stream import END_OF_AUDIO
 from kouxing_client.core import new_future
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.keys import Key, find_key
@@ -165,7 +164,7 @@ class BaseSession:
     def _add(self, pcm: bytes, num_frames: int) -> None:
         self._check_open()
         self._num_added += 1
-        self._thread.call(lambda: self._core.add_audio("audio-chunk", num_frames, {"pcm": pcm}))
+        self._thread.call(lambda: self._core.add_audio(num_frames, {"pcm": pcm}))
 
     def _finish(self) -> None:
         self._num_frames(b"")
@@ -173,7 +172,7 @@ class BaseSession:
         if not self._has_finished:
             self._has_finished = True
             self._num_added += 1
-            self._thread.call(lambda: self._core.add_audio(END_OF_AUDIO, 0, {}))
+            self._thread.call(lambda: self._core.add_audio(0, {"last": True}))
 
     def _request(self, kind: str, fields: Fields) -> Future[Fields]:
         return self._thread.submit(lambda: self._thread.core.request(kind, self.name, **fields))
@@ -220,9 +219,9 @@ class BaseSession:
 
     def _add_shapes(self, name: str) -> Future[Fields] | None:
         """Request a set of blend shapes, unless the session has it already."""
-        if not name or name in self._core.endpoints.get("shapes", {}):
+        if not name or name in (self._options or {}).get("face", {}).get("shapes", ()):
             return None
-        return self._request("add-shapes", {"shapes": [name]})
+        return self._request("set-face", {"face": {"shapes": [name]}})
 
     def _read_events(self) -> Inbox:
         inbox = Inbox(self._thread.make_signal(), MAX_EVENTS)
@@ -293,7 +292,7 @@ def open_fields(
     num_channels: int,
     encoding: str,
     shapes: Sequence[str],
-    options: Mapping[str, object],
+    options: Mapping[str, Any],
 ) -> Fields:
     """Return the fields of ``open-session``."""
     if encoding not in SAMPLE_BYTES:
@@ -303,19 +302,6 @@ def open_fields(
         "sample_rate_hz": sample_rate_hz,
         "num_channels": num_channels,
         "encoding": encoding,
-        **({"shapes": list(shapes)} if shapes else {}),
         **options,
+        **({"face": {**options.get("face", {}), "shapes": list(shapes)}} if shapes else {}),
     }
-
-
-def face_requests(token: str, settings: FaceSettings) -> Iterator[tuple[str, Fields]]:
-    """Yield the requests that change a face."""
-    if "lips" in settings:
-        yield "choose-lips", {"lips": settings["lips"], "token": token}
-    if "expressions" in settings:
-        hold = {"hold_s": settings["hold_s"]} if "hold_s" in settings else {}
-        yield "express", {"expressions": dict(settings["expressions"]), **hold}
-    if "expressiveness" in settings:
-        yield "choose-expressiveness", {"expressiveness": settings["expressiveness"]}
-    if "shapes" in settings:
-        yield "add-shapes", {"shapes": list(settings["shapes"])}

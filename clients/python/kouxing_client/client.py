@@ -13,7 +13,6 @@ from kouxing_client.base import (
     BaseResults,
     BaseSession,
     FaceSettings,
-    face_requests,
     open_fields,
 )
 from kouxing_client.errors import KouxingError, Refused
@@ -131,8 +130,7 @@ class Client(BaseClient):
         KouxingError
             If control does not answer.
         """
-        for kind, fields in face_requests("", settings):
-            self.request(kind, session, **fields)
+        self.request("set-face", session, face=settings)
 
     def request(self, kind: str, session: str = "", **fields: object) -> Fields:
         """Send any request of PROTOCOL.md; return the fields of the answer.
@@ -197,8 +195,7 @@ class Session(BaseSession):
 
     def set_face(self, **settings: Unpack[FaceSettings]) -> None:
         """Change the face, as ``Client.set_face``."""
-        for kind, fields in face_requests(self._core.token, settings):
-            self._request(kind, fields).result()
+        self._request("set-face", {"face": settings}).result()
 
     def close(self) -> None:
         """Close the session if this program opened it, and all its connections."""

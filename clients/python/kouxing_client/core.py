@@ -278,7 +278,7 @@ def newest_session(status: Status) -> Fields:
         "events": endpoints.get("events", ""),
         "session": newest.session,
         "epoch": 0,
-        "language": newest.language,
+        "facts": msgspec.to_builtins(newest.facts),
     }
 
 

@@ -16,10 +16,8 @@ MAX_OLD = 8  # how many of these live frames are kept
 END = "end-of-faps"
 _PUBLISHER_OF = {  # name of the endpoint by kind of message; all other kinds are at "phones"
     "fap-frame": "faps",
-    "shapes": "faps",
     END: "faps",
 }
-_FRAMES = ("fap-frame", "shapes")
 _Number = tuple[int, int]  # epoch and sequence, or media time and sequence
 _NONE = (-1, -1)
 
@@ -132,11 +130,10 @@ class Follower:
         self._confirmed: set[str] = set()  # publishers
         self._first_epoch = 0
         self._epochs: dict[str, int] = {}  # of the newest message, by publisher
-        # Numbers of the newest message by stream: a publisher, or a set of shapes.
-        self._newest: dict[str, _Number] = {}
+        self._newest: dict[str, _Number] = {}  # numbers of the newest message, by publisher
         self._newest_before: dict[str, _Number] = {}  # when it subscribed again
         self._seen: set[tuple[str, _Number]] = set()  # since then
-        self._last_frames: dict[str, _Number] = {}  # media time and sequence
+        self._last_frame = _NONE  # media time and sequence
         self._last_sequence: int | None = None
         self._held_frames: deque[Any] = deque(maxlen=MAX_OLD)
 
@@ -228,7 +225,7 @@ class Follower:
         self.received_at_s = self._transport.now_s
         if message.kind == "joined":
             self._on_joined(message.publisher, confirmed)
-        elif self._live and message.kind in _FRAMES and self._is_catching_up():
+        elif self._live and message.kind == "fap-frame" and self._is_catching_up():
             self._held_frames.append(message)
         else:
             self._release_held()
@@ -274,18 +271,17 @@ class Follower:
     def _is_repeated(self, message: Any, publisher: str) -> bool:
         """Return whether the message arrived before, on the other connection or in an epoch."""
         number = (message.epoch, message.sequence)
-        stream = f"{message.kind} {message.set}" if message.kind == "shapes" else publisher
-        if number <= self._newest_before.get(stream, _NONE) or (stream, number) in self._seen:
+        if number <= self._newest_before.get(publisher, _NONE) or (publisher, number) in self._seen:
             return True
         if self._old_connection is not None:
-            self._seen.add((stream, number))
+            self._seen.add((publisher, number))
         self._epochs[publisher] = message.epoch
-        self._newest[stream] = max(number, self._newest.get(stream, number))
-        if message.kind in _FRAMES:
+        self._newest[publisher] = max(number, self._newest.get(publisher, number))
+        if message.kind == "fap-frame":
             place = (message.media_time, message.sequence)
-            if place <= self._last_frames.get(stream, _NONE):
+            if place <= self._last_frame:
                 return True
-            self._last_frames[stream] = place
+            self._last_frame = place
         return False
 
     def _enter_epoch(self, epoch: int) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 else:
     Floats = array  # what msgspec can evaluate
 
-VERSION = 2
+VERSION = 3
 MEDIA_RATE_HZ = 16000
 NUM_FAPS = 68
 Fields = dict[str, Any]
@@ -73,6 +73,8 @@ class FapFrame(Result, frozen=True, kw_only=True):
 
     values: Floats
     """68 values in FAP units, FAP 1 first"""
+    shapes: dict[str, Floats] = {}
+    """the same face as weights of each requested set of blend shapes, by name of the set"""
 
     def __post_init__(self) -> None:
         if len(self.values) != NUM_FAPS:
@@ -80,9 +82,7 @@ class FapFrame(Result, frozen=True, kw_only=True):
 
 
 class Shapes(Result, frozen=True, kw_only=True):
-    """The face at ``media_time`` as weights of blend shapes."""
-
-    kind: ClassVar[str] = "shapes"
+    """The face at ``media_time`` as weights of blend shapes, from a ``FapFrame``."""
 
     set: str
     """``arkit``, ``oculus`` or ``vrm``"""
@@ -168,6 +168,19 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     metrics: dict[str, float]
 
 
+class SessionFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """What the workers of a session state about their results."""
+
+    language: str | None = None
+    """language of the phones"""
+    frame_rate_hz: float | None = None
+    """FAP frames per second of media time"""
+    delay_ms: float | None = None
+    """from audio to its FAP frame"""
+    lips: str | None = None
+    """lip model of a face whose settings name none"""
+
+
 class SessionState(msgspec.Struct, frozen=True, kw_only=True):
     """One session, as control knows it."""
 
@@ -180,8 +193,7 @@ class SessionState(msgspec.Struct, frozen=True, kw_only=True):
     """addresses of its recognizer and synthesizer: ``audio``, ``phones``, ``faps``, ..."""
     workers: dict[str, str]
     """instance at each endpoint"""
-    language: str = ""
-    """language of the phones"""
+    facts: SessionFacts
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any, Protocol
 from kouxing_client.audio_stream import AudioStream
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.follower import Follower
-from kouxing_client.messages import EndOfFaps, Fields, Result, Shapes, decode, encode
+from kouxing_client.messages import (
+    EndOfFaps,
+    FapFrame,
+    Fields,
+    Message,
+    Result,
+    Shapes,
+    decode,
+    encode,
+)
 
 if TYPE_CHECKING:
     from kouxing_client.sockets import Connection, Sockets
@@ -90,10 +99,11 @@ class Subscription:
         self._shape_set = shape_set
         self._on_joined: Callable[[KouxingError | None], None] | None = on_joined
         self._on_result = on_result or inbox.add
+        self._classes = classes
         self.follower = Follower(
             session.sockets,
             session.name,
-            (*classes, EndOfFaps),
+            {EndOfFaps, *(FapFrame if cls is Shapes else cls for cls in classes)},
             self._on_message,
             live=session.is_live,
             on_complete=lambda: self._join(None),
@@ -118,8 +128,13 @@ class Subscription:
     def _on_message(self, message: Any) -> None:
         if isinstance(message, EndOfFaps):
             self.inbox.end(None)
-        elif not isinstance(message, Shapes) or message.set == self._shape_set:
+        elif type(message) in self._classes:
             self._on_result(message)
+        if Shapes in self._classes and isinstance(message, FapFrame):
+            weights = message.shapes.get(self._shape_set)
+            if weights is not None:
+                place = {name: getattr(message, name) for name in Message.__struct_fields__}
+                self._on_result(Shapes(**place, set=self._shape_set, weights=weights))
 
 
 class SessionCore:
@@ -171,11 +186,11 @@ class SessionCore:
                 self.endpoints["audio"], self._on_answer, queue=AUDIO_QUEUE
             )
 
-    def add_audio(self, kind: str, num_frames: int, fields: Fields) -> None:
-        """Send a chunk of ``num_frames`` samples per channel, or the end of the audio."""
+    def add_audio(self, num_frames: int, fields: Fields) -> None:
+        """Send a chunk of ``num_frames`` samples per channel."""
         if self.stream is not None and not self.is_over:
             fields = {"token": self.token, **fields}
-            self.stream.add(kind, fields, num_frames, self.sockets.now_s)
+            self.stream.add(fields, num_frames, self.sockets.now_s)
             self.send_audio()
 
     def send_audio(self) -> None:
@@ -184,7 +199,7 @@ class SessionCore:
         if self.stream is None or self._audio is None or self._is_rejoining():
             return
         for message in self.stream.unsent():
-            parts = encode(message.kind, self.name, {**message.fields, "epoch": self.epoch})
+            parts = encode("audio-chunk", self.name, {**message, "epoch": self.epoch})
             if not self.sockets.send(self._audio, parts):
                 self.is_blocked = True
                 return
@@ -279,7 +294,7 @@ class SessionCore:
         if (message := decode(parts)) is None or self.stream is None:
             return
         kind, fields = message
-        if kind == "acknowledge":
+        if kind == "acknowledge-audio":
             self.stream.acknowledge(fields["sequence"], self.sockets.now_s)
         elif kind == "error":
             error = refused(fields)
@@ -293,5 +308,5 @@ class SessionCore:
 def refused(fields: Fields) -> Refused:
     """Convert an ``error`` message."""
     return Refused(
-        str(fields.get("code")), str(fields.get("text")), float(fields.get("retry_after_s", 0.0))
+        str(fields.get("code")), str(fields.get("text")), fields.get("retry_after_s") or 0.0
     )
