@@ -72,9 +72,7 @@ def network_of(gain: np.ndarray) -> LipNetwork:
     return network
 
 
-def test_labels_are_of_the_moment_of_the_mouth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_labels_have_the_time_of_the_mouth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = load_model()
     assert isinstance(model, NeuralModel)
@@ -107,7 +105,7 @@ def test_labels_are_of_the_moment_of_the_mouth(
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_the_teacher_learns_lips_from_the_whole_recording() -> None:
+def test_learns_lips_from_the_whole_recording() -> None:
     rng = np.random.default_rng(0)
     speech, examples = [], []
     for number in range(12):
@@ -128,7 +126,7 @@ def test_the_teacher_learns_lips_from_the_whole_recording() -> None:
     assert np.corrcoef(made, wanted)[0, 1] > 0.8
 
 
-def test_recordings_are_drawn_from_each_folder_up_to_an_hour(
+def test_draws_up_to_an_hour_from_each_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(teacher, "_MAX_FOLDER_S", 3.5)
@@ -143,7 +141,7 @@ def test_recordings_are_drawn_from_each_folder_up_to_an_hour(
     assert drawn != draw_recordings([tmp_path / "one", tmp_path / "other"], 1)
 
 
-def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
+def test_names_an_unreadable_recording(tmp_path: Path) -> None:
     (tmp_path / "noise.wav").write_bytes(b"no sound")
     with pytest.raises(UserError, match=r"noise\.wav.*remove it"):
         draw_recordings([tmp_path], 0)

@@ -1,10 +1,7 @@
-"""What the acoustic network computes at every position of a recording, as in the product.
+"""The acoustic network's values at every position of a recording, as in the product.
 
-Augmented copies of a clip have other speeds, rooms, noises, lines and levels; their lips move at
-the same speed.
-
-Positions are kept in the cache folder, 16 bits a number: 2.4 KB for each 20 ms of speech, 0.4 GB
-for an hour.
+Augmented copies of a clip have other speeds, rooms, noises, lines and levels. The lips move at the
+same speed as the audio. Positions are cached on disk, 2.4 KB for each 20 ms of speech.
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _FORMAT = "3"  # raise when the positions change
-_NUM_TOGETHER = 24  # clips that the network hears side by side
+_NUM_TOGETHER = 24  # clips that the network processes together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,23 +35,23 @@ class Speech:
     """A stretch of speech of a clip or of its augmented copy."""
 
     clip: LipClip
-    features: NDArray[np.float16]  # (positions, features) as `LipModel` takes them
-    known_s: Array  # (positions,) media time up to which the sound is known
+    features: NDArray[np.float16]  # (positions, features), inputs of the lip model
+    known_s: Array  # (positions,) media time up to which the audio is known
     speed: float  # of the copy; above 1 is faster than the clip
 
 
 def speech_of(
     model: NeuralModel, clips: Iterable[LipClip], copy: int = 0
 ) -> Iterator[list[Speech]]:
-    """Yield the speech of each clip (copy 0), or of one of its augmented copies, always the same.
+    """Yield the speech of each clip (copy 0) or of one of its augmented copies.
 
-    A few clips at a time are read and heard.
+    A copy is always augmented in the same way. A few clips at a time are processed together.
     """
     following = iter(clips)
     while together := list(islice(following, _NUM_TOGETHER)):
         sounds = [_sound_of(clip, copy) for clip in together]
-        heard = _positions(model, [samples for samples, _ in sounds])
-        for clip, (_, speed), positions in zip(together, sounds, heard, strict=True):
+        recorded = _positions(model, [samples for samples, _ in sounds])
+        for clip, (_, speed), positions in zip(together, sounds, recorded, strict=True):
             parts = [
                 np.split(positions[name], positions["starts"]) for name in ("features", "known_s")
             ]
@@ -75,19 +72,19 @@ def _sound_of(clip: LipClip, copy: int) -> tuple[Floats, float]:
 
 
 def _positions(model: NeuralModel, sounds: Sequence[Floats]) -> list[dict[str, NDArray[Any]]]:
-    """Features and times of all positions and the first of each stretch, cached or computed."""
+    """Compute or load features and times of all positions, and the starts of stretches."""
     of_model = hashlib.sha256(_FORMAT.encode())
     of_model.update(model.network.tobytes())
     paths = [_cache_path(of_model, samples) for samples in sounds]
     new = [number for number, path in enumerate(paths) if not path.is_file()]
     recorded = record_positions(model, [sounds[number] for number in new])
-    for number, each in zip(new, recorded, strict=True):
+    for number, one in zip(new, recorded, strict=True):
         np.savez(
             paths[number],
             allow_pickle=False,
-            starts=np.array(each.starts, dtype=np.int64),
-            known_s=np.array(each.known_s, dtype=np.float64),
-            features=np.array(each.features, dtype=np.float16),
+            starts=np.array(one.starts, dtype=np.int64),
+            known_s=np.array(one.known_s, dtype=np.float64),
+            features=np.array(one.features, dtype=np.float16),
         )
     positions = []
     for path in paths:
@@ -104,10 +101,10 @@ def _cache_path(of_model: hashlib._Hash, samples: Floats) -> Path:
 
 def features_of(speech: Sequence[Speech]) -> Floats:
     """Return the features of all positions in one array, (positions, features)."""
-    return np.concatenate([each.features for each in speech]).astype(np.float32)
+    return np.concatenate([stretch.features for stretch in speech]).astype(np.float32)
 
 
 def components_of(speech: Speech, mean: Floats, projection: Floats) -> Floats:
     """Return the principal components of a stretch of speech, (positions, components)."""
-    centred = speech.features.astype(np.float32) - mean
-    return (centred @ projection).astype(np.float32, copy=False)
+    centered = speech.features.astype(np.float32) - mean
+    return (centered @ projection).astype(np.float32, copy=False)

@@ -1,8 +1,8 @@
-"""The recurrent part of lips from sound, and each source's own units.
+"""The recurrent half of the lip model, and each speaker's units.
 
-Every speaker's lips are measured in units of their own: a tracked face's neutral is never quite
-its rest, and an animator's rig has other extents. So the network predicts a canonical face, and
-each speaker's scale and offset are learnt beside it, held near 1 and 0.
+A tracked face's neutral position is never exactly its rest position, and an animator's rig has
+other extents. The network therefore predicts a canonical face. Each speaker's scale and offset are
+learned with it, and regularized toward 1 and 0.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ _INPUT_NOISE = 0.1  # standard deviation; that of a component is 1
 _PIECE = 200  # positions
 _MIN_PIECE = 10
 _BATCH = 32  # pieces
-_LABELLED_SHARE = 3  # pieces that a teacher labelled, in an epoch, for each of the examples
+_LABELED_SHARE = 3  # labeled pieces in an epoch for each piece of the examples
 _RATE, _WEIGHT_DECAY = 2e-3, 1e-2
-_PROBABILITY_WEIGHT = 0.3  # of closure and of lip to teeth in the loss
+_PROBABILITY_WEIGHT = 0.3  # of closure and lip to teeth in the loss
 _UNITS_WEIGHT = 0.01  # of a speaker's squared scale (log) and offset
 _MAX_GRADIENT = 1.0
 _NUM_FAPS = len(LIP_FAPS)
 
 
 class LipNetwork(nn.Module):
-    """A gated recurrent unit behind a layer of rectified units; a teacher's runs both ways."""
+    """A gated recurrent unit after a rectified linear layer; the teacher's runs both ways."""
 
     def __init__(
         self, num_components: int, num_delays: int, num_speakers: int, *, both_ways: bool = False
@@ -51,14 +51,14 @@ class LipNetwork(nn.Module):
         self.offset = nn.Parameter(torch.zeros(num_speakers, _NUM_FAPS))
 
     def forward(self, components: Tensor) -> Tensor:
-        """Return outputs in canonical units, (batch, positions, delays, 17)."""
+        """Compute the outputs in canonical units, (batch, positions, delays, 17)."""
         entered = torch.relu(self.entry(self.dropout(components)))
         states, _ = self.recurrent(self.dropout(entered))
         outputs: Tensor = self.output(self.dropout(torch.cat([states, entered], dim=-1)))
         return outputs.view(*components.shape[:2], *self.shape)
 
     def loss(self, components: Tensor, targets: Tensor, speakers: Tensor) -> Tensor:
-        """Mean loss of a batch; targets that are NaN do not count."""
+        """Compute the mean loss of a batch; targets that are NaN are ignored."""
         noise = _INPUT_NOISE * torch.randn_like(components)
         outputs = self(components + noise)
         scale = torch.exp(self.log_scale[speakers])[:, None, None]
@@ -81,13 +81,13 @@ class Example:
     """A stretch of speech with its targets."""
 
     components: NDArray[np.floating]  # (positions, components)
-    targets: NDArray[np.floating]  # (positions, delays, 17), FAPs standardised
+    targets: NDArray[np.floating]  # (positions, delays, 17), FAPs standardized
     speaker: int
 
 
 def train_network(
     examples: Sequence[Example],
-    labelled: Sequence[Example] = (),
+    labeled: Sequence[Example] = (),
     *,
     num_epochs: int,
     seed: int,
@@ -98,9 +98,9 @@ def train_network(
     Parameters
     ----------
     examples
-        Every epoch sees them.
-    labelled
-        Every epoch sees another share of these, three times as long as the examples.
+        Every epoch uses all of them.
+    labeled
+        Every epoch uses another share of these, three times as long as the examples.
     num_epochs
         Number of epochs.
     seed
@@ -111,14 +111,14 @@ def train_network(
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
-    pieces, further = _cut(examples), _cut(labelled)
-    share = min(len(further), _LABELLED_SHARE * len(pieces))
+    pieces, further = _cut(examples), _cut(labeled)
+    share = min(len(further), _LABELED_SHARE * len(pieces))
     further = [further[number] for number in rng.permutation(len(further))]
     first = pieces[0]
     network = LipNetwork(
         first.components.shape[1],
         first.targets.shape[1],
-        1 + max(example.speaker for example in [*examples, *labelled]),
+        1 + max(example.speaker for example in [*examples, *labeled]),
         both_ways=both_ways,
     )
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_WEIGHT_DECAY)
@@ -131,13 +131,13 @@ def train_network(
     for epoch in range(num_epochs):
         total = 0.0
         turn = range(epoch * share, (epoch + 1) * share)
-        here = pieces + [further[number % len(further)] for number in turn]
-        # Pieces of about the same length share a batch.
-        lengths = [len(piece.components) // 40 + rng.random() for piece in here]
+        epoch_pieces = pieces + [further[number % len(further)] for number in turn]
+        # Pieces of similar length share a batch.
+        lengths = [len(piece.components) // 40 + rng.random() for piece in epoch_pieces]
         batches = np.array_split(np.argsort(lengths), num_batches)
         for number in rng.permutation(num_batches):
             optimizer.zero_grad()
-            loss = network.loss(*_batch([here[k] for k in batches[number]]))
+            loss = network.loss(*_batch([epoch_pieces[k] for k in batches[number]]))
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), _MAX_GRADIENT)
             optimizer.step()
@@ -148,12 +148,12 @@ def train_network(
 
 
 def _cut(examples: Sequence[Example]) -> list[Example]:
-    """Cut stretches into pieces; those of a moment are left out."""
+    """Cut stretches into pieces, and drop very short ones."""
     return [
-        Example(each.components[start:end], each.targets[start:end], each.speaker)
-        for each in examples
-        for start in range(0, len(each.components), _PIECE)
-        if (end := min(start + _PIECE, len(each.components))) - start >= _MIN_PIECE
+        Example(whole.components[start:end], whole.targets[start:end], whole.speaker)
+        for whole in examples
+        for start in range(0, len(whole.components), _PIECE)
+        if (end := min(start + _PIECE, len(whole.components))) - start >= _MIN_PIECE
     ]
 
 

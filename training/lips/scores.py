@@ -1,12 +1,12 @@
-"""How closely lips from sound follow the lips that made it: figures for the model card.
+"""How closely the lip model follows tracked lips: figures for the model card.
 
-Correlation of opening, width and jaw, each clip's own means removed, all frames of the clips
-pooled. Outside speech there are no lip frames; the mouth counts as at rest there.
+The correlations of opening, width and jaw pool the frames of all clips, after removing each clip's
+means. Outside speech the model gives no lips, and the mouth counts as at rest.
 
-Closures: the tracked lips close where their opening has a minimum within the lowest tenth of the
-speaker's range and an opening to half of it is near. The sound tells a closure where the
-probability is above one half. A real closure is met if one is told within 40 ms; a told closure is
-right if the tracked lips touch within 40 ms.
+The tracked lips close where their opening has a minimum within the lowest tenth of the speaker's
+range, next to an opening to half of it. The model predicts a closure where its probability is above
+one half. A tracked closure is found if one is predicted within 40 ms. A predicted closure is
+correct if the tracked lips touch within 40 ms.
 """
 
 from __future__ import annotations
@@ -32,23 +32,21 @@ _OPEN_WINDOW_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
-    """What the model makes of a stretch of speech."""
+class Prediction:
+    """What the model predicts for a stretch of speech."""
 
     known_s: Array  # (positions,)
     outputs: Floats  # (positions, delays, 17), FAPs in FAP units, then log odds
 
 
-Made = Mapping[str, Sequence[Stretch]]  # by clip
+Predictions = Mapping[str, Sequence[Prediction]]  # by clip
 
 
 def correlations(
-    clips: Sequence[LipClip], made: Made, delay: int, delay_s: float, *, in_speech: bool = False
+    clips: Sequence[LipClip], predictions: Predictions, delay: int, delay_s: float
 ) -> Array:
-    """Return the correlations of the three measures with one delay; NaN where none is tracked."""
-    pairs = [
-        _compared(clip, made[clip.name], delay, delay_s, in_speech=in_speech) for clip in clips
-    ]
+    """Correlate the three measures at one delay; NaN if a measure is not tracked."""
+    pairs = [_compare(clip, predictions[clip.name], delay, delay_s) for clip in clips]
     figures = []
     for measure in range(len(MEASURES)):
         ours, theirs = (np.concatenate([pair[measure][side] for pair in pairs]) for side in (0, 1))
@@ -57,26 +55,24 @@ def correlations(
     return np.array(figures)
 
 
-def _compared(
-    clip: LipClip, stretches: Sequence[Stretch], delay: int, delay_s: float, *, in_speech: bool
+def _compare(
+    clip: LipClip, predictions: Sequence[Prediction], delay: int, delay_s: float
 ) -> list[tuple[Array, Array]]:
-    """Made and tracked values of each measure at the clip's frames, means removed."""
-    spoken = np.zeros(len(clip.time_s), dtype=bool)
-    times, values = [np.array([-1.0])], [np.zeros((1, len(MEASURES)))]
+    """Return predicted and tracked values of each measure at the clip's frames, means removed."""
     rest = np.zeros((1, len(MEASURES)))
-    for stretch in stretches:
-        time_s = stretch.known_s - delay_s
-        spoken |= (clip.time_s >= time_s[0]) & (clip.time_s <= time_s[-1])
+    times, values = [np.array([-1.0])], [rest]
+    for prediction in predictions:
+        time_s = prediction.known_s - delay_s
         times += [time_s[:1] - _TO_REST_S, time_s, time_s[-1:] + _TO_REST_S]
-        values += [rest, lip_measures(stretch.outputs[:, delay]), rest]
+        values += [rest, lip_measures(prediction.outputs[:, delay]), rest]
     time_s = np.concatenate(times)
     order = np.argsort(time_s, kind="stable")
-    made = np.concatenate(values)[order]
+    predicted = np.concatenate(values)[order]
     tracked = lip_measures(lip_tracks(clip.faps))
     pairs = []
     for measure in range(len(MEASURES)):
-        known = ~np.isnan(tracked[:, measure]) & (spoken if in_speech else True)
-        ours = np.interp(clip.time_s[known], time_s[order], made[:, measure])
+        known = ~np.isnan(tracked[:, measure])
+        ours = np.interp(clip.time_s[known], time_s[order], predicted[:, measure])
         theirs = tracked[known, measure]
         pairs.append((ours - ours.mean(), theirs - theirs.mean()) if len(ours) else (ours, theirs))
     return pairs
@@ -86,20 +82,20 @@ def _compared(
 class ClosureCounts:
     """Closures of some clips."""
 
-    real: int = 0
-    met: int = 0
-    told: int = 0
-    right: int = 0
+    tracked: int = 0
+    found: int = 0
+    predicted: int = 0
+    correct: int = 0
 
     @property
     def recall(self) -> float:
-        """Share of the real closures that are told."""
-        return self.met / max(self.real, 1)
+        """Fraction of the tracked closures that are found."""
+        return self.found / max(self.tracked, 1)
 
     @property
     def precision(self) -> float:
-        """Share of the told closures that are right."""
-        return self.right / max(self.told, 1)
+        """Fraction of the predicted closures that are correct."""
+        return self.correct / max(self.predicted, 1)
 
     @property
     def f1(self) -> float:
@@ -109,12 +105,12 @@ class ClosureCounts:
 
 def count_closures(
     clips: Sequence[LipClip],
-    made: Made,
+    predictions: Predictions,
     touch: Mapping[str, Touch],
     delay: int,
     delay_s: float,
 ) -> ClosureCounts:
-    """Count the closures within speech with one delay."""
+    """Count the closures within speech at one delay."""
     counts = ClosureCounts()
     for clip in clips:
         limits = touch[clip.speaker]
@@ -122,37 +118,37 @@ def count_closures(
         known = ~np.isnan(height)
         frame_s, height = clip.time_s[known], height[known]
         touching_s = frame_s[height < limits.closed_below]
-        moments_s = _closures(frame_s, height, limits)
-        for stretch in made[clip.name]:
-            time_s = stretch.known_s - delay_s
-            shut = stretch.outputs[:, delay, CLOSURE] > 0
-            within = (moments_s >= time_s[0]) & (moments_s <= time_s[-1])
-            counts.real += int(within.sum())
-            counts.met += sum(_is_near(moment_s, time_s[shut]) for moment_s in moments_s[within])
-            for told_s in _runs(time_s, shut):
-                if len(frame_s) and frame_s[0] <= told_s[0] and told_s[-1] <= frame_s[-1]:
-                    counts.told += 1
-                    counts.right += any(_is_near(moment_s, touching_s) for moment_s in told_s)
+        closures_s = _closures(frame_s, height, limits)
+        for prediction in predictions[clip.name]:
+            time_s = prediction.known_s - delay_s
+            is_closed = prediction.outputs[:, delay, CLOSURE] > 0
+            within = (closures_s >= time_s[0]) & (closures_s <= time_s[-1])
+            counts.tracked += int(within.sum())
+            counts.found += sum(_is_near(at_s, time_s[is_closed]) for at_s in closures_s[within])
+            for run_s in _runs(time_s, is_closed):
+                if len(frame_s) and frame_s[0] <= run_s[0] and run_s[-1] <= frame_s[-1]:
+                    counts.predicted += 1
+                    counts.correct += any(_is_near(at_s, touching_s) for at_s in run_s)
     return counts
 
 
 def _closures(frame_s: Array, height: Array, limits: Touch) -> Array:
-    """When tracked lips close, seconds."""
-    moments = []
+    """Return the times at which tracked lips close, seconds."""
+    times = []
     for frame in range(1, len(height) - 1):
-        before, here, after = height[frame - 1 : frame + 2]
-        if here <= before and here < after and here < limits.closed_below:
+        before, now, after = height[frame - 1 : frame + 2]
+        if now <= before and now < after and now < limits.closed_below:
             near = np.abs(frame_s - frame_s[frame]) < _OPEN_WINDOW_S
             if height[near].max() > limits.half_open:
-                moments.append(frame_s[frame])
-    return np.array(moments)
+                times.append(frame_s[frame])
+    return np.array(times)
 
 
-def _runs(time_s: Array, shut: NDArray[np.bool_]) -> list[Array]:
-    """Return the times of each run of told positions that does not reach a stretch's end."""
-    edges = np.flatnonzero(np.diff(shut)) + 1
-    return [time_s[start:end] for start, end in pairwise(edges) if shut[start]]
+def _runs(time_s: Array, is_closed: NDArray[np.bool_]) -> list[Array]:
+    """Return the times of each run of closed positions that does not reach a stretch's end."""
+    edges = np.flatnonzero(np.diff(is_closed)) + 1
+    return [time_s[start:end] for start, end in pairwise(edges) if is_closed[start]]
 
 
-def _is_near(moment_s: float, times_s: Array) -> bool:
-    return bool((np.abs(times_s - moment_s) <= _CLOSURE_WINDOW_S).any())
+def _is_near(at_s: float, times_s: Array) -> bool:
+    return bool((np.abs(times_s - at_s) <= _CLOSURE_WINDOW_S).any())

@@ -1,16 +1,16 @@
-"""What the lips of a clip do at the network's positions, for every delay.
+"""Targets of the lip model: a clip's lips at the network's positions, for every delay.
 
 ======== ============================================================== ==========
 symbol   meaning                                                        unit
 ======== ============================================================== ==========
-T        media time up to which the sound is known at a position        s
+T        media time up to which the audio is known at a position        s
 d        delay: a position's target is the mouth at T - d               s
 ======== ============================================================== ==========
 
-Left and right of a face are averaged: which side a speaker favours is not in the sound. Lips touch
-where the tracked opening is within the lowest tenth of its speaker's range. The lower lip touches
-the teeth within the phone f of the clip's text, or where that is unknown of the recognised phones;
-other languages have no such label.
+Left and right are averaged, because the audio does not contain which side a speaker favors. Lips
+touch where the tracked opening is within the lowest tenth of its speaker's range. The lower lip
+touches the teeth within each phone f, aligned with the clip's text or recognized. Other languages
+have no such label.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ _LIP_TO_TEETH = "f"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Touch:
-    """Openings of a speaker, FAP units."""
+    """Limits of a speaker's opening, FAP units."""
 
-    closed_below: float  # the lips touch
+    closed_below: float  # below this the lips touch
     half_open: float
 
 
 def opening(clip: LipClip) -> Array:
-    """Return the height of the inner lips' opening relative to the neutral face, (num_frames,)."""
+    """Return the opening between the inner lips relative to the neutral face, (num_frames,)."""
     upper, lower = (MOUTH_FAPS.index(fap) for fap in (4, 5))
     height: Array = -clip.faps[:, upper] - clip.faps[:, lower]
     return height
 
 
 def touches(clips: Sequence[LipClip]) -> dict[str, Touch]:
-    """Return from where on the lips of each speaker touch, by speaker."""
+    """Measure the limits of each speaker."""
     by_speaker: dict[str, list[Array]] = defaultdict(list)
     for clip in clips:
         by_speaker[clip.speaker].append(opening(clip))
@@ -73,25 +73,25 @@ def targets_at(
     known_s: Array,
     delays_s: Sequence[float],
 ) -> NDArray[np.float32]:
-    """Return the targets of some positions.
+    """Compute the targets of some positions.
 
     Parameters
     ----------
     clip
         The clip.
     phones
-        Its phones; None where the recognizer does not know its language.
+        Its phones; None if the recognizer does not support its language.
     touch
-        From where on its speaker's lips touch.
+        Limits of its speaker.
     known_s
-        Time in the clip up to which the sound is known at each position, (n,).
+        Time in the clip up to which the audio is known at each position, (n,).
     delays_s
         Delays, seconds.
 
     Returns
     -------
     NDArray
-        FAPs in FAP units, closure, lip to teeth (0 or 1), (n, delays, 17); NaN where unknown.
+        FAPs in FAP units, closure and lip to teeth (0 or 1), (n, delays, 17); NaN if unknown.
     """
     time_s = known_s[:, None] - np.asarray(delays_s)
     faps = [interpolate_track(clip.time_s, track, time_s) for track in lip_tracks(clip.faps).T]

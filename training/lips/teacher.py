@@ -1,15 +1,15 @@
-"""A teacher labels speech that nobody filmed, so that the lips know many voices.
+"""The teacher labels speech without video, so that the lip model learns from many voices.
 
 Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
 encoder and its weights); Schuster and Paliwal 1997, "Bidirectional recurrent neural networks"; Xie
-et al. 2020, "Self-training with noisy student improves ImageNet classification" (the student hears
-noise, the teacher does not).
+et al. 2020, "Self-training with noisy student improves ImageNet classification" (only the student's
+input is noisy).
 
-The teacher hears the whole recording, so it follows a stranger's lips more closely than a live
-model can: to what a position knows it adds Whisper's encoder of the clean recording, and its
+The teacher sees the whole recording, so it follows an unseen speaker more closely than a live model
+can. Its inputs are Whisper's encoder of the clean recording and the live model's components. Its
 recurrent layer runs both ways. It learns the clips' lips at `TAUGHT_DELAY_S` in canonical units,
-and labels other recordings in the same units, one after the other: only what the live model knows
-and the labels are kept, 16 bits a number, 0.1 GB for an hour of speech.
+and labels other recordings in the same units. Only the live model's components and the labels are
+kept, 0.1 GB for an hour of speech.
 
     z = P clip((concat(h_2, h_4, h_6) - mean) / deviation, -6, 6)
 
@@ -18,7 +18,7 @@ symbol meaning                                             shape
 ====== =================================================== ==============
 h_l    Whisper's positions after layer l, one every 20 ms  (512,)
 P      projection to principal components of variance 1    (128, 1536)
-z      joins the components that the live model knows      (128,)
+z      joins the components of the live model              (128,)
 ====== =================================================== ==============
 """
 
@@ -61,7 +61,7 @@ _MAX_SAMPLES = 20 * SAMPLE_RATE_HZ
 _NUM_COMPONENTS = 128
 _MAX_DEVIATIONS = 6.0
 _MIN_DEVIATION = 1e-3
-_STRIDE = 2  # positions, of those that the principal components are of
+_STRIDE = 2  # every second position is used for the principal components
 
 _NUM_FAPS = len(LIP_FAPS)
 
@@ -69,14 +69,12 @@ T = TypeVar("T", bound=np.generic)
 
 
 def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
-    """Draw recordings of speech without lips, an hour of each folder or all it holds.
-
-    Those that models are measured on stay out.
+    """Draw recordings, at most an hour from each folder, without those that models are measured on.
 
     Raises
     ------
     UserError
-        If a folder holds no recordings, or one of them cannot be read.
+        If a folder contains no recordings, or one of them cannot be read.
     """
     rng = np.random.default_rng(seed)
     drawn = []
@@ -98,8 +96,8 @@ def _unreadable(error: Exception) -> UserError:
     return UserError(f"{error}; remove it, or give another folder")
 
 
-def _without_lips(path: Path) -> LipClip:
-    """Read a recording, as long as the teacher hears it."""
+def _read_recording(path: Path) -> LipClip:
+    """Read the first 20 s of a recording as a clip without lips."""
     try:
         samples = read_audio(path)[:_MAX_SAMPLES]
     except ValueError as error:
@@ -133,7 +131,7 @@ def load_encoder(whisper: Path) -> WholeEncoder:
 
 @dataclass(frozen=True, slots=True)
 class Projection:
-    """To principal components of variance 1 of the encoder's features."""
+    """Projection of the encoder's features to principal components of variance 1."""
 
     mean: Floats  # (features,)
     deviation: Floats  # (features,)
@@ -144,7 +142,7 @@ class Projection:
         """Fit it to features, (n, features)."""
         some = features[::_STRIDE].astype(np.float32)
         mean, deviation = some.mean(axis=0), some.std(axis=0) + _MIN_DEVIATION
-        standard = _standard(some, mean, deviation)
+        standard = _standardize(some, mean, deviation)
         variances, directions = np.linalg.eigh(standard.T @ standard / len(standard))
         first = slice(-1, -1 - _NUM_COMPONENTS, -1)
         scale = np.sqrt(np.maximum(variances[first], _MIN_DEVIATION))
@@ -152,17 +150,17 @@ class Projection:
 
     def apply(self, features: Features) -> Floats:
         """Project features, (n, features) to (n, components)."""
-        return _standard(features, self.mean, self.deviation) @ self.directions
+        return _standardize(features, self.mean, self.deviation) @ self.directions
 
 
-def _standard(features: NDArray[np.floating], mean: Floats, deviation: Floats) -> Floats:
+def _standardize(features: NDArray[np.floating], mean: Floats, deviation: Floats) -> Floats:
     standard: Floats = (features.astype(np.float32) - mean) / deviation
     return standard.clip(-_MAX_DEVIATIONS, _MAX_DEVIATIONS)
 
 
 @dataclass(frozen=True, slots=True)
 class Teacher:
-    """Tells the lips from what Whisper's encoder and the live model hear."""
+    """Predicts lips from Whisper's encoder and the live model's components."""
 
     encoder: WholeEncoder
     projection: Projection
@@ -183,21 +181,21 @@ class Teacher:
         speech
             Stretches of its augmented copy.
         components
-            What the live model knows of each, (positions, components).
+            Components of each stretch, (positions, components).
         delays_s
             Delays of the labels, seconds.
         speaker
-            The examples' speaker.
+            Speaker number of the examples.
         """
         if not speech:
             return []
         whole = self.projection.apply(_features_of(self.encoder, speech[0].clip))
         examples = []
-        for each, known in zip(speech, components, strict=True):
-            inputs = np.concatenate([_at_positions(whole, each), known], axis=1)
+        for stretch, known in zip(speech, components, strict=True):
+            inputs = np.concatenate([_at_positions(whole, stretch), known], axis=1)
             outputs = self.network(torch.from_numpy(inputs)[None])[0, :, 0].numpy()
             outputs[:, _NUM_FAPS:] = expit(outputs[:, _NUM_FAPS:])
-            labels = _delayed(outputs, each.known_s, delays_s)
+            labels = _delayed(outputs, stretch.known_s, delays_s)
             examples.append(Example(known.astype(np.float16), labels, speaker))
         return examples
 
@@ -216,23 +214,23 @@ def train_teacher(
     Parameters
     ----------
     encoder
-        Whisper's.
+        Whisper's encoder.
     speech
-        Stretches of clips and of their augmented copies. The teacher hears the clips as they are.
+        Stretches of clips and of their augmented copies. The teacher's input is the clean clip.
     examples
-        Of each stretch; `TAUGHT_DELAY_S` is one of the delays.
+        Example of each stretch; `TAUGHT_DELAY_S` is one of its delays.
     delays_s
         Delays of the examples' targets, seconds.
     num_epochs, seed
         As for :func:`kouxing.training.lips.recurrent.train_network`.
     """
-    clips = {each.clip.name: each.clip for each in speech}
+    clips = {stretch.clip.name: stretch.clip for stretch in speech}
     whole = {
         name: _features_of(encoder, clip)
         for name, clip in track(clips.items(), description="clips for the teacher")
     }
-    heard = [_at_positions(whole[each.clip.name], each) for each in speech]
-    projection = Projection.of(np.concatenate(heard))
+    features_of_stretches = [_at_positions(whole[one.clip.name], one) for one in speech]
+    projection = Projection.of(np.concatenate(features_of_stretches))
     taught = delays_s.index(TAUGHT_DELAY_S)
     network, _ = train_network(
         [
@@ -241,7 +239,7 @@ def train_teacher(
                 components=np.concatenate([projection.apply(features), example.components], axis=1),
                 targets=example.targets[:, taught : taught + 1],
             )
-            for features, example in zip(heard, examples, strict=True)
+            for features, example in zip(features_of_stretches, examples, strict=True)
         ],
         num_epochs=num_epochs,
         seed=seed,
@@ -258,32 +256,32 @@ def label_recordings(
     delays_s: Sequence[float],
     speaker: int,
 ) -> list[Example]:
-    """Let the teacher label recordings, and a student hear them with noise, rooms and lines added.
+    """Label recordings; the components of the examples come from augmented copies.
 
     Parameters
     ----------
     teacher
-        Hears them as they are.
+        Labels the clean recordings.
     model
         The acoustic model.
     recordings
-        Their files.
+        Audio files.
     components
-        Returns what the live model knows of a stretch, (positions, components).
+        Computes the components of a stretch, (positions, components).
     delays_s, speaker
-        Delays of the labels, seconds, and the examples' speaker.
+        Delays of the labels, seconds, and speaker number of the examples.
 
     Raises
     ------
     UserError
         If a recording cannot be read.
     """
-    heard = speech_of(model, map(_without_lips, recordings), copy=1)
+    augmented = speech_of(model, map(_read_recording, recordings), copy=1)
     return [
         example
-        for speech in track(heard, description="recordings", total=len(recordings))
+        for speech in track(augmented, description="recordings", total=len(recordings))
         for example in teacher.label(
-            speech, [components(each) for each in speech], delays_s, speaker
+            speech, [components(stretch) for stretch in speech], delays_s, speaker
         )
     ]
 
@@ -293,16 +291,16 @@ def _features_of(encoder: WholeEncoder, clip: LipClip) -> Features:
 
 
 def _at_positions(whole: NDArray[T], speech: Speech) -> NDArray[T]:
-    """Return rows of a recording, one every 20 ms, of the mouth taught at a stretch's positions."""
+    """Select the rows of a recording, one every 20 ms, for the positions of a stretch."""
     time_s = (speech.known_s - TAUGHT_DELAY_S) * speech.speed
-    places = np.rint(time_s / POSITION_S).astype(np.int64) - 1  # the first stands at 20 ms
+    places = np.rint(time_s / POSITION_S).astype(np.int64) - 1  # the first row is at 20 ms
     return whole[np.clip(places, 0, len(whole) - 1)]
 
 
 def _delayed(labels: Floats, known_s: Array, delays_s: Sequence[float]) -> NDArray[np.float16]:
-    """Labels of each delay, (positions, delays, 17), from those of one, (positions, 17).
+    """Shift labels, (positions, 17), to each delay, (positions, delays, 17).
 
-    They are unknown (NaN) where the mouth moved before or after the stretch.
+    They are NaN for times before or after the stretch.
     """
     time_s = known_s - TAUGHT_DELAY_S
     wanted_s = known_s[:, None] - np.asarray(delays_s)
