@@ -1,3 +1,3 @@
-"""Training of models; never imported by a service, nor by the evaluation."""
+"""Training of models. Services and evaluation never import it."""
 
-SYNTHETIC_WEIGHT = 0.3  # relative to real speech; chosen on development data
+SYNTHETIC_WEIGHT = 0.3  # relative to natural speech; chosen on development data

@@ -23,42 +23,38 @@ Corpora = Annotated[
 Model = Annotated[Path, typer.Option("--output", "-o", help="Model file to write (.npz).")]
 Seed = Annotated[int, typer.Option(help="The same seed gives the same model.")]
 SyntheticWeight = Annotated[
-    float, typer.Option(help="Weight of synthetic relative to real speech.")
+    float, typer.Option(help="Weight of synthetic relative to natural speech.")
 ]
 Language = Annotated[str, typer.Option(help="Language of the corpora and texts.")]
 PhoneLm = Annotated[
     Path | None,
-    typer.Option(
-        help="Phone language model: the shipped phone_lm.npz, one that `kouxing train phone-lm` "
-        "made, or a model's own."
-    ),
+    typer.Option(help="File with a phone language model: phone_lm.npz, or a recognizer's model."),
 ]
 AnyLicence = Annotated[
     bool,
-    typer.Option("--any-licence", help="Also use rows that forbid giving the model away."),
+    typer.Option("--any-licence", help="Also use data whose license excludes distribution."),
 ]
 Whisper = Annotated[
-    Path, typer.Option(help="Folder of Whisper base for faster-whisper: the encoder.")
+    Path, typer.Option(help="Folder of Whisper base for faster-whisper, for its encoder.")
 ]
 StartFrom = Annotated[
     Path | None,
     typer.Option(
-        help="Neural model that aligns, and whose HMMs and phone language model are used; "
-        "without it the shipped one."
+        help="Neural model that aligns, and whose HMMs and phone language model are used. "
+        "Default: the shipped one."
     ),
 ]
 Untranscribed = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Folder of recordings without text, in any language, which the teacher labels; "
-        "repeat for several."
+        help="Folder of recordings in any language, which the teacher labels; repeat for several."
     ),
 ]
 
 
 @contextmanager
 def _neural_training() -> Iterator[None]:
-    """Tell how to install what is missing."""
+    """Explain how to install a missing package."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -72,7 +68,7 @@ def phone_lm(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write (.npz).")],
     corpus: Annotated[
         list[Path] | None,
-        typer.Option("--corpus", help="Corpus with sentences to count; repeat for several."),
+        typer.Option("--corpus", help="Corpus whose sentences are counted; repeat for several."),
     ] = None,
     text: Annotated[
         list[Path] | None, typer.Option("--text", help="Text file, UTF-8; repeat for several.")
@@ -81,21 +77,21 @@ def phone_lm(
         Path | None, typer.Option(help="Output of `tslminfo -v`, to draw words from.")
     ] = None,
     dictionary: Annotated[
-        Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, the words of the n-grams.")
+        Path | None, typer.Option(help="SunPinyin's pydict_sc.bin, with the words of --ngrams.")
     ] = None,
-    words: Annotated[int, typer.Option(min=1, help="Words to draw.")] = 30_000_000,
+    words: Annotated[int, typer.Option(min=1, help="Number of words to draw.")] = 30_000_000,
     order: Annotated[int, typer.Option(min=2, max=10, help="Phones in the longest n-grams.")] = 6,
     max_ngrams: Annotated[int, typer.Option(min=1000, help="N-grams to keep, about.")] = 1_000_000,
     language: Language = DEFAULT_LANGUAGE,
     seed: Seed = 0,
 ) -> None:
-    """Train a phone language model on texts, for the recognizers' search."""
+    """Train a phone language model on texts."""
     from kouxing.training.phone_lm.open_gram import draw_phones
     from kouxing.training.phone_lm.recipe import train_phone_lm
 
     check_output(output)
     if (ngrams is None) != (dictionary is None):
-        raise UserError("--ngrams and --dictionary belong together; give both or neither")
+        raise UserError("--ngrams needs --dictionary; give both or neither")
     inventory = load_inventory(language)
     drawn = None
     if ngrams and dictionary:
@@ -122,7 +118,7 @@ def gmm(
     synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the Gaussian mixture recognizer; a model card is written beside it."""
+    """Train the Gaussian mixture recognizer, and write its model card."""
     from kouxing.training.gmm.recipe import train_gmm
 
     check_output(output)
@@ -144,35 +140,28 @@ def neural(
     output: Model,
     aligner: Annotated[
         Path | None,
-        typer.Option(help="Model that aligns at first; without it --start-from aligns."),
+        typer.Option(help="Model that aligns at first. Default: --start-from."),
     ] = None,
     whisper: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of Whisper base for faster-whisper: the teacher, and the network's first "
-            "weights."
+            help="Folder of Whisper base for faster-whisper: teacher and initial weights."
         ),
     ] = None,
     start_from: Annotated[
         Path | None,
-        typer.Option(help="Neural model to train further; without --whisper there is no teacher."),
+        typer.Option(help="Neural model to train further. Without --whisper there is no teacher."),
     ] = None,
-    untranscribed: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Folder of recordings without text, in any language, which the teacher labels; "
-            "repeat for several."
-        ),
-    ] = None,
+    untranscribed: Untranscribed = None,
     phone_lm: PhoneLm = None,
     seed: Seed = 0,
     look_ahead_ms: Annotated[
-        float, typer.Option(help="The look-ahead to train for, in steps of 10 ms.")
+        float, typer.Option(help="Look-ahead to train for, a multiple of 10 ms.")
     ] = 10.0,
-    steps: Annotated[int, typer.Option(min=1, help="Batches of 30 s of sound.")] = 800,
+    steps: Annotated[int, typer.Option(min=1, help="Number of batches of 30 s of audio.")] = 800,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the neural recognizer; a model card and the training curves are written beside it."""
+    """Train the neural recognizer, and write its model card and training curves."""
     check_output(output)
     with _neural_training():
         from kouxing.training.neural.recipe import train_neural
@@ -201,14 +190,14 @@ def blocks(
     untranscribed: Untranscribed = None,
     seed: Seed = 0,
     readout_steps: Annotated[
-        int, typer.Option(min=1, help="Batches of 70 s of sound for the first readout.")
+        int, typer.Option(min=1, help="Number of batches of 70 s of audio for the first readout.")
     ] = 450,
-    steps: Annotated[int, typer.Option(min=1, help="Batches of 32 s of sound.")] = 450,
+    steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 450,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the block model; a model card is written beside it.
+    """Train the block model, and write its model card.
 
-    A run that was interrupted goes on when the command is given again.
+    Repeat the command to resume an interrupted run.
     """
     check_output(output)
     with _neural_training():
@@ -229,11 +218,11 @@ def blocks(
 
 @app.command()
 def visemes(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train the dynamic visemes' parameters on tracked lips."""
+    """Train the parameters of the dynamic visemes on tracked lips."""
     from kouxing.training.visemes.recipe import train_visemes
 
     check_output(output)
@@ -242,24 +231,25 @@ def visemes(
 
 @app.command()
 def lips(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound, any languages.")],
+    clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Model file to write (.npz).")
     ] = Path("services/recognizer/models/lips.npz"),
     speech: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder of speech without lips, in any language, of which the teacher labels an "
-            "hour; repeat for several."
+            help="Folder of speech in any language, of which the teacher labels up to an hour; "
+            "repeat for several."
         ),
     ] = None,
     whisper: Annotated[
-        Path | None, typer.Option(help="Folder of Whisper base for faster-whisper: the teacher.")
+        Path | None,
+        typer.Option(help="Folder of Whisper base for faster-whisper: teacher."),
     ] = None,
     seed: Seed = 0,
     any_licence: AnyLicence = False,
 ) -> None:
-    """Train lips from sound on tracked lips; a model card is written beside it."""
+    """Train the lip model on tracked lips, and write its model card."""
     check_output(output)
     with _neural_training():
         from kouxing.training.lips.recipe import train_lips
@@ -276,12 +266,12 @@ def lips(
 
 @app.command()
 def ferguson(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
     corpus: Corpora,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
     any_licence: AnyLicence = False,
 ) -> None:
-    """Learn the table of the ferguson lips: openings, usual lengths, influence factors."""
+    """Learn the table of the ferguson lip model: openings, durations, influence factors."""
     from kouxing.training.ferguson.recipe import train_ferguson
 
     check_output(output)

@@ -5,13 +5,13 @@ A live recognizer emits a phone before the phone has ended, with its mean durati
 (Klatt 1976, "Linguistic uses of segmental duration in English", found it for English; it holds in
 Mandarin too), so the statistics are kept per position.
 
-Some phones are rare in a position, such as an initial before a pause. Their statistics are smoothed
-towards the phone's own mean over all positions:
+Some phones are rare in a position, such as an initial before a pause. Their statistics are shrunk
+toward the phone's mean over all positions:
 
     mean[p, u] = (sum[p, u] + n0 * mean[u]) / (count[p, u] + n0)
 
-and the second moment likewise. Isolated words and syllables are drawn out, so their weight is
-low: they matter only for phones that no connected speech contains.
+and likewise the second moment. Isolated words and syllables are longer, so they get a low weight.
+They matter only for phones that no connected speech contains.
 """
 
 from __future__ import annotations
@@ -27,25 +27,15 @@ from kouxing.services.recognizer.search.decoder import Segment
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _PRIOR_COUNT = 10.0  # n0
-_MIN_CONNECTED_PHONES = 8  # a recording with fewer phones is no connected speech
+_MIN_CONNECTED_PHONES = 8  # in connected speech
 _WORD_WEIGHT = 0.02
-_UNSEEN_MEAN_FRAMES, _UNSEEN_SPREAD_FRAMES = 10.0, 5.0  # for a phone in no recording
+_UNSEEN_MEAN_FRAMES, _UNSEEN_SPREAD_FRAMES = 10.0, 5.0  # for a phone without data
 
 
 def positions_of(phones: Sequence[int], silence: int) -> list[int]:
-    """Position of each phone between the pauses around it; of a pause, within the recording.
+    """Return ``FIRST``, ``INSIDE`` or ``LAST`` for each phone between two pauses.
 
-    Parameters
-    ----------
-    phones
-        Indices of the phones, pauses included, in order.
-    silence
-        Index of the pause.
-
-    Returns
-    -------
-    list of int
-        ``FIRST``, ``INSIDE`` or ``LAST`` for each phone.
+    For a pause (``silence``), the position refers to the whole recording.
     """
     positions = []
     for number, phone in enumerate(phones):
@@ -65,7 +55,7 @@ class PhoneDurations:
         self._sums = np.zeros((3, NUM_POSITIONS, len(inventory)))
 
     def add(self, aligned: Sequence[Segment], weight: float) -> None:
-        """Add the phones of one recording, pauses included, in order."""
+        """Add the phones of one recording in order, including pauses."""
         phones = [segment.phone for segment in aligned]
         if sum(phone != self._silence for phone in phones) < _MIN_CONNECTED_PHONES:
             weight *= _WORD_WEIGHT
@@ -79,7 +69,7 @@ class PhoneDurations:
             )
 
     def mean_and_spread_s(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean and standard deviation of the durations, shape (3, num_phones) each, seconds."""
+        """Compute mean and standard deviation of the durations, (3, num_phones) each, seconds."""
         second_moment = _UNSEEN_MEAN_FRAMES**2 + _UNSEEN_SPREAD_FRAMES**2
         unseen = np.array((1.0, _UNSEEN_MEAN_FRAMES, second_moment))
         by_phone = self._sums.sum(axis=1) + 1e-6 * unseen[:, None]

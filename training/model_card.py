@@ -1,4 +1,4 @@
-"""The model card: what a model was trained on, written beside it."""
+"""The model card, which states what a model was trained on."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ def write_card(
     Parameters
     ----------
     output
-        The model's file; the card has the same name and the suffix ``.md``.
+        The model's file; the card gets the suffix ``.md``.
     title
         First line of the card.
     details
-        How the model was trained, within a sentence.
+        How the model was trained, as part of a sentence.
     examples
-        The recordings it was trained on; listed by licence.
+        Training recordings; the card lists them by license.
     errors
-        Rows that were skipped; counted.
+        Rows that were skipped; the card counts them.
     chosen
-        The weights of the search, if they were chosen on development data.
+        Search weights, if they were chosen on development data.
     measure
         The meaning of ``chosen.error_rate``.
     """
-    by_licence: dict[str, list[Example]] = defaultdict(list)
+    by_license: dict[str, list[Example]] = defaultdict(list)
     for example in examples:
-        by_licence[example.licence or "none given"].append(example)
+        by_license[example.licence or "none given"].append(example)
     rows = [
-        f"| {licence} | {len(group)} | {len({example.speaker for example in group})} | "
+        f"| {name} | {len(group)} | {len({example.speaker for example in group})} | "
         f"{sum(len(example.log_mel) for example in group) / FRAMES_PER_MINUTE:.1f} |"
-        for licence, group in sorted(by_licence.items())
+        for name, group in sorted(by_license.items())
     ]
     lines = [
         f"# {title}",
         "",
         f"Made by `kouxing train`, {details}.",
         "",
-        "| licence of the recordings | recordings | speakers | minutes without outer silence |",
+        "| license of the recordings | recordings | speakers | minutes without outer silence |",
         "|---|---|---|---|",
         *rows,
         "",

@@ -1,4 +1,4 @@
-"""Lines of progress, as training reports them."""
+"""Progress lines of training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def with_progress(items: Sequence[T], what: str, report: Report) -> Iterator[T]:
-    """Yield the items one after the other; report after each tenth of them."""
+    """Yield the items, and report after each tenth of them."""
     step = math.ceil(len(items) / 10)
     for number, item in enumerate(items, start=1):
         yield item

@@ -1,4 +1,4 @@
-"""The search's weights, chosen on development data: acoustic scale and phone penalty."""
+"""Choose the search weights on development data: acoustic scale and phone penalty."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kouxing.training.progress import Report
 from kouxing.training.training_set import Example, load_examples
 
 M = TypeVar("M", GmmModel, NeuralModel)
-# Error rate of recordings, from their scaled scores of shape (frames, states) each.
+# Computes the error rate of recordings from their scaled scores, (frames, states) each.
 ErrorRate = Callable[[Topology, Sequence[NDArray[np.float32]], Sequence[Example]], float]
 
 _SCALES = (0.05, 0.1, 0.15, 0.2, 0.3, 0.4)
@@ -36,9 +36,9 @@ _BATCH_SIZE = 16  # recordings that are scored together
 class SearchWeights:
     """Weights of the search."""
 
-    acoustic_scale: float  # of the log scores
+    acoustic_scale: float  # factor of the log scores
     phone_penalty: float  # added to the log score of a path for each phone
-    error_rate: float = 1.0  # on the development data that they were chosen on
+    error_rate: float = 1.0  # on the development data
 
     def applied_to(self, model: M) -> M:
         """Return the model with these weights."""
@@ -49,7 +49,7 @@ class SearchWeights:
 def offline_error_rate(
     topology: Topology, scores: Sequence[NDArray[np.float32]], examples: Sequence[Example]
 ) -> float:
-    """Phone error rate of offline decoding (full traceback), from scores of (frames, states)."""
+    """Compute the phone error rate of offline decoding from scores, (frames, states) each."""
     decoder = Decoder(topology)
     inventory = topology.inventory
     total = ErrorCounts()
@@ -77,39 +77,39 @@ def choose_search_weights(
     Parameters
     ----------
     model
-        A model whose own acoustic scale is 1.
+        A model with an acoustic scale of 1.
     corpora
         Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads.
     scales
         Acoustic scales to try.
     shipping
-        Leave out rows whose licence forbids giving the model away.
+        Exclude rows whose license does not allow distributing the model.
     with_samples
-        Compute the features with the model's own front end instead of from the log-mel cache.
+        Compute the features with the model's front end instead of from cached log-mel features.
     rate
-        What is minimised.
+        Error rate to minimize.
     report
         Receives lines of progress.
 
     Returns
     -------
     SearchWeights or None
-        None if the corpora have no recordings for ``dev``.
+        None if the corpora have no recordings of the split ``dev``.
     """
     dev = load_dev(corpora, model.inventory, shipping=shipping, with_samples=with_samples)
     if not dev:
-        report("no dev recordings: acoustic scale and phone penalty are not chosen")
+        report("no dev recordings; acoustic scale and phone penalty keep their defaults")
         return None
     scores = list(all_scores(model, dev))
     best: SearchWeights | None = None
     for scale in scales:
         scaled = [np.float32(scale) * rows for rows in scores]
         for phone_penalty in _PHONE_PENALTIES:
-            found = rate(replace(model.topology, phone_penalty=phone_penalty), scaled, dev)
-            if best is None or found < best.error_rate:
-                best = SearchWeights(scale, phone_penalty, found)
+            error_rate = rate(replace(model.topology, phone_penalty=phone_penalty), scaled, dev)
+            if best is None or error_rate < best.error_rate:
+                best = SearchWeights(scale, phone_penalty, error_rate)
                 report(
-                    f"{100 * found:.1f} % errors on dev with acoustic scale {scale} and phone "
+                    f"{100 * error_rate:.1f} % errors on dev with acoustic scale {scale} and phone "
                     f"penalty {phone_penalty}"
                 )
     return best
@@ -118,7 +118,7 @@ def choose_search_weights(
 def load_dev(
     corpora: Sequence[Path], inventory: PhoneInventory, *, shipping: bool, with_samples: bool
 ) -> list[Example]:
-    """Load the recordings of the split ``dev``; none if the corpora have none."""
+    """Load the recordings of the split ``dev``; empty if the corpora have none."""
     try:
         return load_examples(
             corpora,
@@ -135,8 +135,8 @@ def load_dev(
 def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[NDArray[np.float32]]:
     """Yield the scores of each recording without augmentation, shape (frames, states).
 
-    The model's own front end computes the features from the samples; where an example has none,
-    its log-mel features are used.
+    The model's front end computes the features from the samples, if an example has samples.
+    Otherwise its log-mel features are used.
     """
     for start in range(0, len(examples), _BATCH_SIZE):
         batch = examples[start : start + _BATCH_SIZE]

@@ -13,7 +13,6 @@ from kouxing.services.recognizer.front_end.whisper_mel import FLOOR_BANDS, Whisp
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks import batches, readout, trainer
 from kouxing.training.blocks.batches import block_batch
-from kouxing.training.blocks.labels import load_labels, save_labels
 from kouxing.training.blocks.network import RIGHT_CONTEXT, BlockEncoder, BlockReadout, layout
 from kouxing.training.blocks.readout import encode_windows, train_readout
 from kouxing.training.blocks.recipe import train_blocks
@@ -58,7 +57,7 @@ def whole_encoder() -> WholeEncoder:
 
 
 @pytest.mark.parametrize("block_length", [4, 10])
-def test_a_block_needs_its_right_context_and_no_more(block_length: int) -> None:
+def test_a_block_needs_only_its_right_context(block_length: int) -> None:
     network = small_network()
     frames = np.random.default_rng(0).normal(0.5, 0.5, (121, 80)).astype(np.float32)
     whole = outputs(network, frames, block_length)
@@ -71,7 +70,7 @@ def test_a_block_needs_its_right_context_and_no_more(block_length: int) -> None:
         assert (outputs(network, changed, block_length)[block] - whole[block]).abs().max() > 1e-4
 
 
-def test_a_block_alone_is_read_as_a_window_is() -> None:
+def test_a_single_block_is_read_like_a_window() -> None:
     network = small_network()
     laid = layout(9, 9)
     features = torch.randn(2, 9, 96)
@@ -79,7 +78,7 @@ def test_a_block_alone_is_read_as_a_window_is() -> None:
     torch.testing.assert_close(read, network.readout(features), rtol=0, atol=1e-5)
 
 
-def test_what_is_long_past_is_not_attended_to() -> None:
+def test_attention_is_limited_to_the_past_window() -> None:
     laid = layout(150, 10)
     last = 149
     assert laid.may_attend[last].nonzero()[:, 0].tolist() == list(range(140 - 125, 150))
@@ -89,7 +88,7 @@ def test_what_is_long_past_is_not_attended_to() -> None:
     assert not laid.may_attend[last, 150:].any(), "no copies of other blocks"
 
 
-def test_the_teacher_hears_the_same_undisturbed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_teacher_gets_the_clean_audio(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batches, "_DISTURB_PROB", 0.0)
     batch = block_batch(RECORDINGS, 0, 1)
     again = block_batch(RECORDINGS, 0, 1)
@@ -107,7 +106,9 @@ def test_the_teacher_hears_the_same_undisturbed(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("number", range(6))
-def test_codecs_and_clipping_keep_the_place(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_codecs_and_clipping_do_not_shift_the_audio(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(batches, "_CODEC_PROB", 1.0)
     monkeypatch.setattr(batches, "_CLIP_PROB", 0.0 if number % 2 else 1.0)
     sound = HELLO
@@ -131,7 +132,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_the_readout_learns_which_tone_is_when_and_goes_on_where_it_stopped(
+def test_the_readout_learns_tones_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def as_it_is(recording: Recording, _rng: np.random.Generator) -> tuple[np.ndarray, Targets]:
@@ -172,20 +173,8 @@ def test_the_readout_learns_which_tone_is_when_and_goes_on_where_it_stopped(
         torch.testing.assert_close(second[name], weights, rtol=0, atol=0)
 
 
-def test_labels_are_kept(tmp_path: Path) -> None:
-    recordings = [tones(0), tones(1)]
-    save_labels(tmp_path / "labels.npz", recordings)
-    for before, after in zip(recordings, load_labels(tmp_path / "labels.npz"), strict=True):
-        np.testing.assert_array_equal(after.samples, before.samples)
-        np.testing.assert_array_equal(after.targets.states, before.targets.states)
-        np.testing.assert_array_equal(after.targets.probs, before.targets.probs)
-        assert after.weight == before.weight
-
-
 @pytest.mark.usefixtures("quick")
-def test_the_encoder_learns_and_goes_on_where_it_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_encoder_learns_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "_WARM_UP_STEPS", 5)
     monkeypatch.setattr(trainer, "_RATE", 2e-3)
     lines: list[str] = []
@@ -220,7 +209,7 @@ def test_the_encoder_learns_and_goes_on_where_it_stopped(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_the_recipe_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trains_and_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("kouxing.training.neural.initial_network.Shape", SMALL)
     monkeypatch.setattr(teacher, "_NUM_STEPS", 2)
@@ -247,6 +236,6 @@ def test_the_recipe_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.Mo
     assert left == {"blocks.npz", "blocks.md"}
 
 
-def test_only_a_neural_model_can_be_the_start(tmp_path: Path) -> None:
+def test_needs_a_neural_model_to_start_from(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is not a neural model; give one that"):
         train_blocks([], tmp_path / "b.npz", whisper=tmp_path, start=model_path("gmm"))

@@ -26,7 +26,7 @@ INVENTORY = load_inventory()
 TABLE = load_table(INVENTORY)
 
 
-def test_openings_are_found_again() -> None:
+def test_recovers_openings() -> None:
     phones = utterance(0, 200)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
     true = replace(TABLE, opening={**TABLE.opening, "b": 0.0, "a": 5.0, "i": 1.5, "d": 2.5})
@@ -64,7 +64,7 @@ def aligned(lengths_s: list[tuple[str, float]]) -> list[Phone]:
     return phones
 
 
-def test_lengths_hisses_and_influence_are_counted() -> None:
+def test_computes_durations_crossings_and_influence() -> None:
     phones = aligned([("s", 0.1), ("a", 0.1), ("m", 0.04), ("i", 0.16)] * 30)
     slices = [
         Progress(
@@ -81,13 +81,13 @@ def test_lengths_hisses_and_influence_are_counted() -> None:
     assert usual.level["a"] == 1
 
 
-def test_levels_group_finals_of_like_shares() -> None:
+def test_groups_finals_with_similar_shares() -> None:
     share = {"a": 0.6, "o": 0.58, "e": 0.4, "i": 0.3, "u": 0.29, "v": 0.1}
     level, influence = influence_levels(share, dict.fromkeys(share, 1.0))
     assert level == {"a": 1, "o": 1, "e": 2, "i": 3, "u": 3, "v": 4}
     assert influence["u"] == pytest.approx(0.295)
 
 
-def test_a_folder_without_clips_is_named(tmp_path: Path) -> None:
+def test_rejects_a_folder_without_clips(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no Mandarin clips"):
         train_ferguson(tmp_path, [tmp_path], tmp_path / "table.tsv", print)

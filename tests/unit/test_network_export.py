@@ -57,7 +57,7 @@ def test_onnxruntime_computes_what_pytorch_does(output: int, exact: bool, atol: 
     np.testing.assert_allclose(found, expected, atol=atol)
 
 
-def test_floats_are_read_as_they_were() -> None:
+def test_reads_floats_exactly() -> None:
     network = some_network()
     again = network_of(onnx_of(network, exact=True), SHAPE.look_aheads)
     assert again.shape == SHAPE
@@ -65,7 +65,7 @@ def test_floats_are_read_as_they_were() -> None:
         torch.testing.assert_close(again.state_dict()[name], tensor, rtol=1e-6, atol=0)
 
 
-def test_integers_are_read_within_half_a_step() -> None:
+def test_reads_integers_within_half_a_step() -> None:
     network = some_network()
     file = onnx_of(network)
     assert len(file) < 0.45 * len(onnx_of(network, exact=True))
@@ -80,6 +80,6 @@ def test_integers_are_read_within_half_a_step() -> None:
             torch.testing.assert_close(again[name], tensor, rtol=1e-6, atol=0)
 
 
-def test_what_is_no_such_file_is_refused() -> None:
+def test_rejects_other_files() -> None:
     with pytest.raises(KeyError):
         network_of(np.zeros(0, np.uint8), SHAPE.look_aheads)

@@ -1,7 +1,6 @@
 """Whisper's weights, augmentation, and the training of the network."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import pytest
 import soundfile
 import torch
 
-from kouxing.corpora.feature_cache import as_floats, samples_of
-from kouxing.corpora.speech_corpus import RowErrors, read_corpus
+from kouxing.corpora.feature_cache import as_floats
+from kouxing.corpora.speech_corpus import RowErrors
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import PHONE_LM_PATH, shipped_phone_lm
 from kouxing.services.recognizer.acoustic.network import WINDOW
@@ -24,20 +23,19 @@ from kouxing.training.neural import augmentation, batches, teacher, trainer
 from kouxing.training.neural.augmentation import (
     augment_samples,
     change_tempo,
-    mask,
     scale_level,
     source_frames,
 )
-from kouxing.training.neural.batches import Recording, Targets, augment, batches_of
+from kouxing.training.neural.batches import Recording, Targets, augment
 from kouxing.training.neural.export import network_of, onnx_of
 from kouxing.training.neural.network import Network, Shape, output_frames
 from kouxing.training.neural.optimizer import cross_entropy
 from kouxing.training.neural.recipe import train_neural
-from kouxing.training.neural.scoring import first_hypothesis_error_rate, log_posteriors_of
+from kouxing.training.neural.scoring import log_posteriors_of
 from kouxing.training.neural.trainer import Trainer, shift_targets
 from kouxing.training.neural.whisper_weights import load_whisper
 from kouxing.training.training_set import load_examples, load_untranscribed
-from tests.languages import MANDARIN, SIL
+from tests.languages import MANDARIN
 from tests.tones import burst, tones
 from tests.whisper_folder import encoder_arrays, write_whisper
 
@@ -61,7 +59,7 @@ def floats(tensor: torch.Tensor) -> np.ndarray:
     return tensor.detach().numpy()
 
 
-def test_weights_land_where_they_belong(tmp_path: Path) -> None:
+def test_loads_whispers_weights(tmp_path: Path) -> None:
     arrays = encoder_arrays()
     other = {"decoder/projection/weight": np.zeros((4, 4), np.float16)}
     network = Network(SHAPE)
@@ -91,7 +89,7 @@ def test_weights_land_where_they_belong(tmp_path: Path) -> None:
         assert torch.equal(tensor, before[name])
 
 
-def test_integers_and_short_floats_are_read(tmp_path: Path) -> None:
+def test_loads_integers_and_bfloat16(tmp_path: Path) -> None:
     arrays = encoder_arrays()
     name = "encoder/layer_0/ffn/linear_0/weight"
     weight = arrays[name].astype(np.float32)
@@ -110,31 +108,26 @@ def test_integers_and_short_floats_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(floats(read["first.bias"]), expected, rtol=2**-7)
 
 
-def test_a_folder_without_a_model_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"model\.bin cannot be read .*for faster-whisper"):
-        load_whisper(Network(SHAPE), tmp_path)
-
-
-def test_files_of_other_kinds_and_sizes_are_named(tmp_path: Path) -> None:
+def test_rejects_files_of_other_kinds_and_sizes(tmp_path: Path) -> None:
     def refused(message: str) -> None:
         with pytest.raises(UserError, match=message) as error:
             load_whisper(Network(SHAPE), tmp_path)
         assert str(tmp_path / "model.bin") in str(error.value)
 
     write_whisper(tmp_path, encoder_arrays(width=64))
-    refused("64 x 80 x 3 and not 32 x 80 x 3; give the folder of a Whisper model of width 32")
+    refused("64 x 80 x 3 instead of 32 x 80 x 3; give the folder of a Whisper model of width 32")
     write_whisper(tmp_path, encoder_arrays(num_layers=1))
-    refused("holds no encoder/layer_1")
+    refused("lacks encoder/layer_1")
     write_whisper(tmp_path, encoder_arrays(), name="TransformerSpec")
-    refused("holds a 'TransformerSpec'")
+    refused("contains a 'TransformerSpec'")
     write_whisper(tmp_path, encoder_arrays(), version=3)
     refused("its version 3 is too old")
     unclear = encoder_arrays()
     unclear["encoder/conv2/bias"][3] = np.nan
     write_whisper(tmp_path, unclear)
-    refused("conv2/bias holds values that are no numbers")
+    refused("conv2/bias contains values that are not finite")
     for scale, message in (
-        (np.zeros(32), "values that are no numbers"),
+        (np.zeros(32), "values that are not finite"),
         (np.ones(5), "_scale has 5 values"),
     ):
         scaled = encoder_arrays() | {"encoder/conv1/weight_scale": scale.astype(np.float32)}
@@ -142,12 +135,12 @@ def test_files_of_other_kinds_and_sizes_are_named(tmp_path: Path) -> None:
         refused(message)
     flat = encoder_arrays() | {"encoder/conv1/weight": np.ones((), np.float32)}
     write_whisper(tmp_path, flat | {"encoder/conv1/weight_scale": np.ones(1, np.float32)})
-    refused("no Whisper model")
+    refused("not a Whisper model")
     (tmp_path / "model.bin").write_bytes(b"")
-    refused("no Whisper model")
+    refused("not a Whisper model")
 
 
-def test_no_size_in_the_file_is_believed(tmp_path: Path) -> None:
+def test_checks_every_size_in_the_file(tmp_path: Path) -> None:
     """A file cut anywhere, and one with any number in it made enormous, is refused."""
     write_whisper(tmp_path, encoder_arrays(num_layers=2))
     path = tmp_path / "model.bin"
@@ -155,19 +148,19 @@ def test_no_size_in_the_file_is_believed(tmp_path: Path) -> None:
     used = len(content) - 4  # the aliases at the end are not read
     for size in [*range(1, 90), *range(90, used, 997), used - 1]:
         path.write_bytes(content[:size])
-        with pytest.raises(UserError, match="no Whisper model"):
+        with pytest.raises(UserError, match="not a Whisper model"):
             load_whisper(Network(SHAPE), tmp_path)
     first_array = content.index(b"encoder/conv1/weight\0") + len("encoder/conv1/weight") + 1
     for at in range(first_array, first_array + 18):  # rank, sizes, kind, number of bytes
         path.write_bytes(content[:at] + b"\xff" + content[at + 1 :])
-        with pytest.raises(UserError, match="no Whisper model"):
+        with pytest.raises(UserError, match="not a Whisper model"):
             load_whisper(Network(SHAPE), tmp_path)
 
 
 # --- augmentation
 
 
-def test_the_same_generator_augments_in_the_same_way() -> None:
+def test_augmentation_is_reproducible() -> None:
     results = []
     for seed in (*range(40), *range(40)):
         rng = np.random.default_rng(seed)
@@ -184,34 +177,7 @@ def test_the_same_generator_augments_in_the_same_way() -> None:
         assert np.abs(augment_samples(silence, np.random.default_rng(seed))[0]).max() < 1e-3
 
 
-def test_speed_moves_the_pitch(monkeypatch: pytest.MonkeyPatch) -> None:
-    for share in ("_ROOM_PROB", "_NOISE_PROB", "_TELEPHONE_PROB", "_CODEC_PROB"):
-        monkeypatch.setattr(augmentation, share, 0.0)
-    tone = burst(0.0, 1.0, 1.0)
-    speeds = set()
-    for seed in range(30):
-        sound, speed = augment_samples(tone, np.random.default_rng(seed))
-        spectrum = np.abs(np.fft.rfft(sound))
-        pitch_hz = spectrum.argmax() * 16_000 / len(sound)
-        assert pitch_hz == pytest.approx(1000 * speed, rel=0.01)
-        speeds.add(speed)
-    assert len(speeds) > 4
-
-
-def test_noise_is_as_loud_as_it_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    for share in ("_SPEED_PROB", "_ROOM_PROB", "_TELEPHONE_PROB", "_CODEC_PROB"):
-        monkeypatch.setattr(augmentation, share, 0.0)
-    monkeypatch.setattr(augmentation, "_COLOUR_PROB", 0.0)
-    monkeypatch.setattr(augmentation, "_NOISE_PROB", 1.0)
-    snr_db = []
-    for seed in range(60):
-        sound, _ = augment_samples(HELLO, np.random.default_rng(seed))
-        snr_db.append(10 * np.log10(np.mean(HELLO**2) / np.mean((sound - HELLO) ** 2)))
-    assert 2.9 < min(snr_db) < 8
-    assert 25 < max(snr_db) < 30.1
-
-
-def test_targets_stay_at_their_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_targets_stay_aligned_under_augmentation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where a tone begins and ends, its targets do, whatever the speed and the tempo."""
     for share in ("_ROOM_PROB", "_NOISE_PROB"):
         monkeypatch.setattr(augmentation, share, 0.0)
@@ -240,7 +206,7 @@ def test_targets_stay_at_their_sounds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(lengths) > 350
 
 
-def test_frames_know_their_source() -> None:
+def test_maps_frames_to_their_source() -> None:
     assert source_frames(5, 1.0, 5).tolist() == [0, 1, 2, 3, 4]
     # the middle of frame 100 was at 2 * (16000 + 200) samples: frame 201.25
     assert source_frames(101, 2.0, 500)[100] == 201
@@ -251,23 +217,6 @@ def test_frames_know_their_source() -> None:
         assert 77 <= len(changed) == len(source) <= 123
         np.testing.assert_allclose(changed[:, 0], source, atol=0.51)
         assert (source[0], source[-1]) == (0, 99)
-
-
-def test_masks_hide_few_frames_and_bands() -> None:
-    hidden = []
-    for seed in range(50):
-        frames = np.random.default_rng(100).normal(size=(200, NUM_MELS)).astype(np.float32)
-        before = frames.copy()
-        mask(frames, np.random.default_rng(seed))
-        changed = frames != before
-        assert np.isin(frames[changed], before.mean()).all()
-        rows, columns = changed.all(axis=1), changed.all(axis=0)
-        assert rows.sum() <= 24
-        assert columns.sum() <= 28
-        np.testing.assert_array_equal(changed, rows[:, None] | columns)
-        hidden.append(changed.mean())
-    assert min(hidden) == 0.0
-    assert 0.05 < np.mean(hidden) < 0.25
 
 
 # --- samples beside frames
@@ -287,7 +236,7 @@ def write_corpus(folder: Path, sounds: dict[str, np.ndarray]) -> Path:
     return folder
 
 
-def test_examples_have_the_samples_of_their_frames(tmp_path: Path) -> None:
+def test_examples_contain_the_samples_of_their_frames(tmp_path: Path) -> None:
     late = np.concatenate([np.zeros(20_000, np.float32), HELLO, np.zeros(20_000, np.float32)])
     corpus = write_corpus(tmp_path / "corpus", {"a": late, "b": HELLO})
     plain = load_examples([corpus], RowErrors(), MANDARIN)
@@ -303,21 +252,6 @@ def test_examples_have_the_samples_of_their_frames(tmp_path: Path) -> None:
     assert len(examples[0].log_mel) < len(late) / 160 - 150
 
 
-def test_samples_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    corpus = write_corpus(tmp_path / "corpus", {"a": HELLO, "b": HELLO[:8000]})
-    soundfile.write(corpus / "c.wav", HELLO, 16_000)
-    rows = read_corpus(corpus, RowErrors(), MANDARIN)
-    (corpus / "b.wav").write_bytes(b"no sound")
-    first = samples_of(rows)
-    monkeypatch.setattr(
-        "kouxing.corpora.feature_cache.read_audio", lambda _: pytest.fail("computed again")
-    )
-    for found in (first, samples_of(rows)):
-        np.testing.assert_allclose(as_floats(found[0]), HELLO, atol=2**-16)
-        assert len(found[1]) == 0
-    assert samples_of([]) == []
-
-
 # --- the network
 
 
@@ -328,7 +262,7 @@ def random_frames(num_frames: int, seed: int = 0) -> torch.Tensor:
 
 
 @torch.no_grad()
-def test_the_future_does_not_change_the_past() -> None:
+def test_the_network_is_causal() -> None:
     torch.manual_seed(0)
     network = Network(SHAPE).eval()
     frames = random_frames(41)
@@ -345,7 +279,7 @@ def test_the_future_does_not_change_the_past() -> None:
 
 
 @torch.no_grad()
-def test_a_position_attends_to_the_window_and_no_further() -> None:
+def test_a_position_attends_only_to_its_window() -> None:
     torch.manual_seed(0)
     network = Network(SMALL(num_states=6, look_aheads=(1,), layers=1)).eval()
     frames = random_frames(2 * WINDOW + 21)
@@ -357,15 +291,7 @@ def test_a_position_attends_to_the_window_and_no_further() -> None:
     assert (difference[WINDOW + 3 :] < 1e-6).all()
 
 
-def test_posteriors_sum_to_one_in_mixed_precision() -> None:
-    network = Network(SHAPE)
-    with torch.autocast("cpu", torch.bfloat16):
-        log_posteriors = network.log_posteriors(network(random_frames(41)), 0)
-    assert log_posteriors.dtype == torch.float32
-    torch.testing.assert_close(log_posteriors.exp().sum(dim=-1), torch.ones(1, 20, 2))
-
-
-def test_targets_are_shifted_by_the_look_ahead() -> None:
+def test_shifts_targets_by_the_look_ahead() -> None:
     assert output_frames(3, 1).tolist() == [[1, 2], [3, 4], [5, 6]]
     assert output_frames(3, 6).tolist() == [[-4, -3], [-2, -1], [0, 1]]
     states = torch.arange(100, 109)[None, :, None] + torch.tensor([0, 50])
@@ -381,7 +307,7 @@ def test_targets_are_shifted_by_the_look_ahead() -> None:
 
 
 @pytest.mark.parametrize("num_samples", [8000, 8160, 560])
-def test_whole_recordings_are_scored_as_by_the_recognizer(num_samples: int) -> None:
+def test_scores_whole_recordings_like_the_recognizer(num_samples: int) -> None:
     torch.manual_seed(0)
     network = Network(SHAPE).eval()
     samples = np.rint(32767 * HELLO[4000 : 4000 + num_samples]).astype(np.int16)
@@ -414,19 +340,6 @@ def test_the_loss_is_the_cross_entropy_of_soft_targets() -> None:
     assert float(cross_entropy(posteriors.log(), states, 0 * probs)) == 0.0
 
 
-def test_batches_hold_recordings_with_one_state_a_frame_and_with_several() -> None:
-    hard = Targets.hard(np.array([4, 5]))
-    soft = hard.averaged_with(Targets.hard(np.array([6, 6])))
-    kinds = iter([hard, soft] * 100)
-    rows = np.arange(6, dtype=np.float32).reshape(2, 3)
-    inputs, states, probs = next(
-        batches_of(lambda: (rows, next(kinds)), 4, np.random.default_rng(0))
-    )
-    assert inputs.tolist() == [[*rows.tolist(), rows[1].tolist()]] * 2
-    assert states.tolist() == [[[4, 0], [5, 0]], [[4, 6], [5, 6]]]
-    assert probs.tolist() == [[[1.0, 0.0]] * 2, [[0.5, 0.5]] * 2]
-
-
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "_BATCH_FRAMES", 300)
     monkeypatch.setattr(batches, "_POOL_BATCHES", 2)
@@ -450,9 +363,7 @@ def trained(
 
 
 @pytest.mark.parametrize("main_output", [0, 1])
-def test_the_network_learns_which_tone_is_when(
-    main_output: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_network_learns_tones(main_output: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loss falls, and an output layer tells the states of its frames."""
     quick(monkeypatch)
     monkeypatch.setattr(augmentation, "_MAX_MASKS", 0)
@@ -465,82 +376,6 @@ def test_the_network_learns_which_tone_is_when(
     unseen = tones(100)
     found = log_posteriors_of(learner.mean, main_output, unseen.samples).argmax(axis=1)
     assert np.mean(found == unseen.targets.states[:, 0]) > 0.94  # two frames late would be 0.9
-
-
-def test_convolutions_are_frozen_and_all_else_is_trained(monkeypatch: pytest.MonkeyPatch) -> None:
-    quick(monkeypatch)
-    before = {k: v.clone() for k, v in trained([tones(0)], 0)[0].network.state_dict().items()}
-    learner, losses = trained([tones(0)], 4)
-    assert all(np.isfinite(losses))
-    for network in (learner.network, learner.mean):
-        for name, tensor in network.state_dict().items():
-            is_frozen = name.startswith(("first.", "second."))
-            assert torch.equal(tensor, before[name]) == is_frozen, name
-    weights, mean = (floats(n.norm.weight) for n in (learner.network, learner.mean))
-    assert not np.array_equal(weights, mean)
-
-
-def test_the_rate_rises_and_stays_and_late_weights_count_more(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(trainer, "_WARM_UP_STEPS", 4)
-    monkeypatch.setattr(trainer, "_BATCH_FRAMES", 300)
-    monkeypatch.setattr(trainer, "_MAX_WARM_UP", 0.5)
-    rates: list[float] = []
-    step = Trainer._step
-
-    def noted(learner: Trainer, number: int, rate_factor: float) -> float:
-        rates.append(rate_factor)
-        return step(learner, number, rate_factor)
-
-    monkeypatch.setattr(Trainer, "_step", noted)
-    network = Network(SHAPE)
-    learner = Trainer(network, [tones(0)], main_output=1, seed=0)
-    weights: list[np.ndarray] = []
-
-    def watch(number: int, loss: float) -> None:
-        weights.append(floats(network.norm.weight).copy())
-        assert number == len(weights)
-        assert np.isfinite(loss)
-
-    learner.train(10, watch)
-    assert rates == [0.25, 0.5, 0.75, *[1.0] * 7]
-    counted = [8, *(n * (n + 1) for n in range(3, 12))]
-    expected = np.average(weights, axis=0, weights=counted)
-    np.testing.assert_allclose(floats(learner.mean.norm.weight), expected, rtol=1e-5)
-
-
-def test_the_same_seed_gives_the_same_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    quick(monkeypatch)
-    recordings = [tones(seed) for seed in range(3)]
-    first, second, other = (trained(recordings, 3, seed)[0].mean.state_dict() for seed in (0, 0, 1))
-    assert all(torch.equal(tensor, second[name]) for name, tensor in first.items())
-    assert not torch.equal(first["outputs.0.weight"], other["outputs.0.weight"])
-
-
-def test_long_recordings_are_cropped_and_start_at_any_position(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    long = Recording(
-        samples=np.tile(tones(0).samples, 12),
-        targets=Targets.hard(np.arange(1198) % 6),
-        weight=1.0,
-    )
-    frames, targets = augment(long, np.random.default_rng(0))
-    assert frames.shape == (800, NUM_MELS)
-    assert len(targets) == 800
-    starts = []
-    forward = Network.forward
-
-    def noted(network: Network, seen: torch.Tensor, start: int = 0) -> torch.Tensor:
-        starts.append(start)
-        return forward(network, seen, start)
-
-    quick(monkeypatch)
-    monkeypatch.setattr(Network, "forward", noted)
-    trained([tones(0)], 20)
-    assert 4 < starts.count(0) < 16
-    assert 300 < max(starts) < 900
 
 
 # --- the recipe
@@ -559,7 +394,7 @@ def whisper(tmp_path: Path) -> Path:
     return write_whisper(tmp_path / "whisper", encoder_arrays(num_layers=6))
 
 
-def test_the_recipe_writes_model_card_and_curves(
+def test_trains_and_writes_model_card_and_curves(
     corpus: Path, whisper: Path, tmp_path: Path
 ) -> None:
     lines: list[str] = []
@@ -588,24 +423,6 @@ def test_the_recipe_writes_model_card_and_curves(
     assert "Whisper's weights (Radford et al. 2023, MIT licence)" in card
     assert "with a readout of Whisper's whole encoder as the teacher." in card
     assert output.with_suffix(".png").stat().st_size > 1000
-
-
-def test_the_error_rate_of_the_first_hypothesis(corpus: Path) -> None:
-    """Clear scores make no errors; a phone that is not there is one."""
-    (example,) = load_examples([corpus], RowErrors(), MANDARIN)
-    model = load_model(model_path("gmm"))
-    path = [SIL, *example.phones, SIL]
-    num_states = np.diff(model.topology.first_state)
-    rows = []
-    for phone in path:
-        for state in range(num_states[phone]):
-            row = np.full(model.topology.num_states, -60.0, np.float32)
-            row[model.topology.first_state[phone] + state] = 0.0
-            rows += [row] * 4
-    scores = [np.array(rows)]
-    assert first_hypothesis_error_rate(model, scores, [example]) == 0.0
-    fewer = replace(example, phones=example.phones[1:])
-    assert first_hypothesis_error_rate(model, scores, [fewer]) == 1 / len(fewer.phones)
 
 
 def test_the_teacher_labels_recordings_without_text(
@@ -651,7 +468,7 @@ def test_the_teacher_labels_recordings_without_text(
     assert "as the teacher" in card
 
 
-def test_recordings_without_text_are_trimmed_and_cut(tmp_path: Path) -> None:
+def test_trims_and_cuts_recordings_without_text(tmp_path: Path) -> None:
     silence = np.zeros(20_000, np.float32)
     long = np.concatenate([silence, *[HELLO] * 20, silence])
     soundfile.write(tmp_path / "a.flac", long, 16_000)
@@ -670,15 +487,7 @@ def test_recordings_without_text_are_trimmed_and_cut(tmp_path: Path) -> None:
     ]
 
 
-def test_folders_without_usable_recordings_are_named(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=f"{tmp_path} holds no wav"):
-        load_untranscribed([tmp_path], RowErrors())
-    (tmp_path / "c.ogg").write_bytes(b"no sound")
-    with pytest.raises(UserError, match=r"no usable recordings .*no audio in .*c\.ogg.*; give"):
-        load_untranscribed([tmp_path], RowErrors())
-
-
-def test_the_same_seed_gives_the_same_model_and_it_learns_further(
+def test_training_is_reproducible_and_can_continue(
     corpus: Path, whisper: Path, tmp_path: Path
 ) -> None:
     manifest = corpus / "manifest.tsv"  # nothing to test on
@@ -723,14 +532,14 @@ def test_training_needs_a_start(corpus: Path, tmp_path: Path) -> None:
         train(num_threads=1, start=model_path("gmm"), untranscribed=[corpus])
     with pytest.raises(UserError, match="give --aligner or --start-from"):
         train(aligner=None, num_threads=1, whisper=tmp_path)
-    with pytest.raises(UserError, match=r"model\.bin cannot be read"):
+    with pytest.raises(UserError, match=r"cannot read .*model\.bin"):
         train(num_threads=1, whisper=tmp_path)
-    with pytest.raises(UserError, match=r"not written by this command .* 10, 30, 60, 100, 200 ms"):
+    with pytest.raises(UserError, match=r"not trained here .* 10, 30, 60, 100, 200 ms"):
         train(num_threads=1, start=model_path("gmm"))
 
 
 @pytest.mark.parametrize("look_ahead_ms", [0.0, 5.0, 25.0, -10.0, 2000.0, float("nan")])
-def test_look_aheads_that_cannot_be_are_named(look_ahead_ms: float, tmp_path: Path) -> None:
+def test_rejects_invalid_look_aheads(look_ahead_ms: float, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot be trained; give 10, 20, 30"):
         train_neural(
             [], tmp_path / "n.npz", aligner=model_path("gmm"), whisper=tmp_path,

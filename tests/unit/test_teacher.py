@@ -1,12 +1,8 @@
 """The teacher: Whisper's encoder on whole recordings, and the readout of states."""
 
-import threading
-import time
-
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from scipy.special import erf, softmax
 
 from kouxing.services.recognizer.acoustic.network import position_table
@@ -18,7 +14,6 @@ from kouxing.training.neural.teacher import (
     Teacher,
     WholeEncoder,
     centered_mel,
-    process_all,
     train_teacher,
 )
 from tests.tones import tones
@@ -40,7 +35,7 @@ def whole_encoder() -> WholeEncoder:
 # --- the encoder
 
 
-def test_bands_are_whispers() -> None:
+def test_computes_whispers_bands() -> None:
     """Frame 30 against its definition; the floor lies eight decades below the loudest band."""
     samples = np.zeros(16_000, np.float32)
     samples[:8000] = np.random.default_rng(0).normal(0, 0.1, 8000)
@@ -54,7 +49,7 @@ def test_bands_are_whispers() -> None:
     np.testing.assert_array_equal(bands[:, 60:], bands.min())
 
 
-def test_all_positions_attend_to_all() -> None:
+def test_the_encoder_computes_its_formulas() -> None:
     """The encoder against plain formulas, position by position and head by head."""
     encoder = whole_encoder()
     weights = {name: tensor.numpy() for name, tensor in encoder.state_dict().items()}
@@ -96,9 +91,7 @@ def test_all_positions_attend_to_all() -> None:
 
 
 @pytest.mark.parametrize("num_frames", [1, 2, 19, 20, 21, 45])
-def test_long_recordings_are_cut_into_pieces(
-    num_frames: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cuts_long_recordings_into_pieces(num_frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(teacher, "_PIECE_FRAMES", 20)
     encoder = whole_encoder()
     samples = tones(0).samples[8000 : 8000 + 240 + 160 * num_frames]
@@ -110,7 +103,7 @@ def test_long_recordings_are_cut_into_pieces(
         np.testing.assert_array_equal(features[start // 2 : start // 2 + 10], alone)
 
 
-def test_a_position_encodes_its_two_frames() -> None:
+def test_a_position_encodes_two_frames() -> None:
     """A click in the middle of two frames is largest in the position whose output they are."""
     encoder = whole_encoder()
     with torch.no_grad():
@@ -137,7 +130,7 @@ def taught(num_steps: int, monkeypatch: pytest.MonkeyPatch) -> tuple[Teacher, li
     return train_teacher(whole_encoder(), recordings, seed=0, report=lines.append), lines
 
 
-def test_the_teacher_learns_which_tone_is_when(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_teacher_learns_tones(monkeypatch: pytest.MonkeyPatch) -> None:
     learnt, lines = taught(100, monkeypatch)
     unseen = tones(100)
     targets = learnt.targets_of(unseen.samples)
@@ -158,36 +151,3 @@ def test_the_same_seed_gives_the_same_teacher(monkeypatch: pytest.MonkeyPatch) -
 
 
 # --- many recordings
-
-
-def test_two_recordings_at_a_time_are_processed_in_order() -> None:
-    together = threading.Barrier(2, timeout=10.0)
-
-    def process(samples: NDArray[np.int16]) -> int:
-        assert torch.get_num_threads() == 1
-        together.wait()
-        return len(samples)
-
-    lines: list[str] = []
-    recordings = [np.zeros(num, np.int16) for num in (5, 3, 4, 1)]
-    torch.set_num_threads(2)
-    assert process_all(process, recordings, "processed", lines.append) == [5, 3, 4, 1]
-    assert lines[-1] == "4 of 4 recordings processed"
-    assert torch.get_num_threads() == 2
-
-
-def test_an_error_ends_the_processing() -> None:
-    processed: list[int] = []
-
-    def process(samples: NDArray[np.int16]) -> None:
-        processed.append(len(samples))
-        if len(samples) == 0:
-            raise ValueError("no samples")
-        time.sleep(0.01)
-
-    recordings = [np.zeros(num, np.int16) for num in range(300)]
-    torch.set_num_threads(2)
-    with pytest.raises(ValueError, match="no samples"):
-        process_all(process, recordings, "processed", lambda _: None)
-    assert len(processed) < 150
-    assert torch.get_num_threads() == 2

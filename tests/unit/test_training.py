@@ -26,7 +26,7 @@ from kouxing.shared.errors import UserError
 from kouxing.training.durations import PhoneDurations, positions_of
 from kouxing.training.gmm.decorrelation import decorrelate
 from kouxing.training.gmm.estimation import estimate, first_estimate, split
-from kouxing.training.gmm.frames import Copy, FrameSet, flat_path
+from kouxing.training.gmm.frames import Copy, FrameSet
 from kouxing.training.gmm.recipe import train_gmm
 from kouxing.training.phone_lm.recipe import load_phone_lm, train_phone_lm
 from kouxing.training.training_set import Example, load_examples, speech_span
@@ -84,7 +84,7 @@ def write_corpus(folder: Path, rows: list[str], num_audio: int = 3) -> None:
     (folder / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
-def test_manifest_and_its_bad_rows(tmp_path: Path) -> None:
+def test_reads_a_manifest_and_reports_bad_rows(tmp_path: Path) -> None:
     write_corpus(
         tmp_path,
         [
@@ -110,7 +110,7 @@ def test_manifest_and_its_bad_rows(tmp_path: Path) -> None:
         assert part in message
 
 
-def test_conversation_is_kept_back_and_readable(tmp_path: Path) -> None:
+def test_the_conversation_manifest_is_readable_and_held_out(tmp_path: Path) -> None:
     lines = CONVERSATION.read_text(encoding="utf-8").splitlines()[1:]
     names = [line.split("\t")[0] for line in lines]
     (tmp_path / "audio").mkdir()
@@ -126,7 +126,7 @@ def test_conversation_is_kept_back_and_readable(tmp_path: Path) -> None:
     assert not is_kept_back(tmp_path / "websdk-java-demo_16k_10_00.ogg")
 
 
-def test_kaldi_folder(tmp_path: Path) -> None:
+def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
     write_corpus(tmp_path, [])
     (tmp_path / "manifest.tsv").unlink()
     (tmp_path / "wav.scp").write_text(f"u1 0.wav\nu2 {tmp_path}/1.wav\n")
@@ -155,7 +155,7 @@ def test_kaldi_folder(tmp_path: Path) -> None:
         read_corpus(held_out, RowErrors(), MANDARIN)
 
 
-def test_aishell_folder(tmp_path: Path) -> None:
+def test_reads_an_aishell_folder(tmp_path: Path) -> None:
     (tmp_path / "wav" / "train" / "S0002").mkdir(parents=True)
     (tmp_path / "transcript").mkdir()
     sound = np.zeros(16_000)
@@ -168,7 +168,7 @@ def test_aishell_folder(tmp_path: Path) -> None:
     assert "BAC009S0002W0123" in errors.messages[0]
 
 
-def test_no_corpus_and_no_columns(tmp_path: Path) -> None:
+def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no corpus"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
@@ -180,14 +180,14 @@ def test_no_corpus_and_no_columns(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seconds", ["nan", "inf", "-1", "long"])
-def test_lengths_that_are_none_are_reported(seconds: str, tmp_path: Path) -> None:
+def test_reports_invalid_lengths(seconds: str, tmp_path: Path) -> None:
     write_corpus(tmp_path, [f"a\t0.wav\tA\tx\tMIT\ttrain\t{seconds}\t你\tni3"])
     errors = RowErrors()
     assert read_corpus(tmp_path, errors, MANDARIN) == []
     assert len(errors.messages) == 1
 
 
-def test_the_given_pinyin_counts(tmp_path: Path) -> None:
+def test_pinyin_takes_precedence_over_the_text(tmp_path: Path) -> None:
     """Polyphones, er-hua, ü and syllables without an initial; the text is not asked."""
     write_corpus(
         tmp_path,
@@ -222,7 +222,7 @@ def test_the_given_pinyin_counts(tmp_path: Path) -> None:
         ("", False),
     ],
 )
-def test_licences(licence: str, free: bool) -> None:
+def test_licenses_that_allow_distribution(licence: str, free: bool) -> None:
     assert may_ship(licence) is free
 
 
@@ -247,7 +247,7 @@ def test_weights_and_licence_filter(tmp_path: Path) -> None:
         load_examples([tmp_path], RowErrors(), MANDARIN)
 
 
-def test_cache_is_used_and_unreadable_audio_is_noted(
+def test_uses_the_cache_and_reports_unreadable_audio(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_corpus(
@@ -267,7 +267,7 @@ def test_cache_is_used_and_unreadable_audio_is_noted(
     np.testing.assert_array_equal(first[0], again[0])
 
 
-def test_long_silence_is_trimmed() -> None:
+def test_trims_long_silence() -> None:
     log_mel = np.full((400, 41), 7.0, np.float16)
     log_mel[150:250] = 18.0
     assert len(log_mel[speech_span(log_mel)]) == 150
@@ -326,15 +326,6 @@ def test_pauses_are_optional_and_phones_are_not() -> None:
     assert likelihood == -np.inf
 
 
-def test_flat_path_goes_through_all_phones() -> None:
-    example = made_up_speech(1)[0]
-    graph = utterance_graph(example.phones, example.syllables, FIRST_STATE, silence=SIL)
-    path = flat_path(graph, example.log_mel[:, 0].astype(np.float32))
-    found = [u.phone for u in segments_of_path(path, graph)]
-    assert found == [SIL, *example.phones, SIL]
-    assert (np.diff(path) >= 0).all()
-
-
 # --- estimation
 
 
@@ -343,7 +334,7 @@ def frame_set(num: int) -> FrameSet:
     return FrameSet.build(copies, MANDARIN, FIRST_STATE, np.zeros(13, np.float32), 1)
 
 
-def test_likelihood_never_falls() -> None:
+def test_the_likelihood_never_falls() -> None:
     frames = frame_set(30)
     hmm = first_estimate(frames, FIRST_STATE)
     before = frames.realign(hmm)
@@ -358,7 +349,7 @@ def test_likelihood_never_falls() -> None:
             before = now
 
 
-def test_estimates_of_one_gaussian_are_mean_and_variance() -> None:
+def test_one_gaussian_has_mean_and_variance() -> None:
     frames = frame_set(10)
     hmm = estimate(frames, first_estimate(frames, FIRST_STATE))
     state = int(FIRST_STATE[SIL])
@@ -369,14 +360,7 @@ def test_estimates_of_one_gaussian_are_mean_and_variance() -> None:
     np.testing.assert_allclose(hmm.mixtures.covars[state, 0], expected, rtol=1e-2, atol=1e-3)
 
 
-def test_splitting_keeps_the_weights_whole() -> None:
-    frames = frame_set(20)
-    hmm = split(first_estimate(frames, FIRST_STATE), frames, 4)
-    np.testing.assert_allclose(hmm.mixtures.weights.sum(axis=1), 1, rtol=1e-5)
-    assert (hmm.mixtures.weights[FIRST_STATE[SIL]] > 0).all()
-
-
-def test_decorrelating_raises_the_likelihood() -> None:
+def test_decorrelation_keeps_the_likelihood() -> None:
     frames = frame_set(40)
     hmm = first_estimate(frames, FIRST_STATE)
     for _ in range(3):
@@ -418,7 +402,7 @@ def test_durations_by_position() -> None:
 # --- whole recipes
 
 
-def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
+def test_trains_models_and_writes_cards(tmp_path: Path) -> None:
     rows = [
         f"{n}\t{n}.wav\tS{n}\tx\tCC0-1.0\t{'dev' if n == 5 else 'train'}\t1.25\t你好\tni3 hao3"
         for n in range(6)
@@ -448,7 +432,7 @@ def test_recipes_write_models_and_cards(tmp_path: Path) -> None:
         train_gmm([tmp_path / "corpus"], gmm, MANDARIN, num_mixtures=3)
 
 
-def test_alignment_refuses_what_cannot_be() -> None:
+def test_alignment_rejects_texts_that_do_not_fit() -> None:
     model = load_model()
     sound = np.zeros(4000, np.float32)
     with pytest.raises(UserError, match="text is empty"):

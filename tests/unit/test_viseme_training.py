@@ -29,7 +29,7 @@ START = initial_parameters()
 
 
 @pytest.mark.slow
-def test_estimation_finds_what_made_the_curves() -> None:
+def test_estimates_the_parameters_behind_curves() -> None:
     phones = utterance(0, 160)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.04)
     true = replace(START, target=0.6 * START.target, offset_s=START.offset_s - 0.02)
@@ -60,7 +60,7 @@ def test_estimation_finds_what_made_the_curves() -> None:
     assert found.offset_s[VISEME_INDEX["b"], LOWER_LIP] == 0.0
 
 
-def test_short_clips_and_few_measures_are_learnt_from() -> None:
+def test_learns_from_short_clips_with_few_faps() -> None:
     phones = utterance(0, 2)
     time_s = np.arange(0.0, 1.5, 0.04)
     curve = blend(
@@ -75,11 +75,11 @@ def test_short_clips_and_few_measures_are_learnt_from() -> None:
     vowel = VISEME_INDEX[phones[1].symbol]
     assert abs(found.target[vowel, LOWER_LIP]) < 0.8 * abs(START.target[vowel, LOWER_LIP])
     np.testing.assert_array_equal(found.target[:, JAW], START.target[:, JAW])
-    with pytest.raises(UserError, match="have no speech"):
+    with pytest.raises(UserError, match="contain no speech"):
         frames_of([clip], [[]], INVENTORY)
 
 
-def test_usual_levels_tell_vowels_from_consonants() -> None:
+def test_usual_levels_differ_between_vowels_and_consonants() -> None:
     phones = utterance(2, 60)
     end_s = phones[-1].onset_s + phones[-1].duration_s + 0.3
     samples = np.zeros(int(end_s * SAMPLE_RATE_HZ), dtype=np.float32)
@@ -94,7 +94,7 @@ def test_usual_levels_tell_vowels_from_consonants() -> None:
     assert found[VISEME_INDEX["er"]] == START.level_db[VISEME_INDEX["er"]]  # in no recording
 
 
-def test_closures_are_as_long_as_the_lips_are_shut() -> None:
+def test_closures_last_as_long_as_in_the_clips() -> None:
     phones = utterance(3, 80)
     time_s = np.arange(0.0, phones[-1].onset_s + 0.5, 0.02)
     for reach_s in (0.05, 0.1):
@@ -114,7 +114,7 @@ def write_clip(
     soundfile.write(folder / f"{name}.flac", np.zeros(1600), 16_000)
 
 
-def test_clips_of_both_kinds_are_read(tmp_path: Path) -> None:
+def test_reads_tracked_clips_and_rigs(tmp_path: Path) -> None:
     write_clip(tmp_path, "a_film", "zh", "t,ok,F3_open_jaw,F5_raise_b_midlip", "0.5,1,10,-20")
     write_clip(
         tmp_path, "b_rig", "zh", "t,mouth_stretch_c,mouth_press_l,mouth_press_r", "0.5,1,0,0"
@@ -146,14 +146,14 @@ def test_clips_of_both_kinds_are_read(tmp_path: Path) -> None:
         ("{}", "t,F3_open_jaw\n0,1\n", "bad.flac"),
     ],
 )
-def test_bad_clips_are_named(about: str, table: str, message: str, tmp_path: Path) -> None:
+def test_rejects_bad_clips(about: str, table: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text(about)
     (tmp_path / "bad.csv").write_text(table)
     with pytest.raises(UserError, match=f"the clip bad: .*{message}"):
         read_clips(tmp_path)
 
 
-def test_a_rule_says_what_clips_are_for(tmp_path: Path) -> None:
+def test_a_rule_assigns_clips_to_parts(tmp_path: Path) -> None:
     names = [f"clip_{k}" for k in range(40)]
     free, closed = ([part_of(name, may_train=free) for name in names] for free in (True, False))
     assert {"train", "choice", "held"} == set(free)
@@ -173,6 +173,6 @@ def test_a_rule_says_what_clips_are_for(tmp_path: Path) -> None:
     }
 
 
-def test_folders_without_clips_are_refused(tmp_path: Path) -> None:
+def test_rejects_folders_without_clips(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no Mandarin clips"):
         train_visemes(tmp_path, tmp_path / "out.json")

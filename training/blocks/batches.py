@@ -1,12 +1,11 @@
-"""Batches for the block network: speech as its teacher hears it, and disturbed as it comes live.
+"""Batches for the block network: clean speech for the teacher, disturbed speech for the network.
 
-Sources as in :mod:`training.neural.augmentation`, whose disturbances are used; others' speech in
-the background, clipping and lossy coding come on top.
+The disturbances are those of :mod:`kouxing.training.neural.augmentation`, and background speech,
+clipping and lossy coding.
 
-An excerpt is cut from the recordings played one after another. Its speed is drawn; the teacher
-hears it clean, and a little beyond the end of what the network hears. A tempo is drawn for the
-frames of both. Every batch is drawn by a generator of its own, so training that goes on later
-gives the same network.
+An excerpt is cut from the concatenated recordings, and its speed is drawn. The teacher sees it
+clean, and slightly longer than the network does. A tempo is drawn for the frames of both. Every
+batch has its own random generator, so resumed training gives the same network.
 """
 
 from __future__ import annotations
@@ -39,14 +38,14 @@ from kouxing.training.neural.batches import Recording, Targets, sampling_probs
 BATCH_S = 32
 _POSITIONS_PER_S = 50
 _LENGTHS = (80, 120, 160, 200)  # positions of an excerpt
-_BEYOND = 25  # positions that the teacher alone hears
+_BEYOND = 25  # further positions that only the teacher sees
 _BLOCK_LENGTHS, _BLOCK_PROBS = (5, 10, 20), (0.2, 0.4, 0.4)
 _FROM_START_PROB = 0.5  # of a recording
 _FIRST_ROW_PROB, _MAX_START = 0.7, 1200  # row of the table of positions
 _DISTURB_PROB, _TEMPO_PROB, _HURRY_PROB = 0.9, 0.3, 0.4
-_MAX_STRETCH = 2.2  # samples needed for an excerpt, of any speed and tempo
-_MAX_SHORTENING = 0.7  # of the duration of a frame that is like its neighbours
-_STEADY_FRAMES = 5  # that steadiness is averaged over
+_MAX_STRETCH = 2.2  # frames needed for an excerpt of any speed and tempo
+_MAX_SHORTENING = 0.7  # of a frame that resembles its neighbors
+_STEADY_FRAMES = 5  # steadiness is averaged over them
 _TEACHER_PEAK = 0.5
 _BABBLE_PROB, _MAX_VOICES, _MIN_BABBLE_DB, _MAX_BABBLE_DB = 0.15, 3, 0.0, 20.0
 _CLIP_PROB, _MIN_CLIPPED = 0.1, 0.15  # lowest limit, of the peak
@@ -62,8 +61,8 @@ Floats = NDArray[np.float32]
 class BlockBatch:
     """Excerpts of a step."""
 
-    frames: Tensor  # (batch, 2 positions + 1, 80), as the network hears them
-    clean: Tensor  # (batch, 80, more frames), as the teacher does
+    frames: Tensor  # (batch, 2 positions + 1, 80), the network's input
+    clean: Tensor  # (batch, 80, more frames), the teacher's input
     states: Tensor  # (batch, positions, 2, k), the targets
     probs: Tensor  # (batch, positions, 2, k)
     block_length: int
@@ -71,24 +70,24 @@ class BlockBatch:
 
 
 def block_batch(recordings: Sequence[Recording], seed: int, number: int) -> BlockBatch:
-    """Draw the batch of a number."""
+    """Draw the batch with this number."""
     rng = np.random.default_rng([seed, number])
     probs = sampling_probs(recordings)
     length = int(rng.choice(_LENGTHS))
-    num_heard = 2 * (length + _BEYOND) + 1
-    heard, clean, states, target_probs = [], [], [], []
+    num_frames = 2 * (length + _BEYOND) + 1
+    disturbed, clean, states, target_probs = [], [], [], []
     for _ in range(_POSITIONS_PER_S * BATCH_S // length):
-        samples, targets = _speech(recordings, probs, math.ceil(_MAX_STRETCH * num_heard), rng)
+        samples, targets = _speech(recordings, probs, math.ceil(_MAX_STRETCH * num_frames), rng)
         both, source = _frames(samples, len(targets), recordings, rng)
-        bands = both[:num_heard, :NUM_MELS]
+        bands = both[:num_frames, :NUM_MELS]
         clean.append(np.maximum(bands, bands.max() - FLOOR_BANDS).T)
-        heard.append(both[: 2 * length + 1, NUM_MELS:])
+        disturbed.append(both[: 2 * length + 1, NUM_MELS:])
         target = targets.of(source[: 2 * length])
         states.append(target.states.astype(np.int64))
         target_probs.append(target.probs.astype(np.float32))
     shape = len(states), length, 2, -1
     return BlockBatch(
-        frames=torch.from_numpy(np.stack(heard)),
+        frames=torch.from_numpy(np.stack(disturbed)),
         clean=torch.from_numpy(np.stack(clean)),
         states=torch.from_numpy(np.stack(states)).view(*shape),
         probs=torch.from_numpy(np.stack(target_probs)).view(*shape),
@@ -103,18 +102,18 @@ def _speech(
     num_frames: int,
     rng: np.random.Generator,
 ) -> tuple[Samples, Targets]:
-    """Draw recordings until they fill the frames; the first may begin anywhere."""
+    """Draw recordings until they fill the frames; the first may start anywhere."""
     sounds, states, target_probs = [], [], []
     missing = num_frames
     while missing > 0:
         recording = recordings[int(rng.choice(len(probs), p=probs))]
         size = len(recording.targets)
-        begin = 0
+        start_frame = 0
         if missing == num_frames and size > num_frames and rng.random() >= _FROM_START_PROB:
-            begin = int(rng.integers(size - num_frames))
-        size = min(size - begin, missing)
-        sounds.append(recording.samples[HOP_SAMPLES * begin :][: HOP_SAMPLES * size])
-        target = recording.targets.of(slice(begin, begin + size))
+            start_frame = int(rng.integers(size - num_frames))
+        size = min(size - start_frame, missing)
+        sounds.append(recording.samples[HOP_SAMPLES * start_frame :][: HOP_SAMPLES * size])
+        target = recording.targets.of(slice(start_frame, start_frame + size))
         states.append(target.states)
         target_probs.append(target.probs)
         missing -= size
@@ -125,12 +124,12 @@ def _speech(
 def _frames(
     samples: Samples, num_source: int, recordings: Sequence[Recording], rng: np.random.Generator
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """Compute frames, clean and disturbed side by side, (n, 160), and each one's source frame."""
+    """Compute frames, clean and disturbed, (n, 160), and their source frames, (n,)."""
     sound, speed = change_speed(samples, rng)
     sound = (sound * (_TEACHER_PEAK / (np.abs(sound).max() + _TINY))).astype(np.float32)
     disturbed = sound
     if rng.random() < _DISTURB_PROB:
-        disturbed = _distort(disturb(_with_voices(sound, recordings, rng), rng), rng)
+        disturbed = _distort(disturb(_add_babble(sound, recordings, rng), rng), rng)
     frames = np.hstack(
         [WhisperMel().accept_waveform(one) for one in (sound, scale_level(disturbed, rng))]
     )
@@ -143,7 +142,7 @@ def _frames(
 
 
 def _hurry(frames: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.int64]]:
-    """Shorten what is steady, as fast speakers do: vowels and pauses more than consonants.
+    """Shorten steady sounds, as fast speakers do: vowels and pauses more than consonants.
 
     Returns
     -------
@@ -159,10 +158,10 @@ def _hurry(frames: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np
     return frames[kept], kept
 
 
-def _with_voices(
+def _add_babble(
     sound: Samples, recordings: Sequence[Recording], rng: np.random.Generator
 ) -> Samples:
-    """Add others' speech, at times."""
+    """Add background speech, at random."""
     if rng.random() >= _BABBLE_PROB:
         return sound
     babble = np.zeros_like(sound)
@@ -175,7 +174,7 @@ def _with_voices(
 
 
 def _distort(sound: Samples, rng: np.random.Generator) -> Samples:
-    """Clip, or code and decode, at times; the peak becomes 1/2."""
+    """Clip, or code and decode, at random; the peak becomes 1/2."""
     peak = np.abs(sound).max() + _TINY
     if rng.random() < _CLIP_PROB:
         peak *= np.exp(rng.uniform(np.log(_MIN_CLIPPED), 0.0))

@@ -1,1 +1,1 @@
-"""Learns the table of the ferguson lips, and how far each FAP travels."""
+"""Learns the table of the ferguson lip model, and how far each FAP travels."""

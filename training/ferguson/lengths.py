@@ -1,8 +1,8 @@
-"""Usual lengths, zero crossings and influence of the phones, from aligned speech.
+"""Usual durations, zero crossings and influence of the phones, from aligned speech.
 
 Source of the influence factors: Zhang et al. 2021, table 2, gives vowels four levels. Their values
-are learnt here: the share of the syllable that is its initial, by final. Finals of like shares make
-a level, such that the shares differ least from their level's.
+are learned here from each final's mean fraction of the syllable that is the initial. Finals are
+grouped into levels such that the fractions deviate least from their level's mean.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class AlignedSpeech:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UsualTimes:
-    """What is usual of each phone."""
+    """Usual values of each phone."""
 
     duration_s: dict[str, float]
     crossings: dict[str, float]
@@ -45,14 +45,15 @@ class UsualTimes:
 
 
 def usual_times(speech: Iterable[AlignedSpeech], inventory: PhoneInventory) -> UsualTimes:
-    """Count lengths, zero crossings and shares."""
+    """Compute durations, zero crossings and influence."""
     durations: dict[str, list[float]] = defaultdict(list)
     crossings: dict[str, list[float]] = defaultdict(list)
     shares: dict[str, list[float]] = defaultdict(list)
-    for one in speech:
-        hiss = Hiss(one.slices)
-        for first, syllable in zip(_first_phones(one.syllables), one.syllables, strict=True):
-            phones = one.phones[first : first + len(syllable)]
+    for recording in speech:
+        hiss = Hiss(recording.slices)
+        firsts = _first_phones(recording.syllables)
+        for first, syllable in zip(firsts, recording.syllables, strict=True):
+            phones = recording.phones[first : first + len(syllable)]
             for phone in phones:
                 durations[phone.symbol].append(phone.duration_s)
             crossings[syllable[0]].append(float(hiss.at(np.array([phones[0].onset_s]))[0]))
@@ -74,14 +75,14 @@ def usual_times(speech: Iterable[AlignedSpeech], inventory: PhoneInventory) -> U
 def influence_levels(
     share: Mapping[str, float], weight: Mapping[str, float]
 ) -> tuple[dict[str, int], dict[str, float]]:
-    """Group finals by their initials' share; return each one's level and factor.
+    """Group finals by their initials' share; return level and factor of each.
 
     Parameters
     ----------
     share
-        Of the syllable that is its initial, by final; at least ``NUM_LEVELS`` finals.
+        Mean fraction of the syllable that is the initial, for at least ``NUM_LEVELS`` finals.
     weight
-        Of each final.
+        Weight of each final.
     """
     finals = sorted(share, key=lambda final: (-share[final], final))
     values = np.array([share[final] for final in finals])
@@ -109,16 +110,16 @@ def _first_phones(syllables: Sequence[Syllable]) -> list[int]:
 
 
 def _means(
-    found: Mapping[str, list[float]], phones: Sequence[str], kind: Callable[[str], str]
+    by_phone: Mapping[str, list[float]], phones: Sequence[str], kind: Callable[[str], str]
 ) -> dict[str, float]:
-    """Mean of each phone, those that are seldom heard nearer to the mean of their kind."""
+    """Compute the mean of each phone; rare phones are shrunk toward the mean of their kind."""
     of_kind: dict[str, list[float]] = defaultdict(list)
     for phone in phones:
-        of_kind[kind(phone)] += found.get(phone, [])
+        of_kind[kind(phone)] += by_phone.get(phone, [])
     everything = [value for values in of_kind.values() for value in values]
     means = {}
     for phone in phones:
-        values = found.get(phone, [])
+        values = by_phone.get(phone, [])
         usual = np.mean(of_kind[kind(phone)] or everything)
         means[phone] = float((sum(values) + _RIDGE * usual) / (len(values) + _RIDGE))
     return means

@@ -1,9 +1,9 @@
 """Openings R of the phones, from tracked lips.
 
 Source: Zhang et al. 2021, section 4, measured each opening on photographs. Here the tracked opening
-is R(t) itself: between key frames it is linear in the openings of the two phones (eq. 6), so these
-are a linear least-squares problem with bounds. A phone that is seldom heard is held near what its
-visemes have in other phones. Silence and the bilabials are closed: R is 0.
+is R(t). Between key frames it is linear in the openings of the two phones (eq. 6), so the openings
+are the solution of a bounded linear least-squares problem. Rare phones are shrunk toward the values
+of their visemes in other phones. Silence and bilabials are closed: R is 0.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
-_FULL_PERCENTILE = 98.0  # of a speaker's opening: R is 5 there
-_RIDGE = 10.0  # weight of what a phone's visemes tell, video frames
+_FULL_PERCENTILE = 98.0  # of a speaker's opening, where R is 5
+_RIDGE = 10.0  # weight of the value from a phone's visemes, video frames
 _CLOSED = (REST, "b")  # visemes whose lips touch
-_MIDDLING = 2.0  # opening of a viseme that was never seen
+_DEFAULT_OPENING = 2.0  # of a viseme without data
 
 
 def relative_openings(clips: Sequence[LipClip]) -> list[Array]:
-    """Return R of the frames of each clip, (num_frames,), NaN where not measured.
+    """Compute R of the frames of each clip, (num_frames,); NaN if not measured.
 
-    0 is a closed mouth, 5 the speaker's widest.
+    R is 0 for a closed mouth and 5 for the speaker's widest.
     """
     openings = [-clip.faps[:, columns((4, 5))].sum(axis=1) for clip in clips]
     of_speaker: dict[str, list[Array]] = defaultdict(list)
@@ -54,17 +54,7 @@ def relative_openings(clips: Sequence[LipClip]) -> list[Array]:
 def fit_openings(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> dict[str, float]:
-    """Estimate the opening of each phone; that of silence and of bilabials is 0.
-
-    Parameters
-    ----------
-    clips
-        To learn from.
-    labels
-        The phones of each clip.
-    inventory
-        Their language.
-    """
+    """Estimate the opening of each phone from clips and their phones."""
     is_open = np.array(
         [inventory.visemes[phone][0][0] not in _CLOSED for phone in inventory.phones]
     )
@@ -75,16 +65,18 @@ def fit_openings(
         heights.append(opening[is_measured])
     weights, height = np.concatenate(parts), np.concatenate(heights)
     shares = _viseme_shares(inventory) * is_open[:, None]
-    of_visemes = _least_squares(weights @ shares, height, np.full(shares.shape[1], _MIDDLING))
+    of_visemes = _least_squares(
+        weights @ shares, height, np.full(shares.shape[1], _DEFAULT_OPENING)
+    )
     fitted = _least_squares(weights, height, shares @ of_visemes)
     return dict(zip(inventory.phones, (fitted * is_open).tolist(), strict=True))
 
 
 def travel_of(clips: Sequence[LipClip]) -> Array:
-    """Return how far each mouth FAP goes from a closed to the widest mouth, FAP units.
+    """Measure the travel of each mouth FAP from a closed to the widest mouth, FAP units.
 
-    Zhang et al. 2021, section 3: the coefficients of motion, by least squares through the closed
-    mouth, (num_mouth_faps,); 0 where nothing was measured.
+    These are the coefficients of motion of Zhang et al. 2021, section 3, by least squares through
+    the closed mouth, (num_mouth_faps,); 0 for FAPs that were not measured.
     """
     opening = np.concatenate(relative_openings(clips)) / MAX_OPENING
     faps = np.concatenate([clip.faps for clip in clips])
@@ -98,7 +90,7 @@ def travel_of(clips: Sequence[LipClip]) -> Array:
 
 
 def _weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory) -> Array:
-    """Weight of each phone's opening in R at some times, (num_times, num_phones)."""
+    """Compute the weight of each phone's opening in R at some times, (num_times, num_phones)."""
     anchors = anchors_of(phones, inventory.silence)
     weights = np.zeros((len(times_s), len(inventory)))
     anchors_s = [time_s for time_s, _ in anchors]
@@ -110,7 +102,7 @@ def _weights(times_s: Array, phones: Sequence[Phone], inventory: PhoneInventory)
 
 
 def _viseme_shares(inventory: PhoneInventory) -> Array:
-    """Share of each viseme in each phone, (num_phones, num_visemes)."""
+    """Return the share of each viseme in each phone, (num_phones, num_visemes)."""
     names = sorted({name for shares in inventory.visemes.values() for name, _ in shares})
     shares = np.zeros((len(inventory), len(names)))
     for row, phone in enumerate(inventory.phones):
@@ -121,10 +113,10 @@ def _viseme_shares(inventory: PhoneInventory) -> Array:
 
 def _least_squares(weights: Array, height: Array, start: Array) -> Array:
     ridge = np.sqrt(_RIDGE)
-    found = lsq_linear(
+    result = lsq_linear(
         np.vstack([weights, ridge * np.eye(len(start))]),
         np.concatenate([height, ridge * start]),
         (0.0, MAX_OPENING),
     )
-    solution: Array = np.clip(found.x, 0.0, MAX_OPENING)
+    solution: Array = np.clip(result.x, 0.0, MAX_OPENING)
     return solution

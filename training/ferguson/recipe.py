@@ -1,4 +1,4 @@
-"""From clips of real lips and a corpus of speech to the table of the ferguson lips."""
+"""From clips of tracked lips and speech corpora to the table of the ferguson lip model."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from kouxing.training.ferguson.lengths import AlignedSpeech, usual_times
 from kouxing.training.ferguson.openings import fit_openings, travel_of
 from kouxing.training.progress import Report
 
-_MIN_SYLLABLES = 3  # words alone are spoken slower than speech
-_MAX_OF_SPEAKER = 60  # recordings, so that nobody counts too much
+_MIN_SYLLABLES = 3  # isolated words are slower than connected speech
+_MAX_OF_SPEAKER = 60  # recordings
 
 
 def train_ferguson(
@@ -37,7 +37,7 @@ def train_ferguson(
     *,
     any_licence: bool = False,
 ) -> None:
-    """Learn the table from the clips and the recordings that are for training.
+    """Learn the table from the training clips and recordings.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def train_ferguson(
     used = [clip for clip in read_clips(clips, any_licence=any_licence) if clip.part == "train"]
     if not used:
         raise UserError(
-            f"no clip in {clips} may be used; give clips with a free licence, or --any-licence"
+            f"no clip in {clips} may be used; give clips with a free license, or --any-licence"
         )
     openings = fit_openings(used, [label_clip(model, clip) for clip in used], inventory)
     errors = RowErrors()
@@ -74,28 +74,28 @@ def train_ferguson(
     try:
         output.write_text(format_table(table, inventory, about), encoding="utf-8")
     except OSError as error:
-        raise UserError(f"{output}: cannot be written: {error.strerror}") from None
+        raise UserError(f"cannot write {output}: {error.strerror}") from None
 
 
 def _report_travels(travels: NDArray[np.float64], report: Report) -> None:
-    """Tell the travels that belong into ``lip_points.tsv``, and which of them are not measured."""
+    """Report the travels for ``lip_points.tsv``."""
     of_fap = dict(zip(MOUTH_FAPS, travels, strict=True))
     for name, point in lip_points().items():
         if point.fap is not None:
             travel = of_fap[point.fap]
-            told = f"travel {travel:.1f} FAP units" if travel else "not measured, keep what it has"
-            report(f"lip_points.tsv: point {name}, FAP {point.fap}: {told}")
+            result = f"travel {travel:.1f} FAP units" if travel else "not measured; keep its value"
+            report(f"lip_points.tsv: point {name}, FAP {point.fap}: {result}")
 
 
 def training_rows(
     corpora: Sequence[Path], inventory: PhoneInventory, errors: RowErrors, *, any_licence: bool
 ) -> list[Utterance]:
-    """Read sentences of the training split, some of each speaker.
+    """Read sentences of the training split, at most ``_MAX_OF_SPEAKER`` of each speaker.
 
     Raises
     ------
     UserError
-        If there are none.
+        If there are no usable sentences.
     """
     chosen: list[Utterance] = []
     of_speaker: dict[str, int] = {}
@@ -114,7 +114,7 @@ def training_rows(
 def aligned_speech(
     model: AcousticModel, rows: Sequence[Utterance], errors: RowErrors
 ) -> Iterator[AlignedSpeech]:
-    """Align recordings with their texts; those that do not fit are reported."""
+    """Align recordings with their texts; report those that do not fit."""
     for row in rows:
         syllables = syllables_of(row, model.inventory)
         try:

@@ -1,9 +1,9 @@
-"""Augmentation of log-mel bands, for the Gaussian mixtures: other voices, rooms and lines.
+"""Augmentation of log-mel bands for the Gaussian mixtures: voices, rooms and lines.
 
-It takes seconds for an hour of speech, because it works on the bands; the neural training, whose
-front end has other bands, augments samples (:mod:`training.neural.augmentation`). The band energies
-of speech and noise add. Warping the band axis lengthens or shortens the vocal tract (Jaitly and
-Hinton 2013, "Vocal tract length perturbation"); stretching the time axis changes the speed.
+It works on the bands and takes seconds for an hour of speech. Neural training augments samples
+instead (:mod:`kouxing.training.neural.augmentation`). The band energies of speech and noise add up.
+Warping the band axis changes the vocal tract's length (Jaitly and Hinton 2013, "Vocal tract length
+perturbation"). Stretching the time axis changes the speed.
 
 ======== =================================================== ===============
 symbol   meaning                                             shape
@@ -36,23 +36,23 @@ _NARROW_LOSS = 8.0  # outside a telephone's band, natural log of power
 
 
 def _over_bands(values: tuple[float, ...]) -> NDArray[np.float32]:
-    """Values at equal mel distances, interpolated to all bands, shape (40,)."""
+    """Interpolate values at equal mel distances to all bands, shape (40,)."""
     at = np.linspace(0, NUM_BANDS - 1, len(values))
     return np.interp(np.arange(NUM_BANDS), at, values).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """One change of a recording; equal values give equal results."""
+    """One augmentation of a recording; equal values give equal results."""
 
     speed: float  # above 1 is faster
     warp: float  # factor of all frequencies
     level: float  # added to all log energies
     noise_below: float  # level of the speech above the noise, natural log of power
     noise_tilt: float  # slope of the noise over the bands, natural log
-    colour: tuple[float, ...]  # added to the bands; values at equal mel distances
-    decay: float  # fraction of the energy that remains in the next frame; 0 is a dry room
-    narrow: bool  # whether it passes a telephone line, 300 to 3400 Hz
+    color: tuple[float, ...]  # added to the bands; values at equal mel distances
+    decay: float  # fraction of the energy that remains in the next frame; 0: no reverberation
+    narrow: bool  # whether to simulate a telephone line, 300 to 3400 Hz
     seed: int
 
     @classmethod
@@ -64,14 +64,14 @@ class Augmentation:
             level=float(rng.uniform(-5.0, 1.0)),
             noise_below=float(rng.uniform(5.0, 14.0)),
             noise_tilt=float(rng.uniform(-4.0, 1.0)),
-            colour=tuple(rng.normal(0.0, 0.7, 6).tolist()),
+            color=tuple(rng.normal(0.0, 0.7, 6).tolist()),
             decay=float(rng.uniform(0.0, 0.6)) if rng.random() < 0.5 else 0.0,
             narrow=bool(rng.random() < 0.05),
             seed=int(rng.integers(2**31)),
         )
 
     def positions(self, num_frames: int) -> NDArray[np.float64]:
-        """Position of each new frame in a recording of ``num_frames`` frames."""
+        """Return the position of each new frame among the ``num_frames`` original frames."""
         return np.linspace(0, num_frames - 1, max(2, round(num_frames / self.speed)))
 
     def apply(self, log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -82,7 +82,7 @@ class Augmentation:
         fraction = (at - low)[:, None].astype(np.float32)
         frames = (1 - fraction) * log_mel[low] + fraction * log_mel[low + 1]
         bands, energy = self._warped(frames[:, 1:]), frames[:, 0]
-        bands = bands + _over_bands(self.colour)
+        bands = bands + _over_bands(self.color)
         power = np.exp(np.concatenate([energy[:, None], bands], axis=1))
         if self.decay:  # the room adds a tail
             tail = lfilter([0.0, 1 - self.decay], [1.0, -self.decay], power, axis=0)
@@ -101,7 +101,7 @@ class Augmentation:
         spectrum = np.linspace(0, self.noise_tilt, NUM_BANDS)
         noise = np.exp(np.concatenate([[0.0], spectrum]) - self.noise_below) * loud
         noise[0] = noise[1:].mean() * np.median(power[:, 0] / power[:, 1:].mean(axis=1))
-        scatter = rng.gamma(4.0, 0.25, power.shape)  # a band's energy fluctuates like this
+        scatter = rng.gamma(4.0, 0.25, power.shape)  # models the fluctuation of a band's energy
         return np.asarray(noise * scatter)
 
     def _warped(self, bands: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Decorrelate the features, so that diagonal covariances fit them.
+"""Decorrelate the features for diagonal covariances.
 
 Source: Gales 1999, "Semi-tied covariance matrices for hidden Markov models", with one matrix for
 all components.
@@ -20,9 +20,7 @@ from kouxing.training.gmm.frames import FrameSet, Hmm
 def decorrelate(
     frames: FrameSet, hmm: Hmm, num_iterations: int = 15
 ) -> tuple[Hmm, NDArray[np.float32]]:
-    """Rotate the features so that diagonal covariances fit best (Gales 1999, eq. 20-24).
-
-    The frames are rotated in place.
+    """Rotate the features, in place, so that diagonal covariances fit best (Gales 1999, eq. 20-24).
 
     Returns
     -------
@@ -59,7 +57,7 @@ def decorrelate(
 def _component_covariances(
     frames: FrameSet, hmm: Hmm
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Full covariance of each component, (components, 39, 39), and its frames, (components,)."""
+    """Compute the covariance, (components, 39, 39), and weight, (components,), of components."""
     mixtures = hmm.mixtures
     num_states, num_mixtures, num = mixtures.means.shape
     matrix = mixtures.score_matrix().reshape(2 * num + 1, num_states, num_mixtures)
@@ -72,12 +70,14 @@ def _component_covariances(
         design = np.concatenate([x * x, x, np.ones((len(x), 1), np.float32)], axis=1)
         nearest = (design @ matrix[:, state]).argmax(axis=1)
         for component in range(num_mixtures):
-            mine = nearest == component
-            count = float(frames.weights[numbers][mine].sum())
-            if mine.sum() < 2 * num:
+            members = nearest == component
+            count = float(frames.weights[numbers][members].sum())
+            if members.sum() < 2 * num:
                 continue
             at = state * num_mixtures + component
-            centred = (x[mine] - mixtures.means[state, component]).astype(np.float64)
-            scatter[at] = (centred * frames.weights[numbers][mine][:, None]).T @ centred / count
+            centered = (x[members] - mixtures.means[state, component]).astype(np.float64)
+            scatter[at] = (
+                (centered * frames.weights[numbers][members][:, None]).T @ centered / count
+            )
             counts[at] = count
     return scatter, counts

@@ -4,7 +4,7 @@ Source: Li et al. 2011, section 3.1 (the model; the paper trained with HTK); the
 HTK book's (Young et al. 2009, chapters 8 and 10): flat start, embedded re-estimation along the best
 path, Gaussian splitting with realignment, optional pauses between syllables.
 
-Path and mixtures are re-estimated in turn. While the number of components stays the same, the log
+Path and mixtures are re-estimated alternately. With a constant number of components, the log
 likelihood of the data along the best path never falls:
 
     L = sum_t log b_{s(t)}(x_t) + sum_t log a_{s(t-1) s(t)},     s = argmax L
@@ -12,7 +12,7 @@ likelihood of the data along the best path never falls:
 ======== ================================================ =====================
 symbol   meaning                                          shape
 ======== ================================================ =====================
-x        normalised features of the frames of a copy      (frames, 39)
+x        normalized features of the frames of a copy      (frames, 39)
 s        state of every frame                             (frames,)
 gamma    probability of a component in a frame            (frames, mixtures)
 ======== ================================================ =====================
@@ -65,7 +65,7 @@ def estimate(frames: FrameSet, hmm: Hmm, num_iterations: int = 1) -> Hmm:
     floor = variance_floor(frames)
     mixtures = hmm.mixtures
     weights, means, covars = mixtures.weights.copy(), mixtures.means.copy(), mixtures.covars.copy()
-    # With the path fixed, states are independent: each one runs all its iterations in turn.
+    # With a fixed path the states are independent, so each runs all its iterations at once.
     for state, numbers in enumerate(frames.by_state(hmm.num_states)):
         if len(numbers) < _MIN_FRAMES:
             continue
@@ -97,7 +97,7 @@ def _component_sums(
 ) -> NDArray[np.float64]:
     """Sum [x^2, x, 1] over a state's frames, weighted by gamma, shape (mixtures, 79)."""
     sums = np.zeros((matrix.shape[1], design.shape[1]))
-    for start in range(0, len(design), _BLOCK_FRAMES):  # blocks keep single precision exact enough
+    for start in range(0, len(design), _BLOCK_FRAMES):  # short sums keep enough precision
         block = design[start : start + _BLOCK_FRAMES]
         gamma = block @ matrix
         gamma -= gamma.max(axis=1, keepdims=True)
@@ -108,7 +108,7 @@ def _component_sums(
 
 
 def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Estimate log_stay and log_leave from the paths."""
+    """Estimate the log transition probabilities from the paths."""
     occupied = np.full(hmm.num_states, 2.0)
     left = np.full(hmm.num_states, 1.0)
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
@@ -125,14 +125,14 @@ def _transitions(frames: FrameSet, hmm: Hmm) -> tuple[NDArray[np.float32], NDArr
 def split(hmm: Hmm, frames: FrameSet, num_mixtures: int) -> Hmm:
     """Split the heaviest components until every state has ``num_mixtures`` (HTK book, 10.6).
 
-    States with little data keep fewer; their missing components have weight 0.
+    States with little data keep fewer components; the others have weight 0.
     """
     mixtures = hmm.mixtures
-    num_states, had, _ = mixtures.means.shape
+    num_states, num_before, _ = mixtures.means.shape
     weights = np.zeros((num_states, num_mixtures), np.float32)
     means = np.zeros((num_states, num_mixtures, NUM_FEATURES), np.float32)
     covars = np.ones((num_states, num_mixtures, NUM_FEATURES), np.float32)
-    weights[:, :had], means[:, :had], covars[:, :had] = (
+    weights[:, :num_before], means[:, :num_before], covars[:, :num_before] = (
         mixtures.weights,
         mixtures.means,
         mixtures.covars,
@@ -164,7 +164,7 @@ def _drop_light(weights: NDArray[np.float32], count: float) -> None:
 
 
 def topology_of(hmm: Hmm, phone_lm: PhoneLanguageModel, frames: FrameSet) -> Topology:
-    """Make the model's topology, with phone durations measured on the alignment."""
+    """Make the model's topology, with phone durations from the alignment."""
     durations = PhoneDurations(phone_lm.inventory)
     for number, (graph, path) in enumerate(zip(frames.graphs, frames.paths, strict=True)):
         if len(path):

@@ -24,12 +24,12 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.gmm.augmentation import Augmentation
 from kouxing.training.training_set import Example
 
-_LOUD_LEVEL = 0.4  # speech is louder than this, from quiet (0) to loud (1)
+_LOUD_LEVEL = 0.4  # threshold of speech between quiet (0) and loud (1)
 
 
 @dataclass(frozen=True, slots=True)
 class Copy:
-    """A copy of a recording; a recording may have several, each with an augmentation of its own."""
+    """A copy of a recording, with or without augmentation."""
 
     example: Example
     weight: float  # weight of its frames in the estimates
@@ -52,26 +52,16 @@ class Hmm:
 
 
 def flat_path(graph: UtteranceGraph, log_energy: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Make a flat start: silence at both ends by energy, phones of equal length, no pauses.
+    """Make a flat start from the log energy of each frame: phones of equal length, no pauses.
 
-    Parameters
-    ----------
-    graph
-        The nodes of the utterance.
-    log_energy
-        Log energy of each frame, shape (frames,).
-
-    Returns
-    -------
-    NDArray
-        Node of the graph of each frame, shape (frames,).
+    The energy decides about silence at both ends. Returns the node of each frame, (frames,).
     """
     num_frames = len(log_energy)
     low, high = np.percentile(log_energy, [5, 95])
     loud = np.flatnonzero(log_energy > low + _LOUD_LEVEL * (high - low))
     first_pause = np.flatnonzero(graph.phone_number == 0)
     last_pause = np.flatnonzero(graph.phone_number == graph.phone_number[-1])
-    silence = graph.phones[0]  # every graph begins with a pause
+    silence = graph.phones[0]  # every graph starts with a pause
     speech = np.flatnonzero(graph.phones[graph.phone_number] != silence)
     start, end = int(loud[0]), int(loud[-1]) + 1
     if end - start < len(speech):
@@ -92,7 +82,7 @@ def _spread(nodes: NDArray[np.int64], num_frames: int) -> NDArray[np.int64]:
 def features_of(
     copy: Copy, prior_mean: NDArray[np.float32], half_width: int
 ) -> NDArray[np.float32]:
-    """Compute the normalised features of a copy as a new session computes them, (frames, 39)."""
+    """Compute the normalized features of a copy as a new session does, (frames, 39)."""
     log_mel = copy.example.log_mel.astype(np.float32)
     if copy.augmentation is not None:
         log_mel = copy.augmentation.apply(log_mel)
@@ -102,13 +92,13 @@ def features_of(
 
 @dataclass(slots=True)
 class FrameSet:
-    """Frames of all copies with the state of each."""
+    """Frames of all copies, each with its state."""
 
     features: NDArray[np.float32]  # (frames, 39)
     weights: NDArray[np.float32]  # (frames,)
     bounds: NDArray[np.int64]  # (copies + 1,) first frame of each copy
     graphs: list[UtteranceGraph]
-    states: NDArray[np.int64]  # (frames,) -1 where the copy could not be aligned
+    states: NDArray[np.int64]  # (frames,) -1 if the copy could not be aligned
     paths: list[NDArray[np.int64]]
 
     @classmethod
@@ -120,7 +110,7 @@ class FrameSet:
         prior_mean: NDArray[np.float32],
         half_width: int,
     ) -> FrameSet:
-        """Compute the features and a flat start."""
+        """Compute the features and the flat start."""
         blocks = [features_of(copy, prior_mean, half_width) for copy in copies]
         silence = inventory.index[inventory.silence]
         graphs = [

@@ -25,14 +25,14 @@ from kouxing.training.search_weights import SearchWeights, choose_search_weights
 from kouxing.training.training_set import Example, load_examples
 
 _STATES_PER_PHONE = 5  # Li et al. 2011, section 3.1
-_HALF_WIDTH = 2  # frames, of the differences: the textbook's
-_FLAT_START_STEP = 4  # the flat start takes every fourth copy
+_HALF_WIDTH = 2  # of the differences, frames
+_FLAT_START_STEP = 4  # the flat start uses every fourth copy
 _FLAT_START_ITERATIONS = 4
 _DECORRELATED_AT = 8  # mixtures per state when the features are decorrelated
-_MIN_SENTENCE_SYLLABLES = 4  # a real recording with fewer syllables is a word
+_MIN_SENTENCE_SYLLABLES = 4  # a natural recording with fewer syllables is a word
 _SENTENCE_COPIES = 3
 _WORD_WEIGHT = 0.3
-_MIN_COPY_WEIGHT = 0.5  # recordings of lower weight are sampled instead
+_MIN_COPY_WEIGHT = 0.5  # recordings with a lower weight are sampled instead
 _UNTUNED = SearchWeights(acoustic_scale=0.2, phone_penalty=-1.0)
 _MEAN_RECORDINGS = 500  # for the mean of the cepstra
 
@@ -54,32 +54,33 @@ def train_gmm(
     Parameters
     ----------
     corpora
-        Folders that :func:`corpora.speech_corpus.read_corpus` reads; splits ``train`` and ``dev``.
+        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads; splits ``train`` and
+        ``dev``.
     output
-        The ``.npz`` file to write; the card is written beside it as ``.md``.
+        The ``.npz`` file to write; the card gets the suffix ``.md``.
     inventory
         The corpora's language.
     seed
         Seed of the augmentation.
     phone_lm
-        A file of :func:`training.phone_lm.recipe.train_phone_lm`; without it the phone language
-        model is estimated from the corpora's texts.
+        File with a phone language model. Without it, the model is estimated from the corpora's
+        texts.
     num_mixtures
         Gaussians per state, a power of two.
     synthetic_weight
-        Weight of synthetic relative to real speech.
+        Weight of synthetic relative to natural speech.
     shipping
-        Leave out rows whose licence forbids giving the model away.
+        Exclude rows whose license does not allow distributing the model.
     report
         Receives lines of progress.
 
     Raises
     ------
     UserError
-        If there is nothing to train on, or the number of mixtures is no power of two.
+        If there is nothing to train on, or the number of mixtures is not a power of two.
     """
     if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
-        raise UserError(f"{num_mixtures} mixtures are no power of two; give 1, 2, 4, 8, 16...")
+        raise UserError(f"{num_mixtures} mixtures is not a power of two; give 1, 2, 4, 8, 16...")
     errors = RowErrors()
     examples = load_examples(
         corpora, errors, inventory, shipping=shipping, synthetic_weight=synthetic_weight
@@ -142,10 +143,10 @@ def _train_mixtures(
 
 
 def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
-    """Make the copies of a recording: three of a real sentence, one of anything else.
+    """Make the copies of a recording: three of a natural sentence, one of anything else.
 
-    The first copy is augmented in half of the cases, all others always. Isolated words
-    and syllables have a lower weight. Low-weight recordings are sampled less often.
+    Half of the first copies are augmented, and all others. Isolated words have a lower weight.
+    Low-weight recordings are sampled less often.
     """
     num_copies, weight = 1, example.weight
     if not is_synthetic(example.licence):
@@ -164,7 +165,7 @@ def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
 
 
 def _mean_cepstra(examples: Sequence[Example]) -> NDArray[np.float32]:
-    """Mean cepstra of the recordings, shape (13,)."""
+    """Compute the mean cepstra of the recordings, shape (13,)."""
     step = max(1, len(examples) // _MEAN_RECORDINGS)
     means = [
         cepstra_of_all(example.log_mel.astype(np.float32)).mean(axis=0)

@@ -1,4 +1,4 @@
-"""Forced alignment of the training set, and the statistics of the HMMs that it gives."""
+"""Forced alignment of the training set, and the HMM statistics from it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from kouxing.training.search_weights import all_scores
 from kouxing.training.training_set import Example
 
 STATES_PER_PHONE = 3
-_LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; layers with more are trained less
+_LOOK_AHEAD_FRAMES = 3  # of the output layer that aligns; those with more are trained less
 _MIN_STAY, _MAX_STAY = 0.05, 0.98
 _LM_SCALE = 2.0  # chosen on development data
 _PRIOR_SCALE = 0.5  # of the states' log priors; chosen on development data
@@ -45,21 +45,21 @@ class AlignedExample:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """The part of a model that is counted on an alignment."""
+    """The parts of a model that are counted on an alignment."""
 
     topology: Topology
     log_prior: NDArray[np.float32]  # (states,)
 
 
 def aligning_output(look_aheads: Sequence[int]) -> int:
-    """Output layer that aligns best: its look-ahead shows a little of what follows an onset."""
+    """Return the output layer that aligns best; it sees a little of what follows an onset."""
     return int(np.abs(np.array(look_aheads) - _LOOK_AHEAD_FRAMES).argmin())
 
 
 def aligner_scores(
     aligner: AcousticModel, examples: Sequence[Example]
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield the scores of another model, of each recording, shape (frames, states).
+    """Yield the aligner's scores of each recording, shape (frames, states).
 
     A network of this package computes whole recordings at once, which is faster.
     """
@@ -79,14 +79,14 @@ def align_all(
     examples: Sequence[Example],
     report: Report,
 ) -> list[AlignedExample]:
-    """Align each recording with its text; recordings that do not fit are dropped.
+    """Align each recording with its text; drop recordings that do not fit.
 
     Parameters
     ----------
     scores
-        Of each recording, shape (frames, states).
+        Scores of each recording, shape (frames, states).
     topology
-        The HMMs of the scores, with any number of states per phone.
+        HMMs of the scores, with any number of states per phone.
     examples
         The recordings.
     report
@@ -105,8 +105,8 @@ def align_all(
     place = np.arange(len(phone)) - topology.first_state[phone]
     # the middle of a phone's n-th state, among STATES_PER_PHONE
     new_place = (2 * place + 1) * STATES_PER_PHONE // (2 * num_states[phone])
-    followed = with_progress(examples, "aligned", report)
-    for number, (rows, example) in enumerate(zip(scores, followed, strict=True)):
+    tracked = with_progress(examples, "aligned", report)
+    for number, (rows, example) in enumerate(zip(scores, tracked, strict=True)):
         graph = utterance_graph(
             example.phones, example.syllables, topology.first_state, silence=silence
         )
@@ -116,7 +116,7 @@ def align_all(
             states = phone[on_path] * STATES_PER_PHONE + new_place[on_path]
             aligned.append(AlignedExample(number, example, states, segments_of_path(path, graph)))
     if not aligned:
-        raise UserError("no recording fits its text; is the aligner trained?")
+        raise UserError("no recording fits its text; check the texts and the aligner")
     return aligned
 
 
@@ -125,14 +125,7 @@ def statistics_of(
 ) -> Statistics:
     """Count priors, transitions and durations.
 
-    Parameters
-    ----------
-    aligned
-        The alignment.
-    weights
-        How often the training samples each recording, relative to the others.
-    phone_lm
-        The phone language model.
+    ``weights`` are the relative sampling weights of the recordings in training.
     """
     num_states = STATES_PER_PHONE * len(phone_lm.inventory)
     counts = np.ones(num_states)

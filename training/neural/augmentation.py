@@ -1,30 +1,28 @@
-"""Augmentation of samples, for the neural network: other speeds, rooms, noises and lines.
+"""Augmentation of samples for neural training: speeds, rooms, noises and lines.
 
-(The Gaussian mixtures' augmentation, :mod:`training.gmm.augmentation`, works on log-mel bands.)
-
-Sources: Ko et al. 2015, "Audio augmentation for speech recognition" (speed, by resampling: pitch
-and formants move along); Ko et al. 2017, "A study on data augmentation of reverberant speech for
-robust speech recognition" (rooms and noise); Polack 1988 (a room's response is a decaying noise);
-Park et al. 2019, "SpecAugment" (masks of frames and bands).
+Sources: Ko et al. 2015, "Audio augmentation for speech recognition" (speed by resampling, which
+also moves pitch and formants); Ko et al. 2017, "A study on data augmentation of reverberant speech
+for robust speech recognition" (rooms and noise); Polack 1988 (a room's response is a decaying
+noise); Park et al. 2019, "SpecAugment" (masks of frames and bands).
 
 ======== ============================================================= ============
 symbol   meaning                                                       unit, shape
 ======== ============================================================= ============
 x        samples at 16 kHz                                             (n,)
 s        speed; above 1 is faster                                      1
-T60      a room's sound falls by 60 dB in it                           s
+T60      time in which reverberation falls by 60 dB                    s
 h        a room's response: h[0] = 1, then noise * exp(-6.9 t / T60)   (m,)
 f^b      power density of the noise, multiplied by random peaks        1
 t        number of a feature frame, samples 160 t to 160 t + 400       1
 ======== ============================================================= ============
 
-Everything is drawn from the given generator: the same state gives the same result. Each augmented
-frame has a source frame in the recording, whose targets it takes. The middle of frame t, sample
-160 t + 200, was sample s (160 t + 200) of the recording, which is the middle of the source frame
+The given generator draws everything, so the same state gives the same result. Each augmented frame
+takes the targets of its source frame in the recording. The middle of frame t, sample 160 t + 200,
+was sample s (160 t + 200) of the recording, which is the middle of the source frame
 
     t_source = s t + (s - 1) 200 / 160
 
-A tempo changes the number of frames and leaves the pitch alone: frames are interpolated.
+A change of tempo interpolates frames, so the number of frames changes but not the pitch.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ _HALF_WINDOW = WINDOW_S / HOP_S / 2  # from a frame's first sample to its middle
 _TINY = 1e-9
 
 # Probabilities of the changes.
-_SPEED_PROB, _ROOM_PROB, _NOISE_PROB, _COLOUR_PROB = 0.75, 0.35, 0.6, 0.5
+_SPEED_PROB, _ROOM_PROB, _NOISE_PROB, _COLOR_PROB = 0.75, 0.35, 0.6, 0.5
 _TELEPHONE_PROB, _CODEC_PROB = 0.14, 0.2
 _FLUTTER_PROB, _KNOCKS_PROB = 0.35, 0.15  # of a noise
 
@@ -81,7 +79,7 @@ def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples
 
 
 def change_speed(samples: Sound, rng: np.random.Generator) -> tuple[Sound, float]:
-    """Change the speed of some recordings; return the new samples, (n / speed,), and the speed."""
+    """Change the speed at random; return the new samples, (n / speed,), and the speed."""
     if rng.random() < _SPEED_PROB:
         steps = int(rng.integers(_MIN_STEPS, _MAX_STEPS + 1))
         return resample_poly(samples, steps, _SPEED_STEPS), _SPEED_STEPS / steps
@@ -89,15 +87,15 @@ def change_speed(samples: Sound, rng: np.random.Generator) -> tuple[Sound, float
 
 
 def disturb(samples: Sound, rng: np.random.Generator) -> Samples:
-    """Draw a room, a noise, a line and a microphone for a recording, each at times."""
+    """Simulate a room, noise, a transmission line and a microphone, each at random."""
     sound = samples
     if rng.random() < _ROOM_PROB:
         sound = fftconvolve(sound, _room(rng))[: len(sound)]
     if rng.random() < _NOISE_PROB:
         sound = sound + _noise(sound, rng)
     sound = _transmitted(sound, rng)
-    if rng.random() < _COLOUR_PROB:
-        sound = _coloured(sound, rng)
+    if rng.random() < _COLOR_PROB:
+        sound = _color(sound, rng)
     return sound.astype(np.float32)
 
 
@@ -109,7 +107,7 @@ def scale_level(samples: Samples, rng: np.random.Generator) -> Samples:
 
 
 def source_frames(num_frames: int, speed: float, num_source: int) -> NDArray[np.int64]:
-    """Source frame of each frame after a change of speed, of ``num_source``, (num_frames,)."""
+    """Return the source frame of each frame after a change of speed, (num_frames,)."""
     at = speed * np.arange(num_frames) + (speed - 1) * _HALF_WINDOW  # t_source
     nearest: NDArray[np.int64] = np.clip(np.rint(at), 0, num_source - 1).astype(np.int64)
     return nearest
@@ -139,7 +137,7 @@ def mask(frames: NDArray[np.float32], rng: np.random.Generator) -> None:
 
 
 def _room(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a room's response; the first echo comes after 1 to 8 ms."""
+    """Draw a room's response; the first echo arrives after 1 to 8 ms."""
     t60_s = rng.uniform(_MIN_T60_S, _MAX_T60_S)
     num_samples = int(SAMPLE_RATE_HZ * min(t60_s, _MAX_ROOM_S))
     time_s = np.arange(num_samples) / SAMPLE_RATE_HZ
@@ -152,7 +150,7 @@ def _room(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a noise for a recording, 3 to 30 dB below it."""
+    """Draw a noise 3 to 30 dB below a recording."""
     num_samples = len(samples)
     frequency = np.maximum(np.fft.rfftfreq(num_samples, 1 / SAMPLE_RATE_HZ), _MIN_NOISE_HZ)
     slope = rng.uniform(-2.2, 0.2)
@@ -175,7 +173,7 @@ def _noise(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
-    """Filter some of the recordings as a telephone or a codec does."""
+    """Filter some recordings like a telephone or a codec."""
     line = rng.random()
     if line < _TELEPHONE_PROB:
         band = [rng.uniform(200, 400), rng.uniform(3000, 3900)]
@@ -189,11 +187,11 @@ def _transmitted(samples: Sound, rng: np.random.Generator) -> Sound:
     return filtered
 
 
-def _coloured(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Filter a recording as another microphone does."""
+def _color(samples: Sound, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Filter a recording like another microphone."""
     frequency = np.fft.rfftfreq(len(samples), 1 / SAMPLE_RATE_HZ)
-    colour = _random_curve(frequency, 7, (0.1, 0.5), rng)
-    return np.fft.irfft(np.fft.rfft(samples) * colour, len(samples))
+    color = _random_curve(frequency, 7, (0.1, 0.5), rng)
+    return np.fft.irfft(np.fft.rfft(samples) * color, len(samples))
 
 
 def _random_curve(
@@ -202,7 +200,7 @@ def _random_curve(
     spread: tuple[float, float],
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Draw amplitudes over frequency; their logarithm varies by a spread, which is drawn too."""
+    """Draw amplitudes over frequency; the spread of their logarithm is also drawn."""
     knots = rng.normal(0.0, rng.uniform(*spread), num_knots)
     at = np.linspace(0.0, _HALF_RATE_HZ, num_knots)
     curve: NDArray[np.float64] = np.exp(np.interp(frequency, at, knots))

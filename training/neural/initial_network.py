@@ -1,4 +1,4 @@
-"""The networks that training starts with: the recognizer's and the teacher's."""
+"""The initial networks: the recognizer's and the teacher's."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def init_network(
     inventory: PhoneInventory,
     look_aheads: tuple[int, ...],
 ) -> Network:
-    """Make the network to train, with the weights of Whisper or of a model trained before.
+    """Make the network to train, with the weights of Whisper or of an earlier model.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def init_network(
     if before is None:
         if whisper is None:
             raise UserError(
-                "training starts with Whisper's weights or with a model made here: give --whisper, "
+                "training starts with Whisper's weights or an earlier model; give --whisper, "
                 "--start-from or both"
             )
         network = Network(Shape(num_states=num_states, look_aheads=look_aheads))
@@ -50,12 +50,12 @@ def init_network(
             f"{inventory.language}; give models of one language"
         )
     if isinstance(before, NeuralModel) and tuple(before.look_aheads.tolist()) == look_aheads:
-        with suppress(KeyError):  # a network of another program
+        with suppress(KeyError):  # the network was not exported here
             return network_of(before.network, look_aheads)
-    asked = ", ".join(f"{frames * FRAME_MS:g}" for frames in look_aheads)
+    requested = ", ".join(f"{frames * FRAME_MS:g}" for frames in look_aheads)
     raise UserError(
-        f"the model of --start-from was not written by this command with the look-aheads {asked} "
-        "ms; start with one that was"
+        f"the model of --start-from was not trained here with the look-aheads {requested} ms; "
+        "give one that was"
     )
 
 
@@ -67,12 +67,12 @@ def init_encoder(whisper: Path, num_states: int) -> WholeEncoder:
 
 
 def all_look_aheads(main_ms: float) -> tuple[int, ...]:
-    """Look-aheads of all output layers, ascending, feature frames.
+    """Return the look-aheads of all output layers, ascending, feature frames.
 
     Raises
     ------
     UserError
-        If the main one is no multiple of 10 ms, or out of range.
+        If the main one is not a multiple of 10 ms, or out of range.
     """
     main = main_ms / FRAME_MS
     if not (1 <= main <= _MAX_LOOK_AHEAD and main == round(main)):

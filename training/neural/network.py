@@ -1,11 +1,10 @@
-"""The neural recognizer's network, in PyTorch: a causal transformer encoder.
+"""The neural recognizer's network in PyTorch: a causal transformer encoder.
 
 Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (Whisper:
-the encoder's layers, and the weights that training starts with); Vaswani et al. 2017, "Attention is
-all you need" (sinusoidal positions). The layers and the weights are those of Whisper's encoder. To
-run live, a position attends to itself and to the ``WINDOW - 1`` positions before it instead of the
-whole recording. The teacher (:mod:`kouxing.training.neural.teacher`) runs the same layers on whole
-recordings.
+the encoder's layers and the initial weights); Vaswani et al. 2017, "Attention is all you need"
+(sinusoidal positions). For live use, a position attends only to itself and the ``WINDOW - 1``
+positions before it. The teacher (:mod:`kouxing.training.neural.teacher`) runs the same layers on
+whole recordings.
 
 ======== =========================================================== ============================
 symbol   meaning                                                     shape
@@ -46,7 +45,7 @@ class Shape:
 
 
 class Layer(nn.Module):
-    """Attention, then two products position by position; each is added to its input."""
+    """Attention, then two linear layers; both parts have residual connections."""
 
     def __init__(self, shape: Shape, dropout: float) -> None:
         super().__init__()
@@ -62,7 +61,7 @@ class Layer(nn.Module):
     def forward(self, hidden: Tensor, may_attend: Tensor | None = None) -> Tensor:
         """Compute (batch, positions, width) from the same shape.
 
-        ``may_attend`` has the shape (positions, positions); None lets all attend to all.
+        ``may_attend`` is a mask, (positions, positions); with None all positions attend to all.
         """
         batch, num_positions, width = hidden.shape
         query, key, value = (
@@ -81,7 +80,7 @@ class Layer(nn.Module):
 class Encoder(nn.Module):
     """Whisper's encoder: two convolutions, a table of positions, layers.
 
-    ``padding`` is the number of zeros at both ends of each convolution's input.
+    ``padding`` is the padding of each convolution's input.
     """
 
     positions: Tensor  # (1500, width)
@@ -99,7 +98,7 @@ class Encoder(nn.Module):
     def embed(self, bands: Tensor, start: int = 0) -> Tensor:
         """Compute the first layer's input: (batch, 80, frames) to (batch, positions, width).
 
-        ``start`` is the first position's row in the table, which must hold all that follow too.
+        ``start`` is the first position's row in the table.
         """
         hidden = gelu(self.second(gelu(self.first(bands)))).transpose(1, 2)
         return hidden + self.positions[start : start + hidden.shape[1]]
@@ -139,12 +138,12 @@ class Network(Encoder):
 
 
 def mixed_precision() -> torch.autocast:
-    """Multiply 16-bit floats, and add in 32 bits, where that is faster."""
+    """Use bfloat16 products if the processor supports them."""
     faster = torch.cpu.get_capabilities().get("avx512_bf16", False)
     return torch.autocast("cpu", torch.bfloat16, enabled=faster)
 
 
 def output_frames(num_positions: int, look_ahead_frames: int) -> Tensor:
-    """Numbers of each position's two output frames, (positions, 2); the first may be negative."""
+    """Return the numbers of each position's two output frames, (positions, 2)."""
     first = 2 * torch.arange(num_positions) + 2 - look_ahead_frames
     return torch.stack([first, first + 1], dim=1)

@@ -1,4 +1,4 @@
-"""Scores of whole recordings by a network in PyTorch, as the recognizer computes them live."""
+"""Score whole recordings with PyTorch as the recognizer does live."""
 
 from __future__ import annotations
 
@@ -26,24 +26,10 @@ from kouxing.training.training_set import Example
 def log_posteriors_of(
     network: Network, output: int, samples: NDArray[np.int16]
 ) -> NDArray[np.float32]:
-    """Log posteriors of the states in all frames of a recording.
+    """Compute the log posteriors of a recording, (n,) at 16 kHz to (frames, states).
 
-    The recognizer advances position by position. Here all positions are computed at once, which is
-    faster and gives the same.
-
-    Parameters
-    ----------
-    network
-        The network.
-    output
-        Number of its output layer.
-    samples
-        Shape (n,), 16 kHz.
-
-    Returns
-    -------
-    NDArray
-        Shape (frames, states).
+    All positions are computed at once. This is faster than position by position, with equal
+    results. ``output`` is the number of the output layer.
     """
     network.eval()
     frames = WhisperMel().accept_waveform(as_floats(samples))
@@ -52,7 +38,7 @@ def log_posteriors_of(
     num_missing = max(0, 2 * num_positions + 1 - num_frames)
     padded = np.concatenate([frames, np.repeat(frames[-1:], num_missing, axis=0)])
     pieces = []
-    for start in range(0, num_positions, MAX_POSITIONS):  # where the recognizer starts again
+    for start in range(0, num_positions, MAX_POSITIONS):  # the recognizer also restarts here
         piece = padded[2 * start : 2 * (start + MAX_POSITIONS) + 1]
         hidden = network(torch.from_numpy(piece)[None])
         pieces.append(network.log_posteriors(hidden, output)[0].flatten(0, 1).numpy())

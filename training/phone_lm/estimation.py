@@ -13,8 +13,8 @@ N, T     count of its context, and number of phones seen after it (n-grams,)
 
     p(u | h) = (c + T p(u | h')) / (N + T)
 
-The gain of an n-gram is ``c log(p(u | h) / (T p(u | h') / (N + T)))``: by how much it raises the
-log likelihood of the texts. The n-grams with the highest gains are kept, and their prefixes too.
+The gain of an n-gram, ``c log(p(u | h) / (T p(u | h') / (N + T)))``, is how much it raises the log
+likelihood of the texts. The n-grams with the highest gains and their prefixes are kept.
 """
 
 from __future__ import annotations
@@ -60,26 +60,26 @@ def estimate_phone_lm(
     Parameters
     ----------
     streams
-        Texts as indices of phones, with a pause between sentences or where a reader would make
-        one. A text that is in several streams counts as often.
+        Texts as indices of phones, with a pause between sentences or where a reader would pause.
+        A text counts once for each stream that contains it.
     inventory
         The texts' language.
     order
         Phones in the longest n-grams, 2 or more.
     max_ngrams
-        N-grams to keep, about.
+        Approximate number of n-grams to keep.
 
     Raises
     ------
     UserError
-        If the n-grams are too long for so many phones.
+        If ``order`` is too high for the number of phones.
     """
     num_phones = len(inventory)
     if num_phones**order > _MAX_CODE:
         raise UserError(f"order {order} is too high for {num_phones} phones; give a lower one")
     silence = inventory.index[inventory.silence]
-    grams, counts = _counted(np.concatenate(streams), order, silence, num_phones)
-    probs: _Probs = {1: _smoothed(grams[1], counts[1], num_phones)}
+    grams, counts = _count(np.concatenate(streams), order, silence, num_phones)
+    probs: _Probs = {1: _smooth(grams[1], counts[1], num_phones)}
     grams[1] = np.arange(num_phones)
     gains: dict[int, NDArray[np.float64]] = {}
     for n in range(2, order + 1):
@@ -94,7 +94,7 @@ def estimate_phone_lm(
     return _Tree(grams, probs, inventory).phone_lm()
 
 
-def _counted(
+def _count(
     stream: Stream, order: int, silence: int, num_phones: int
 ) -> tuple[_Grams, dict[int, NDArray[np.int64]]]:
     """Count n-grams of 1 to ``order`` phones; a pause may only be the first or the last phone."""
@@ -113,10 +113,10 @@ def _counted(
     return grams, counts
 
 
-def _smoothed(
+def _smooth(
     phones: NDArray[np.int64], counts: NDArray[np.int64], num_phones: int
 ) -> NDArray[np.float64]:
-    """Probabilities of single phones; none is 0."""
+    """Estimate probabilities of single phones, all above 0."""
     smooth = np.full(num_phones, _UNSEEN_COUNT)
     smooth[phones] += counts
     probs: NDArray[np.float64] = smooth / smooth.sum()
@@ -145,14 +145,14 @@ def _prune(
 
 @dataclass(frozen=True, slots=True)
 class _Tree:
-    """The kept n-grams, on their way to a tree with back-off weights."""
+    """Arranges n-grams as a tree with back-off weights."""
 
     grams: _Grams
     probs: _Probs
     inventory: PhoneInventory
 
     def phone_lm(self) -> PhoneLanguageModel:
-        """Lay the n-grams out as a tree, with back-off weights that make probabilities sum to 1."""
+        """Compute back-off weights such that the probabilities after each context sum to 1."""
         order, num_phones = len(self.grams), len(self.inventory)
         backoffs: _Probs = {}
         for n in range(1, order):
@@ -180,10 +180,10 @@ class _Tree:
         )
 
     def _prob(self, wanted: NDArray[np.int64], n: int, backoffs: _Probs) -> NDArray[np.float64]:
-        """Probabilities of n-grams, by back-off where they are not kept."""
+        """Return probabilities of n-grams, backing off for those that were pruned."""
         num_phones = len(self.inventory)
         at = np.minimum(np.searchsorted(self.grams[n], wanted), len(self.grams[n]) - 1)
-        found = self.probs[n][at]
+        probs = self.probs[n][at]
         missing = np.flatnonzero(self.grams[n][at] != wanted)
         if len(missing):
             pruned = wanted[missing]
@@ -191,18 +191,18 @@ class _Tree:
             at = np.minimum(np.searchsorted(contexts, context), len(contexts) - 1)
             weight = np.where(contexts[at] == context, backoffs[n - 1][at], 1.0)
             shorter = self._prob(pruned % num_phones ** (n - 1), n - 1, backoffs)
-            found[missing] = weight * shorter
-        return found
+            probs[missing] = weight * shorter
+        return probs
 
 
 def _remainder(total: NDArray[Any]) -> NDArray[np.float64]:
-    """Return what a sum of probabilities leaves, at least a little."""
+    """Return what a sum of probabilities leaves of 1, at least a little."""
     left: NDArray[np.float64] = np.maximum(1 - total, _MIN_REMAINDER)
     return left
 
 
 def _logs(values: _Probs) -> NDArray[np.float32]:
-    """Logarithms of all levels in order, the root's (0) first."""
+    """Return the logarithms of all levels in order, the root's (0) first."""
     logs = np.log(np.concatenate([[1.0], *(values[n] for n in range(1, len(values) + 1))]))
     single: NDArray[np.float32] = logs.astype(np.float32)
     return single

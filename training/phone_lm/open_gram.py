@@ -1,12 +1,12 @@
-"""Draw sentences from a language model of words, as phones for a phone language model.
+"""Draw sentences from a word language model, as phones for a phone language model.
 
-The language model of words is Open-gram, a trigram of 72,000 Chinese words (CC BY-SA 3.0), as the
-SunPinyin input method comes with it (Debian package ``sunpinyin-data``). ``tslminfo -v lm_sc.t3g``
-(Debian package ``sunpinyin-utils``) prints it as text; its words are those of ``pydict_sc.bin``.
+The word model is Open-gram, a trigram of 72,000 Chinese words (CC BY-SA 3.0), as the SunPinyin
+input method ships it (Debian package ``sunpinyin-data``). ``tslminfo -v lm_sc.t3g`` (Debian package
+``sunpinyin-utils``) prints it as text. Its words are in ``pydict_sc.bin``.
 
-A word is drawn by its probability after the two words before it. The probability that its counted
-words leave goes to the words counted after one word, and what those leave to all words. Words that
-the inventory's language does not write (punctuation, foreign words) are pauses.
+Words are drawn by their probability after the two words before. The probability that the counted
+words leave is distributed over the words counted after one word, and the rest over all words. Words
+that the language does not write (punctuation, foreign words) become pauses.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from kouxing.shared.phones.inventory import PhoneInventory
 from kouxing.training.phone_lm.estimation import Stream
 from kouxing.training.phone_lm.recipe import phones_of_text
 
-_BASE = 100_000  # of the n-grams' codes, larger than the number of words
-_NUM_CHAINS = 100_000  # drawn side by side
+_BASE = 100_000  # of the n-grams' codes, greater than the number of words
+_NUM_CHAINS = 100_000  # drawn in parallel
 _CONTEXT_WORDS = 2
 _NUM_LEVELS = 4  # n-grams of 0 to 3 words
-_WORDS_OFFSET = slice(8, 12)  # bytes of a dictionary that hold the offset of its words
+_WORDS_OFFSET = slice(8, 12)  # bytes of a dictionary with the offset of its words
 _MAX_TRIES = 8  # to draw a word that is not counted after its context
 
 
@@ -43,7 +43,7 @@ class _Level:
     def draw(
         self, context: NDArray[np.int64], rng: np.random.Generator
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Draw a word after each context; return the words and which draws hit a counted one."""
+        """Draw a word after each context; return the words and which of them are counted there."""
         first, end = (np.searchsorted(self.code, (context + n) * _BASE) for n in (0, 1))
         start = self.cumulative[first]
         height = rng.random(len(context))
@@ -52,10 +52,10 @@ class _Level:
         return self.code[np.minimum(at, len(self.code) - 1)] % _BASE, counted
 
     def has(self, code: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Tell which n-grams are counted."""
+        """Return which n-grams are counted."""
         at = np.minimum(np.searchsorted(self.code, code), len(self.code) - 1)
-        found: NDArray[np.bool_] = self.code[at] == code
-        return found
+        is_counted: NDArray[np.bool_] = self.code[at] == code
+        return is_counted
 
 
 def draw_phones(
@@ -72,7 +72,7 @@ def draw_phones(
     inventory
         The words' language.
     num_words
-        Words to draw, about.
+        Approximate number of words.
     seed
         The same seed draws the same words.
 
@@ -84,7 +84,9 @@ def draw_phones(
     words = _words(dictionary)
     levels = _levels(ngrams)
     if max(int((level.code % _BASE).max()) for level in levels) >= len(words):
-        raise UserError(f"{ngrams} has words that {dictionary} has not; give files of one version")
+        raise UserError(
+            f"{ngrams} has words that {dictionary} lacks; give files of the same version"
+        )
     rng = np.random.default_rng(seed)
     num_chains = min(_NUM_CHAINS, num_words)
     num_drawn = max(1, num_words // num_chains)
@@ -96,7 +98,7 @@ def draw_phones(
 
 
 def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInventory) -> Stream:
-    """Replace words by their phones; pauses that meet become one."""
+    """Replace words by their phones, and merge adjacent pauses."""
     silence = inventory.index[inventory.silence]
     phones = [_phones_of(word, inventory) or (silence,) for word in words]
     lengths = np.array([len(one) for one in phones])
@@ -105,9 +107,9 @@ def _stream(drawn: NDArray[np.int64], words: Sequence[str], inventory: PhoneInve
     shift = np.repeat(ends - lengths[drawn] - starts[drawn], lengths[drawn])
     all_phones = np.concatenate([np.array(one, np.uint8) for one in phones])
     stream = all_phones[np.arange(ends[-1]) - shift]
-    again = (stream[1:] == silence) & (stream[:-1] == silence)
-    single: Stream = stream[np.concatenate([[True], ~again])]
-    return single
+    repeated = (stream[1:] == silence) & (stream[:-1] == silence)
+    merged: Stream = stream[np.concatenate([[True], ~repeated])]
+    return merged
 
 
 def _phones_of(word: str, inventory: PhoneInventory) -> tuple[int, ...]:
@@ -146,9 +148,9 @@ def _levels(path: Path) -> list[_Level]:
                     code = code * _BASE + int(word)
                 rows[-1].append((code, float(columns[len(rows) - 1])))
     except (OSError, ValueError, IndexError) as error:
-        raise UserError(f"{path} is not what `tslminfo -v` prints: {error}") from error
+        raise UserError(f"{path} is not output of `tslminfo -v`: {error}") from error
     if len(rows) != _NUM_LEVELS or not all(rows):
-        raise UserError(f"{path} has {len(rows)} levels of n-grams, expected {_NUM_LEVELS}")
+        raise UserError(f"{path} has {len(rows)} levels of n-grams instead of {_NUM_LEVELS}")
     levels = []
     for level in rows[1:]:
         codes, costs = zip(*level, strict=True)
@@ -158,10 +160,10 @@ def _levels(path: Path) -> list[_Level]:
 
 
 def _words(path: Path) -> list[str]:
-    """Read the words; a word's number is its place."""
+    """Read the words in the order of their numbers."""
     try:
         content = path.read_bytes()
         (start,) = struct.unpack("<I", content[_WORDS_OFFSET])
         return content[start:].decode("utf-32-le").split("\0")
     except (OSError, struct.error, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is no dictionary of SunPinyin: {error}") from error
+        raise UserError(f"{path} is not a SunPinyin dictionary: {error}") from error

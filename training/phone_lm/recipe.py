@@ -22,7 +22,7 @@ from kouxing.training.phone_lm.estimation import Stream, estimate_phone_lm, stre
 from kouxing.training.progress import Report
 from kouxing.training.training_set import MAX_WORD_PHONES, Example
 
-_CORPUS_WEIGHT = 0.012  # phones of the corpora's sentences per phone of other texts
+_CORPUS_WEIGHT = 0.012  # corpus phones per phone of other texts
 
 
 def train_phone_lm(
@@ -41,16 +41,16 @@ def train_phone_lm(
     Parameters
     ----------
     corpora
-        Folders of speech. The real sentences of the split ``train`` count about one phone in a
-        hundred of the texts.
+        Folders of speech. Non-synthetic sentences of the split ``train`` get about a hundredth of
+        the texts' weight.
     texts
-        Files of text, UTF-8.
+        Text files, UTF-8.
     output
         The ``.npz`` file to write.
     inventory
-        The language of all of them.
+        The language of corpora and texts.
     drawn
-        Phones that :func:`kouxing.training.phone_lm.open_gram.draw_phones` has drawn.
+        Phones from :func:`kouxing.training.phone_lm.open_gram.draw_phones`.
     order, max_ngrams
         See :func:`kouxing.training.phone_lm.estimation.estimate_phone_lm`.
     report
@@ -71,7 +71,9 @@ def train_phone_lm(
     if len(corpus):
         streams += [corpus] * max(1, round(_CORPUS_WEIGHT * num_text / len(corpus)))
     if not num_text + len(corpus):
-        raise UserError("no text to count; give --text, --ngrams or a corpus with sentences")
+        raise UserError(
+            "there is no text to count; give --text, --ngrams or a corpus with sentences"
+        )
     report(f"{num_text} phones of text, {len(corpus)} of sentences of the corpora")
     phone_lm = estimate_phone_lm(streams, inventory, order=order, max_ngrams=max_ngrams)
     write_archive(output, phone_lm_arrays(phone_lm))
@@ -92,29 +94,29 @@ def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> Phone
 
 
 def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
-    """Read a file of :func:`train_phone_lm`, or the phone language model in a recognizer's model.
+    """Read a file of :func:`train_phone_lm`, or the phone language model of a recognizer's model.
 
     Raises
     ------
     UserError
-        If the file is missing, holds no phone language model or is of another language.
+        If the file is missing, contains no phone language model or is for another language.
     """
     try:
         phone_lm = phone_lm_from(read_archive(path))
     except ValueError as error:
         raise UserError(
-            f"no phone language model in {path}: {error}; write one with: kouxing train phone-lm"
+            f"{path} has no phone language model: {error}; make one with: kouxing train phone-lm"
         ) from error
     if phone_lm.inventory.language != inventory.language:
         raise UserError(
             f"{path} is for {phone_lm.inventory.language}, not for {inventory.language}; give a "
-            "phone language model of the same language"
+            "phone language model for this language"
         )
     return phone_lm
 
 
 def _sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
-    """Read the sentences of a file; those that cannot be pronounced are left out."""
+    """Read the sentences of a file that can be pronounced."""
     try:
         lines = text.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -129,7 +131,7 @@ def _sentences(text: Path, inventory: PhoneInventory) -> list[tuple[int, ...]]:
 
 
 def phones_of_text(text: str, inventory: PhoneInventory) -> tuple[int, ...]:
-    """Return the indices of a text's phones; none if a part of it cannot be pronounced."""
+    """Return the indices of a text's phones; empty if a part of it cannot be pronounced."""
     try:
         syllables = inventory.pronounce(text)
     except UserError:

@@ -1,8 +1,8 @@
 """Fit the dynamic visemes' parameters to tracked lips by least squares.
 
-Source: Wang & Cai 2003, section 4: two stages of gradient descent on the squared error between the
-model's curves and measured ones: first the vowels, with the silences and the exponent, then the
-consonants with those fixed; repeated.
+Source: Wang & Cai 2003, section 4. Two stages of gradient descent minimize the squared error
+between the model's curves and measured ones: first the vowels, with the silences and the exponent,
+then the consonants with those fixed. The stages are repeated.
 
 ======  =============================================  =========  ================
 symbol  name                                           unit       shape
@@ -13,12 +13,16 @@ T       static target                                  FAP units  (num_visemes,)
 tau     apex minus time                                s          (num_frames, near)
 ======  =============================================  =========  ================
 
-Deviations: the speech is words and sentences, not single finals and syllables, so a stage changes
-its own visemes only and keeps all others. Each FAP is fitted on its own. Ridge regularisation keeps
-parameters with little data close to their initial values. The closure rule is not part of the fit;
-neither are the lips of labials, which are closed by definition, and the tongue, which is not
-visible. Least squares flattens motion that the model does not explain, so in the end the targets
-are scaled to the measured extent.
+Deviations from the paper:
+
+- The speech consists of words and sentences instead of single finals and syllables. A stage
+  therefore changes only its own visemes.
+- Each FAP is fitted on its own. Ridge regularization keeps parameters with little data close to
+  their initial values.
+- The closure rule is not fitted, nor the lips of labials, which are closed by definition, nor the
+  tongue, which is not visible.
+- Least squares flattens motion that the model does not explain. The fitted targets are therefore
+  scaled to the measured extent.
 """
 
 from __future__ import annotations
@@ -56,12 +60,12 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.training.visemes.frames import Array, Frames
 
-_RIDGE = 10.0  # weight of the initial values, frames; neighbouring frames are not independent
+_RIDGE = 10.0  # weight of the initial values, frames; adjacent frames are not independent
 _SPREAD = {"alpha": 0.7, "theta": 0.5, "offset": 0.04, "target": 1.0}
 # largest distance from the initial values, in spreads
 _ALPHA_RANGE, _THETA_RANGE, _OFFSET_RANGE = 4.0, 2.0, 2.0
 _MAX_GAIN = 2.0
-_EXPONENTS = (1.3, 1.5, 1.8)  # lower ones make visible corners at the apexes
+_EXPONENTS = (1.3, 1.5, 1.8)  # lower ones give visible corners at the apexes
 _ROUNDS = 2
 _SILENCE_STEP = 1e-4  # of the finite differences, in spreads
 _UNKNOWNS = ("alpha", "theta_minus", "theta_plus", "offset_s", "target")
@@ -103,23 +107,23 @@ class _FapFit:
             ]
         )
         self.visemes, self.silences = self._start.copy(), self._silence_start.copy()
-        # Closed lips, and lip to teeth, are given by definition, and so is their timing.
+        # Closed lips and lip to teeth are defined, and so is their timing.
         self.fixed = np.zeros(len(VISEMES), dtype=bool)
         labials = [*CLOSURE_FAPS] if MOUTH_FAPS[column] in LIP_HEIGHT_FAPS else []
         self.fixed[[VISEME_INDEX[viseme] for viseme in [REST, *labials]]] = True
-        # The initial shapes are another speaker's: scale them to this speaker's size.
+        # The initial shapes are from another speaker, so they are scaled to this one.
         curve = self.curve()[0]
         gain = max(float(curve @ self._measured) / max(float(curve @ curve), 1e-9), 0.0)
         self._start[4, ~self.fixed] *= gain
         self.visemes[4, ~self.fixed] *= gain
 
     def curve(self) -> tuple[Array, Array]:
-        """Modelled and measured values of all frames."""
+        """Return modeled and measured values of all frames."""
         silent = self._log_silences(self.silences)
         return self._blend(self.visemes, silent)[0], self._measured
 
     def descend(self, rows: NDArray[np.intp], with_silences: bool) -> float:
-        """Minimise the loss over the unknowns of some visemes, and of the silences; return it."""
+        """Minimize the loss over the unknowns of some visemes and of the silences; return it."""
         num = 5 * len(rows)
 
         def place(z: Array) -> tuple[Array, Array]:
@@ -145,9 +149,9 @@ class _FapFit:
             for unknown in range(len(silences) if with_silences else 0):
                 moved = silences.copy()
                 moved[unknown] += _SILENCE_STEP * self._silence_spread[unknown]
-                beside = self._blend(visemes, self._log_silences(moved))[0]
+                moved_curve = self._blend(visemes, self._log_silences(moved))[0]
                 gradient[num + unknown] = (
-                    np.sum(2.0 * error * (beside - curve)) / self._scale / _SILENCE_STEP
+                    np.sum(2.0 * error * (moved_curve - curve)) / self._scale / _SILENCE_STEP
                 )
             gradient += 2.0 * _RIDGE * z
             return float(error @ error + _RIDGE * (z @ z)), gradient
@@ -165,12 +169,12 @@ class _FapFit:
         if with_silences:
             z = np.append(z, (self.silences - self._silence_start) / self._silence_spread)
             bounds += [(-2.0, 2.0)] * len(self.silences)
-        found = minimize(loss, z, jac=True, method="L-BFGS-B", bounds=bounds)
-        self.visemes, self.silences = place(found.x)
-        return float(found.fun)
+        result = minimize(loss, z, jac=True, method="L-BFGS-B", bounds=bounds)
+        self.visemes, self.silences = place(result.x)
+        return float(result.fun)
 
     def _log_silences(self, silences: Array) -> Array:
-        """Log weights of the silences, (num_frames, 2)."""
+        """Compute the log weights of the silences, (num_frames, 2)."""
         theta_left, theta_right = np.exp(silences[:2])
         start, end = self._silence
         one = np.ones(1)
@@ -181,7 +185,7 @@ class _FapFit:
         )
 
     def _blend(self, visemes: Array, silent: Array) -> tuple[Array, list[Array]]:
-        """Model's curve (num_frames,) and its slopes by the five unknowns, (num_frames, near)."""
+        """Compute the curve, (num_frames,), and its five slopes, (num_frames, near)."""
         viseme, c = self._viseme, self.c
         log_alpha, log_minus, log_plus, offset, target = visemes[:, viseme]
         tau = np.maximum(self._before + offset, 0.0) + np.minimum(self._after + offset, 0.0)
@@ -217,7 +221,7 @@ _VOWEL_ROWS = np.array(
 
 
 def estimate(frames: Frames) -> VisemeParameters:
-    """Fit all FAPs that were measured, in the two stages of Wang & Cai 2003."""
+    """Fit all measured FAPs in the two stages of Wang & Cai 2003."""
     measured = [
         column
         for column in range(NUM_MOUTH_FAPS)
@@ -242,9 +246,9 @@ def estimate(frames: Frames) -> VisemeParameters:
             fit.descend(_VOWEL_ROWS, with_silences=True)
             fit.descend(_CONSONANT_ROWS, with_silences=False)
         visemes, silences = fit.visemes.copy(), fit.silences.copy()
-        # Least squares flattens motion that the model does not explain: restore its extent.
-        modelled, seen = fit.curve()
-        gain = min(max(float(np.std(seen) / np.std(modelled)), 1.0), _MAX_GAIN)
+        # restore the extent that least squares flattens
+        modeled, measured_fap = fit.curve()
+        gain = min(max(float(np.std(measured_fap) / np.std(modeled)), 1.0), _MAX_GAIN)
         visemes[4, ~fit.fixed] *= gain
         visemes[:3], silences[:2] = np.exp(visemes[:3]), np.exp(silences[:2])
         sides = [column] + [

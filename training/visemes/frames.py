@@ -1,4 +1,4 @@
-"""The frames of clips, each with the visemes and silences near it."""
+"""The frames of clips, each with the nearest visemes and silences."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
-_NEAR = 8  # visemes around a frame that may have weight
+_NEAR = 8  # visemes of a frame that can have weight
 _FAR_S = 60.0  # a viseme this far away has no weight
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Frames of all clips, with the visemes and silences near each."""
+    """Frames of all clips, with the nearest visemes and silences of each."""
 
     viseme: NDArray[np.intp]  # (num_frames, near)
     before_s: Array  # (num_frames, near) start of the apex minus time
@@ -36,7 +36,7 @@ class Frames:
 def frames_of(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> Frames:
-    """Find the visemes and silences near each frame; all others have no weight there.
+    """Find the nearest visemes and silences of each frame.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def frames_of(
     """
     parts = []
     for clip, phones in zip(clips, labels, strict=True):
-        timeline = _filled_up(build_timeline(phones, inventory))
+        timeline = _padded(build_timeline(phones, inventory))
         if not len(timeline.silence_start_s):
             continue
         time = clip.time_s[:, None]
@@ -67,12 +67,12 @@ def frames_of(
             )
         )
     if not parts:
-        raise UserError("the clips for training have no speech; give clips with speech")
+        raise UserError("the training clips contain no speech; give clips with speech")
     return Frames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _filled_up(timeline: Timeline) -> Timeline:
-    """Add visemes far away, so that even a short clip has ``_NEAR`` of them."""
+def _padded(timeline: Timeline) -> Timeline:
+    """Add distant visemes, so that even a short clip has ``_NEAR`` of them."""
     far_s = np.full(max(_NEAR - len(timeline.viseme), 0), np.append(timeline.apex_end_s, 0.0).max())
     far_s += _FAR_S
     return replace(

@@ -27,12 +27,12 @@ from kouxing.training.visemes.fit import estimate
 from kouxing.training.visemes.frames import Array, frames_of
 
 _LEVEL_RIDGE = 3.0  # weight of the initial levels, phones
-_SPOKEN_DB = 25.0  # sound this far below the loudest is no speech
-_CLOSURE_REACHES_S = (0.05, 0.06, 0.07, 0.08, 0.1)  # shorter ones are hardly visible
+_SPOKEN_DB = 25.0  # audio this far below the loudest is not speech
+_CLOSURE_REACHES_S = (0.05, 0.06, 0.07, 0.08, 0.1)  # shorter closures are hardly visible
 _CLOSURE_WINDOW_S, _CLOSURE_NEIGHBOURS_S = 0.12, 1.0
-# The fit knows when a phone begins; live, it is told late, and the mouth is led to it. Of 0, 10,
-# 15, 20 and 40 ms this much takes most of the lips' lag away on clips for choices, 160 ms behind
-# the sound, and a long vowel still stays open.
+# The fit uses exact phone onsets, but live phones arrive late. Of 0, 10, 15, 20 and 40 ms, this
+# lead removes most of the lag on clips of the part "choice" at a delay of 160 ms, and keeps long
+# vowels open.
 _LEAD_S = 0.015
 _SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apache-2.0"
 
@@ -40,7 +40,7 @@ _SOURCE = "start and tongue: targets of Crystal.TTVS (Tsinghua University), Apac
 def usual_levels(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> Array:
-    """Level of each viseme relative to its speaker's mean speech level, dB, (num_visemes,)."""
+    """Measure the level of each viseme relative to its speaker's mean, dB, (num_visemes,)."""
     start = initial_parameters().level_db
     total, count = _LEVEL_RIDGE * start, np.full(len(VISEMES), _LEVEL_RIDGE)
     for clip, phones in zip(clips, labels, strict=True):
@@ -66,9 +66,9 @@ def closure_reach(
     labels: Sequence[list[Phone]],
     inventory: PhoneInventory,
 ) -> float:
-    """Find the T of the closure rule that fits the lips around b p m best, seconds.
+    """Find the T of the closure rule that best fits the lips around b p m, seconds.
 
-    C cannot be estimated: every value above 20 shuts the lips, and a larger one changes nothing.
+    C cannot be estimated, because all values above 20 give the same closed lips.
     """
     lips = columns((4, 5))
 
@@ -92,8 +92,8 @@ def closure_reach(
     return min(_CLOSURE_REACHES_S, key=loss)
 
 
-def leading(parameters: VisemeParameters) -> VisemeParameters:
-    """Let every apex, and every beginning and end of speech, be a little sooner."""
+def _lead(parameters: VisemeParameters) -> VisemeParameters:
+    """Move every apex, and the start and end of speech, forward a little."""
     return replace(
         parameters,
         offset_s=parameters.offset_s - _LEAD_S,
@@ -103,7 +103,7 @@ def leading(parameters: VisemeParameters) -> VisemeParameters:
 
 
 def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> None:
-    """Train viseme parameters on the clips of ``folder`` that are for training.
+    """Train viseme parameters on the training clips of a folder.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> N
     used = [clip for clip in clips if clip.part == "train"]
     if not used:
         raise UserError(
-            f"no clip in {folder} may be used; give clips with a free licence, or --any-licence"
+            f"no clip in {folder} may be used; give clips with a free license, or --any-licence"
         )
     model = load_model()
     inventory = model.inventory
@@ -122,15 +122,15 @@ def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> N
     parameters = estimate(frames_of(used, labels, inventory))
     parameters = replace(parameters, level_db=usual_levels(used, labels, inventory))
     reach_s = closure_reach(parameters, used, labels, inventory)
-    parameters = leading(replace(parameters, closure_reach_s=reach_s))
+    parameters = _lead(replace(parameters, closure_reach_s=reach_s))
     licences = "; ".join(sorted({clip.licence for clip in used}))
     try:
         save_parameters(
             parameters,
             output,
-            f"{_SOURCE}; the rest learnt from clips under: {licences}",
+            f"{_SOURCE}; the rest learned from clips under: {licences}",
             learnt_from=[clip.name for clip in used],
             chosen_with=[clip.name for clip in clips if clip.part == "choice"],
         )
     except OSError as error:
-        raise UserError(f"{output}: cannot be written: {error.strerror}") from None
+        raise UserError(f"cannot write {output}: {error.strerror}") from None
