@@ -1,7 +1,7 @@
-"""The whole chain in one process: sound in, FAP frames out, without sockets.
+"""The whole chain in one process, without sockets: audio in, FAP frames out.
 
-The services run the same two halves, ``SpeechStream`` and ``Face``, with messages between them.
-Offline rendering and evaluation run them here; the frames are the same, bit for bit.
+The services run the same two halves, ``SpeechStream`` and ``Face``, and exchange messages between
+them. Offline rendering and evaluation use this chain. Its frames are identical, bit for bit.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ def sound_events(
     face_delay_s: float = 0.0,
     config: RecognizerConfig | None = None,
 ) -> list[SoundEvent]:
-    """Return the events of a whole sound, 16 kHz mono, shape (n,); None: by default settings.
+    """Return the events of a whole sound, 16 kHz mono, shape (n,).
 
-    With a model of lips there are lip frames among them, in time for a face of this delay.
+    With ``lips_from_sound``, they include lip frames for a face with the delay ``face_delay_s``.
+    Without ``config``, the default settings are used.
     """
     config = config or RecognizerConfig()
     stream = _new_stream(model, config, MEDIA_RATE_HZ, 1, lips_from_sound, face_delay_s)
@@ -38,7 +39,7 @@ def sound_events(
 
 
 class LiveChain:
-    """One session's sound to FAP frames.
+    """Computes the FAP frames of one session from its audio.
 
     Parameters
     ----------
@@ -47,16 +48,16 @@ class LiveChain:
     lips
         The lip model, for the acoustic model's language.
     sample_rate_hz, num_channels
-        Of the sound.
+        Format of the audio.
     recognizer, synthesizer
-        The two services' settings; ``lips`` stands for ``synthesizer.lips``.
+        Settings of the two services. ``synthesizer.lips`` is ignored.
     lips_from_sound
-        The recognizer's model of lips; None: the one that the recognizer itself would load.
+        The network that predicts learnt lips. If None, the recognizer's default.
 
     Attributes
     ----------
     events : list of SoundEvent
-        What the recognizer has emitted so far.
+        The events that the recognizer has emitted so far.
 
     Examples
     --------
@@ -95,17 +96,17 @@ class LiveChain:
         )
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> list[Frame]:
-        """Take the next samples, shape (n,) or (n, channels); return the frames that are due.
+        """Process samples, shape (n,) or (n, channels), and return the frames that are due.
 
         Raises
         ------
         UserError
-            If the samples have another shape or are no numbers.
+            If the samples have another shape or are not finite.
         """
         return self._animate(self._stream.accept_waveform(samples))
 
     def input_finished(self) -> list[Frame]:
-        """End the sound; return the frames still owed and those that lead to rest."""
+        """End the audio and return the remaining frames, until the face is at rest."""
         return self._animate(self._stream.input_finished())
 
     def _animate(self, outputs: list[StreamOutput]) -> list[Frame]:

@@ -1,12 +1,13 @@
-"""A whole recording to FAP frames, with everything known.
+"""Animates a face from a whole recording.
 
-    sound -> scores -> phones: offline decoding, or those of a known text
-                    -> lip frames of the longest delay                   -> face, 1.5 s later
+    sound -> scores -> phones, by offline decoding or forced alignment of a known text
+                    -> lip frames with the longest delay
+                    -> face
 
-The face is that of the live chain (``Face``), with the same lip models and modifiers. It is made so
-late that everything is known that moves a frame: dynamic visemes blend all visemes within 1.5 s
-(Wang & Cai 2003, eq. 6); beyond that they weigh less than a face can show. The phones of learnt
-lips say where lips do not meet, too; live, they are known too late for that.
+The face is the one of the live chain (``Face``), with the same lip models and modifiers. It has the
+longest delay, 1.5 s, so that everything that affects a frame is known. Dynamic visemes blend all
+visemes within 1.5 s (Wang & Cai 2003, eq. 6); the weight of others is too small to see. With learnt
+lips, phones also decide where the lips do not close. In the live chain, they arrive too late.
 """
 
 from __future__ import annotations
@@ -35,33 +36,33 @@ from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent, SpeechChange
 
-# Chosen on clips for choices, as those of the live chain. Where the sound tells one closure and the
-# phones two, the vowel between them counts; no clip has such a place.
-_RECOGNISED = ClosureRule(other=1.0, vowel=3.0)
-_CERTAIN = ClosureRule(phone=6.0, other=6.0)  # of a known text: its phones decide
+# Tuned on the same held-out clips as the rule of the live chain. If the sound has one closure and
+# the phones have two, the vowel between them counts. No clip has such a place.
+_RECOGNIZED = ClosureRule(other=1.0, vowel=3.0)
+_KNOWN_TEXT = ClosureRule(phone=6.0, other=6.0)  # the phones decide
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeardRecording:
-    """What is known of a whole recording."""
+class AnalyzedRecording:
+    """Everything that moves a face, for a whole recording."""
 
     duration_s: float
-    events: Sequence[SoundEvent]  # phones, lip frames, voice activity and levels, in any order
+    events: Sequence[SoundEvent]  # phones, lip frames, voice activity and levels; not sorted
     is_text_known: bool
 
     @property
     def phones(self) -> list[Phone]:
-        """Its phones with their times, silence included."""
+        """Phones with their times, including silence."""
         return [event for event in self.events if isinstance(event, Phone)]
 
 
-def hear_recording(
+def analyze_recording(
     model: AcousticModel,
     samples: NDArray[np.float32],
     lips_from_sound: LipsFromSound | None = None,
     aligned: Sequence[Phone] | None = None,
-) -> HeardRecording:
-    """Find out all about a recording.
+) -> AnalyzedRecording:
+    """Find the phones, lip frames, voice activity and levels of a recording.
 
     Parameters
     ----------
@@ -70,18 +71,18 @@ def hear_recording(
     samples
         16 kHz mono, shape (n,).
     lips_from_sound
-        The recognizer's model of lips, if it fits the acoustic model.
+        The network that predicts learnt lips, if it fits the acoustic model.
     aligned
-        The phones, if the text is known.
+        The phones of the known text; None: phones are recognized.
     """
-    silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)  # the face is as late
+    silence = np.zeros(round(MAX_DELAY_S * MEDIA_RATE_HZ), np.float32)  # the delay of the face
     padded = np.concatenate([samples, silence])
     lips = None
     if lips_from_sound is not None:
         lips = lips_from_sound.stream(lips_from_sound.delays_s[-1:])
     events = score_recording(model, padded, MEDIA_RATE_HZ, lips)
     phones = decode_offline(model, events) if aligned is None else aligned
-    return HeardRecording(
+    return AnalyzedRecording(
         duration_s=len(samples) / MEDIA_RATE_HZ,
         events=[
             *(phone if aligned is None else replace(phone, confidence=1.0) for phone in phones),
@@ -99,10 +100,12 @@ def hear_recording(
     )
 
 
-def animate(heard: HeardRecording, lips: LipModel, config: SynthesizerConfig) -> list[Frame]:
-    """Make all frames of a recording, with those that lead to rest; ``delay_ms`` is ignored."""
+def animate_recording(
+    recording: AnalyzedRecording, lips: LipModel, config: SynthesizerConfig
+) -> list[Frame]:
+    """Return all frames of a recording, until the face is at rest. ``delay_ms`` is ignored."""
     if isinstance(lips, LearntLips):
-        lips = replace(lips, closures=_CERTAIN if heard.is_text_known else _RECOGNISED)
+        lips = replace(lips, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED)
     face = Face(
         lips,
         frame_rate_hz=config.frame_rate_hz,
@@ -110,13 +113,13 @@ def animate(heard: HeardRecording, lips: LipModel, config: SynthesizerConfig) ->
         idle_motion_seed=config.idle_motion_seed,
         expressiveness=config.expressiveness,
     )
-    end = EndOfSound(time_s=heard.duration_s + MAX_DELAY_S)
+    end = EndOfSound(time_s=recording.duration_s + MAX_DELAY_S)
     frames = [
         frame
-        for event in [*sorted(heard.events, key=_time_of), end]
+        for event in [*sorted(recording.events, key=_time_of), end]
         for frame in face.accept(event)
     ]
-    return [frame for frame in frames if frame[0] <= heard.duration_s + REST_S]
+    return [frame for frame in frames if frame[0] <= recording.duration_s + REST_S]
 
 
 def _time_of(event: SoundEvent) -> float:

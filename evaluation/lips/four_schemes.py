@@ -36,7 +36,7 @@ from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_source import LipsFromSound
 from kouxing.services.recognizer.lips import lips_for
-from kouxing.services.recording_chain import HeardRecording, animate, hear_recording
+from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
 from kouxing.services.synthesizer.face import Face, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -85,7 +85,7 @@ class Listener:
 class Hearing:
     """What one recognizer makes of a sentence."""
 
-    recognised: HeardRecording
+    recognised: AnalyzedRecording
     live: Mapping[float, Sequence[SoundEvent]]  # by the face's delay in s
     has_paper_rule: bool
 
@@ -95,7 +95,7 @@ class HeardSentence:
     """A sentence with what the recognizers make of it."""
 
     sentence: Sentence
-    aligned: HeardRecording | None
+    aligned: AnalyzedRecording | None
     hearings: Mapping[str, Hearing]  # by the recognizer's name
 
 
@@ -146,10 +146,10 @@ def _hear(model: AcousticModel, listeners: Sequence[Listener], sentence: Sentenc
     samples, aligned = sentence.clip.samples, sentence.aligned
     return HeardSentence(
         sentence,
-        None if aligned is None else hear_recording(model, samples, lips_for(model), aligned),
+        None if aligned is None else analyze_recording(model, samples, lips_for(model), aligned),
         {
             each.name: Hearing(
-                hear_recording(each.model, samples, each.lips),
+                analyze_recording(each.model, samples, each.lips),
                 live_events(each.model, samples, each.lips, _DELAYS_S, each.config),
                 each.has_paper_rule,
             )
@@ -164,10 +164,10 @@ def face_of(
     """Return the frames of a condition; None where the sentence's text is not known."""
     lips = load_lip_model(name=condition.lips)
     if condition.scheme == BOUND:
-        return None if heard.aligned is None else animate(heard.aligned, lips, config)
+        return None if heard.aligned is None else animate_recording(heard.aligned, lips, config)
     hearing = heard.hearings[condition.recognizer]
     if condition.scheme == RECOGNISED:
-        return animate(hearing.recognised, lips, config)
+        return animate_recording(hearing.recognised, lips, config)
     face = Face(
         lips,
         frame_rate_hz=config.frame_rate_hz,

@@ -1,126 +1,193 @@
-"""The curves of a face's motion as files: FAPs, or blend shapes; an animated head."""
+"""Exporters of a face's curves: FAPs or blend shapes of every frame.
+
+To add a format, write a subclass of ``CurveExporter`` and add its suffix to ``CURVE_EXPORTERS``.
+``kouxing render`` and ``kouxing listen`` then write it.
+"""
 
 from __future__ import annotations
 
-import csv
 import json
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.progress import Progress
 
-from kouxing.services.cli.options import CurveForm
+from kouxing.services.cli.options import CurveForm, ExportOptions
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, write_fap
-from kouxing.shared.face.faps import FAPS
+from kouxing.shared.face.faps import FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
+from kouxing.shared.terminal import cannot_write
 
 if TYPE_CHECKING:
-    from kouxing.services.cli.motion import Motion
+    from kouxing.services.cli.animation import Motion
 
 Values = NDArray[np.float32]
-CURVE_SUFFIXES = (".fap", ".csv", ".jsonl", ".glb")
-_FORMS_OF_SUFFIX = {
-    ".fap": (CurveForm.FAPS,),
-    ".glb": (CurveForm.FAPS, CurveForm.ARKIT),
+Row = tuple[float, int, Values]  # media time in seconds, frame number, FAPs (68,)
+
+
+class CurveExporter(ABC):
+    """Writes the curves of a face to a file.
+
+    Parameters
+    ----------
+    output
+        File to write.
+    options
+        Only ``form``, ``head`` and ``lips`` are used.
+
+    Raises
+    ------
+    UserError
+        If the options do not fit the format, or the folder does not exist.
+    """
+
+    unit: ClassVar[str] = "frame"
+    forms: ClassVar[tuple[CurveForm, ...]] = tuple(CurveForm)
+
+    def __init__(self, output: Path, options: ExportOptions) -> None:
+        if options.form not in self.forms:
+            raise UserError(
+                f"{output}: this format holds {' or '.join(self.forms)}; for {options.form}, write"
+                " .csv or .jsonl"
+            )
+        if len(options.lips) > 1:
+            raise UserError("curves are of one face; give --lips only once")
+        if not output.parent.is_dir():
+            raise cannot_write(output, FileNotFoundError())
+        self._output = output
+        self._form = options.form
+        self._head = options.head
+
+    def export(self, motion: Motion, progress: Progress) -> int:
+        """Write all frames of a motion and return their number."""
+        rows = ((time_s, number, faps) for number, (time_s, faps) in enumerate(motion.frames))
+        return self.write(rows, motion.frame_rate_hz)
+
+    @abstractmethod
+    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+        """Write frames as they arrive and return their number.
+
+        Parameters
+        ----------
+        rows
+            The frames.
+        frame_rate_hz
+            If None, it is estimated from the times of the frames.
+
+        Raises
+        ------
+        UserError
+            If the file cannot be written.
+        """
+
+
+class TableExporter(CurveExporter):
+    """Writes a line of text for each frame."""
+
+    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+        """Write each frame when it arrives."""
+        count = 0
+        try:
+            with self._output.open("w", encoding="utf-8", newline="") as file:
+                file.write(self.header(self._form))
+                for row in rows:
+                    file.write(self.line(row, self._form) + "\n")
+                    file.flush()
+                    count += 1
+        except OSError as error:
+            raise cannot_write(self._output, error) from None
+        return count
+
+    @staticmethod
+    def header(form: CurveForm) -> str:
+        """Return the text before the first frame."""
+        return ""
+
+    @staticmethod
+    @abstractmethod
+    def line(row: Row, form: CurveForm) -> str:
+        """Return the line of a frame."""
+
+
+class CsvExporter(TableExporter):
+    """Writes comma-separated values, with a column for each FAP or shape."""
+
+    @staticmethod
+    def header(form: CurveForm) -> str:
+        """Return the names of the columns."""
+        return ",".join(["time_s", *_value_names(form)]) + "\n"
+
+    @staticmethod
+    def line(row: Row, form: CurveForm) -> str:
+        """Return the values of a frame."""
+        time_s, _, faps = row
+        return ",".join([f"{time_s:.3f}", *(f"{value:.4g}" for value in _values(faps, form))])
+
+
+class JsonLinesExporter(TableExporter):
+    """Writes a JSON object for each frame: FAPs in the order of their numbers, or named shapes."""
+
+    @staticmethod
+    def line(row: Row, form: CurveForm) -> str:
+        """Return the JSON object of a frame."""
+        time_s, number, faps = row
+        is_faps = form is CurveForm.FAPS
+        rounded = [round(float(value), 2 if is_faps else 4) for value in _values(faps, form)]
+        values = rounded if is_faps else dict(zip(_value_names(form), rounded, strict=True))
+        return json.dumps({"time_s": time_s, "sequence": number, form.value: values})
+
+
+class FapExporter(CurveExporter):
+    """Writes an MPEG-4 ``.fap`` file."""
+
+    forms = (CurveForm.FAPS,)
+
+    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+        """Write the frames when the last one has arrived."""
+        frames = list(rows)
+        if frame_rate_hz is None:
+            steps_s = np.diff([time_s for time_s, _, _ in frames])
+            steps_s = steps_s[steps_s > 0]
+            frame_rate_hz = float(1.0 / np.median(steps_s)) if len(steps_s) else 50.0
+        faps = np.array([values for _, _, values in frames], np.float32).reshape(-1, NUM_FAPS)
+        write_fap(self._output, FapAnimation(self._output.stem, frame_rate_hz, faps))
+        return len(frames)
+
+
+class GlbExporter(CurveExporter):
+    """Writes the head as a GLB with the motion as an animation."""
+
+    forms = (CurveForm.FAPS, CurveForm.ARKIT)
+
+    def write(self, rows: Iterable[Row], frame_rate_hz: float | None = None) -> int:
+        """Write the frames when the last one has arrived."""
+        from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - slow
+        from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
+
+        frames = [(time_s, faps) for time_s, _, faps in rows]
+        is_arkit = self._form is CurveForm.ARKIT
+        export_glb(load_head(self._head), self._output, frames, as_arkit=is_arkit)
+        return len(frames)
+
+
+CURVE_EXPORTERS: dict[str, type[CurveExporter]] = {
+    ".fap": FapExporter,
+    ".csv": CsvExporter,
+    ".jsonl": JsonLinesExporter,
+    ".glb": GlbExporter,
 }
 
 
-def is_curves(output: Path) -> bool:
-    """Whether a name stands for curves."""
-    return output.suffix.lower() in CURVE_SUFFIXES
-
-
-def check_curves(output: Path, form: CurveForm) -> None:
-    """Check a name of a curve file before long work.
-
-    Raises
-    ------
-    UserError
-        If the file cannot hold such values.
-    """
-    forms = _FORMS_OF_SUFFIX.get(output.suffix.lower(), tuple(CurveForm))
-    if form not in forms:
-        raise UserError(
-            f"{output}: such a file holds {' or '.join(forms)}; for {form} write .csv or .jsonl"
-        )
-    if not output.parent.is_dir():
-        raise UserError(f"{output}: cannot be written: there is no folder {output.parent}")
-
-
-def write_curves(motion: Motion, output: Path, form: CurveForm, head: str) -> None:
-    """Write the values of every frame; the suffix tells how.
-
-    Parameters
-    ----------
-    motion
-        Of one face.
-    output
-        ``.fap``, ``.csv``, ``.jsonl``, or ``.glb``: the head with the motion as an animation.
-    form
-        What the values are.
-    head
-        The head of a ``.glb``.
-
-    Raises
-    ------
-    UserError
-        If the file cannot be written.
-    """
-    suffix = output.suffix.lower()
-    if suffix == ".fap":
-        faps = np.array([faps for _, faps in motion.frames], np.float32)
-        write_fap(output, FapAnimation(output.stem, motion.frame_rate_hz, faps))
-        return
-    if suffix == ".glb":
-        from kouxing.services.driver.head.glb_export import export_glb  # noqa: PLC0415 - it draws
-        from kouxing.services.driver.render.scene import load_head  # noqa: PLC0415
-
-        export_glb(load_head(head), output, motion.frames, as_arkit=form is CurveForm.ARKIT)
-        return
-    try:
-        with output.open("w", encoding="utf-8", newline="") as file:
-            write = row_writer(file, suffix, form)
-            for number, (time_s, faps) in enumerate(motion.frames):
-                write(time_s, number, faps)
-    except OSError as error:
-        raise UserError(f"{output}: cannot be written: {error.strerror}") from None
-
-
-def row_writer(file: IO[str], suffix: str, form: CurveForm) -> Callable[[float, int, Values], None]:
-    """Begin a table of values; return what writes a row of it.
-
-    Parameters
-    ----------
-    file
-        Text file.
-    suffix
-        ``.csv``, else lines of JSON: FAPs in the order of their numbers, shapes by name.
-    form
-        What the values are.
-
-    Returns
-    -------
-    Function of the media time in seconds, the frame's number, and its FAPs (68,).
-    """
+def _value_names(form: CurveForm) -> tuple[str, ...]:
     shapes = SHAPE_SETS.get(form)
-    names = shapes.names if shapes else tuple(fap.name for fap in FAPS)
-    table = csv.writer(file, lineterminator="\n")
+    return shapes.names if shapes else tuple(fap.name for fap in FAPS)
 
-    def write_csv(time_s: float, _number: int, values: Values) -> None:
-        table.writerow([f"{time_s:.3f}", *(f"{value:.4g}" for value in values)])
 
-    def write_json(time_s: float, number: int, values: Values) -> None:
-        rounded = [round(float(value), 4 if shapes else 2) for value in values]
-        named = dict(zip(names, rounded, strict=True)) if shapes else rounded
-        line = {"time_s": time_s, "sequence": number, form.value: named}
-        file.write(json.dumps(line) + "\n")
-
-    if suffix == ".csv":
-        table.writerow(["time_s", *names])
-    write = write_csv if suffix == ".csv" else write_json
-    return lambda time_s, number, faps: write(
-        time_s, number, shapes.weights(faps) if shapes else faps
-    )
+def _values(faps: Values, form: CurveForm) -> Values:
+    shapes = SHAPE_SETS.get(form)
+    return shapes.weights(faps) if shapes else faps

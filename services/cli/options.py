@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.config import DriverConfig, Framing
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from kouxing.shared.face.shape_names import ShapeSetName
 
 DEFAULT_HEAD = DriverConfig().head
@@ -60,3 +62,19 @@ class Timing(StrEnum):
 
     ENDPOINTS = "endpoints"  # energy and zero crossings
     ALIGN = "align"  # forced alignment with the acoustic model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportOptions:
+    """How ``kouxing render`` shows and writes a face. The defaults are those of its options."""
+
+    lips: tuple[LipModelName, ...] = (DEFAULT_LIP_MODEL,)
+    form: CurveForm = CurveForm.FAPS
+    head: str = DEFAULT_HEAD
+    size: str = "1280x720"
+    background: str = "studio"
+    camera: Framing = Framing.FACE
+    yaw_deg: float = 0.0
+    pitch_deg: float = 0.0
+    rate_hz: float | None = None  # images per second; None: the default of the motion
+    at_s: float | None = None  # time of a single picture

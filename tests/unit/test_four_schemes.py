@@ -21,7 +21,7 @@ from kouxing.evaluation.lips.schemes import once_the_next_begins
 from kouxing.evaluation.lips.sentences import choose
 from kouxing.evaluation.mos.commands import app as mos
 from kouxing.services.driver.video import film
-from kouxing.services.recording_chain import HeardRecording
+from kouxing.services.recording_chain import AnalyzedRecording
 from kouxing.services.synthesizer.config import DELAYS_MS
 from kouxing.services.synthesizer.face import Frame
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -144,7 +144,7 @@ def test_the_papers_rule_is_three_frames_of_any_confidence() -> None:
 
 def test_live_schemes_are_told_by_the_listeners_rule() -> None:
     lips = LipModelName.DYNAMIC_VISEMES
-    nothing = HeardRecording(duration_s=0.0, events=[], is_text_known=False)
+    nothing = AnalyzedRecording(duration_s=0.0, events=[], is_text_known=False)
     for has_paper_rule, live, next_phone in (
         (True, as_emitted(LIVE), once_the_next_is_emitted(LIVE)),
         (False, LIVE, once_the_next_begins(LIVE)),

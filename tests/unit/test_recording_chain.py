@@ -14,7 +14,7 @@ from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_live_model, load_model
 from kouxing.services.recognizer.alignment import align_text
 from kouxing.services.recognizer.lips import lips_for
-from kouxing.services.recording_chain import HeardRecording, animate, hear_recording
+from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -31,16 +31,16 @@ TEXT = "爸爸妈妈跑步买苹果，伯伯陪婆婆慢慢品茶。"
 
 
 @lru_cache
-def bilabials(*, is_text_known: bool) -> HeardRecording:
+def bilabials(*, is_text_known: bool) -> AnalyzedRecording:
     samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
     model = load_model()
     aligned = align_text(model, samples, rate_hz, TEXT) if is_text_known else None
-    return hear_recording(model, samples[:, 0], lips_for(model), aligned)
+    return analyze_recording(model, samples[:, 0], lips_for(model), aligned)
 
 
-def openings(heard: HeardRecording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def openings(heard: AnalyzedRecording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return times and the opening of the inner lips, learnt, FAP units."""
-    frames = animate(heard, load_lip_model(name="learnt"), STILL)
+    frames = animate_recording(heard, load_lip_model(name="learnt"), STILL)
     return (
         np.array([time_s for time_s, _ in frames]),
         np.array([-faps[3] - faps[4] for _, faps in frames]),
@@ -49,10 +49,10 @@ def openings(heard: HeardRecording) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 def test_dynamic_visemes_are_the_full_model() -> None:
     samples = read_audio(VOWELS_FILE)[0][:, 0]
-    heard = hear_recording(load_model(), samples)
+    heard = analyze_recording(load_model(), samples)
     lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
-    made = np.array([faps for _, faps in animate(heard, lips, STILL)])
+    made = np.array([faps for _, faps in animate_recording(heard, lips, STILL)])
     num_frames = int(heard.duration_s * 50) + 1
     full = synthesize(lips, heard.phones, num_frames, 50.0, level_track(samples))
     assert np.ptp(full[:, 2]) > 100
@@ -88,7 +88,7 @@ def test_recognised_phones_err_where_the_text_does_not() -> None:
 def test_lips_part_in_a_recognised_vowel_between_two_closures() -> None:
     samples = read_audio(DEMO / "bilabials-female.wav")[0][:, 0]
     model = load_live_model()
-    heard = hear_recording(model, samples, lips_for(model))
+    heard = analyze_recording(model, samples, lips_for(model))
     times_s, opening = openings(heard)
     (vowel,) = [
         phone
@@ -104,7 +104,7 @@ def test_lips_part_in_a_recognised_vowel_between_two_closures() -> None:
 def test_every_phone_of_a_sentence_with_many_rounded_vowels_is_right() -> None:
     samples = read_audio(DEMO / "lake-male.wav")[0][:, 0]
     model = load_live_model()
-    heard = hear_recording(model, samples)
+    heard = analyze_recording(model, samples)
     spoken = [phone.symbol for phone in heard.phones if phone.symbol != model.inventory.silence]
     text = model.inventory.pronounce("五月的湖边，我和女儿读书、画鱼。")
     assert spoken == [phone for syllable in text for phone in syllable]
@@ -120,7 +120,8 @@ def test_the_face_knows_of_speech_when_it_is_due() -> None:
     config = SynthesizerConfig(lips="dynamic-visemes")  # type: ignore[arg-type]
     lips = load_lip_model(name="dynamic-visemes")
     silent, spoken = (
-        animate(replace(heard, events=[*quiet, *changes]), lips, config) for changes in ([], speech)
+        animate_recording(replace(heard, events=[*quiet, *changes]), lips, config)
+        for changes in ([], speech)
     )
     moved = [s for (s, one), (_, other) in zip(silent, spoken, strict=True) if (one != other).any()]
     assert 1.95 < moved[0] < 2.2  # from the first loud syllable on

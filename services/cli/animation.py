@@ -1,0 +1,172 @@
+"""The motion of a face: computed from sound, or read from a ``.fap`` file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from kouxing.services.cli.sound_file import read_mono_16k
+from kouxing.services.cli.spoken_text import does_not_fit, read_text
+from kouxing.services.driver.video import film
+from kouxing.services.live_chain import LiveChain
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.alignment import align_syllables
+from kouxing.services.recognizer.lips import LipPredictor, lips_for
+from kouxing.services.recognizer.mouth_profile import read_mouth_profile
+from kouxing.services.recording_chain import analyze_recording, animate_recording
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import read_fap
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.phones.events import Phone, SoundEvent
+from kouxing.shared.terminal import print_message
+
+_IMAGE_RATE_HZ = 25.0  # of a video, if the source is sound
+_MAX_IMAGE_RATE_HZ = 240.0
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A face over time."""
+
+    frames: list[film.Frame]
+    frame_rate_hz: float
+    image_rate_hz: float  # default for a video
+    samples: NDArray[np.float32] | None  # 16 kHz mono, shape (n,)
+    num_phones: int | None = None  # None if the source is a .fap file
+
+
+def is_fap(source: Path) -> bool:
+    """Return whether a source already contains the motion of a face."""
+    return source.suffix.lower() == ".fap"
+
+
+def read_motion(source: Path, sound: Path | None) -> Motion:
+    """Read a ``.fap`` file, with the sound that goes with it, if any."""
+    animation = read_fap(source)
+    return Motion(
+        film.frames_of(animation),
+        animation.frame_rate_hz,
+        min(animation.frame_rate_hz, _MAX_IMAGE_RATE_HZ),
+        None if sound is None else read_mono_16k(sound),
+    )
+
+
+def animate(
+    source: Path,
+    lips: Sequence[LipModelName],
+    progress: Progress,
+    *,
+    live: bool,
+    text: str | None,
+    mouth: Path | None,
+    expressiveness: float | None,
+) -> Motion:
+    """Animate a face from sound.
+
+    Parameters
+    ----------
+    source
+        A sound file.
+    lips
+        Lip models. Each one moves a face; the frames hold all faces side by side.
+    progress
+        Shows the progress.
+    live
+        Whether to make the frames as the live services do, with their default settings. Otherwise
+        the whole recording is known.
+    text
+        The spoken text, or the name of a file with it. If None, phones are recognized.
+    mouth
+        The speaker's mouth profile, for learnt lips.
+    expressiveness
+        Size of the mouth's movements, 0.5 to 2. If None, the default.
+
+    Raises
+    ------
+    UserError
+        If a file cannot be read, or the text has nothing to say.
+    """
+    model = load_live_model()
+    predictor = _load_lip_predictor(model, mouth)
+    settings = [_synthesizer_settings(name, expressiveness) for name in lips]
+    samples = read_mono_16k(source)
+    events: Sequence[SoundEvent]
+    if live:
+        chains = [_new_chain(model, predictor, config) for config in settings]
+        faces = [_stream(chain, samples, progress) for chain in chains]
+        events = chains[-1].events
+    else:
+        progress.add_task("recognizing", total=None)
+        phones = None if text is None else _align(model, samples, source, text)
+        recording = analyze_recording(model, samples, predictor, phones)
+        faces = [
+            animate_recording(recording, load_lip_model(name=config.lips), config)
+            for config in settings
+        ]
+        events = recording.events
+    return Motion(
+        faces[0] if len(faces) == 1 else film.beside(faces),
+        settings[0].frame_rate_hz,
+        _IMAGE_RATE_HZ,
+        samples,
+        _count_phones(events, model.inventory.silence),
+    )
+
+
+def _synthesizer_settings(lips: LipModelName, expressiveness: float | None) -> SynthesizerConfig:
+    if expressiveness is None:
+        return SynthesizerConfig(lips=lips)
+    return SynthesizerConfig(lips=lips, expressiveness=expressiveness)
+
+
+def _new_chain(
+    model: AcousticModel, predictor: LipPredictor | None, settings: SynthesizerConfig
+) -> LiveChain:
+    lips = load_lip_model(name=settings.lips)
+    return LiveChain(model, lips, synthesizer=settings, lips_from_sound=predictor)
+
+
+def _stream(chain: LiveChain, samples: NDArray[np.float32], progress: Progress) -> list[film.Frame]:
+    """Pass sound through a live chain, a second at a time."""
+    frames: list[film.Frame] = []
+    for start in progress.track(range(0, len(samples), MEDIA_RATE_HZ), description="recognizing"):
+        frames += chain.accept_waveform(samples[start : start + MEDIA_RATE_HZ])
+    return frames + chain.input_finished()
+
+
+def _align(
+    model: AcousticModel, samples: NDArray[np.float32], source: Path, text: str
+) -> list[Phone]:
+    """Return the phones of a text with their times."""
+    transcript = read_text(text, model.inventory)
+    alignment = align_syllables(model, samples, MEDIA_RATE_HZ, transcript.phones)
+    if not alignment.fits:
+        print_message(does_not_fit(source, alignment))
+    return alignment.phones
+
+
+def _load_lip_predictor(model: AcousticModel, mouth: Path | None) -> LipPredictor | None:
+    """Return the network that predicts learnt lips, adapted to a mouth profile, if any."""
+    predictor = lips_for(model)
+    if mouth is None or predictor is None:
+        return predictor
+    profile = read_mouth_profile(mouth)
+    try:
+        return predictor.with_mouth_profile(profile)
+    except UserError as error:
+        raise UserError(f"--mouth {mouth}: {error}") from None
+
+
+def _count_phones(events: Iterable[SoundEvent], silence: str) -> int:
+    return len(
+        {event.index for event in events if isinstance(event, Phone) and event.symbol != silence}
+    )

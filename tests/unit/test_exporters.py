@@ -1,0 +1,104 @@
+"""Output formats: chosen by suffix, checked before long work, and written as documented."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.progress import Progress
+
+from kouxing.services.cli.animation import Motion
+from kouxing.services.cli.curves import CURVE_EXPORTERS, Row
+from kouxing.services.cli.exporters import open_exporter
+from kouxing.services.cli.follow import follow
+from kouxing.services.cli.options import CurveForm, ExportOptions, Shown
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.fap_file import read_fap
+from kouxing.shared.face.faps import NUM_FAPS
+from kouxing.shared.face.lip_models import LipModelName
+from kouxing.shared.face.shapes import ARKIT
+
+pytestmark = pytest.mark.unit
+RATE_HZ = 40.0
+
+
+def rows(number: int = 5) -> list[Row]:
+    faps = np.zeros((number, NUM_FAPS), np.float32)
+    faps[:, 2] = np.linspace(0, 400, number)  # open_jaw
+    return [(index / RATE_HZ, index, faps[index]) for index in range(number)]
+
+
+def export(output: Path, form: CurveForm = CurveForm.FAPS) -> None:
+    frames = [(time_s, faps) for time_s, _, faps in rows()]
+    motion = Motion(frames, RATE_HZ, 25.0, samples=None)
+    exporter = open_exporter(output, ExportOptions(form=form))
+    assert exporter.export(motion, Progress(disable=True)) == len(frames)
+
+
+@pytest.mark.parametrize("name", ["face.CSV", "face.csv"])
+def test_csv_has_a_column_per_value(tmp_path: Path, name: str) -> None:
+    export(tmp_path / name, CurveForm.ARKIT)
+    with (tmp_path / name).open(encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    assert tuple(table[0]) == ("time_s", *ARKIT.names)
+    assert [row["time_s"] for row in table] == ["0.000", "0.025", "0.050", "0.075", "0.100"]
+    assert float(table[-1]["jawOpen"]) > 0.2 > float(table[0]["jawOpen"])
+
+
+def test_json_lines_have_an_object_per_frame(tmp_path: Path) -> None:
+    path = tmp_path / "face.jsonl"
+    export(path)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["sequence"] for line in lines] == [0, 1, 2, 3, 4]
+    assert [line["faps"][2] for line in lines] == [0, 100, 200, 300, 400]
+    export(path, CurveForm.ARKIT)
+    assert tuple(json.loads(path.read_text().splitlines()[0])["arkit"]) == ARKIT.names
+
+
+def test_fap_has_the_frame_rate_of_the_motion_or_of_the_times(tmp_path: Path) -> None:
+    export(tmp_path / "face.fap")
+    exporter = CURVE_EXPORTERS[".fap"](tmp_path / "live.fap", ExportOptions())
+    assert exporter.write(rows()) == 5
+    for name in ("face.fap", "live.fap"):
+        animation = read_fap(tmp_path / name)
+        assert animation.frame_rate_hz == pytest.approx(RATE_HZ)
+        np.testing.assert_allclose(animation.faps[:, 2], [0, 100, 200, 300, 400], atol=0.01)
+
+
+def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
+    for name in ("face.json", "face.txt", "face.avi"):
+        output = tmp_path / name
+        with pytest.raises(UserError, match=r"unknown format; .*\.mp4, .*\.png, .*\.csv"):
+            open_exporter(output, ExportOptions())
+        with pytest.raises(UserError, match=r"unknown format; .*\.fap, \.csv, \.jsonl"):
+            follow("", output, Shown.FAPS, CurveForm.FAPS, control="")
+        assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "message"),
+    [
+        ("a.fap", {"form": CurveForm.ARKIT}, "holds faps; for arkit, write .csv"),
+        ("a.glb", {"form": CurveForm.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
+        ("a.csv", {"lips": tuple(LipModelName)[:2]}, "curves are of one face"),
+        ("no/a.csv", {}, "cannot be written"),
+        ("no/a.mp4", {}, "cannot be written"),
+        ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit is for curves"),
+        ("a.mp4", {"background": "transparent"}, "MP4 has no transparency"),
+        ("a.mp4", {"background": "mud"}, "write studio, transparent"),
+        ("a.mp4", {"at_s": 0.1}, "--at selects one picture"),
+        ("a.mp4", {"size": "huge"}, "WIDTHxHEIGHT"),
+        ("a.mp4", {"size": "161x120"}, "even for a video"),
+        ("a.mp4", {"size": "99999x2"}, "7680"),
+        ("a.png", {"head": "nobody"}, "there is no head 'nobody'"),
+    ],
+)
+def test_options_are_checked_before_the_work(
+    tmp_path: Path, output: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UserError, match=message):
+        open_exporter(tmp_path / output, ExportOptions(**options))
