@@ -8,7 +8,7 @@ from itertools import zip_longest
 
 import numpy as np
 
-from kouxing.services.recognizer.recognizer import Emission
+from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.phones.events import Phone
 
 
@@ -87,7 +87,7 @@ def count_errors(reference: Sequence[str], recognized: Sequence[str]) -> ErrorCo
     return counts
 
 
-def is_emitted(phone: Phone, after: Emission | None) -> bool:
+def is_emitted(phone: Phone, after: StreamOutput | None) -> bool:
     """Tell whether the output rule emitted a phone, by the event that came after it.
 
     The rule emits a phone after the revisions of all phones before it.
@@ -95,7 +95,7 @@ def is_emitted(phone: Phone, after: Emission | None) -> bool:
     return not phone.final and not (isinstance(after, Phone) and after.index > phone.index)
 
 
-def first_hypothesis(events: Sequence[Emission], known: set[int]) -> list[Phone]:
+def first_hypothesis(events: Sequence[StreamOutput], known: set[int]) -> list[Phone]:
     """Pick each phone as it was emitted first, by the rule or along with the next one.
 
     Parameters
@@ -114,6 +114,6 @@ def first_hypothesis(events: Sequence[Emission], known: set[int]) -> list[Phone]
     return first
 
 
-def final_hypothesis(events: Iterable[Emission]) -> list[Phone]:
+def final_hypothesis(events: Iterable[StreamOutput]) -> list[Phone]:
     """Pick the phones that will not change any more from a live recognizer's output."""
     return [event for event in events if isinstance(event, Phone) and event.final]

@@ -11,20 +11,21 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_source import LipsFromSound
-from kouxing.services.recognizer.lips import lips_for
-from kouxing.services.recognizer.stream import SpeechStream, StreamOutput, Waveform
+from kouxing.services.recognizer.lip_frames import LipFrameModel
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face import Face, Frame
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.phones.events import SoundEvent
+from kouxing.shared.phones.events import SoundEvent, Waveform
 
 
 def sound_events(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lips_from_sound: LipsFromSound | None = None,
+    lips_from_sound: LipFrameModel | None = None,
     face_delay_s: float = 0.0,
     config: RecognizerConfig | None = None,
 ) -> list[SoundEvent]:
@@ -34,8 +35,11 @@ def sound_events(
     Without ``config``, the default settings are used.
     """
     config = config or RecognizerConfig()
-    stream = _new_stream(model, config, MEDIA_RATE_HZ, 1, lips_from_sound, face_delay_s)
-    return _events_of(stream.accept_waveform(samples) + stream.input_finished())
+    recognizer = Recognizer(model, config.output_rule)
+    stream = recognizer.create_stream(lips=lips_from_sound, face_delay_s=face_delay_s)
+    stream.accept_waveform(samples)
+    stream.input_finished()
+    return _decode(recognizer, stream)
 
 
 class LiveChain:
@@ -74,18 +78,17 @@ class LiveChain:
         num_channels: int = 1,
         recognizer: RecognizerConfig | None = None,
         synthesizer: SynthesizerConfig | None = None,
-        lips_from_sound: LipsFromSound | None = None,
+        lips_from_sound: LipFrameModel | None = None,
     ) -> None:
         recognizer = recognizer or RecognizerConfig()
         synthesizer = synthesizer or SynthesizerConfig()
         self.events: list[SoundEvent] = []
-        self._stream = _new_stream(
-            model,
-            recognizer,
-            sample_rate_hz,
-            num_channels,
-            lips_from_sound or lips_for(model),
-            synthesizer.delay_ms / 1e3,
+        self._recognizer = Recognizer(model, recognizer.output_rule)
+        self._stream = self._recognizer.create_stream(
+            sample_rate_hz=sample_rate_hz,
+            num_channels=num_channels,
+            lips=lips_from_sound or lip_predictor_for(model),
+            face_delay_s=synthesizer.delay_ms / 1e3,
         )
         self._face = Face(
             lips,
@@ -103,36 +106,21 @@ class LiveChain:
         UserError
             If the samples have another shape or are not finite.
         """
-        return self._animate(self._stream.accept_waveform(samples))
+        self._stream.accept_waveform(samples)
+        return self._animate()
 
     def input_finished(self) -> list[Frame]:
         """End the audio and return the remaining frames, until the face is at rest."""
-        return self._animate(self._stream.input_finished())
+        self._stream.input_finished()
+        return self._animate()
 
-    def _animate(self, outputs: list[StreamOutput]) -> list[Frame]:
-        events = _events_of(outputs)
+    def _animate(self) -> list[Frame]:
+        events = _decode(self._recognizer, self._stream)
         self.events += events
         return [frame for event in events for frame in self._face.accept(event)]
 
 
-def _new_stream(
-    model: AcousticModel,
-    config: RecognizerConfig,
-    sample_rate_hz: int,
-    num_channels: int,
-    lips: LipsFromSound | None,
-    face_delay_s: float,
-) -> SpeechStream:
-    return SpeechStream(
-        model,
-        sample_rate_hz=sample_rate_hz,
-        num_channels=num_channels,
-        num_stable_frames=config.num_stable_frames,
-        min_confidence=config.min_confidence,
-        lips=lips,
-        face_delay_s=face_delay_s,
-    )
-
-
-def _events_of(outputs: list[StreamOutput]) -> list[SoundEvent]:
-    return [output for output in outputs if not isinstance(output, Waveform)]
+def _decode(recognizer: Recognizer, stream: SpeechStream) -> list[SoundEvent]:
+    recognizer.decode_streams([stream])
+    results = recognizer.get_result(stream)
+    return [result for result in results if not isinstance(result, Waveform)]

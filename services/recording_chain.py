@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.front_end.pcm import progress_of
-from kouxing.services.recognizer.lip_source import LipsFromSound
+from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.offline import decode_offline
-from kouxing.services.recognizer.speech_scores import (
+from kouxing.services.recognizer.speech_scorer import (
     SpeechEnd,
     SpeechStart,
     frame_time_s,
@@ -59,7 +59,7 @@ class AnalyzedRecording:
 def analyze_recording(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lips_from_sound: LipsFromSound | None = None,
+    lips_from_sound: LipFrameModel | None = None,
     aligned: Sequence[Phone] | None = None,
 ) -> AnalyzedRecording:
     """Find the phones, lip frames, voice activity and levels of a recording.
@@ -79,7 +79,7 @@ def analyze_recording(
     padded = np.concatenate([samples, silence])
     lips = None
     if lips_from_sound is not None:
-        lips = lips_from_sound.stream(lips_from_sound.delays_s[-1:])
+        lips = lips_from_sound.create_stream(lips_from_sound.delays_s[-1:])
     events = score_recording(model, padded, MEDIA_RATE_HZ, lips)
     phones = decode_offline(model, events) if aligned is None else aligned
     return AnalyzedRecording(

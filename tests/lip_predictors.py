@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.lips import NUM_OUTPUTS, LipPredictor
+from kouxing.services.recognizer.lip_predictor import NUM_OUTPUTS, LipPredictor
 
 WIDTH = 512  # of the shipped network
 NUM_FEATURES, NUM_COMPONENTS, UNITS, HISTORY = 160 + 2 * WIDTH, 6, 5, 3

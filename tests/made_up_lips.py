@@ -21,7 +21,7 @@ class LoudLips:
 
     delays_s: Sequence[float] = (-0.005, 0.025, 0.085, 0.145)
 
-    def stream(self, delays_s: Sequence[float]) -> LoudLipStream:
+    def create_stream(self, delays_s: Sequence[float]) -> LoudLipStream:
         assert set(delays_s) <= set(self.delays_s)
         return LoudLipStream(delays_s)
 
@@ -39,7 +39,7 @@ class LoudLipStream:
     def reset(self) -> None:
         self._num_positions = 0
 
-    def accept(
+    def process_position(
         self,
         known_s: float,
         frames: NDArray[np.float32],

@@ -56,7 +56,7 @@ def offline_error_rate(
     for rows, example in zip(scores, examples, strict=True):
         decoder.reset()
         decoder.advance(rows)
-        decoded = [inventory.phones[segment.phone] for segment in decoder.finish()]
+        decoded = [inventory.phones[segment.phone] for segment in decoder.final_path()]
         recognized = [phone for phone in decoded if phone != inventory.silence]
         total += count_errors([inventory.phones[phone] for phone in example.phones], recognized)
     return total.rate
@@ -140,7 +140,7 @@ def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[ND
     """
     for start in range(0, len(examples), _BATCH_SIZE):
         batch = examples[start : start + _BATCH_SIZE]
-        streams = [model.stream() for _ in batch]
+        streams = [model.create_stream() for _ in batch]
         features = [_features(model, example) for example in batch]
         first = model.score(list(zip(streams, features, strict=True)))
         last = model.score([(stream, None) for stream in streams])
@@ -151,4 +151,4 @@ def all_scores(model: AcousticModel, examples: Sequence[Example]) -> Iterator[ND
 def _features(model: AcousticModel, example: Example) -> NDArray[np.float32]:
     if example.samples is None:
         return without_pitch(example.log_mel.astype(np.float32))
-    return model.front_end().accept_waveform(as_floats(example.samples))
+    return model.create_front_end().accept_waveform(as_floats(example.samples))

@@ -17,7 +17,7 @@ from kouxing.services.driver.video import film
 from kouxing.services.driver.video.writer import check_name
 from kouxing.services.live_chain import sound_events
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
@@ -45,7 +45,7 @@ def film_clip(folder: Path, name: str, output: Path) -> None:
     faces = []
     for lips in LipModelName:
         delay_s = SynthesizerConfig(lips=lips).delay_ms / 1e3
-        events = sound_events(model, clip.samples, lips_for(model), delay_s)
+        events = sound_events(model, clip.samples, lip_predictor_for(model), delay_s)
         faces.append(live_frames(load_lip_model(name=lips), events, delay_s, FRAME_RATE_HZ))
     times_s = np.arange(len(faces[0])) / FRAME_RATE_HZ
     faces.append(tracked_frames(clip, times_s))

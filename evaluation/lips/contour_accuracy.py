@@ -40,7 +40,7 @@ from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.config import DELAYS_MS
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
@@ -200,7 +200,7 @@ def _methods(
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
         yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
     delays_s = {name: DELAYS_MS[name] / 1e3 for name in LIP_MODELS}
-    events = live_events(model, samples, lips_for(model), sorted(set(delays_s.values())))
+    events = live_events(model, samples, lip_predictor_for(model), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)
         frames = live_frames(lips, events[delay_s], delay_s, FRAME_RATE_HZ)

@@ -34,8 +34,8 @@ from kouxing.services.driver.video import film
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_source import LipsFromSound
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_frames import LipFrameModel
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
 from kouxing.services.synthesizer.face import Face, Frame
@@ -72,7 +72,7 @@ class Listener:
 
     name: str
     model: AcousticModel
-    lips: LipsFromSound | None
+    lips: LipFrameModel | None
     config: RecognizerConfig
     has_paper_rule: bool  # it emits phones as in the paper, and they are never corrected
 
@@ -110,7 +110,9 @@ def listeners_of(names: Sequence[str], *, has_paper_rule: bool = False) -> list[
         model = load_live_model(name)
         config = paper_config(name) if has_paper_rule else RecognizerConfig(acoustic=name)
         found.append(
-            Listener(Path(name).stem + suffix, model, lips_for(model), config, has_paper_rule)
+            Listener(
+                Path(name).stem + suffix, model, lip_predictor_for(model), config, has_paper_rule
+            )
         )
     return found
 
@@ -146,7 +148,9 @@ def _hear(model: AcousticModel, listeners: Sequence[Listener], sentence: Sentenc
     samples, aligned = sentence.clip.samples, sentence.aligned
     return HeardSentence(
         sentence,
-        None if aligned is None else analyze_recording(model, samples, lips_for(model), aligned),
+        None
+        if aligned is None
+        else analyze_recording(model, samples, lip_predictor_for(model), aligned),
         {
             each.name: Hearing(
                 analyze_recording(each.model, samples, each.lips),

@@ -29,7 +29,7 @@ from kouxing.services.live_chain import sound_events
 from kouxing.services.mouth_profiles.lip_tracks import LEVEL_STEP_S, level_track
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_source import LipFrameStream, LipsFromSound, delay_for
+from kouxing.services.recognizer.lip_frames import LipFrameModel, LipFrameStream, delay_for
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face import Face, Frame
@@ -80,7 +80,7 @@ class Scheme:
 def hear(
     model: AcousticModel,
     clip: LipClip,
-    lips: LipsFromSound | None,
+    lips: LipFrameModel | None,
     delays_s: Sequence[float] = DELAYS_S,
 ) -> HeardClip:
     """Recognise a clip live and offline, and align it with its text where that is known.
@@ -102,11 +102,11 @@ def hear(
 class _SeveralDelays:
     """A model of lips that makes frames for faces of several delays at once."""
 
-    lips: LipsFromSound
+    lips: LipFrameModel
     delays_s: Sequence[float]
 
-    def stream(self, _delays_s: Sequence[float]) -> LipFrameStream:
-        return self.lips.stream(self.delays_s)
+    def create_stream(self, _delays_s: Sequence[float]) -> LipFrameStream:
+        return self.lips.create_stream(self.delays_s)
 
     def with_mouth_profile(self, profile: bytes) -> Self:
         return replace(self, lips=self.lips.with_mouth_profile(profile))
@@ -115,7 +115,7 @@ class _SeveralDelays:
 def live_events(
     model: AcousticModel,
     samples: NDArray[np.float32],
-    lips: LipsFromSound | None,
+    lips: LipFrameModel | None,
     delays_s: Sequence[float],
     config: RecognizerConfig | None = None,
 ) -> dict[float, list[SoundEvent]]:

@@ -57,7 +57,7 @@ from kouxing.evaluation.lips.clip_scores import (
 from kouxing.evaluation.lips.measures import Hits, best_lag
 from kouxing.evaluation.lips.schemes import all_schemes, hear
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
 from kouxing.services.synthesizer.lips.load import LIP_MODELS
@@ -288,7 +288,7 @@ def main(
 ) -> list[LipScore]:
     """Score every lip model on the held clips of a folder."""
     model = load_live_model()
-    lips = lips_for(model)
+    lips = lip_predictor_for(model)
     visemes = DynamicVisemes(load_parameters(parameters), model.inventory)
     models = {name: make(model.inventory) for name, make in LIP_MODELS.items()}
     schemes = all_schemes(visemes, models | {"dynamic-visemes": visemes})

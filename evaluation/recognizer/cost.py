@@ -24,12 +24,16 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         samples[at : at + BLOCK_SAMPLES]
         for at in range(0, len(samples) - BLOCK_SAMPLES + 1, BLOCK_SAMPLES)
     ]
-    front_end, stream, decoder = model.front_end(), model.stream(), Decoder(model.topology)
+    front_end, stream, decoder = (
+        model.create_front_end(),
+        model.create_stream(),
+        Decoder(model.topology),
+    )
     detector, resampler = VoiceActivityDetector(), Resampler(48_000)
     at_48_khz = np.repeat(samples, 3)
-    frames = model.front_end().accept_waveform(samples)
-    scores = model.stream().accept(frames)  # compiles, before the clock starts
-    decoder.accept(scores[0])
+    frames = model.create_front_end().accept_waveform(samples)
+    scores = model.create_stream().score(frames)  # compiles, before the clock starts
+    decoder.advance(scores[:1])
     decoder.reset()
 
     def run(
@@ -44,8 +48,8 @@ def cpu_by_stage(model: AcousticModel, samples: NDArray[np.float32]) -> dict[str
         "resampler_from_48_khz": run(
             resampler.accept_waveform, np.array_split(at_48_khz, len(chunks))
         ),
-        "voice_activity": run(detector.accept_block, blocks),
+        "voice_activity": run(detector.detect, blocks),
         "front_end": run(front_end.accept_waveform, chunks),
-        "acoustic_model": run(stream.accept, np.split(frames, len(frames))),
-        "decoder": run(decoder.accept, scores),
+        "acoustic_model": run(stream.score, np.split(frames, len(frames))),
+        "decoder": run(decoder.advance, np.split(scores, len(scores))),
     }

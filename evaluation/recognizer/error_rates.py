@@ -39,12 +39,13 @@ from kouxing.corpora.scoring import (
 from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus
 from kouxing.evaluation.recognizer.confusions import Confusions
 from kouxing.evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.offline import decode_offline
-from kouxing.services.recognizer.recognizer import DEFAULT_RULE, Recognizer
-from kouxing.services.recognizer.speech_scores import ScoreEvent, SpeechScores
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.services.recognizer.speech_scorer import ScoreEvent, SpeechScorer, score_streams
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -127,7 +128,7 @@ def evaluate_recognizer(
     *,
     audio: Path | None = None,
     rules: Sequence[Rule] = RULES,
-    own_rule: Rule = DEFAULT_RULE,
+    own_rule: Rule,
 ) -> dict[str, object]:
     """Measure a model on one split of a corpus.
 
@@ -231,14 +232,16 @@ def _scores(
     model: AcousticModel, samples: NDArray[np.float32]
 ) -> list[tuple[float, list[ScoreEvent]]]:
     """Score a recording as it arrives: media time in seconds, and the new events by then."""
-    scores = SpeechScores(model, SAMPLE_RATE_HZ)
+    scorer = SpeechScorer(model)
     scored = []
     for start in range(0, len(samples), CHUNK_SAMPLES):
         chunk = samples[start : start + CHUNK_SAMPLES]
-        (events,) = run_scoring_tasks(model, [scores.process(chunk)])
-        scored.append(((start + len(chunk)) / SAMPLE_RATE_HZ, events))
-    (rest,) = run_scoring_tasks(model, [scores.finish()])
-    return [*scored, (len(samples) / SAMPLE_RATE_HZ, rest)]
+        scorer.accept_waveform(chunk)
+        score_streams(model, [scorer])
+        scored.append(((start + len(chunk)) / SAMPLE_RATE_HZ, scorer.get_events()))
+    scorer.input_finished()
+    score_streams(model, [scorer])
+    return [*scored, (len(samples) / SAMPLE_RATE_HZ, scorer.get_events())]
 
 
 @dataclass(slots=True)
@@ -250,25 +253,14 @@ class _LiveOutput:
     final: list[Phone] = field(default_factory=list)
 
 
-def recognizer_with(model: AcousticModel, rule: Rule) -> Recognizer:
-    """Start a live recognizer with an output rule."""
-    num_stable_frames, min_confidence = rule
-    return Recognizer(
-        model,
-        sample_rate_hz=SAMPLE_RATE_HZ,
-        num_stable_frames=num_stable_frames,
-        min_confidence=min_confidence,
-    )
-
-
 def _decode_live(
     model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: Rule
 ) -> _LiveOutput:
-    recognizer = recognizer_with(model, rule)
+    decoder = LiveDecoder(model.topology, OutputRuleConfig(*rule))
     output = _LiveOutput()
     known: set[int] = set()
     for time_s, scores in scored:
-        events = recognizer.decode(scores)
+        events = decoder.decode(scores)
         output.final += spoken(final_hypothesis(events), model.inventory)
         new = spoken(first_hypothesis(events, known), model.inventory)
         output.first += new

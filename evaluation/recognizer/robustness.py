@@ -26,14 +26,15 @@ from kouxing.evaluation.recognizer.disturbances import (
     babble,
     with_sound,
 )
-from kouxing.evaluation.recognizer.error_rates import Rule, mouth_shapes, recognizer_with
+from kouxing.evaluation.recognizer.error_rates import Rule, mouth_shapes
 from kouxing.evaluation.recognizer.report import percent
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
+from kouxing.services.recognizer.live_decoder import LiveDecoder
 from kouxing.services.recognizer.offline import decode_offline
-from kouxing.services.recognizer.recognizer import DEFAULT_RULE
-from kouxing.services.recognizer.speech_scores import score_recording
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.services.recognizer.speech_scorer import score_recording
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _SOUND_S = 60.0
@@ -51,7 +52,7 @@ def evaluate_robustness(
     split: str,
     *,
     audio: Path | None = None,
-    own_rule: Rule = DEFAULT_RULE,
+    own_rule: Rule,
     other_language: Path | None = None,
 ) -> dict[str, Any]:
     """Measure a model on disturbed speech and on sounds without its language.
@@ -161,7 +162,7 @@ def _outputs(
 ) -> dict[str, list[str]]:
     """Recognise a recording offline and live; return the phones of each of ``_OUTPUTS``."""
     scores = score_recording(model, samples, SAMPLE_RATE_HZ)
-    events = recognizer_with(model, rule).decode(scores)
+    events = LiveDecoder(model.topology, OutputRuleConfig(*rule)).decode(scores)
     outputs = {
         "offline": decode_offline(model, scores),
         "first_hypothesis": first_hypothesis(events, set()),
@@ -179,9 +180,8 @@ def _phones_per_minute(
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
     num_phones = 0
     for samples in sounds:
-        events = recognizer_with(model, rule).decode(
-            score_recording(model, samples, SAMPLE_RATE_HZ)
-        )
+        scores = score_recording(model, samples, SAMPLE_RATE_HZ)
+        events = LiveDecoder(model.topology, OutputRuleConfig(*rule)).decode(scores)
         num_phones += len(spoken(final_hypothesis(events), model.inventory))
     return num_phones / minutes
 

@@ -11,12 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 from kouxing.evaluation.system.live import CHUNK
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
 from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lips import LipPredictor, lips_for
-from kouxing.services.recognizer.recognizer import warm_up
-from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predictor_for
+from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
@@ -30,10 +29,11 @@ def measure(path: Path) -> dict[str, float]:
     costs = {}
     for name in MODELS:
         model = load_live_model(name)
-        warm_up(model)
+        recognizer = Recognizer(model, RecognizerConfig(acoustic=name).output_rule)
+        recognizer.warm_up()
         for number in NUM_SESSIONS:
-            for lips, note in ((None, ""), (lips_for(model), " with lips")):
-                costs[f"{name}, {number}{note}"] = _cpu_s(model, lips, samples, number)
+            for lips, note in ((None, ""), (lip_predictor_for(model), " with lips")):
+                costs[f"{name}, {number}{note}"] = _cpu_s(recognizer, lips, samples, number)
     return costs
 
 
@@ -46,21 +46,21 @@ def show(costs: dict[str, float], console: Console) -> None:
 
 
 def _cpu_s(
-    model: AcousticModel,
+    recognizer: Recognizer,
     lips: LipPredictor | None,
     samples: NDArray[np.float32],
     num_sessions: int,
 ) -> float:
     """Let every session go once around the recording, each from a place of its own."""
-    streams = [SpeechStream(model, lips=lips) for _ in range(num_sessions)]
+    streams = [recognizer.create_stream(lips=lips) for _ in range(num_sessions)]
     starts = np.arange(num_sessions) * len(samples) // num_sessions
     sounds = [np.roll(samples, -start) for start in starts]
     begin_s = time.process_time()
     for at in range(0, len(samples), CHUNK):
-        tasks = [
-            stream.process([(at, sound[at : at + CHUNK])])
-            for stream, sound in zip(streams, sounds, strict=True)
-        ]
-        run_scoring_tasks(model, tasks)
+        for stream, sound in zip(streams, sounds, strict=True):
+            stream.accept_waveform(sound[at : at + CHUNK])
+        recognizer.decode_streams(streams)
+        for stream in streams:
+            recognizer.get_result(stream)
     cpu_s = time.process_time() - begin_s
     return cpu_s * MEDIA_RATE_HZ / len(samples) / num_sessions

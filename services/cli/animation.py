@@ -17,7 +17,7 @@ from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_syllables
-from kouxing.services.recognizer.lips import LipPredictor, lips_for
+from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predictor_for
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -156,7 +156,7 @@ def _align(
 
 def _load_lip_predictor(model: AcousticModel, mouth: Path | None) -> LipPredictor | None:
     """Return the network that predicts learnt lips, adapted to a mouth profile, if any."""
-    predictor = lips_for(model)
+    predictor = lip_predictor_for(model)
     if mouth is None or predictor is None:
         return predictor
     profile = read_mouth_profile(mouth)

@@ -21,7 +21,7 @@ from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lips import LIPS_PATH, LipPredictor, lips_for
+from kouxing.services.recognizer.lip_predictor import LIPS_PATH, LipPredictor, lip_predictor_for
 from kouxing.shared.errors import UserError
 
 
@@ -76,7 +76,7 @@ def load_models(path: Path = LIPS_PATH) -> tuple[NeuralModel, LipPredictor]:
         If they do not fit each other.
     """
     model = load_model()
-    lips = lips_for(model, path)
+    lips = lip_predictor_for(model, path)
     if lips is None or not isinstance(model, NeuralModel):
         raise UserError(f"{path} does not fit the neural acoustic model; train it again")
     return model, lips

@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
 from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lip_source import delay_for
-from kouxing.services.recognizer.lips import LIP_FAPS, LipPredictor
+from kouxing.services.recognizer.lip_frames import delay_for
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS, LipPredictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.shared.errors import UserError
 
@@ -109,7 +109,7 @@ class ProfileGain:
 def observe(model: NeuralModel, lips: LipPredictor, filmed: FilmedSpeech) -> Observations:
     """Run the lip model over a recording; the result is empty if there is no speech."""
     (positions,) = record_positions(model, [filmed.samples])
-    stream = lips.stream(lips.delays_s)
+    stream = lips.create_stream(lips.delays_s)
     predicted = np.zeros((len(positions.known_s), len(lips.delays_s), _NUM_FAPS), np.float32)
     hidden = np.zeros((len(predicted), len(stream.inner)), np.float32)
     starts = {*positions.starts}

@@ -11,13 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.front_end.features import HOP_S
-from kouxing.services.recognizer.lips import features_at
-from kouxing.services.recognizer.speech_scores import SpeechScores
-from kouxing.shared.clock import MEDIA_RATE_HZ
+from kouxing.services.recognizer.front_end.features import HOP_S, SAMPLE_RATE_HZ
+from kouxing.services.recognizer.front_end.resample import to_16_khz
+from kouxing.services.recognizer.lip_predictor import features_at
+from kouxing.services.recognizer.speech_scorer import SpeechScorer, score_streams
 from kouxing.shared.phones.events import LipFrame
 
 Floats = NDArray[np.float32]
@@ -43,7 +42,7 @@ class LipPositions:
         self.known_s: list[float] = []
         self.features: list[NDArray[np.float16]] = []
 
-    def accept(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
+    def process_position(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
         """Store the network's values at a position."""
         self.known_s.append(known_s)
         self.features.append(features_at(frames, values).astype(np.float16))
@@ -60,8 +59,9 @@ def record_positions(model: NeuralModel, recordings: Sequence[Floats]) -> list[L
     Processing them together takes half the time. It does not change the values.
     """
     positions = [LipPositions() for _ in recordings]
-    scores = [SpeechScores(model, MEDIA_RATE_HZ, lips=recorder) for recorder in positions]
-    tasks = [score.process(samples) for score, samples in zip(scores, recordings, strict=True)]
-    run_scoring_tasks(model, tasks)
-    run_scoring_tasks(model, [score.finish() for score in scores])
+    scorers = [SpeechScorer(model, recorder) for recorder in positions]
+    for scorer, samples in zip(scorers, recordings, strict=True):
+        scorer.accept_waveform(to_16_khz(samples, SAMPLE_RATE_HZ))
+        scorer.input_finished()
+    score_streams(model, scorers)
     return positions

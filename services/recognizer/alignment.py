@@ -16,7 +16,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, score_segment
 from kouxing.services.recognizer.front_end.features import HOP_S
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.recognizer.search.forced_path import (
@@ -25,7 +25,7 @@ from kouxing.services.recognizer.search.forced_path import (
     utterance_graph,
     viterbi_path,
 )
-from kouxing.services.recognizer.speech_scores import frame_time_s
+from kouxing.services.recognizer.speech_scorer import frame_time_s
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
@@ -99,9 +99,8 @@ def align_syllables(
 ) -> Alignment:
     """Like :func:`align_phones`, with how well they fit."""
     inventory, topology = model.inventory, model.topology
-    stream = model.stream()
-    frames = model.front_end().accept_waveform(to_16_khz(samples, sample_rate_hz))
-    scores = np.concatenate([stream.accept(frames), stream.finish()])
+    frames = model.create_front_end().accept_waveform(to_16_khz(samples, sample_rate_hz))
+    scores = score_segment(model, frames)
     silence = inventory.index[inventory.silence]
     graph = utterance_graph(
         [inventory.index[symbol] for syllable in syllables for symbol in syllable],

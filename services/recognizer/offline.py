@@ -1,4 +1,4 @@
-"""Offline decoding: a whole recording with the full traceback, nothing provisional.
+"""Offline decoding: the phones of a whole recording by full traceback, without corrections.
 
 Source: Li et al. 2011, sections 1 and 2.2, without the output rule.
 """
@@ -8,24 +8,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.search.decoder import Decoder
-from kouxing.services.recognizer.speech_scores import (
+from kouxing.services.recognizer.speech_scorer import (
+    FrameScores,
     ScoreEvent,
     SpeechEnd,
     SpeechStart,
     frame_time_s,
     score_recording,
 )
-from kouxing.shared.phones.events import LipFrame, Phone
+from kouxing.shared.phones.events import Phone
 
 
-def recognize(
-    model: AcousticModel, samples: NDArray[np.float32], sample_rate_hz: int
-) -> list[Phone]:
-    """Recognise a whole recording.
+def recognize(model: AcousticModel, samples: Floats, sample_rate_hz: int) -> list[Phone]:
+    """Recognize the phones of a recording, silence within speech included.
 
     Parameters
     ----------
@@ -34,19 +32,13 @@ def recognize(
     samples
         Shape (n,) or (n, channels), in [-1, 1].
     sample_rate_hz
-        Their rate.
-
-    Returns
-    -------
-    list of Phone
-        Phones of all stretches of speech with their onsets and durations, silence included.
+        Rate of the samples.
     """
     return decode_offline(model, score_recording(model, samples, sample_rate_hz))
 
 
 def decode_offline(model: AcousticModel, events: Iterable[ScoreEvent]) -> list[Phone]:
-    """Like :func:`recognize`, from all scores of a recording."""
-    symbols = model.inventory.phones
+    """Like :func:`recognize`, from the scores of a recording."""
     decoder = Decoder(model.topology)
     phones: list[Phone] = []
     offset = 0
@@ -56,19 +48,21 @@ def decode_offline(model: AcousticModel, events: Iterable[ScoreEvent]) -> list[P
             offset = event.frame
             decoder.reset()
             confidence = []
+        elif isinstance(event, FrameScores):
+            for row in event.settled:
+                decoder.advance(row[None])
+                confidence.append(decoder.last_phone.confidence)
         elif isinstance(event, SpeechEnd):
-            for segment in decoder.finish():
+            for segment in decoder.final_path():
                 onset_s = frame_time_s(offset + segment.start)
                 phones.append(
                     Phone(
                         index=len(phones),
-                        symbol=symbols[segment.phone],
+                        symbol=model.inventory.phones[segment.phone],
                         onset_s=onset_s,
                         duration_s=frame_time_s(offset + segment.end) - onset_s,
                         confidence=float(np.mean(confidence[segment.start : segment.end])),
                         final=True,
                     )
                 )
-        elif not isinstance(event, LipFrame):
-            confidence += [decoder.accept(row)[2] for row in event.settled]
     return phones

@@ -8,15 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TypeAlias
 
-from kouxing.services.recognizer.stream import Chunk, StreamOutput, Waveform
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
-from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange, Waveform
 
 WARM_UP_S = 2.8  # of sound before that time; docs/recognition.md tells how it was chosen
 # Sound begins at a multiple of this: of the voice detector's blocks, the networks' positions and
 # the feature frames, which then lie as in a session without a loss.
 GRID_S = 0.16
+
+Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
 
 
 class Resumption:

@@ -16,24 +16,24 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from functools import partial
 
-from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.audio_order import AudioOrder
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
 from kouxing.services.recognizer.link import SynthesizerLink
-from kouxing.services.recognizer.lip_source import LipsFromSound
-from kouxing.services.recognizer.lips import lips_for
-from kouxing.services.recognizer.recognizer import warm_up
-from kouxing.services.recognizer.resumption import WARM_UP_S, Resumption
-from kouxing.services.recognizer.stream import Chunk, SpeechStream, StreamOutput, Waveform
+from kouxing.services.recognizer.lip_frames import LipFrameModel
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.resumption import WARM_UP_S, Chunk, Resumption
+from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.shared.bus import Socket
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NOBODY, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.metrics import give_back_memory
-from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange
+from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange, Waveform
 from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.service import Handler, Service
 from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
@@ -121,7 +121,7 @@ class RecognizerService(Service):
     role = "worker"
     needs = ("phone_input",)
 
-    def __init__(self, config: RecognizerConfig, lips: LipsFromSound | None = None) -> None:
+    def __init__(self, config: RecognizerConfig, lips: LipFrameModel | None = None) -> None:
         super().__init__(config)
         self._config = config
         self._sessions: dict[str, _Session] = {}
@@ -143,15 +143,16 @@ class RecognizerService(Service):
             "phones": config.reachable(self._phones.endpoint),
             "unpaced_audio": config.reachable(self._unpaced_audio.endpoint),
         }
-        self._model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
-        self.facts = SessionFacts(language=self._model.inventory.language)
-        self._lips = lips or lips_for(self._model)
+        model = load_live_model(config.acoustic, look_ahead_ms=config.look_ahead_ms)
+        self._recognizer = Recognizer(model, config.output_rule)
+        self.facts = SessionFacts(language=model.inventory.language)
+        self._lips = lips or lip_predictor_for(model)
         if self._lips is None:
             LOG.warning(
                 "there are no lips from sound for this acoustic model: dynamic visemes move the "
                 "mouth; with synthesizer.lips=dynamic-visemes they have the delay that suits them"
             )
-        warm_up(self._model)
+        self._recognizer.warm_up()
         for socket in (self._audio, self._unpaced_audio):
             on_audio = partial(self._on_audio, socket)
             self.register(socket, {AudioChunk: on_audio})
@@ -195,7 +196,7 @@ class RecognizerService(Service):
             session = _Session(start, self._new_stream(start, lips), socket)
             session.mouth_profile_error = mouth_profile_error
             if start.media_time:
-                silence = self._model.inventory.silence
+                silence = self._recognizer.model.inventory.silence
                 session.resumption = Resumption(to_seconds(start.media_time), silence)
             self._sessions[start.session] = session
             is_new = True
@@ -207,7 +208,7 @@ class RecognizerService(Service):
             self._leave_synthesizers()
         return True
 
-    def _lips_of(self, start: StartSession) -> tuple[LipsFromSound | None, str]:
+    def _lips_of(self, start: StartSession) -> tuple[LipFrameModel | None, str]:
         """Return the lip model for a session, and why its mouth profile is not used, if so."""
         if start.mouth_profile is None:
             return self._lips, ""
@@ -218,13 +219,10 @@ class RecognizerService(Service):
         except UserError as error:
             return self._lips, f"the mouth profile is not used: {error}"
 
-    def _new_stream(self, start: StartSession, lips: LipsFromSound | None) -> SpeechStream:
-        return SpeechStream(
-            self._model,
+    def _new_stream(self, start: StartSession, lips: LipFrameModel | None) -> SpeechStream:
+        return self._recognizer.create_stream(
             sample_rate_hz=start.sample_rate_hz,
             num_channels=start.num_channels,
-            num_stable_frames=self._config.num_stable_frames,
-            min_confidence=self._config.min_confidence,
             lips=lips,
             face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
             speech_time=start.speech_time or 0,
@@ -246,7 +244,8 @@ class RecognizerService(Service):
             )
             found.link.forget()
             found.silent_s = 0.0  # the face shall learn anew that its client is
-            self._emit(found, found.stream.flush())
+            found.stream.flush()
+            self._emit(found)
 
     def on_tick(self, now_s: float) -> None:
         """Acknowledge audio, tell who is silent, repeat what the synthesizer did not acknowledge.
@@ -471,17 +470,16 @@ class RecognizerService(Service):
             return
         started_s = time.perf_counter()
         sessions = [self._sessions[name] for name in self._queued]
-        tasks = [
-            session.stream.process(chunks)
-            for session, chunks in zip(sessions, self._queued.values(), strict=True)
-        ]
+        for session, chunks in zip(sessions, self._queued.values(), strict=True):
+            for media_time, samples in chunks:
+                session.stream.accept_waveform(samples, media_time)
         self._queued, self._queued_share = {}, 0.0
-        results = run_scoring_tasks(self._model, tasks)
+        self._recognizer.decode_streams([session.stream for session in sessions])
         self._ask_what_changed()  # if this stood still meanwhile, others may serve the sessions
-        for session, outputs in zip(sessions, results, strict=True):
+        for session in sessions:
             if self._sessions.get(session.start.session) is not session:
                 continue
-            self._emit(session, outputs)
+            self._emit(session)
             self.metrics.count("audio_gaps", session.stream.num_gaps - session.num_gaps)
             session.num_gaps = session.stream.num_gaps
         self.metrics.observe("chunk_ms", (time.perf_counter() - started_s) * 1e3)
@@ -521,11 +519,14 @@ class RecognizerService(Service):
     def _finish(self, session: _Session) -> None:
         if not session.finished:
             session.finished = True
-            self._emit(session, run_scoring_tasks(self._model, [session.stream.finish()])[0])
+            session.stream.input_finished()
+            self._recognizer.decode_streams([session.stream])
+            self._emit(session)
             LOG.info("end of audio", extra={"session": session.start.session})
 
-    def _emit(self, session: _Session, outputs: Sequence[StreamOutput]) -> None:
+    def _emit(self, session: _Session) -> None:
         now_s = time.monotonic()
+        outputs = self._recognizer.get_result(session.stream)
         if session.resumption is not None:
             outputs = session.resumption.pass_on(outputs)
         for output in outputs:

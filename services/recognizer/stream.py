@@ -1,290 +1,244 @@
-"""One session's audio to sound events, without sockets: the recognizer as a session sees it.
+"""One session's audio, between the recognizer's calls.
 
-    chunks -> gaps -> resampler -> 20 ms slices -> recognizer -> events, level
+    chunks -> gaps -> resampler -> 20 ms slices -> scores -> phones, lip frames, level
 
-What is emitted does not depend on how the audio was cut into chunks. Times are whole samples at
-16 kHz, so that messages carry them without loss.
+The chunk sizes do not affect the results. Times are whole samples at 16 kHz, so that messages carry
+them without loss.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import (
-    AcousticModel,
-    ScoringTask,
-    run_scoring_tasks,
-)
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.front_end.pcm import SLICE, progress_at, slices
-from kouxing.services.recognizer.front_end.pitch import Pitch
+from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.services.recognizer.front_end.resample import Resampler
-from kouxing.services.recognizer.lip_source import LipsFromSound, delay_for
-from kouxing.services.recognizer.recognizer import DEFAULT_RULE, Emission, Recognizer
-from kouxing.services.recognizer.speech_scores import frame_at
+from kouxing.services.recognizer.lip_frames import LipFrameModel, delay_for
+from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
+from kouxing.services.recognizer.speech_scorer import SpeechScorer, frame_at
 from kouxing.shared.clock import MEDIA_RATE_HZ, duration_to_samples, to_samples, to_seconds
 from kouxing.shared.phones.events import (
     EndOfSound,
     LipFrame,
     Phone,
     Progress,
-    SoundEvent,
     SpeechChange,
+    Waveform,
 )
 
 MAX_JITTER = MEDIA_RATE_HZ // 10  # media time that jumps further ahead leaves a gap; samples
 SILENT_DB = -120.0  # the level after the last sample
 
-Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Waveform:
-    """A stretch of the session's sound as the recognizer processes it."""
-
-    time_s: float  # of the first sample
-    samples: NDArray[np.float32]  # (n,) 16 kHz mono
-
-
-StreamOutput: TypeAlias = SoundEvent | Waveform
-
 
 class SpeechStream:
-    """One session's audio in, sound events and the 16 kHz sound out.
+    """One session's audio and its results; created by ``Recognizer.create_stream``.
 
-    Chunks carry the media time of their first sample. One that comes later than the last one
-    ended, by more than ``MAX_JITTER``, leaves a gap: the speech before it ends, and recognition
-    starts again behind it.
-
-    Parameters
-    ----------
-    model
-        The acoustic model, shared by any number of streams.
-    sample_rate_hz
-        Rate of the audio, 8000 to 48000.
-    num_channels
-        Channels of the audio; they are averaged.
-    num_stable_frames, min_confidence
-        The output rule, as in ``Recognizer``.
-    lips
-        The model of lips, shared by any number of streams; None: no lip frames are emitted. It
-        needs a model whose streams are ``PositionStream``s.
-    face_delay_s
-        How much later than its sound a frame of the face is made: the lip frames have the longest
-        delay that is in time for it.
-    speech_time
-        Media time, samples at 16 kHz, at which speech that another recognizer has begun began: the
-        networks' blocks lie as there. 0: there is none, or nobody knows.
+    A chunk carries the media time of its first sample. If a chunk starts more than ``MAX_JITTER``
+    after the end of the previous one, there is a gap: the speech before it ends, and recognition
+    starts again after it.
 
     Attributes
     ----------
     num_gaps : int
-        Gaps met so far.
-
-    Raises
-    ------
-    UserError
-        If the rate or the channels are out of range.
+        Number of gaps so far.
     """
 
     def __init__(
         self,
         model: AcousticModel,
+        rule: OutputRuleConfig,
         *,
-        sample_rate_hz: int = MEDIA_RATE_HZ,
-        num_channels: int = 1,
-        num_stable_frames: int = DEFAULT_RULE[0],
-        min_confidence: float = DEFAULT_RULE[1],
-        lips: LipsFromSound | None = None,
-        face_delay_s: float = 0.0,
-        speech_time: int = 0,
+        sample_rate_hz: int,
+        num_channels: int,
+        lips: LipFrameModel | None,
+        face_delay_s: float,
+        speech_time: int,
     ) -> None:
         self.num_gaps = 0
-        self._speech_time = speech_time
         self._model = model
+        self._rule = rule
         self._rate_hz = sample_rate_hz
         self._num_channels = num_channels
-        self._rule = (num_stable_frames, min_confidence)
         self._lips = lips
         self._face_delay_s = face_delay_s
+        self._speech_time = speech_time
         self._first_chunk: int | None = None  # media time of the first chunk after the last gap
         self._num_in = 0  # samples since then, at the audio's own rate
         self._next_index = 0
-        self._speaking = False
-        self._segment = self._new_segment(0)
+        self._is_speaking = False
+        self._results: list[StreamOutput] = []  # not yet returned
+        self._segments = [self._new_segment(0)]  # those with results to come; the last takes audio
 
     @property
     def media_time(self) -> int:
-        """Media time up to which the audio has been processed, samples at 16 kHz."""
-        return self._segment.media_time
+        """Media time up to which audio was taken, without the resampler's delay, 16 kHz samples."""
+        return self._segments[-1].media_time
 
     @property
     def next_media_time(self) -> int:
-        """Media time of the next chunk if nothing is lost, samples at 16 kHz."""
+        """Media time of the next chunk if no audio is lost, samples at 16 kHz."""
         if self._first_chunk is None:
             return 0
         return self._first_chunk + self._num_in * MEDIA_RATE_HZ // self._rate_hz
 
-    def process(self, chunks: Sequence[Chunk]) -> ScoringTask[list[StreamOutput]]:
-        """Take chunks in order, for ``run_scoring_tasks`` beside other sessions."""
-        outputs: list[StreamOutput] = []
-        for media_time, samples in chunks:
-            if self._first_chunk is None:
-                self._start_at(media_time)
-            elif media_time > self.next_media_time + MAX_JITTER:
-                self.num_gaps += 1
-                outputs += yield from self._end_segment()
-                self._start_at(media_time)
-            self._num_in += len(samples)
-            outputs += self._numbered((yield from self._segment.process(samples)))
-        return outputs
+    @property
+    def scorers(self) -> list[SpeechScorer]:
+        """The scorers that may have audio to score."""
+        return [segment.scorer for segment in self._segments]
 
-    def finish(self) -> ScoringTask[list[StreamOutput]]:
-        """End the audio, for ``run_scoring_tasks`` beside other sessions."""
-        outputs = yield from self._end_segment()
-        return [*outputs, EndOfSound(time_s=to_seconds(self.media_time))]
+    def accept_waveform(self, samples: Floats, media_time: int | None = None) -> None:
+        """Queue samples for decoding.
 
-    def accept_waveform(self, samples: NDArray[np.float32]) -> list[StreamOutput]:
-        """Take the next samples, shape (n,) or (n, channels), without a gap.
-
-        Returns
-        -------
-        list
-            What became known, in order.
+        Parameters
+        ----------
+        samples
+            Shape (n,) or (n, channels), in [-1, 1], at the stream's rate.
+        media_time
+            Media time of the first sample, samples at 16 kHz. None: there is no gap.
 
         Raises
         ------
         UserError
-            If the samples have another shape or are no numbers.
+            If the samples have another shape or are not finite.
         """
-        task = self.process([(self.next_media_time, samples)])
-        return run_scoring_tasks(self._model, [task])[0]
+        if media_time is None:
+            media_time = self.next_media_time
+        if self._first_chunk is None:
+            self._start_at(media_time)
+        elif media_time > self.next_media_time + MAX_JITTER:
+            self.num_gaps += 1
+            self._segments[-1].input_finished()
+            self._start_at(media_time)
+        self._num_in += len(samples)
+        self._segments[-1].accept_waveform(samples)
 
-    def input_finished(self) -> list[StreamOutput]:
-        """Return all that is still owed; no more sound will come."""
-        return run_scoring_tasks(self._model, [self.finish()])[0]
+    def input_finished(self) -> None:
+        """End the audio."""
+        self._segments[-1].input_finished()
+        self._segments[-1].scorer.add_event(EndOfSound(time_s=to_seconds(self.media_time)))
 
-    def flush(self) -> list[SoundEvent]:
-        """Drop the speech under way (an interruption); the next chunk starts again."""
+    def flush(self) -> None:
+        """Drop the current speech (an interruption); the next chunk starts a new segment."""
         start = self.next_media_time
-        self._segment = self._new_segment(start)
-        if not self._speaking:
-            return []
-        self._speaking = False
-        return [SpeechChange(active=False, time_s=to_seconds(start))]
+        self._segments = [self._new_segment(start)]
+        if self._is_speaking:
+            self._is_speaking = False
+            self._results.append(SpeechChange(active=False, time_s=to_seconds(start)))
+
+    def decode(self) -> None:
+        """Search for phones in the scores so far."""
+        for segment in self._segments:
+            for result in segment.decode():
+                if isinstance(result, Phone):
+                    self._results.append(self._numbered(result, segment))
+                    continue
+                if isinstance(result, SpeechChange):
+                    self._is_speaking = result.active
+                self._results.append(result)
+        self._segments = self._segments[-1:]
+
+    def take_results(self) -> list[StreamOutput]:
+        """Return the results since the last call."""
+        results, self._results = self._results, []
+        return results
+
+    def _numbered(self, phone: Phone, segment: _Segment) -> Phone:
+        """Continue the phone indices of the previous segments."""
+        if segment.first_index is None:
+            segment.first_index = self._next_index
+        index = segment.first_index + phone.index
+        self._next_index = max(self._next_index, index + 1)
+        return replace(phone, index=index)
 
     def _start_at(self, media_time: int) -> None:
-        self._first_chunk, self._num_in = media_time, 0
-        self._segment = self._new_segment(media_time)
+        """Start the first segment again, or add one after a gap."""
+        is_first, self._first_chunk, self._num_in = self._first_chunk is None, media_time, 0
+        segment = self._new_segment(media_time)
+        self._segments = [segment] if is_first else [*self._segments, segment]
 
     def _new_segment(self, media_time: int) -> _Segment:
-        num_stable_frames, min_confidence = self._rule
-        lips = None
+        lips = start_frame = None
         if self._lips is not None:
-            lips = self._lips.stream([delay_for(self._lips.delays_s, self._face_delay_s)])
-        under_way = None
+            lips = self._lips.create_stream([delay_for(self._lips.delays_s, self._face_delay_s)])
         if self._speech_time and self._first_chunk is not None:
-            under_way = frame_at(to_seconds(self._speech_time - media_time))
+            start_frame = frame_at(to_seconds(self._speech_time - media_time))
             self._speech_time = 0
-        recognizer = Recognizer(
-            self._model,
-            sample_rate_hz=MEDIA_RATE_HZ,
-            num_stable_frames=num_stable_frames,
-            min_confidence=min_confidence,
-            lips=lips,
-            under_way=under_way,
+        return _Segment(
+            media_time,
+            Resampler(self._rate_hz, self._num_channels),
+            SpeechScorer(self._model, lips, start_frame),
+            LiveDecoder(self._model.topology, self._rule),
         )
-        self._index_base = self._next_index
-        return _Segment(media_time, Resampler(self._rate_hz, self._num_channels), recognizer)
-
-    def _end_segment(self) -> ScoringTask[list[StreamOutput]]:
-        return self._numbered((yield from self._segment.finish()))
-
-    def _numbered(self, outputs: list[StreamOutput]) -> list[StreamOutput]:
-        """Let the indices of a segment's phones continue those before it."""
-        numbered: list[StreamOutput] = []
-        for output in outputs:
-            if isinstance(output, Phone):
-                index = self._index_base + output.index
-                self._next_index = max(self._next_index, index + 1)
-                numbered.append(replace(output, index=index))
-            else:
-                numbered.append(output)
-            if isinstance(output, SpeechChange):
-                self._speaking = output.active
-        return numbered
 
 
 class _Segment:
-    """Sound without a gap."""
+    """Audio without a gap."""
 
-    def __init__(self, start: int, resampler: Resampler, recognizer: Recognizer) -> None:
+    def __init__(
+        self, start: int, resampler: Resampler, scorer: SpeechScorer, decoder: LiveDecoder
+    ) -> None:
+        self.scorer = scorer
+        self.first_index: int | None = None  # in the session, of the segment's first phone
         self._start = start  # media time, samples at 16 kHz
-        self._num_samples = 0  # processed since then
-        self._slice: list[NDArray[np.float32]] = []  # pieces of the 20 ms under way
-        self._pitch = Pitch(start // SLICE)
+        self._num_samples = 0  # since then
+        self._slice: list[Floats] = []  # pieces of the incomplete 20 ms
+        self._pitch = PitchTracker(start // SLICE)
         self._resampler = resampler
-        self._recognizer = recognizer
+        self._decoder = decoder
 
     @property
     def media_time(self) -> int:
-        """Media time up to which the sound has been processed, samples at 16 kHz."""
+        """Media time of the end of the resampled audio, samples at 16 kHz."""
         return self._start + self._num_samples
 
-    def process(self, samples: NDArray[np.float32]) -> ScoringTask[list[StreamOutput]]:
-        """Take samples, shape (n,) or (n, channels), at the input's rate."""
-        return (yield from self._process_mono(self._resampler.accept_waveform(samples)))
+    def accept_waveform(self, samples: Floats) -> None:
+        """Queue samples, shape (n,) or (n, channels), at the input's rate."""
+        self._queue(self._resampler.accept_waveform(samples))
 
-    def finish(self) -> ScoringTask[list[StreamOutput]]:
-        """End the sound."""
-        outputs = yield from self._process_mono(self._resampler.finish())
-        outputs += self._placed((yield from self._recognizer.finish()))
-        return [*outputs, Progress(time_s=to_seconds(self.media_time), level_db=SILENT_DB)]
+    def input_finished(self) -> None:
+        """End the audio."""
+        self._queue(self._resampler.finish())
+        self.scorer.input_finished()
+        self.scorer.add_event(Progress(time_s=to_seconds(self.media_time), level_db=SILENT_DB))
 
-    def _process_mono(self, samples: NDArray[np.float32]) -> ScoringTask[list[StreamOutput]]:
-        outputs: list[StreamOutput] = [
-            Waveform(time_s=to_seconds(self.media_time), samples=samples)
-        ]
+    def _queue(self, samples: Floats) -> None:
+        self.scorer.add_event(Waveform(time_s=to_seconds(self.media_time), samples=samples))
         for piece in slices(samples, self._num_samples):
             self._num_samples += len(piece)
             self._slice.append(piece)
-            outputs += self._placed((yield from self._recognizer.process(piece)))
+            self.scorer.accept_waveform(piece)
             if self._num_samples % SLICE == 0:
-                outputs.append(
-                    progress_at(self.media_time, np.concatenate(self._slice), self._pitch)
-                )
+                newest = np.concatenate(self._slice)
+                self.scorer.add_event(progress_at(self.media_time, newest, self._pitch))
                 self._slice.clear()
-        return outputs
 
-    def _placed(self, results: Sequence[Emission]) -> list[Emission]:
-        """Count results' times from the session's first sample, in whole samples.
-
-        Lips before the sound are dropped.
-        """
+    def decode(self) -> list[StreamOutput]:
+        """Return the new results at the session's times, without lip frames before the audio."""
         return [
             self._place(result)
-            for result in results
+            for result in self._decoder.decode(self.scorer.get_events())
             if not (isinstance(result, LipFrame) and result.time_s < 0.0)
         ]
 
-    def _place(self, result: Emission) -> Emission:
-        if isinstance(result, LipFrame):
-            return replace(
-                result,
-                time_s=self._media_s(result.time_s),
-                delay_s=to_seconds(duration_to_samples(result.delay_s)),
-            )
-        if isinstance(result, SpeechChange):
-            return replace(result, time_s=self._media_s(result.time_s))
-        return replace(
-            result,
-            onset_s=self._media_s(result.onset_s),
-            duration_s=to_seconds(to_samples(result.duration_s)),
-        )
+    def _place(self, result: StreamOutput) -> StreamOutput:
+        """Count the time from the session's first sample, in whole samples."""
+        match result:
+            case LipFrame():
+                delay_s = to_seconds(duration_to_samples(result.delay_s))
+                return replace(result, time_s=self._media_s(result.time_s), delay_s=delay_s)
+            case SpeechChange():
+                return replace(result, time_s=self._media_s(result.time_s))
+            case Phone():
+                return replace(
+                    result,
+                    onset_s=self._media_s(result.onset_s),
+                    duration_s=to_seconds(to_samples(result.duration_s)),
+                )
+        return result
 
     def _media_s(self, time_s: float) -> float:
         return to_seconds(self._start + to_samples(time_s))

@@ -69,4 +69,12 @@ class EndOfSound:
     time_s: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waveform:
+    """A stretch of the session's audio as the recognizer processes it."""
+
+    time_s: float  # of the first sample
+    samples: NDArray[np.float32]  # (n,) 16 kHz mono
+
+
 SoundEvent = Phone | LipFrame | SpeechChange | Progress | EndOfSound

@@ -16,7 +16,7 @@ from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lip_source import delay_for
+from kouxing.services.recognizer.lip_frames import delay_for
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model

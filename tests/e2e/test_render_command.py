@@ -26,7 +26,7 @@ from kouxing.services.driver.head.head import Head
 from kouxing.services.driver.video.film import frames_of
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.lips import load_lips
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
@@ -172,7 +172,7 @@ def test_lip_models_side_by_side(tmp_path: Path) -> None:
 
 
 def test_a_mouth_profile_changes_the_face(tmp_path: Path) -> None:
-    lips = load_lips()
+    lips = load_lip_predictor()
     mouth, misfit = tmp_path / "me.mouth", tmp_path / "misfit.mouth"
     profile = MouthProfile(
         scale=np.full(15, 3, np.float32),

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.load import load_live_model
-from kouxing.services.recognizer.lips import lips_for
-from kouxing.services.recognizer.stream import SpeechStream, Waveform
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.config import DELAYS_MS
 from kouxing.services.synthesizer.face import Face, Frame
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
+from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange, Waveform
+from tests.live_streams import recognize_live
 from tests.system import DEMO
 
 pytestmark = pytest.mark.property
@@ -37,8 +37,7 @@ def events() -> tuple[SoundEvent, ...]:
     """What a live recognizer tells of a sentence full of closures."""
     samples, _ = read_audio(DEMO / "bilabials-female.wav")
     model = load_live_model()
-    stream = SpeechStream(model, lips=lips_for(model), face_delay_s=0.06)
-    outputs = stream.accept_waveform(samples) + stream.input_finished()
+    outputs = recognize_live(model, samples, lips=lip_predictor_for(model), face_delay_s=0.06)
     return tuple(each for each in outputs if not isinstance(each, Waveform))
 
 

@@ -19,18 +19,19 @@ from kouxing.services.recognizer.front_end.features import (
     with_differences,
 )
 from kouxing.services.recognizer.front_end.resample import Resampler, to_16_khz
+from kouxing.services.recognizer.live_decoder import LiveDecoder, StreamOutput
 from kouxing.services.recognizer.offline import recognize
-from kouxing.services.recognizer.recognizer import Emission, Recognizer
-from kouxing.services.recognizer.search.decoder import Decoder
-from kouxing.services.recognizer.search.output_rule import OutputRule
-from kouxing.services.recognizer.speech_scores import (
+from kouxing.services.recognizer.search.decoder import Decoder, LastPhone
+from kouxing.services.recognizer.search.output_rule import MODEL_RULES, OutputRule, OutputRuleConfig
+from kouxing.services.recognizer.speech_scorer import (
     FrameScores,
     SpeechEnd,
     SpeechStart,
     score_recording,
 )
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.phones.events import Phone
+from kouxing.shared.phones.events import Phone, Waveform
+from tests.live_streams import LiveStream
 
 pytestmark = pytest.mark.property
 
@@ -49,22 +50,27 @@ def the_model(name: str = "neural") -> AcousticModel:
     return load_model(model_path(name))
 
 
+def last_phone_after(decoder: Decoder, row: np.ndarray) -> LastPhone:
+    decoder.advance(row[None])
+    return decoder.last_phone
+
+
 def settled_rows(model: AcousticModel) -> np.ndarray:
     events = score_recording(model, HELLO, 16_000)
     return np.concatenate([event.settled for event in events if isinstance(event, FrameScores)])
 
 
-def recognise(chunks: list[np.ndarray], rate_hz: int) -> list[Emission]:
-    recognizer = Recognizer(the_model(), sample_rate_hz=rate_hz)
-    events = [event for chunk in chunks for event in recognizer.accept_waveform(chunk)]
-    return events + recognizer.input_finished()
+def recognize_chunks(chunks: list[np.ndarray], rate_hz: int) -> list[StreamOutput]:
+    stream = LiveStream(the_model(), sample_rate_hz=rate_hz)
+    outputs = [output for chunk in chunks for output in stream.feed(chunk)] + stream.finish()
+    return [output for output in outputs if not isinstance(output, Waveform)]
 
 
 @pytest.mark.slow
 @settings(max_examples=12)
 @given(cuts=CUTS, rate_hz=st.sampled_from([16_000, 44_100]))
 def test_any_chunking_gives_the_same_phones(cuts: list[int], rate_hz: int) -> None:
-    assert recognise(pieces(HELLO, cuts), rate_hz) == recognise([HELLO], rate_hz)
+    assert recognize_chunks(pieces(HELLO, cuts), rate_hz) == recognize_chunks([HELLO], rate_hz)
 
 
 @pytest.mark.slow
@@ -72,9 +78,9 @@ def test_any_chunking_gives_the_same_phones(cuts: list[int], rate_hz: int) -> No
 @given(seed=st.integers(0, 2**31), num_sessions=st.integers(1, 20))
 def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: int) -> None:
     model, rng = the_model(), np.random.default_rng(seed)
-    frames = model.front_end().accept_waveform(HELLO)
+    frames = model.create_front_end().accept_waveform(HELLO)
     parts = [frames[start : start + 40] for start in rng.integers(0, 150, num_sessions)]
-    streams = [model.stream() for _ in parts]
+    streams = [model.create_stream() for _ in parts]
     found: list[list[np.ndarray]] = [[] for _ in parts]
     at = [0] * num_sessions
     while min(at) < 40:
@@ -88,9 +94,9 @@ def test_scores_are_the_same_to_the_bit_in_any_company(seed: int, num_sessions: 
         for number, rows in zip(who, model.score(work), strict=True):
             found[number].append(rows)
     for part, stream, scores in zip(parts, streams, found, strict=True):
-        alone = model.stream()
-        whole = np.concatenate([alone.accept(part), alone.finish()])
-        np.testing.assert_array_equal(np.concatenate([*scores, stream.finish()]), whole)
+        alone = model.create_stream()
+        whole = np.concatenate([alone.score(part), alone.score(None)])
+        np.testing.assert_array_equal(np.concatenate([*scores, stream.score(None)]), whole)
 
 
 @settings(max_examples=30)
@@ -107,7 +113,7 @@ def test_resampling_in_any_chunks(cuts: list[int], rate_hz: int) -> None:
 def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
     log_mel, differences = LogMel(), Differences(half_width)
     parts = [
-        differences.accept(cepstra(log_mel.accept_waveform(piece))) for piece in pieces(NOISE, cuts)
+        differences.append(cepstra(log_mel.accept_waveform(piece))) for piece in pieces(NOISE, cuts)
     ]
     whole = with_differences(cepstra(LogMel().accept_waveform(NOISE)), half_width)
     np.testing.assert_array_equal(np.concatenate([*parts, differences.finish()]), whole)
@@ -117,9 +123,9 @@ def test_features_in_any_chunks(cuts: list[int], half_width: int) -> None:
 @given(cuts=CUTS, name=st.sampled_from(["gmm", "neural"]))
 def test_front_ends_in_any_chunks(cuts: list[int], name: str) -> None:
     model = the_model(name)
-    front_end = model.front_end()
+    front_end = model.create_front_end()
     parts = [front_end.accept_waveform(piece) for piece in pieces(NOISE, cuts)]
-    whole = model.front_end().accept_waveform(NOISE)
+    whole = model.create_front_end().accept_waveform(NOISE)
     np.testing.assert_array_equal(np.concatenate(parts), whole)
 
 
@@ -133,12 +139,12 @@ def test_the_output_rule_is_the_paper_s(
     phones: list[int], num_stable_frames: int, before: int
 ) -> None:
     """Li 2011, eq. 4, word for word."""
-    rule = OutputRule(num_stable_frames, 0.0, last_emitted=before)
+    rule = OutputRule(OutputRuleConfig(num_stable_frames, 0.0), last_emitted=before)
     last = before
     for t, phone in enumerate(phones):
         recent = phones[max(0, t - num_stable_frames + 1) : t + 1]
         expected = len(recent) == num_stable_frames and set(recent) == {phone} and phone != last
-        assert rule.accept(phone, 0.1) == expected
+        assert rule.update(phone, 0.1) == expected
         last = phone if expected else last
 
 
@@ -149,11 +155,11 @@ def test_the_search_covers_all_frames_once(seed: int, num_frames: int) -> None:
     rng = np.random.default_rng(seed)
     decoder = Decoder(topology)
     for row in rng.normal(0, 5, (num_frames, topology.num_states)).astype(np.float32):
-        phone, start, confidence = decoder.accept(row)
+        phone, start, confidence = last_phone_after(decoder, row)
         assert 0 <= phone < len(topology.inventory)
         assert start < num_frames
         assert 0 < confidence <= 1
-    segments = decoder.finish()
+    segments = decoder.final_path()
     assert segments[0].start == 0
     assert segments[-1].end == num_frames
     shortest = np.diff(topology.first_state)
@@ -173,26 +179,26 @@ def test_a_search_goes_on_from_where_another_stands(
     at = data.draw(st.integers(0, num_frames - 1))
     one, before, after = (Decoder(topology) for _ in range(3))
     for row in rows[::-1]:
-        after.accept(row)  # it has searched something else
-    expected = [one.accept(row) for row in rows]
-    begun = [before.accept(row) for row in rows[:at]]
-    after.go_on_from(before)
+        last_phone_after(after, row)  # it has searched something else
+    expected = [last_phone_after(one, row) for row in rows]
+    begun = [last_phone_after(before, row) for row in rows[:at]]
+    after.copy_state(before)
     for decoder in (after, before):
-        assert begun + [decoder.accept(row) for row in rows[at:]] == expected
+        assert begun + [last_phone_after(decoder, row) for row in rows[at:]] == expected
         assert decoder.path_since(0) == one.path_since(0)
-        assert decoder.finish() == one.finish()
+        assert decoder.final_path() == one.final_path()
 
 
 def test_phones_too_many_are_withdrawn() -> None:
     model = the_model()
     silence = model.inventory.silence
     rows = settled_rows(model)
-    recognizer = Recognizer(model, sample_rate_hz=16_000, min_confidence=0.0)
-    events = recognizer.decode([SpeechStart(0)])
+    decoder = LiveDecoder(model.topology, OutputRuleConfig(1, 0.0))
+    events = decoder.decode([SpeechStart(0)])
     for start in range(0, len(rows), 10):  # provisional scores of other sounds
         other = np.roll(rows, 50, axis=0)[start : start + 20]
-        events += recognizer.decode([FrameScores(rows[start : start + 10], other)])
-    events += recognizer.decode([SpeechEnd(len(rows))])
+        events += decoder.decode([FrameScores(rows[start : start + 10], other)])
+    events += decoder.decode([SpeechEnd(len(rows))])
     phones = [event for event in events if isinstance(event, Phone)]
     finals = [phone for phone in phones if phone.final]
     assert [phone.index for phone in finals] == list(range(len(finals)))
@@ -214,17 +220,17 @@ def test_provisional_scores_that_hold_give_the_same_phones_sooner() -> None:
 
     def phones(num_provisional: int) -> tuple[list[Phone], list[int]]:
         """All phones, and the frame known when each was emitted."""
-        recognizer = Recognizer(model, sample_rate_hz=16_000)
-        recognizer.decode([SpeechStart(0)])
+        decoder = LiveDecoder(model.topology, MODEL_RULES["neural"])
+        decoder.decode([SpeechStart(0)])
         found: list[Phone] = []
         frames: list[int] = []
         for start in range(0, len(rows), 10):
             settled = rows[start : start + 10]
             provisional = rows[start + 10 : start + 10 + num_provisional]
-            events = recognizer.decode([FrameScores(settled, provisional)])
+            events = decoder.decode([FrameScores(settled, provisional)])
             found += [event for event in events if isinstance(event, Phone)]
             frames += [start] * (len(found) - len(frames))
-        events = recognizer.decode([SpeechEnd(len(rows))])
+        events = decoder.decode([SpeechEnd(len(rows))])
         return found + [event for event in events if isinstance(event, Phone)], frames
 
     expected, late = phones(0)

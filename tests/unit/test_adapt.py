@@ -21,7 +21,7 @@ from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.mouth_profiles.landmark_file import landmark_file
 from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, lip_tracks
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lips import load_lips
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
@@ -126,7 +126,7 @@ def test_learns_a_mouth_profile_from_a_landmark_file(tmp_path: Path) -> None:
     (tmp_path / "me.landmarks").write_bytes(seen)
     profile, figures = tmp_path / "me.mouth", tmp_path / "me.json"
     run(adapt_app, tmp_path / "me.landmarks", "-o", profile, "--json", figures)
-    lips = load_lips()
+    lips = load_lip_predictor()
     assert lips.with_mouth_profile(profile.read_bytes()).digest != lips.digest
     found = json.loads(figures.read_text(encoding="utf-8"))
     assert found["held_back_s"] == pytest.approx(found["speech_s"] / 4, abs=0.05)

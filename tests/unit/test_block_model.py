@@ -8,13 +8,11 @@ import pytest
 import torch
 
 from kouxing.services.recognizer.acoustic import blocks as blocks_module
-from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
 from kouxing.services.recognizer.acoustic.load import MODELS, load_model
 from kouxing.services.recognizer.acoustic.model_file import read_archive, write_archive
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.training.blocks.export import onnx_of
@@ -61,8 +59,8 @@ def blocks() -> BlockModel:
 
 
 def scores_of(model: BlockModel, frames: np.ndarray) -> np.ndarray:
-    stream = model.stream()
-    return np.concatenate([stream.accept(frames), stream.finish()])
+    stream = model.create_stream()
+    return np.concatenate([stream.score(frames), stream.score(None)])
 
 
 def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
@@ -84,11 +82,11 @@ def torch_scores(frames: np.ndarray, block_length: int) -> np.ndarray:
 
 def test_onnxruntime_computes_what_pytorch_does() -> None:
     expected = torch_scores(FRAMES, BLOCK)
-    stream = blocks().stream()
+    stream = blocks().create_stream()
     start = 0
     for number, scores in enumerate(expected[:-4]):  # those with a whole right context
         end = 2 * (BLOCK * number + LENGTH) + 1
-        settled = stream.accept(FRAMES[start:end])
+        settled = stream.score(FRAMES[start:end])
         assert len(settled) == 2 * BLOCK
         assert len(stream.provisional) == 2 * RIGHT
         np.testing.assert_allclose(settled, scores[: 2 * BLOCK], atol=0.05)
@@ -106,10 +104,10 @@ def test_the_last_run_settles_all_positions_together(num_frames: int) -> None:
 
 
 def test_before_the_first_whole_block_all_scores_are_provisional() -> None:
-    stream = blocks().stream()
+    stream = blocks().create_stream()
     for number in range(1, 2 * LENGTH + 1):
         before = stream.provisional
-        assert len(stream.accept(FRAMES[number - 1 : number])) == 0
+        assert len(stream.score(FRAMES[number - 1 : number])) == 0
         num_positions = (number - 1) // 2
         if number % 2 and num_positions % BLOCK == RIGHT % BLOCK:
             (expected,) = torch_scores(FRAMES[:number], LENGTH)
@@ -117,42 +115,42 @@ def test_before_the_first_whole_block_all_scores_are_provisional() -> None:
             assert len(stream.provisional) == 2 * num_positions
         else:
             assert stream.provisional is before
-    assert len(stream.accept(FRAMES[2 * LENGTH : 2 * LENGTH + 1])) == 2 * BLOCK
+    assert len(stream.score(FRAMES[2 * LENGTH : 2 * LENGTH + 1])) == 2 * BLOCK
 
 
 def test_scores_come_in_time() -> None:
-    stream = blocks().stream()
+    stream = blocks().create_stream()
     assert stream.look_ahead_frames == 2 * LENGTH
     num_settled = 0
     for number in range(1, 100):
-        num_settled += len(stream.accept(FRAMES[number - 1 : number]))
+        num_settled += len(stream.score(FRAMES[number - 1 : number]))
         assert num_settled >= number - 2 * LENGTH
         run = (number - 1) // 2 - ((number - 1) // 2 - RIGHT) % BLOCK  # positions at the last run
         assert num_settled + len(stream.provisional) == max(0, 2 * run)
-    assert num_settled + len(stream.finish()) == 99
+    assert num_settled + len(stream.score(None)) == 99
     assert len(stream.provisional) == 0
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 2, 3, 28, 29, 30, 36, 37])
 def test_every_frame_of_a_segment_is_settled_once(num_frames: int) -> None:
-    stream = blocks().stream()
+    stream = blocks().create_stream()
     for _ in range(2):
-        rows = [*stream.accept(FRAMES[:num_frames]), *stream.finish()]
+        rows = [*stream.score(FRAMES[:num_frames]), *stream.score(None)]
         assert len(rows) == num_frames
-    assert len(stream.finish()) == 0
+    assert len(stream.score(None)) == 0
 
 
 def test_scores_are_the_same_in_any_chunks_and_any_company() -> None:
     model = blocks()
-    lone = model.stream()
+    lone = model.create_stream()
     expected = {}
     for number in range(1, len(FRAMES) + 1):
-        settled = lone.accept(FRAMES[number - 1 : number])
+        settled = lone.score(FRAMES[number - 1 : number])
         expected[number] = (settled, lone.provisional)
     whole = scores_of(model, FRAMES)
     rng = np.random.default_rng(0)
     num_streams = 18  # more than share a run
-    streams = [model.stream() for _ in range(num_streams)]
+    streams = [model.create_stream() for _ in range(num_streams)]
     rows: list[list[np.ndarray]] = [[] for _ in streams]
     at = [0] * num_streams
     while min(at) < len(FRAMES):
@@ -165,22 +163,7 @@ def test_scores_are_the_same_in_any_chunks_and_any_company() -> None:
             at[n] = ends[n]
             np.testing.assert_array_equal(streams[n].provisional, expected[at[n]][1])
     for stream, found in zip(streams, rows, strict=True):
-        np.testing.assert_array_equal(np.concatenate([*found, stream.finish()]), whole)
-
-
-def test_sessions_recognised_together_give_what_each_gives_alone() -> None:
-    model = blocks()
-    sounds = [HELLO, HELLO[8000:], np.zeros(4000, np.float32)]
-    alone = []
-    for sound in sounds:
-        recognizer = Recognizer(model, sample_rate_hz=16_000)
-        alone.append(recognizer.accept_waveform(sound) + recognizer.input_finished())
-    recognizers = [Recognizer(model, sample_rate_hz=16_000) for _ in sounds]
-    tasks = [r.process(sound) for r, sound in zip(recognizers, sounds, strict=True)]
-    together = run_scoring_tasks(model, tasks)
-    ends = run_scoring_tasks(model, [recognizer.finish() for recognizer in recognizers])
-    assert [events + end for events, end in zip(together, ends, strict=True)] == alone
-    assert alone[0]
+        np.testing.assert_array_equal(np.concatenate([*found, stream.score(None)]), whole)
 
 
 def test_only_the_past_counts() -> None:
@@ -198,21 +181,21 @@ def test_only_the_past_counts() -> None:
 
 def scores_of_encoder(model: BlockModel, frames: np.ndarray) -> np.ndarray:
     """Keys and values of each block: the recurrent layer remembers more than the caches."""
-    stream = model.stream()
+    stream = model.create_stream()
     kept = []
     for start in range(0, len(frames), 8):
-        stream.accept(frames[start : start + 8])
+        stream.score(frames[start : start + 8])
         kept.append(stream.cache.rings.copy())
     return np.stack(kept)
 
 
 def test_a_segment_begins_afresh() -> None:
-    stream = blocks().stream()
-    first = np.concatenate([stream.accept(FRAMES), stream.finish()])
-    stream.accept(FRAMES[:77])
+    stream = blocks().create_stream()
+    first = np.concatenate([stream.score(FRAMES), stream.score(None)])
+    stream.score(FRAMES[:77])
     stream.reset()
     assert len(stream.provisional) == 0
-    again = np.concatenate([stream.accept(FRAMES), stream.finish()])
+    again = np.concatenate([stream.score(FRAMES), stream.score(None)])
     np.testing.assert_array_equal(again, first)
 
 

@@ -224,9 +224,9 @@ def test_trains_and_writes_model_and_card(tmp_path: Path, monkeypatch: pytest.Mo
     assert "5 of 5 recordings labeled by the teacher" in lines
     model = load_model(output)
     assert isinstance(model, BlockModel)
-    stream = model.stream()
+    stream = model.create_stream()
     frames = WhisperMel().accept_waveform(HELLO)
-    assert len(stream.accept(frames)) + len(stream.finish()) == len(frames)
+    assert len(stream.score(frames)) + len(stream.score(None)) == len(frames)
     np.testing.assert_array_equal(model.topology.log_stay, load_model().topology.log_stay)
     card = output.with_suffix(".md").read_text()
     assert "4 steps of the readout, 2 of" in card

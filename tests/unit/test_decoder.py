@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import NUM_POSITIONS, Topology
 from kouxing.services.recognizer.search import decoder as search
-from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
+from kouxing.services.recognizer.search.decoder import Decoder, LastPhone, Segment, segments_after
 from kouxing.services.recognizer.search.phone_lm import PhoneLanguageModel
 from tests.languages import MANDARIN, NUM_PHONES, SIL, Gram, Table, flat_language
 
@@ -36,6 +36,11 @@ def only(phones: list[int], states_per_phone: int, scores: NDArray[np.float32]) 
     for phone in range(NUM_PHONES):
         if phone not in phones:
             scores[:, phone * states_per_phone : (phone + 1) * states_per_phone] = -1e4
+
+
+def last_phone_after(decoder: Decoder, scores: NDArray[np.float32]) -> LastPhone:
+    decoder.advance(scores[None])
+    return decoder.last_phone
 
 
 @dataclass(frozen=True)
@@ -96,9 +101,8 @@ def test_same_as_trying_every_path(
     scores = rng.normal(size=(num_frames, model.num_states)).astype(np.float32)
     only(phones, states_per_phone, scores)
     decoder = Decoder(model)
-    for row in scores:
-        decoder.accept(row)
-    assert decoder.finish() == brute_force(model, table, scores, phones)
+    decoder.advance(scores)
+    assert decoder.final_path() == brute_force(model, table, scores, phones)
 
 
 def clear_scores(
@@ -119,9 +123,11 @@ def test_clear_speech_is_read_off() -> None:
     sequence = [SIL, 3, 30, 12, 45, SIL]
     decoder = Decoder(model)
     scores = clear_scores(sequence, model, frames_per_state=2)
-    last = [decoder.accept(row) for row in scores]
-    assert [segment.phone for segment in decoder.finish()] == sequence
-    assert [(s.start, s.end) for s in decoder.finish()] == [(t, t + 10) for t in range(0, 60, 10)]
+    last = [last_phone_after(decoder, row) for row in scores]
+    assert [segment.phone for segment in decoder.final_path()] == sequence
+    assert [(s.start, s.end) for s in decoder.final_path()] == [
+        (t, t + 10) for t in range(0, 60, 10)
+    ]
     # the last phone of the best string, and where it began
     assert [phone for phone, _, _ in last[::10]] == sequence
     assert last[25][:2] == (30, 20)
@@ -131,9 +137,8 @@ def test_clear_speech_is_read_off() -> None:
 def test_speech_cut_off_inside_a_unit_keeps_what_came_before() -> None:
     model = topology(5, np.random.default_rng(0))
     decoder = Decoder(model)
-    for row in clear_scores([3, 30, 12], model, frames_per_state=2)[:23]:
-        decoder.accept(row)
-    assert decoder.finish() == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 23)]
+    decoder.advance(clear_scores([3, 30, 12], model, frames_per_state=2)[:23])
+    assert decoder.final_path() == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 23)]
 
 
 def test_the_phones_before_decide_between_equal_scores() -> None:
@@ -146,9 +151,8 @@ def test_the_phones_before_decide_between_equal_scores() -> None:
     for phone in (30, 31):
         states = slice(model.first_state[phone], model.first_state[phone + 1])
         scores[6:12, states] = scores[18:, states] = 0.0
-    for row in scores:
-        decoder.accept(row)
-    assert [segment.phone for segment in decoder.finish()] == [3, 30, 4, 31]
+    decoder.advance(scores)
+    assert [segment.phone for segment in decoder.final_path()] == [3, 30, 4, 31]
 
 
 def test_endless_speech_keeps_its_memory_and_its_result() -> None:
@@ -156,11 +160,10 @@ def test_endless_speech_keeps_its_memory_and_its_result() -> None:
     model = topology(5, rng)
     sequence = rng.permutation(np.arange(SIL)).tolist() * 8  # 472 phones, 4720 frames
     decoder = Decoder(model)
-    for row in clear_scores(sequence, model, frames_per_state=2, contrast=2.0):
-        decoder.accept(row)
+    decoder.advance(clear_scores(sequence, model, frames_per_state=2, contrast=2.0))
     assert len(decoder._shared) > 300
-    assert len(decoder._records) < 2 * search._RECORD_CAPACITY
-    assert [segment.phone for segment in decoder.finish()] == sequence
+    assert len(decoder._records) < 2 * search._MIN_RECORDS
+    assert [segment.phone for segment in decoder.final_path()] == sequence
     assert [segment.phone for segment in decoder.path_since(4000)] == sequence[400:-1]
 
 
@@ -190,18 +193,18 @@ def test_a_crowd_of_paths_stays_within_its_bound() -> None:
     decoder = Decoder(model)
     most = 0
     for _ in range(60):
-        phone, start, confidence = decoder.accept(np.zeros(model.num_states, np.float32))
+        phone, start, confidence = last_phone_after(decoder, np.zeros(model.num_states, np.float32))
         assert 0 <= phone < NUM_PHONES
         assert 0 <= start < decoder.num_frames
         assert 0 < confidence <= 1
         most = max(most, decoder._num_tokens)
-        assert len(decoder._records) <= 2 * search._RECORD_CAPACITY
-        contexts = decoder._context[: decoder._num_tokens]
+        assert len(decoder._records) <= 2 * search._MIN_RECORDS
+        contexts = decoder._tokens.context[: decoder._num_tokens]
         assert len(np.unique(contexts)) == len(contexts)
         table = search._token_table(len(language.graph.last_phone))
         assert (table == search._NO_TOKEN).all(), "another search would find these tokens"
     assert most == search._MAX_TOKENS
-    path = decoder.finish()
+    path = decoder.final_path()
     assert (path[0].start, path[-1].end) == (0, 60)
     assert all(one.end == two.start for one, two in pairwise(path))
 
@@ -210,20 +213,19 @@ def test_searches_that_take_turns_do_not_disturb_each_other() -> None:
     model = topology(3, np.random.default_rng(0), crowded_language())
     scores = np.random.default_rng(1).normal(scale=4.0, size=(2, 40, model.num_states))
     together = [Decoder(model), Decoder(model)]
-    for one, two in scores.astype(np.float32).transpose(1, 0, 2):
-        together[0].accept(one)
-        together[1].accept(two)
+    for rows in scores.astype(np.float32).transpose(1, 0, 2):
+        for decoder, row in zip(together, rows, strict=True):
+            decoder.advance(row[None])
     for decoder, rows in zip(together, scores.astype(np.float32), strict=True):
         alone = Decoder(model)
         alone.advance(rows)
-        assert decoder.finish() == alone.finish()
+        assert decoder.final_path() == alone.final_path()
 
 
 def test_path_since_gives_the_phones_before_the_last() -> None:
     model = topology(5, np.random.default_rng(0))
     decoder = Decoder(model)
-    for row in clear_scores([3, 30, 12, 45], model, frames_per_state=2)[:35]:
-        decoder.accept(row)
+    decoder.advance(clear_scores([3, 30, 12, 45], model, frames_per_state=2)[:35])
     assert decoder.path_since(0) == [Segment(3, 0, 10), Segment(30, 10, 20), Segment(12, 20, 30)]
     assert decoder.path_since(14) == [Segment(30, 14, 20), Segment(12, 20, 30)]
     assert segments_after([Segment(1, 0, 4)], 4) == []
@@ -233,7 +235,7 @@ def test_reset_and_no_frames() -> None:
     rng = np.random.default_rng(0)
     model = topology(2, rng, Table.draw(rng, [1, 2, SIL], order=3).tree())
     decoder = Decoder(model)
-    assert decoder.finish() == []
-    first = [decoder.accept(row) for row in clear_scores([1, 2], model, 3)]
+    assert decoder.final_path() == []
+    first = [last_phone_after(decoder, row) for row in clear_scores([1, 2], model, 3)]
     decoder.reset()
-    assert [decoder.accept(row) for row in clear_scores([1, 2], model, 3)] == first
+    assert [last_phone_after(decoder, row) for row in clear_scores([1, 2], model, 3)] == first

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from kouxing.services.mouth_profiles.face_landmarks import _STEADY, LANDMARKS, mouth_faps
 from kouxing.services.mouth_profiles.landmark_file import landmark_file, parse_landmark_file
-from kouxing.services.recognizer.lips import LIP_FAPS
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 

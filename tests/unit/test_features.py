@@ -75,7 +75,7 @@ def test_differences_look_ahead_as_stated(half_width: int) -> None:
     static = np.random.default_rng(0).normal(size=(30, NUM_STATIC)).astype(np.float32)
     differences = Differences(half_width)
     assert differences.look_ahead_frames == 2 * half_width
-    ready = differences.accept(static)
+    ready = differences.append(static)
     assert len(ready) == 30 - 2 * half_width
     whole = np.concatenate([ready, differences.finish()])
     np.testing.assert_array_equal(whole, with_differences(static, half_width))
@@ -83,7 +83,7 @@ def test_differences_look_ahead_as_stated(half_width: int) -> None:
 
 def test_differences_of_nothing() -> None:
     assert Differences(2).finish().shape == (0, NUM_FEATURES)
-    assert Differences(2).accept(np.empty((0, NUM_STATIC), np.float32)).shape == (0, NUM_FEATURES)
+    assert Differences(2).append(np.empty((0, NUM_STATIC), np.float32)).shape == (0, NUM_FEATURES)
 
 
 def test_live_mean_goes_from_the_prior_to_the_speaker() -> None:
@@ -92,21 +92,21 @@ def test_live_mean_goes_from_the_prior_to_the_speaker() -> None:
     static = speaker + rng.normal(0, 1, (3000, NUM_STATIC))
     features = np.concatenate([static, rng.normal(size=(3000, 26))], axis=1).astype(np.float32)
     mean = LiveMean(np.zeros(NUM_STATIC, np.float32))
-    normalised = mean.normalise(features)
-    assert normalised[0, 1:NUM_STATIC].mean() > 3  # the prior still rules
-    assert np.abs(normalised[-1000:, :NUM_STATIC].mean(axis=0)).max() < 0.6
-    np.testing.assert_array_equal(normalised[:, NUM_STATIC:], features[:, NUM_STATIC:])
+    normalized = mean.normalize(features)
+    assert normalized[0, 1:NUM_STATIC].mean() > 3  # the prior still rules
+    assert np.abs(normalized[-1000:, :NUM_STATIC].mean(axis=0)).max() < 0.6
+    np.testing.assert_array_equal(normalized[:, NUM_STATIC:], features[:, NUM_STATIC:])
     # goes on with the same speaker, starts anew after reset
-    assert abs(mean.normalise(features[:50])[:, 1:NUM_STATIC].mean()) < 1
+    assert abs(mean.normalize(features[:50])[:, 1:NUM_STATIC].mean()) < 1
     mean.reset()
-    np.testing.assert_array_equal(mean.normalise(features), normalised)
+    np.testing.assert_array_equal(mean.normalize(features), normalized)
 
 
 def test_quiet_frames_do_not_move_the_mean() -> None:
     speech = np.full((200, NUM_FEATURES), 20.0, np.float32)
     pause = np.full((200, NUM_FEATURES), 1.0, np.float32)
     with_pause, without = LiveMean(np.zeros(13, np.float32)), LiveMean(np.zeros(13, np.float32))
-    with_pause.normalise(speech)
-    with_pause.normalise(pause)
-    without.normalise(speech)
-    np.testing.assert_array_equal(with_pause.normalise(speech[:1]), without.normalise(speech[:1]))
+    with_pause.normalize(speech)
+    with_pause.normalize(pause)
+    without.normalize(speech)
+    np.testing.assert_array_equal(with_pause.normalize(speech[:1]), without.normalize(speech[:1]))

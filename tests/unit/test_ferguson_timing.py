@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.pcm import progress_of, zero_crossing_rate
-from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableCutter, pieces_of
 from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
 from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
@@ -20,6 +19,7 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
+from tests.live_streams import LiveStream
 from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
@@ -91,13 +91,11 @@ def test_pieces_are_found_in_loud_noise_and_again_after_it_has_begun() -> None:
 @pytest.mark.parametrize("chunk", [113, 4000])
 def test_pieces_of_a_stream_are_those_of_the_whole(chunk: int) -> None:
     samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]
-    stream = SpeechStream(load_model())
     cutter = SyllableCutter()
     pieces = []
-    for begin in range(0, len(samples), chunk):
-        for output in stream.accept_waveform(samples[begin : begin + chunk]):
-            if isinstance(output, Progress):
-                pieces += cutter.accept(output)
+    for output in LiveStream(load_model()).feed(samples, chunk=chunk):
+        if isinstance(output, Progress):
+            pieces += cutter.accept(output)
     pieces += cutter.finish()
     assert pieces == pieces_of(progress_of(samples))
     assert len(pieces) > 3

@@ -89,11 +89,11 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     model.save(tmp_path / "model.npz")
     loaded = load_model(tmp_path / "model.npz")
     noise = np.random.default_rng(0).normal(0, 0.1, 4000).astype(np.float32)
-    frames = model.front_end().accept_waveform(noise)
-    first, second = model.stream(), loaded.stream()
+    frames = model.create_front_end().accept_waveform(noise)
+    first, second = model.create_stream(), loaded.create_stream()
     assert first.look_ahead_frames == second.look_ahead_frames
-    expected = np.concatenate([first.accept(frames), first.finish()])
-    found = np.concatenate([second.accept(frames), second.finish()])
+    expected = np.concatenate([first.score(frames), first.score(None)])
+    found = np.concatenate([second.score(frames), second.score(None)])
     assert expected.shape == (len(frames), NUM_STATES)
     np.testing.assert_allclose(found, expected, rtol=2e-2, atol=2e-2)
     again = loaded.topology
@@ -104,13 +104,13 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
 def test_a_stream_scores_the_same_in_any_pieces_and_after_reset() -> None:
     noise = np.random.default_rng(0).normal(0, 0.1, 6000).astype(np.float32)
     model = random_gmm()
-    frames = model.front_end().accept_waveform(noise)
-    stream = model.stream()
-    whole = np.concatenate([stream.accept(frames), stream.finish()])
+    frames = model.create_front_end().accept_waveform(noise)
+    stream = model.create_stream()
+    whole = np.concatenate([stream.score(frames), stream.score(None)])
     stream.reset()
-    pieces = [stream.accept(piece) for piece in np.split(frames, [0, 1, 3, 10, 11, 30])]
-    np.testing.assert_array_equal(np.concatenate([*pieces, stream.finish()]), whole)
-    assert len(stream.finish()) == 0
+    pieces = [stream.score(piece) for piece in np.split(frames, [0, 1, 3, 10, 11, 30])]
+    np.testing.assert_array_equal(np.concatenate([*pieces, stream.score(None)]), whole)
+    assert len(stream.score(None)) == 0
 
 
 def low_voice(num_samples: int) -> np.ndarray:
@@ -124,19 +124,19 @@ def low_voice(num_samples: int) -> np.ndarray:
 
 def test_low_voices_are_normalised_and_the_pitch_is_known_in_the_next_segment() -> None:
     model = random_gmm()
-    frames = model.front_end().accept_waveform(low_voice(16_000))
+    frames = model.create_front_end().accept_waveform(low_voice(16_000))
     assert frames.shape[1] == 1 + NUM_BANDS + 2
     vtln = VocalTractNormalizer()
-    live, given = model.stream(), model.stream()
+    live, given = model.create_stream(), model.create_stream()
     for segment in (frames[:60], frames[60:]):
-        warped = vtln.accept(segment[:, :-2], segment[:, -2], segment[:, -1])
+        warped = vtln.warp(segment[:, :-2], segment[:, -2], segment[:, -1])
         assert not np.array_equal(warped[-1], segment[-1, :-2])
-        found = np.concatenate([live.accept(segment), live.finish()])
-        expected = np.concatenate([given.accept(without_pitch(warped)), given.finish()])
+        found = np.concatenate([live.score(segment), live.score(None)])
+        expected = np.concatenate([given.score(without_pitch(warped)), given.score(None)])
         np.testing.assert_array_equal(found, expected)
     live.reset()
-    anew = model.stream()
-    np.testing.assert_array_equal(live.accept(frames), anew.accept(frames))
+    anew = model.create_stream()
+    np.testing.assert_array_equal(live.score(frames), anew.score(frames))
 
 
 def test_the_model_that_ships_loads_and_fits() -> None:

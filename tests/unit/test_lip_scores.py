@@ -32,7 +32,7 @@ from kouxing.evaluation.lips.viseme_fit import changes, errors_of_visemes, fit_c
 from kouxing.services.live_chain import sound_events
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_model
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -276,7 +276,7 @@ def write_clip(folder: Path, name: str, column: str = "F3_open_jaw", language: s
 def test_one_run_of_the_recognizer_serves_faces_of_all_delays() -> None:
     model = load_model()
     samples = read_audio(VOWELS_FILE)[0][:, 0]
-    lips = lips_for(model)
+    lips = lip_predictor_for(model)
     found = live_events(model, samples, lips, DELAYS_S)
     assert list(found) == DELAYS_S
     alone = sound_events(model, samples, lips, DEFAULT_DELAY_S)

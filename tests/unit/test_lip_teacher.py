@@ -15,7 +15,7 @@ from kouxing.corpora.feature_cache import as_integers, read_audio
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS
+from kouxing.services.recognizer.lip_predictor import CLOSURE, LIP_FAPS, NUM_OUTPUTS
 from kouxing.shared.errors import UserError
 from kouxing.training.lips import teacher
 from kouxing.training.lips.positions import Speech, speech_of

@@ -10,22 +10,22 @@ import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.model_file import write_archive
-from kouxing.services.recognizer.lips import (
+from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     FORMAT,
     LIP_FAPS,
     NUM_OUTPUTS,
     LipPredictor,
     features_at,
-    load_lips,
+    load_lip_predictor,
     mouth_faps,
 )
-from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame
 from tests.e2e.following import samples_of_file
 from tests.lip_predictors import DELAYS_S, HISTORY, NUM_FEATURES, UNITS, made_up_model
+from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
@@ -42,19 +42,14 @@ def arrays_of(model: LipPredictor) -> dict[str, np.ndarray]:
 
 
 def lips_of(chunk: int, delay_s: float = 0.2) -> list[LipFrame]:
-    stream = SpeechStream(load_model(), lips=MODEL, face_delay_s=delay_s)
-    outputs = [
-        output
-        for start in range(0, len(SAMPLES), chunk)
-        for output in stream.accept_waveform(SAMPLES[start : start + chunk])
-    ]
-    return [output for output in outputs + stream.input_finished() if isinstance(output, LipFrame)]
+    outputs = recognize_live(load_model(), SAMPLES, chunk, lips=MODEL, face_delay_s=delay_s)
+    return [output for output in outputs if isinstance(output, LipFrame)]
 
 
 def test_a_step_is_what_the_formulas_say() -> None:
     rng = np.random.default_rng(1)
     rows = rng.normal(size=(4, NUM_FEATURES)).astype(np.float32)
-    stream = MODEL.stream(MODEL.delays_s)
+    stream = MODEL.create_stream(MODEL.delays_s)
     made = [stream.step(row) for row in rows]
 
     components = [(row - MODEL.feature_mean) @ MODEL.projection for row in rows]
@@ -75,7 +70,7 @@ def test_a_step_is_what_the_formulas_say() -> None:
 
 def test_reset_forgets_everything() -> None:
     row = np.ones(NUM_FEATURES, np.float32)
-    stream = MODEL.stream(MODEL.delays_s)
+    stream = MODEL.create_stream(MODEL.delays_s)
     first, second = stream.step(row), stream.step(row)
     stream.reset()
     assert not np.allclose(first, second)
@@ -84,12 +79,12 @@ def test_reset_forgets_everything() -> None:
 
 def test_each_delay_has_its_own_outputs_and_times() -> None:
     frames, values = np.ones((2, 80), np.float32), np.ones((4, 8, 64), np.float32)
-    both = MODEL.stream([-0.005, 0.155]).accept(1.0, frames, values)
-    alone = MODEL.stream([0.155]).accept(1.0, frames, values)
+    both = MODEL.create_stream([-0.005, 0.155]).process_position(1.0, frames, values)
+    alone = MODEL.create_stream([0.155]).process_position(1.0, frames, values)
     assert [(lip.time_s, lip.delay_s) for lip in both] == [(1.005, -0.005), (0.845, 0.155)]
     np.testing.assert_allclose(both[1].faps, alone[0].faps, rtol=1e-5)
     assert 0 < both[0].closure < 1
-    outputs = MODEL.stream([0.155]).step(features_at(frames, values))
+    outputs = MODEL.create_stream([0.155]).step(features_at(frames, values))
     assert alone[0].closure == pytest.approx(1 / (1 + np.exp(-outputs[0, CLOSURE])))
 
 
@@ -112,10 +107,10 @@ def test_any_chunking_gives_the_same_lips() -> None:
 
 def test_a_model_comes_back_from_its_file(tmp_path: Path) -> None:
     MODEL.save(tmp_path / "lips.npz")
-    again = load_lips(tmp_path / "lips.npz")
+    again = load_lip_predictor(tmp_path / "lips.npz")
     assert again.delays_s == DELAYS_S
     row = np.random.default_rng(2).normal(size=NUM_FEATURES).astype(np.float32)
-    made, before = (one.stream(DELAYS_S).step(row) for one in (again, MODEL))
+    made, before = (one.create_stream(DELAYS_S).step(row) for one in (again, MODEL))
     np.testing.assert_allclose(made, before, atol=0.01)  # weights have 16 bits
 
 
@@ -138,7 +133,7 @@ def test_a_file_that_does_not_fit_is_refused(
 ) -> None:
     write_archive(tmp_path / "bad.npz", {**arrays_of(MODEL), name: array})
     with pytest.raises(UserError, match=message):
-        load_lips(tmp_path / "bad.npz")
+        load_lip_predictor(tmp_path / "bad.npz")
 
 
 def test_a_missing_array_or_delay_is_named(tmp_path: Path) -> None:
@@ -146,14 +141,13 @@ def test_a_missing_array_or_delay_is_named(tmp_path: Path) -> None:
     del arrays["entry_bias"]
     write_archive(tmp_path / "bad.npz", arrays)
     with pytest.raises(UserError, match="entry_bias is missing"):
-        load_lips(tmp_path / "bad.npz")
-    with pytest.raises(UserError, match="no delay of 70 ms; give one of -5, 55, 155"):
-        MODEL.stream([0.07])
+        load_lip_predictor(tmp_path / "bad.npz")
+    with pytest.raises(UserError, match="no delay of 70 ms; choose -5, 55, 155"):
+        MODEL.create_stream([0.07])
 
 
 def test_the_shipped_lips_open_round_and_close() -> None:
-    stream = SpeechStream(load_model(), lips=load_lips(), face_delay_s=0.2)
-    outputs = stream.accept_waveform(SAMPLES) + stream.input_finished()
+    outputs = recognize_live(load_model(), SAMPLES, lips=load_lip_predictor(), face_delay_s=0.2)
     lips = [output for output in outputs if isinstance(output, LipFrame)]
 
     def mean(fap: int, start_s: float, end_s: float) -> float:

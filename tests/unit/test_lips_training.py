@@ -13,7 +13,12 @@ import soundfile
 import torch
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, part_of
-from kouxing.services.recognizer.lips import CLOSURE, LIP_FAPS, NUM_OUTPUTS, load_lips
+from kouxing.services.recognizer.lip_predictor import (
+    CLOSURE,
+    LIP_FAPS,
+    NUM_OUTPUTS,
+    load_lip_predictor,
+)
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -225,7 +230,7 @@ def test_writes_a_model_and_its_card(tmp_path: Path, monkeypatch: pytest.MonkeyP
     write_clip(folder, name_for("held"), "clara", "CC0")
     write_clip(folder, "closed", "dora", "academic use only")
     train_lips(folder, output, seed=1)
-    assert load_lips(output).delays_s == DELAYS_S
+    assert load_lip_predictor(output).delays_s == DELAYS_S
     card = output.with_suffix(".md").read_text()
     assert "| CC0 | 1 | 1 | en | 2 |" in card
     assert "| MIT | 1 | 1 | en | 2 |" in card
@@ -244,7 +249,7 @@ def test_labels_speech_without_video(tmp_path: Path, monkeypatch: pytest.MonkeyP
     small = Shape(num_states=0, look_aheads=(), width=32, heads=2, layers=4, inner=48)
     monkeypatch.setattr(recipe, "load_encoder", lambda _: WholeEncoder(small, (0, 1, 2, 3)).eval())
     train_lips(folder, output, speech=[folder], whisper=tmp_path)
-    assert load_lips(output).delays_s == DELAYS_S
+    assert load_lip_predictor(output).delays_s == DELAYS_S
     card = output.with_suffix(".md").read_text()
     assert "--speech DIR --whisper DIR" in card
     assert "labeled 0.0 hours of speech" in card

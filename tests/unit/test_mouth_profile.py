@@ -20,7 +20,7 @@ from kouxing.services.mouth_profiles.learning import (
 from kouxing.services.mouth_profiles.lip_tracks import lip_measures
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lips import LIP_FAPS
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.services.recognizer.mouth_profile import (
     MouthProfile,
     parse_mouth_profile,
@@ -97,8 +97,8 @@ def test_reads_only_small_files_that_start_like_a_profile(tmp_path: Path) -> Non
 
 
 def test_the_adapted_model_computes_the_formula() -> None:
-    plain = MODEL.stream(MODEL.delays_s)
-    adapted = MODEL.adapt(PROFILE).stream(MODEL.delays_s)
+    plain = MODEL.create_stream(MODEL.delays_s)
+    adapted = MODEL.adapt(PROFILE).create_stream(MODEL.delays_s)
     for features in RNG.normal(size=(30, len(MODEL.feature_mean))).astype(np.float32):
         outputs, changed = plain.step(features), adapted.step(features)
         expected = PROFILE.scale * outputs[:, :NUM_FAPS] + PROFILE.offset

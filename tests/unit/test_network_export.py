@@ -43,7 +43,7 @@ def scores_of(file: np.ndarray, frames: np.ndarray, output: int) -> np.ndarray:
         acoustic_scale=1.0,
         output_layer=output,
     )
-    return model.stream().accept(frames)
+    return model.create_stream().score(frames)
 
 
 @pytest.mark.parametrize("output", [0, 1])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from kouxing.services.recognizer.acoustic import neural as neural_module
-from kouxing.services.recognizer.acoustic.acoustic_model import run_scoring_tasks
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import read_archive
 from kouxing.services.recognizer.acoustic.network import (
@@ -20,9 +19,10 @@ from kouxing.services.recognizer.acoustic.network import (
 )
 from kouxing.services.recognizer.acoustic.neural import FORMAT, NeuralModel
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
+from kouxing.shared.phones.events import Phone
+from tests.live_streams import recognize_live, recognize_together
 
 pytestmark = [pytest.mark.unit, pytest.mark.slow]
 
@@ -39,20 +39,20 @@ def neural(look_ahead_ms: float | None = None) -> NeuralModel:
 
 
 def scores_of(model: NeuralModel, frames: np.ndarray) -> np.ndarray:
-    stream = model.stream()
-    return np.concatenate([stream.accept(frames), stream.finish()])
+    stream = model.create_stream()
+    return np.concatenate([stream.score(frames), stream.score(None)])
 
 
 def test_every_look_ahead_has_scores_of_its_own() -> None:
     found = {}
     for frames in neural().look_aheads:
         model = neural(10.0 * frames)
-        stream = model.stream()
+        stream = model.create_stream()
         assert stream.look_ahead_frames == frames
-        early = stream.accept(FRAMES)
+        early = stream.score(FRAMES)
         num_early = len(early) - (len(FRAMES) - frames)
         assert num_early in (0, 1)  # a position scores two frames, the second as soon as the first
-        found[int(frames)] = np.concatenate([early, stream.finish()])
+        found[int(frames)] = np.concatenate([early, stream.score(None)])
         assert found[int(frames)].shape == (len(FRAMES), model.topology.num_states)
     assert len({scores.tobytes() for scores in found.values()}) == len(found)
 
@@ -60,19 +60,19 @@ def test_every_look_ahead_has_scores_of_its_own() -> None:
 @pytest.mark.parametrize("num_frames", range(8))
 def test_short_segments_have_scores_of_all_their_frames(num_frames: int) -> None:
     for frames in neural().look_aheads:
-        stream = neural(10.0 * frames).stream()
+        stream = neural(10.0 * frames).create_stream()
         for _ in range(2):
-            rows = [*stream.accept(FRAMES[:num_frames]), *stream.finish()]
+            rows = [*stream.score(FRAMES[:num_frames]), *stream.score(None)]
             assert len(rows) == num_frames
-        assert len(stream.finish()) == 0
+        assert len(stream.score(None)) == 0
 
 
 def test_scores_come_no_later_than_the_look_ahead() -> None:
     for frames in neural().look_aheads:
-        stream = neural(10.0 * frames).stream()
+        stream = neural(10.0 * frames).create_stream()
         num_scores = 0
         for number in range(60):
-            num_scores += len(stream.accept(FRAMES[number : number + 1]))
+            num_scores += len(stream.score(FRAMES[number : number + 1]))
             # Frame 0 with a look-ahead of one frame comes along with frame 1.
             assert num_scores >= number + 1 - frames or number < 2
             assert num_scores <= number + 2 - frames or num_scores == 0
@@ -116,14 +116,14 @@ def test_only_the_window_counts() -> None:
 
 
 def test_a_segment_begins_afresh() -> None:
-    stream = neural().stream()
-    first = np.concatenate([stream.accept(FRAMES), stream.finish()])
-    assert len(stream.finish()) == 0
-    second = np.concatenate([stream.accept(FRAMES), stream.finish()])
+    stream = neural().create_stream()
+    first = np.concatenate([stream.score(FRAMES), stream.score(None)])
+    assert len(stream.score(None)) == 0
+    second = np.concatenate([stream.score(FRAMES), stream.score(None)])
     np.testing.assert_array_equal(second, first)
-    stream.accept(FRAMES[:77])
+    stream.score(FRAMES[:77])
     stream.reset()
-    again = np.concatenate([stream.accept(FRAMES), stream.finish()])
+    again = np.concatenate([stream.score(FRAMES), stream.score(None)])
     np.testing.assert_array_equal(again, first)
 
 
@@ -145,22 +145,19 @@ def test_speech_beyond_the_table_of_positions_continues_with_an_empty_past(
 def test_sessions_scored_together_give_what_each_gives_alone() -> None:
     model = neural()
     sounds = [HELLO, HELLO[8000:], HELLO[:9000], np.zeros(4000, np.float32)]
-    alone = []
-    for sound in sounds:
-        recognizer = Recognizer(model, sample_rate_hz=16_000)
-        alone.append(recognizer.accept_waveform(sound) + recognizer.input_finished())
-    recognizers = [Recognizer(model, sample_rate_hz=16_000) for _ in sounds]
-    tasks = [r.process(sound) for r, sound in zip(recognizers, sounds, strict=True)]
-    together = run_scoring_tasks(model, tasks)
-    ends = run_scoring_tasks(model, [recognizer.finish() for recognizer in recognizers])
-    assert [events + end for events, end in zip(together, ends, strict=True)] == alone
-    assert alone[0]
+    alone = [recognize_live(model, sound) for sound in sounds]
+    phones = [[event for event in events if isinstance(event, Phone)] for events in alone]
+    together = recognize_together(model, sounds)
+    assert [
+        [event for event in events if isinstance(event, Phone)] for events in together
+    ] == phones
+    assert phones[0]
 
 
 def test_scores_are_the_same_whoever_comes_and_goes() -> None:
     model = neural()
     expected = scores_of(model, FRAMES)
-    streams = [model.stream() for _ in range(5)]
+    streams = [model.create_stream() for _ in range(5)]
     rows: list[list[np.ndarray]] = [[] for _ in streams]
     num_frames = len(FRAMES)
     for frame in range(num_frames):
@@ -187,24 +184,24 @@ def test_saved_and_loaded_scores_are_the_same(tmp_path: Path) -> None:
     model = neural()
     model.save(tmp_path / "model.npz")
     again = load_model(tmp_path / "model.npz")
-    np.testing.assert_array_equal(again.stream().accept(FRAMES), model.stream().accept(FRAMES))
+    np.testing.assert_array_equal(scores_of(again, FRAMES), scores_of(model, FRAMES))
 
 
 def test_an_unknown_look_ahead_is_refused() -> None:
-    with pytest.raises(UserError, match="look_ahead_ms is 50; give one of 10, 30"):
+    with pytest.raises(UserError, match="no look-ahead of 50 ms; choose 10, 30"):
         neural(50.0)
 
 
 def test_a_gmm_has_one_look_ahead() -> None:
     model = load_model(model_path("gmm"), look_ahead_ms=10.0)
-    assert model.stream().look_ahead_frames == 4
+    assert model.create_stream().look_ahead_frames == 4
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"network": np.zeros(100, np.uint8)}, "network cannot be read"),
-        ({"look_aheads": np.array([], np.int64)}, "names no look-aheads"),
+        ({"look_aheads": np.array([], np.int64)}, "has no look-aheads"),
         ({"look_aheads": np.array([1, 0])}, "look-aheads"),
         ({"look_aheads": np.array([1, 101])}, "look-aheads"),
         ({"look_aheads": np.arange(1, 50)}, "its network scores"),

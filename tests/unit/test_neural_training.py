@@ -319,9 +319,9 @@ def test_scores_whole_recordings_like_the_recognizer(num_samples: int) -> None:
         acoustic_scale=1.0,
     )
     for output, look_ahead in enumerate(SHAPE.look_aheads):
-        stream = model.with_look_ahead(10.0 * look_ahead).stream()
+        stream = model.with_look_ahead(10.0 * look_ahead).create_stream()
         frames = WhisperMel().accept_waveform(as_floats(samples))
-        expected = np.concatenate([stream.accept(frames), stream.finish()])
+        expected = np.concatenate([stream.score(frames), stream.score(None)])
         found = log_posteriors_of(network, output, samples)
         assert found.shape == (len(frames), 6)
         np.testing.assert_allclose(found, expected, atol=1e-4)

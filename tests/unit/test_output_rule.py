@@ -1,14 +1,14 @@
 import pytest
 
-from kouxing.services.recognizer.search.output_rule import OutputRule
+from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
 
 pytestmark = pytest.mark.unit
 
 
 def put_out(frames: str, num_stable_frames: int, before: str = "-") -> list[tuple[int, str]]:
     """Which letters of a string of last phones are emitted, and at which frame."""
-    rule = OutputRule(num_stable_frames, 0.0, last_emitted=ord(before))
-    return [(t, phone) for t, phone in enumerate(frames) if rule.accept(ord(phone), 0.5)]
+    rule = OutputRule(OutputRuleConfig(num_stable_frames, 0.0), last_emitted=ord(before))
+    return [(t, phone) for t, phone in enumerate(frames) if rule.update(ord(phone), 0.5)]
 
 
 def test_put_out_at_the_third_agreeing_frame() -> None:
@@ -37,20 +37,20 @@ def test_silence_before_speech_is_not_put_out() -> None:
 
 
 def test_reset_forgets() -> None:
-    rule = OutputRule(2, 0.0, last_emitted=0)
-    assert [rule.accept(1, 1.0), rule.accept(1, 1.0)] == [False, True]
+    rule = OutputRule(OutputRuleConfig(2, 0.0), last_emitted=0)
+    assert [rule.update(1, 1.0), rule.update(1, 1.0)] == [False, True]
     rule.reset()
-    assert [rule.accept(1, 1.0), rule.accept(1, 1.0)] == [False, True]
+    assert [rule.update(1, 1.0), rule.update(1, 1.0)] == [False, True]
 
 
 def test_agreement_must_be_positive() -> None:
     with pytest.raises(ValueError, match="num_stable_frames is 0"):
-        OutputRule(0, 0.0, last_emitted=0)
+        OutputRule(OutputRuleConfig(0, 0.0), last_emitted=0)
 
 
 def test_unsure_frames_do_not_count() -> None:
-    rule = OutputRule(2, 0.7, last_emitted=0)
+    rule = OutputRule(OutputRuleConfig(2, 0.7), last_emitted=0)
     frames = [(1, 0.9), (1, 0.6), (1, 0.8), (1, 0.7), (2, 0.9), (3, 0.9), (3, 0.9)]
-    assert [rule.accept(phone, confidence) for phone, confidence in frames] == [
+    assert [rule.update(phone, confidence) for phone, confidence in frames] == [
         False, False, False, True, False, False, True,
     ]  # fmt: skip

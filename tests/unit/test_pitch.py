@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.front_end.pitch import Pitch
+from kouxing.services.recognizer.front_end.pitch import PitchTracker
 
 pytestmark = pytest.mark.unit
 
@@ -21,8 +21,8 @@ def voice(frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def pitches(samples: NDArray[np.float32], num_before: int = 0) -> NDArray[np.float64]:
-    pitch = Pitch(num_before)
-    return np.array([pitch.accept_slice(each) for each in samples.reshape(-1, SLICE)])
+    pitch = PitchTracker(num_before)
+    return np.array([pitch.track(each) for each in samples.reshape(-1, SLICE)])
 
 
 def noise(num_samples: int) -> NDArray[np.float32]:

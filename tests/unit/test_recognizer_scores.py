@@ -143,7 +143,7 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     header = "utt_id\tpath\tspeaker\tsplit\tseconds\ttext\tpinyin"
     (tmp_path / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     rules = [(3, 0.0), (1, 0.7)]
-    results = evaluate_recognizer(load_model(), tmp_path, "test", rules=rules)
+    results = evaluate_recognizer(load_model(), tmp_path, "test", rules=rules, own_rule=(1, 0.9))
     assert results["recordings"] == 1
     assert results["num_bad_rows"] == 5
     json.dumps(results)  # everything is plain
@@ -170,4 +170,4 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     assert "first hypothesis  final hypothesis" in text  # side by side
     assert text.count("lying") == 1  # once, not once a model
     with pytest.raises(UserError, match="'nothing'"):
-        evaluate_recognizer(load_model(), tmp_path, "nothing")
+        evaluate_recognizer(load_model(), tmp_path, "nothing", own_rule=(1, 0.9))

@@ -13,7 +13,12 @@ import pytest
 
 from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.config import RecognizerConfig
-from kouxing.services.recognizer.lips import NUM_OUTPUTS, LipPredictor, lips_for, load_lips
+from kouxing.services.recognizer.lip_predictor import (
+    NUM_OUTPUTS,
+    LipPredictor,
+    lip_predictor_for,
+    load_lip_predictor,
+)
 from kouxing.services.recognizer.mouth_profile import MouthProfile
 from kouxing.services.recognizer.service import (
     MAX_LEAD_S,
@@ -21,7 +26,6 @@ from kouxing.services.recognizer.service import (
     MAX_UNPACED_S,
     RecognizerService,
 )
-from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.shared.bus import Bus
 from kouxing.shared.keys import Peer
 from kouxing.shared.phones.events import LipFrame
@@ -32,6 +36,7 @@ from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
 from kouxing.shared.wire.session import SessionFacts
 from kouxing.shared.wire.speech import AudioState, Progress
 from tests.e2e.following import samples_of_file
+from tests.live_streams import LiveStream
 from tests.system import VOWELS_FILE, free_port
 
 pytestmark = pytest.mark.unit
@@ -275,7 +280,7 @@ def test_a_mouth_profile_that_does_not_fit_is_refused_once_and_the_session_goes_
 
 
 def test_a_session_has_the_lips_of_its_mouth_profile(service: Watched) -> None:
-    lips = load_lips()
+    lips = load_lip_predictor()
     profile = MouthProfile(
         scale=np.zeros(15, np.float32),
         offset=np.full(15, 77, np.float32),
@@ -284,7 +289,9 @@ def test_a_session_has_the_lips_of_its_mouth_profile(service: Watched) -> None:
     start = start_of(profile.to_bytes(lips.digest))
     service.start_session(start)
     stream = service._sessions["s"].stream
-    events = stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
+    stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
+    service._recognizer.decode_streams([stream])
+    events = service._recognizer.get_result(stream)
     frames = [event for event in events if isinstance(event, LipFrame)]
     assert len(frames) > 5
     assert {frame.faps[0] for frame in frames} == {77.0}
@@ -320,13 +327,12 @@ def test_the_shipped_lips_are_used_with_the_network_that_they_were_trained_on(
     neural = load_model()
     width = 2 * 80 + 2 * 512
     tiny_lips(width + 2).save(path)
-    assert lips_for(neural, path) is None
+    assert lip_predictor_for(neural, path) is None
     tiny_lips(width).save(path)
-    assert lips_for(load_model(model_path("gmm")), path) is None
-    lips = lips_for(neural, path)
+    assert lip_predictor_for(load_model(model_path("gmm")), path) is None
+    lips = lip_predictor_for(neural, path)
     assert lips is not None
-    stream = SpeechStream(neural, lips=lips, face_delay_s=0.2)
-    events = stream.accept_waveform(samples_of_file(VOWELS_FILE))
+    events = LiveStream(neural, lips=lips, face_delay_s=0.2).feed(samples_of_file(VOWELS_FILE))
     frames = [event for event in events if isinstance(event, LipFrame)]
     assert len(frames) > 50
     assert {frame.delay_s for frame in frames} == {0.1}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.acoustic.load import load_live_model, load_model
 from kouxing.services.recognizer.alignment import align_text
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
@@ -35,7 +35,7 @@ def bilabials(*, is_text_known: bool) -> AnalyzedRecording:
     samples, rate_hz = read_audio(DEMO / "bilabials-female.wav")
     model = load_model()
     aligned = align_text(model, samples, rate_hz, TEXT) if is_text_known else None
-    return analyze_recording(model, samples[:, 0], lips_for(model), aligned)
+    return analyze_recording(model, samples[:, 0], lip_predictor_for(model), aligned)
 
 
 def openings(heard: AnalyzedRecording) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -88,7 +88,7 @@ def test_recognised_phones_err_where_the_text_does_not() -> None:
 def test_lips_part_in_a_recognised_vowel_between_two_closures() -> None:
     samples = read_audio(DEMO / "bilabials-female.wav")[0][:, 0]
     model = load_live_model()
-    heard = analyze_recording(model, samples, lips_for(model))
+    heard = analyze_recording(model, samples, lip_predictor_for(model))
     times_s, opening = openings(heard)
     (vowel,) = [
         phone

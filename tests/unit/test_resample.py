@@ -40,13 +40,6 @@ def test_16_khz_passes_through_and_is_clipped() -> None:
     np.testing.assert_array_equal(column, [0.0, 0.5, 1.0, -1.0])
 
 
-def test_reset_starts_a_new_stream() -> None:
-    resampler = Resampler(44_100)
-    first = resampler.accept_waveform(tone(44_100))
-    resampler.reset()
-    np.testing.assert_array_equal(resampler.accept_waveform(tone(44_100)), first)
-
-
 @pytest.mark.parametrize("rate_hz", [0, 7_999, 48_001, 192_000])
 def test_rates_out_of_range(rate_hz: int) -> None:
     with pytest.raises(UserError, match=str(rate_hz)):

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
+from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.services.recognizer.resumption import GRID_S, WARM_UP_S, Resumption
-from kouxing.services.recognizer.stream import SpeechStream, StreamOutput, Waveform
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.clock import to_samples
-from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
+from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange, Waveform
 from kouxing.shared.phones.final_time import QUIET_S, FinalTime
 from tests.e2e.following import samples_of_file
+from tests.live_streams import LiveStream
 from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
@@ -62,14 +64,15 @@ def recognized(
     speech_time: int = 0,
 ) -> list[list[StreamOutput]]:
     """Return the outputs after each chunk from a sample on, and after the end."""
-    stream = SpeechStream(model, num_stable_frames=2, min_confidence=0.95, speech_time=speech_time)
+    stream = LiveStream(model, OutputRuleConfig(), speech_time=speech_time)
     outputs = []
     for start in range(begin, len(samples), CHUNK):
         chunk = (start, samples[start : start + CHUNK])
         if start == begin:
             chunk = resumption.on_grid(chunk, 16_000)
-        outputs.append(run_scoring_tasks(model, [stream.process([chunk])])[0])
-    outputs.append(stream.input_finished())
+        media_time, samples_in = chunk
+        outputs.append(stream.feed(samples_in, media_time))
+    outputs.append(stream.finish())
     return [resumption.pass_on(each) for each in outputs]
 
 

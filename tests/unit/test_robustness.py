@@ -124,7 +124,9 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     conditions = {name: SPEECH_CONDITIONS[name] for name in ("as recorded", "half level")}
     monkeypatch.setattr(robustness, "SPEECH_CONDITIONS", conditions)
     monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
-    figures = evaluate_robustness(load_model(), tmp_path, "dev", other_language=DEMO)
+    figures = evaluate_robustness(
+        load_model(), tmp_path, "dev", own_rule=(1, 0.9), other_language=DEMO
+    )
     assert set(figures["speech"]) == {*conditions, "babble 10 dB below"}
     rates = figures["speech"]["as recorded"]["offline"]
     assert rates["phone_error_rate"] > 0 < rates["viseme_error_rate"]  # the text is too short
@@ -135,7 +137,7 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     print_robustness({"a model": figures}, Console(file=output, width=120))
     assert "half level" in output.getvalue()
     with pytest.raises(UserError, match="no usable recordings in the split 'test'"):
-        evaluate_robustness(load_model(), tmp_path, "test")
+        evaluate_robustness(load_model(), tmp_path, "test", own_rule=(1, 0.9))
 
 
 def test_a_folder_without_sound(tmp_path: Path) -> None:

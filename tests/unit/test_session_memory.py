@@ -7,10 +7,11 @@ import gc
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
-from kouxing.services.recognizer.lips import lips_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.metrics import give_back_memory, memory_mb
@@ -28,15 +29,15 @@ class Sessions:
     """Streams that speak at once; any of them are processed together, as chunks happen to come."""
 
     def __init__(self, model: AcousticModel) -> None:
-        self._model = model
+        self._recognizer = Recognizer(model)
+        self._lips = lip_predictor_for(model)
         self._sound = to_16_khz(*read_audio(DEMO / "bilabials-female.wav"))
         self._rng = np.random.default_rng(0)
         self._streams: list[SpeechStream] = []
         self._num_sent: list[int] = []  # samples
 
     def add(self, number: int) -> None:
-        lips = lips_for(self._model)
-        self._streams += [SpeechStream(self._model, lips=lips) for _ in range(number)]
+        self._streams += [self._recognizer.create_stream(lips=self._lips) for _ in range(number)]
         self._num_sent += [0] * number
 
     def remove_all(self) -> None:
@@ -48,8 +49,13 @@ class Sessions:
             order = self._rng.permutation(len(self._streams))
             cut = int(self._rng.integers(len(order) + 1))
             for group in (order[:cut], order[cut:]):
-                tasks = [self._streams[number].process([self._next(number)]) for number in group]
-                run_scoring_tasks(self._model, tasks)
+                for number in group:
+                    media_time, samples = self._next(number)
+                    self._streams[number].accept_waveform(samples, media_time)
+                streams = [self._streams[number] for number in group]
+                self._recognizer.decode_streams(streams)
+                for stream in streams:
+                    self._recognizer.get_result(stream)
 
     def _next(self, number: int) -> tuple[int, np.ndarray[tuple[int, ...], np.dtype[np.float32]]]:
         at = self._num_sent[number]

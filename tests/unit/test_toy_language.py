@@ -31,8 +31,7 @@ from kouxing.services.recognizer.front_end.features import (
 )
 from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTractNormalizer
 from kouxing.services.recognizer.offline import recognize
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.speech_scores import frame_time_s
+from kouxing.services.recognizer.speech_scorer import frame_time_s
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face import Face
 from kouxing.services.synthesizer.lips.load import load_lip_model
@@ -42,6 +41,7 @@ from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import flat_language, install_language
+from tests.live_streams import recognize_live
 from tests.system import VOWELS_FILE
 
 pytestmark = pytest.mark.unit
@@ -77,10 +77,10 @@ def trained(inventory: PhoneInventory) -> GmmModel:
     """A model of one Gaussian for each phone of the recording."""
     samples, labels = vowels()
     frames = PitchedLogMel().accept_waveform(samples)
-    log_mel = VocalTractNormalizer().accept(frames[:, :-2], frames[:, -2], frames[:, -1])
+    log_mel = VocalTractNormalizer().warp(frames[:, :-2], frames[:, -2], frames[:, -1])
     static = cepstra(log_mel)
     prior_mean = static.mean(axis=0)
-    features = LiveMean(prior_mean).normalise(with_differences(static, HALF_WIDTH))
+    features = LiveMean(prior_mean).normalize(with_differences(static, HALF_WIDTH))
     means = np.tile(features.mean(axis=0) + 10, (len(inventory), 1))  # far from any sound
     covars = np.tile(features.var(axis=0), (len(inventory), 1))
     for symbol in {symbol for symbol, _, _ in labels}:
@@ -138,8 +138,7 @@ def test_it_is_recognised_live_and_offline(toy: PhoneInventory, tmp_path: Path) 
     model = loaded(toy, tmp_path)
     samples, _ = vowels()
     assert symbols(recognize(model, samples, 16_000), toy) == "a o e i u y"
-    recognizer = Recognizer(model, sample_rate_hz=16_000)
-    events = recognizer.accept_waveform(samples) + recognizer.input_finished()
+    events = recognize_live(model, samples)
     final = [event for event in events if isinstance(event, Phone) and event.final]
     assert symbols(final, toy) == "a o e i u y"
 

@@ -6,14 +6,15 @@ from typing import cast
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, run_scoring_tasks
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_model, with_early_network
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.acoustic.two_networks import TwoNetworks
-from kouxing.services.recognizer.lips import lips_for
-from kouxing.services.recognizer.speech_scores import FrameScores, SpeechScores
-from kouxing.services.recognizer.stream import SpeechStream, StreamOutput
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
+from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.speech_scorer import FrameScores, SpeechScorer, score_streams
 from kouxing.shared.phones.events import LipFrame, Phone
+from tests.live_streams import recognize_live, recognize_together
 from tests.unit.test_block_model import FRAMES, HELLO, blocks
 
 pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("one_thread")]
@@ -31,34 +32,35 @@ def test_a_model_that_is_early_itself_stays_alone() -> None:
 
 def test_the_newest_frames_have_the_causal_scores() -> None:
     model = two_networks()
-    together, early, late = model.stream(), model.early.stream(), model.late.stream()
+    together, early, late = (
+        model.create_stream(),
+        model.early.create_stream(),
+        model.late.create_stream(),
+    )
     num_settled = 0
     newest = np.empty((0, model.topology.num_states), np.float32)
     for start in range(0, len(FRAMES), 3):
         chunk = FRAMES[start : start + 3]
-        settled = together.accept(chunk)
-        np.testing.assert_array_equal(settled, late.accept(chunk))
-        newest = np.concatenate([newest, early.accept(chunk)])
+        settled = together.score(chunk)
+        np.testing.assert_array_equal(settled, late.score(chunk))
+        newest = np.concatenate([newest, early.score(chunk)])
         num_settled += len(settled)
         known = len(late.provisional)
         np.testing.assert_array_equal(together.provisional[:known], late.provisional)
         np.testing.assert_array_equal(together.provisional[known:], newest[num_settled + known :])
     assert num_settled + len(together.provisional) >= len(FRAMES) - 2
-    np.testing.assert_array_equal(together.finish(), late.finish())
+    np.testing.assert_array_equal(together.score(None), late.score(None))
     assert len(together.provisional) == 0
 
 
 def events_of(model: AcousticModel, chunk: int = 320) -> list[StreamOutput]:
-    lips = lips_for(model)
+    lips = lip_predictor_for(model)
     assert lips is not None
-    stream = SpeechStream(model, lips=lips, face_delay_s=0.06)
-    pieces = np.split(HELLO, range(chunk, len(HELLO), chunk))
-    events = [event for piece in pieces for event in stream.accept_waveform(piece)]
-    return events + stream.input_finished()
+    return recognize_live(model, HELLO, chunk, lips=lips, face_delay_s=0.06)
 
 
 def test_the_lips_are_those_of_the_causal_network() -> None:
-    assert lips_for(blocks()) is None
+    assert lip_predictor_for(blocks()) is None
     found, expected = (
         [event for event in events_of(model) if isinstance(event, LipFrame)]
         for model in (two_networks(), cast(NeuralModel, load_model()))
@@ -72,12 +74,13 @@ def test_the_lips_are_those_of_the_causal_network() -> None:
 @pytest.mark.parametrize("chunk", [160, 777])
 def test_provisional_scores_are_the_same_in_any_chunks(chunk: int) -> None:
     def scores_of(pieces: list[np.ndarray]) -> list[FrameScores]:
-        scores = SpeechScores(two_networks(), 16_000)
-        found = []
+        scorer = SpeechScorer(two_networks())
         for piece in pieces:
-            found += run_scoring_tasks(two_networks(), [scores.process(piece)])[0]
-        found += run_scoring_tasks(two_networks(), [scores.finish()])[0]
-        return [event for event in found if isinstance(event, FrameScores)]
+            scorer.accept_waveform(piece)
+            score_streams(two_networks(), [scorer])
+        scorer.input_finished()
+        score_streams(two_networks(), [scorer])
+        return [event for event in scorer.get_events() if isinstance(event, FrameScores)]
 
     expected = scores_of([HELLO])
     found = scores_of(np.split(HELLO, range(chunk, len(HELLO), chunk)))
@@ -92,7 +95,5 @@ def test_phones_are_the_same_in_any_chunks_and_any_company() -> None:
     expected = [event for event in events_of(model) if isinstance(event, Phone)]
     assert len(expected) > 5
     assert [event for event in events_of(model, 777) if isinstance(event, Phone)] == expected
-    streams = [SpeechStream(model) for _ in range(3)]
-    tasks = [stream.process([(0, HELLO[1000 * number :])]) for number, stream in enumerate(streams)]
-    first = run_scoring_tasks(model, tasks)[0] + streams[0].input_finished()
+    first = recognize_together(model, [HELLO[1000 * number :] for number in range(3)])[0]
     assert [event for event in first if isinstance(event, Phone)] == expected

@@ -20,7 +20,7 @@ QUIET, SPEAKING, STOPPING = VoiceState
 def states(samples: np.ndarray) -> list[VoiceState]:
     detector = VoiceActivityDetector()
     whole = len(samples) // BLOCK_SAMPLES * BLOCK_SAMPLES
-    return [detector.accept_block(block) for block in samples[:whole].reshape(-1, BLOCK_SAMPLES)]
+    return [detector.detect(block) for block in samples[:whole].reshape(-1, BLOCK_SAMPLES)]
 
 
 def test_silence_and_noise_are_quiet() -> None:
@@ -37,31 +37,21 @@ def test_silence_and_noise_are_quiet() -> None:
 def test_three_states() -> None:
     detector = VoiceActivityDetector()
     assert detector.state is QUIET
-    assert detector.accept_probability(0.1) is QUIET
-    assert detector.accept_probability(0.9) is SPEAKING
-    assert detector.accept_probability(0.4) is SPEAKING  # weaker, but not improbable
-    assert detector.accept_probability(0.1) is STOPPING
-    assert detector.accept_probability(0.9) is SPEAKING  # a stop's closure
-    ending = [detector.accept_probability(0.1) for _ in range(16)]
+    assert detector.update(0.1) is QUIET
+    assert detector.update(0.9) is SPEAKING
+    assert detector.update(0.4) is SPEAKING  # weaker, but not improbable
+    assert detector.update(0.1) is STOPPING
+    assert detector.update(0.9) is SPEAKING  # a stop's closure
+    ending = [detector.update(0.1) for _ in range(16)]
     assert ending == [STOPPING] * 15 + [QUIET]
     assert [state.is_speech for state in VoiceState] == [False, True, True]
-
-
-def test_reset_gives_the_same_again() -> None:
-    samples = np.random.default_rng(0).normal(0, 0.1, BLOCK_SAMPLES).astype(np.float32)
-    detector = VoiceActivityDetector()
-    first = [detector.speech_probability(samples) for _ in range(2)]
-    assert first[0] != first[1]  # it remembers
-    detector.reset()
-    assert [detector.speech_probability(samples) for _ in range(2)] == first
 
 
 def test_detectors_share_the_network_only() -> None:
     blocks = HELLO[: 20 * BLOCK_SAMPLES].reshape(-1, BLOCK_SAMPLES)
     detector, other = VoiceActivityDetector(), VoiceActivityDetector()
     alone = [detector.speech_probability(block) for block in blocks]
-    detector.reset()
-    beside = []
+    detector, beside = VoiceActivityDetector(), []
     for block in blocks:
         beside.append(detector.speech_probability(block))
         other.speech_probability(-block[::-1])

@@ -110,7 +110,7 @@ def test_any_chunks_give_the_same_bits(size: int | None) -> None:
     sound = np.concatenate([vowel(105.0, 0.15), noise(0.05), vowel(180.0, 0.1)])
     pitch_hz, strength = PitchTracker().accept_waveform(sound)
     log_mel = LogMel().accept_waveform(sound)
-    warped = VocalTractNormalizer().accept(log_mel, pitch_hz, strength)
+    warped = VocalTractNormalizer().warp(log_mel, pitch_hz, strength)
     assert (warped != log_mel).any()
 
     bank, tracker, vtln = LogMel(), PitchTracker(), VocalTractNormalizer()
@@ -119,7 +119,7 @@ def test_any_chunks_give_the_same_bits(size: int | None) -> None:
         pitch, strong = tracker.accept_waveform(sound[chunk])
         pitches.append(pitch)
         strengths.append(strong)
-        frames.append(vtln.accept(bank.accept_waveform(sound[chunk]), pitch, strong))
+        frames.append(vtln.warp(bank.accept_waveform(sound[chunk]), pitch, strong))
     np.testing.assert_array_equal(np.concatenate(pitches), pitch_hz)
     np.testing.assert_array_equal(np.concatenate(strengths), strength)
     np.testing.assert_array_equal(np.concatenate(frames), warped)
@@ -130,7 +130,7 @@ def test_a_low_voice_goes_up_with_time() -> None:
     assert vtln.factor == 1.0
     factors = []
     for _ in range(10):
-        vtln.accept(bands_with_a_peak(100, 20), *voice(110.0, 100))
+        vtln.warp(bands_with_a_peak(100, 20), *voice(110.0, 100))
         factors.append(vtln.factor)
     after_1_s = (REFERENCE_HZ / 110) ** (0.2 * 100 / 120)  # 20 frames are the reference's
     assert factors[0] == pytest.approx(after_1_s, abs=2e-3)
@@ -141,7 +141,7 @@ def test_a_low_voice_goes_up_with_time() -> None:
 def test_a_vowel_spoken_low_is_warped() -> None:
     sound = vowel(110.0, seconds=2.0)
     vtln = VocalTractNormalizer()
-    vtln.accept(LogMel().accept_waveform(sound), *PitchTracker().accept_waveform(sound))
+    vtln.warp(LogMel().accept_waveform(sound), *PitchTracker().accept_waveform(sound))
     assert vtln.factor == pytest.approx((REFERENCE_HZ / 110) ** (0.2 * 198 / 218), abs=4e-3)
 
 
@@ -149,7 +149,7 @@ def test_a_high_voice_keeps_every_bit() -> None:
     sound = vowel(240.0)
     log_mel = LogMel().accept_waveform(sound)
     vtln = VocalTractNormalizer()
-    warped = vtln.accept(log_mel, *PitchTracker().accept_waveform(sound))
+    warped = vtln.warp(log_mel, *PitchTracker().accept_waveform(sound))
     np.testing.assert_array_equal(warped, log_mel)
     assert vtln.factor == 1.0
     assert not np.shares_memory(warped, log_mel)
@@ -158,7 +158,7 @@ def test_a_high_voice_keeps_every_bit() -> None:
 def test_a_formant_moves_up_by_the_factor() -> None:
     log_mel = bands_with_a_peak(2000, 20)
     vtln = VocalTractNormalizer()
-    warped = vtln.accept(log_mel, *voice(90.0, 2000))
+    warped = vtln.warp(log_mel, *voice(90.0, 2000))
     np.testing.assert_array_equal(warped[:, 0], log_mel[:, 0])
     for band in (25, 30, 35):  # on the falling side, where a value tells its place
         place = 20 + 12.0 - warped[-1, 1 + band]
@@ -169,36 +169,36 @@ def test_a_formant_moves_up_by_the_factor() -> None:
 
 def test_the_factor_has_a_limit() -> None:
     vtln = VocalTractNormalizer()
-    warped = vtln.accept(bands_with_a_peak(2000, 20), *voice(40.0, 2000))
+    warped = vtln.warp(bands_with_a_peak(2000, 20), *voice(40.0, 2000))
     assert vtln.factor == MAX_FACTOR
     assert np.isfinite(warped).all()
 
 
 def test_frames_without_voice_do_not_move_the_mean() -> None:
     vtln = VocalTractNormalizer()
-    vtln.accept(bands_with_a_peak(50, 20), *voice(110.0, 50))
+    vtln.warp(bands_with_a_peak(50, 20), *voice(110.0, 50))
     before = vtln.factor
-    vtln.accept(bands_with_a_peak(50, 20), *voice(300.0, 50, strength=0.7))
-    vtln.accept(bands_with_a_peak(50, 20), *voice(0.0, 50, strength=0.0))
+    vtln.warp(bands_with_a_peak(50, 20), *voice(300.0, 50, strength=0.7))
+    vtln.warp(bands_with_a_peak(50, 20), *voice(0.0, 50, strength=0.0))
     assert vtln.factor == before
 
 
 def test_another_speaker_is_followed() -> None:
     vtln = VocalTractNormalizer()
-    vtln.accept(bands_with_a_peak(20_000, 20), *voice(110.0, 20_000))
-    vtln.accept(bands_with_a_peak(3000, 20), *voice(330.0, 3000))
+    vtln.warp(bands_with_a_peak(20_000, 20), *voice(110.0, 20_000))
+    vtln.warp(bands_with_a_peak(3000, 20), *voice(330.0, 3000))
     assert vtln.factor == 1.0
 
 
 def test_reset_forgets() -> None:
     vtln = VocalTractNormalizer()
     log_mel = bands_with_a_peak(100, 20)
-    first = vtln.accept(log_mel, *voice(110.0, 100))
+    first = vtln.warp(log_mel, *voice(110.0, 100))
     vtln.reset()
     assert vtln.factor == 1.0
-    np.testing.assert_array_equal(vtln.accept(log_mel, *voice(110.0, 100)), first)
+    np.testing.assert_array_equal(vtln.warp(log_mel, *voice(110.0, 100)), first)
 
 
 def test_shapes_that_do_not_fit() -> None:
     with pytest.raises(ValueError, match="shapes"):
-        VocalTractNormalizer().accept(bands_with_a_peak(3, 20), *voice(110.0, 2))
+        VocalTractNormalizer().warp(bands_with_a_peak(3, 20), *voice(110.0, 2))

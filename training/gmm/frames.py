@@ -87,7 +87,7 @@ def features_of(
     if copy.augmentation is not None:
         log_mel = copy.augmentation.apply(log_mel)
     features = with_differences(cepstra_of_all(log_mel), half_width)
-    return LiveMean(prior_mean).normalise(features)
+    return LiveMean(prior_mean).normalize(features)
 
 
 @dataclass(slots=True)

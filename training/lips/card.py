@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.services.mouth_profiles.positions import POSITION_S
-from kouxing.services.recognizer.lips import LipPredictor
+from kouxing.services.recognizer.lip_predictor import LipPredictor
 from kouxing.training.lips.positions import Speech
 from kouxing.training.lips.recurrent import Example
 from kouxing.training.lips.scores import Prediction, correlations, count_closures
@@ -80,7 +80,7 @@ def write_card(
         "",
         f"Made by `kouxing train lips --clips DIR{options} --seed {trained.seed}`. "
         "`training/lips/recipe.py`",
-        "describes the training, `services/recognizer/lips.py` the model.",
+        "describes the training, `services/recognizer/lip_predictor.py` the model.",
         "",
         "## Data",
         "",
@@ -110,7 +110,7 @@ def write_card(
 
 def predict(model: LipPredictor, speech: Sequence[Speech]) -> list[Prediction]:
     """Run the model over stretches of speech, as a session does."""
-    stream = model.stream(model.delays_s)
+    stream = model.create_stream(model.delays_s)
     predictions = []
     for stretch in speech:
         stream.reset()

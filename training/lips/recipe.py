@@ -25,7 +25,7 @@ from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
-from kouxing.services.recognizer.lips import (
+from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
     LIP_FAPS,
     NUM_LAYERS,

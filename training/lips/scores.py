@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, lip_tracks
-from kouxing.services.recognizer.lips import CLOSURE
+from kouxing.services.recognizer.lip_predictor import CLOSURE
 from kouxing.training.lips.targets import Touch, opening
 
 Array = NDArray[np.float64]

@@ -41,7 +41,7 @@ from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.corpora.speech_corpus import audio_files, duration_s
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lips import LIP_FAPS
+from kouxing.services.recognizer.lip_predictor import LIP_FAPS
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.training.lips.positions import Speech, speech_of

@@ -14,10 +14,10 @@ from kouxing.corpora.scoring import ErrorCounts, count_errors, first_hypothesis
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.network import MAX_POSITIONS
 from kouxing.services.recognizer.alignment import spoken
-from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
-from kouxing.services.recognizer.recognizer import Recognizer
-from kouxing.services.recognizer.speech_scores import FrameScores, SpeechEnd, SpeechStart
+from kouxing.services.recognizer.live_decoder import LiveDecoder
+from kouxing.services.recognizer.search.output_rule import MODEL_RULES
+from kouxing.services.recognizer.speech_scorer import FrameScores, SpeechEnd, SpeechStart
 from kouxing.training.neural.network import Network
 from kouxing.training.training_set import Example
 
@@ -70,9 +70,9 @@ def first_hypothesis_error_rate(
     inventory = model.inventory
     total = ErrorCounts()
     for rows, example in zip(scores, examples, strict=True):
-        recognizer = Recognizer(model, sample_rate_hz=SAMPLE_RATE_HZ)
+        decoder = LiveDecoder(model.topology, MODEL_RULES["neural"])
         scored = FrameScores(rows, provisional=rows[:0])
-        events = recognizer.decode([SpeechStart(0), scored, SpeechEnd(len(rows))])
+        events = decoder.decode([SpeechStart(0), scored, SpeechEnd(len(rows))])
         first = spoken(first_hypothesis(events, set()), inventory)
         reference = [inventory.phones[phone] for phone in example.phones]
         total += count_errors(reference, [phone.symbol for phone in first])

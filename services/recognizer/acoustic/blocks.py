@@ -2,16 +2,16 @@
 
 Sources: Radford et al. 2023, "Robust speech recognition via large-scale weak supervision" (the
 encoder); Shi et al. 2021, "Emformer: efficient memory transformer based acoustic model for low
-latency streaming speech recognition" (blocks with a cached past, whose right context is computed
-anew); Bourlard and Morgan 1994, "Connectionist speech recognition" (scores are posteriors divided
-by priors). HMMs, search and output rule are those of Li et al. 2011. The network is that of
+latency streaming speech recognition" (blocks with a cached past, whose right context is
+recomputed); Bourlard and Morgan 1994, "Connectionist speech recognition" (scores are posteriors
+divided by priors). HMMs, search and output rule are those of Li et al. 2011. The network is that of
 :mod:`kouxing.training.blocks.network`.
 
 ============== ====================================================== ========================
 symbol         meaning                                                unit, shape
 ============== ====================================================== ========================
-x              log-mel bands, none eight decades below the loudest    (frames, 80)
-               so far
+x              log-mel bands, at most eight decades below the         (frames, 80)
+               loudest so far
 y              log posteriors of the states                           (frames, states)
 B, R           positions of a block, and of its right context         positions
 PAST           positions before a block that it attends to            positions
@@ -21,20 +21,20 @@ acoustic_scale weight of the log scores, chosen on development data   1
 
     log b(x) = acoustic_scale * (y - log prior)
 
-Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1`` and sees those from ``2 p - 2``
-(zeros stand before the first) to ``2 p + 2``. Whenever ``B`` more positions are there, the network
-runs on a block and on the ``R`` positions after it, which are the newest. The block's scores are
-settled, its keys and values kept. The scores of the right context are provisional. When speech
-begins, the first runs have fewer positions and settle none. The last one, in which the segment's
-last frame is repeated once or twice, settles all.
+Position ``p`` of a segment has the frames ``2 p`` and ``2 p + 1``. It sees the frames from
+``2 p - 2`` to ``2 p + 2`` (zeros precede the first). Whenever ``B`` more positions are complete,
+the network runs on a block and on the ``R`` positions after it, which are the newest. The block's
+scores are settled, and its keys and values are kept. The scores of the right context are
+provisional. When speech starts, the first runs have fewer positions and settle none. The last run
+repeats the segment's last frame once or twice and settles all positions.
 
 The table of positions ends after 30 seconds. Longer speech without a pause starts again at the
 first row, with an empty past.
 
-Sessions that have a block at the same time share one run. A session's scores are the same to the
-last bit in any batch and any chunking, because the network rounds each row of a product with a
-scale of its own. Keys and values are rings, as attention does not depend on their order; those of a
-session take 1.5 MB while it speaks, in 16 bits.
+Sessions that have a block at the same time share one run. The network scales and rounds each row of
+a product separately, so a session's scores are the same to the last bit in any batch and any
+chunking. Keys and values are rings, because attention does not depend on their order. They take
+1.5 MB per speaking session, in 16 bits.
 """
 
 from __future__ import annotations
@@ -49,13 +49,14 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
-from kouxing.services.recognizer.acoustic.caches import (
-    CacheMemory,
-    CacheSizes,
-    Halves,
-    cache_names,
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    Floats,
+    NetworkPosition,
+    Topology,
+    Work,
+    no_scores,
 )
+from kouxing.services.recognizer.acoustic.caches import CacheMemory, CacheSizes, Halves, cache_names
 from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -65,7 +66,6 @@ from kouxing.services.recognizer.acoustic.model_file import (
 from kouxing.services.recognizer.acoustic.network import (
     FRAMES_PER_POSITION,
     MAX_POSITIONS,
-    Floats,
     open_session,
     position_table,
 )
@@ -78,7 +78,7 @@ _INPUTS = ["frames", "positions", "num_positions", "num_cached", "state"]  # bef
 _OUTPUTS = ["log_posteriors", "new_state", "new"]
 _PADDING = 2  # frames of zeros before a segment's first
 _SEEN_AFTER = 2  # frames that a position sees after its first
-_MAX_BATCH = 4  # sessions in a run; with more each takes no less time, but memory
+_MAX_BATCH = 4  # sessions in a run; more need memory and do not lower the time per session
 _MAX_SIZE = 4096
 _MAX_CACHE_BYTES = 3_000_000  # of a session
 
@@ -107,19 +107,19 @@ class BlockModel:
         """Keys and values of all sessions."""
         return CacheMemory(self.session.sizes.cache, _MAX_BATCH)
 
-    def front_end(self) -> WhisperMel:
-        """Start a front end for one session."""
+    def create_front_end(self) -> WhisperMel:
+        """Create the front end of one session."""
         return WhisperMel()
 
-    def stream(self) -> BlockStream:
-        """Start a stream of scores for one speaker."""
+    def create_stream(self, *, keep_positions: bool = False) -> BlockStream:
+        """Create the stream of one speaker; it keeps no positions."""
         return BlockStream(self)
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
         """Score frames of several streams in batches; None ends a stream's segment."""
         streams = [cast(BlockStream, stream) for stream, _ in work]
         for stream, (_, frames) in zip(streams, work, strict=True):
-            stream.take_frames(frames)
+            stream.append_frames(frames)
         while ready := [stream for stream in streams if stream.is_due]:
             for numbers, rings in self.caches.runs([stream.cache for stream in ready]):
                 self._run([ready[number] for number in numbers], rings)
@@ -129,8 +129,8 @@ class BlockModel:
         blocks = [stream.block() for stream in streams]
         log_posteriors, states, new = self.session.run(blocks, rings)
         scores = np.float32(self.acoustic_scale) * (log_posteriors - self.log_prior)
-        for row, stream in enumerate(streams):  # copies: a row would keep all of them
-            stream.take_outputs(scores[row].copy(), states[row].copy(), new[row])
+        for row, stream in enumerate(streams):  # copies: a view would keep the whole batch
+            stream.append_outputs(scores[row].copy(), states[row].copy(), new[row])
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
@@ -165,7 +165,7 @@ class BlockSizes:
 
 @dataclass(slots=True)
 class Past:
-    """What a session's network has computed before a block, beside its cache."""
+    """A session's network state before a block, besides its cache."""
 
     state: Floats  # of the recurrent layer, (width,)
     num_cached: int = 0  # positions in the cache
@@ -192,7 +192,7 @@ class BlockSession:
     Raises
     ------
     ValueError
-        If it is no network of this kind.
+        If it is not a network of this kind.
     """
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
@@ -203,21 +203,21 @@ class BlockSession:
         self._positions = np.concatenate([position_table(self.sizes.width), unused])
 
     def run(self, blocks: Sequence[Block], rings: Halves) -> tuple[Floats, Floats, Halves]:
-        """Run the network on a block of each session, with ``n`` the number of sessions.
+        """Run the network on the next block of each of ``n`` sessions.
 
         Parameters
         ----------
         blocks
-            The sessions' next ones.
+            The sessions' next blocks.
         rings
             Their caches, (2 layers, n, heads, PAST, size).
 
         Returns
         -------
         tuple
-            Log posteriors, (n, 2 (B + R), states), of which those of positions that a block does
-            not have mean nothing; the recurrent layer's new state, (n, width); keys of all layers
-            and then values of the block's own positions, (n, 2 layers, heads, B, size).
+            Log posteriors, (n, 2 (B + R), states), undefined for positions that a block lacks; the
+            recurrent layer's new state, (n, width); the block's keys of all layers and then its
+            values, (n, 2 layers, heads, B, size).
 
         Raises
         ------
@@ -238,7 +238,7 @@ class BlockSession:
         }
         try:
             log_posteriors, state, new = self._session.run(_OUTPUTS, inputs)
-        except Exception as error:  # onnxruntime's errors have no base of their own
+        except Exception as error:  # onnxruntime's errors have no common base
             raise ValueError(f"its network does not run ({error})") from error
         return log_posteriors, state, new
 
@@ -247,24 +247,21 @@ class BlockStream:
     """Scores of one speaker's speech, segment by segment."""
 
     def __init__(self, model: BlockModel) -> None:
+        self.positions: list[NetworkPosition] = []
         self._model = model
         self._sizes = model.session.sizes
         self.look_ahead_frames = FRAMES_PER_POSITION * self._sizes.length
-        self._nothing = no_scores(model.topology.num_states)
+        self._no_scores = no_scores(model.topology.num_states)
         self.cache = model.caches.open()  # what lies beyond the past's positions is masked
         self.reset()
 
-    def accept(self, frames: Floats) -> Floats:
-        """Take frames, shape (n, 80); return the scores settled, (m, states)."""
+    def score(self, frames: Floats | None) -> Floats:
+        """Score frames, shape (n, 80); None ends the segment. Return the settled scores."""
         return self._model.score([(self, frames)])[0]
 
-    def finish(self) -> Floats:
-        """End the segment; return its remaining scores."""
-        return self._model.score([(self, None)])[0]
-
     def reset(self) -> None:
-        """Forget the segment. Nothing is known of the speaker."""
-        self.provisional = self._nothing
+        """Forget the segment. The network has no memory of the speaker."""
+        self.provisional = self._no_scores
         self._settled: list[Floats] = []  # not yet returned
         self._num_frames = 0  # of the segment
         self._num_settled = 0
@@ -274,13 +271,13 @@ class BlockStream:
         self._start_table()
 
     def _start_table(self) -> None:
-        """Go to the first row of the table of positions, with nothing before it."""
+        """Start at the first row of the table of positions, with an empty past."""
         self._row = 0  # of the next block
         self._num_due = self._sizes.length % self._sizes.block or self._sizes.block
         self.past = Past(np.zeros(self._sizes.state, np.float32))
 
-    def take_frames(self, frames: Floats | None) -> None:
-        """Take frames, (n, 80), or the segment's end, at which its last frame is repeated."""
+    def append_frames(self, frames: Floats | None) -> None:
+        """Append frames, (n, 80); None, the end of the segment, repeats the last frame."""
         if frames is None:
             self._ended = True
             num_more = _SEEN_AFTER - (self._num_frames - 1) % FRAMES_PER_POSITION
@@ -300,17 +297,27 @@ class BlockStream:
 
     @property
     def _num_positions(self) -> int:
-        """Positions from the next block's first on whose frames are there."""
+        """Number of complete positions, from the next block's first on."""
         return max(0, (len(self._frames) - 1 - _SEEN_AFTER) // FRAMES_PER_POSITION)
 
     def block(self) -> Block:
-        """Return what the network must compute next."""
+        """Return the block that the network must compute next."""
         num_positions = min(self._num_positions, self._num_due)
         frames = self._frames[: FRAMES_PER_POSITION * num_positions + _PADDING + 1]
         return Block(frames, self._row, num_positions, self.past)
 
-    def take_outputs(self, scores: Floats, state: Floats, new: Halves) -> None:
-        """Take what the network computed: scores, (2 (B + R), states), state, keys and values."""
+    def append_outputs(self, scores: Floats, state: Floats, new: Halves) -> None:
+        """Append the network's outputs for ``block()``.
+
+        Parameters
+        ----------
+        scores
+            Shape (2 (B + R), states).
+        state
+            New state of the recurrent layer, (width,).
+        new
+            Keys and values, (2 layers, heads, B, size).
+        """
         sizes, block = self._sizes, self.block()
         ends_table = block.row + block.num_positions == MAX_POSITIONS
         if ends_table or (self._ended and block.num_positions == self._num_positions):
@@ -335,8 +342,8 @@ class BlockStream:
         self._num_due = min(self._num_due, MAX_POSITIONS - self._row)
 
     def take_settled(self) -> Floats:
-        """Return the new settled scores, (m, states); at the end those of all frames left."""
-        rows = np.concatenate([self._nothing, *self._settled])
+        """Return the new settled scores, (m, states); at the end those of all remaining frames."""
+        rows = np.concatenate([self._no_scores, *self._settled])
         self._settled = []
         self._num_settled += len(rows)
         if self._ended:
@@ -365,7 +372,7 @@ def _sizes_of(session: Any) -> BlockSizes:
             heads=heads,
             head_size=head_size,
         )
-        positive = min(astuple(sizes)) >= 1
+        are_positive = min(astuple(sizes)) >= 1
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise ValueError(f"its network has the inputs {shapes}") from error
     cache = [heads, sizes.past, head_size]
@@ -373,7 +380,7 @@ def _sizes_of(session: Any) -> BlockSizes:
     if list(shapes.values()) != expected + [cache] * 2 * num_layers or rings != 2 * num_layers:
         raise ValueError(f"its network has the inputs {shapes}")
     if (
-        not positive
+        not are_positive
         or max(length, width, sizes.state, num_layers) > _MAX_SIZE
         or width % 2
         or not block < length
@@ -385,7 +392,13 @@ def _sizes_of(session: Any) -> BlockSizes:
 
 
 def blocks_from(archive: Archive) -> BlockModel:
-    """Build the model after checking every size; ValueError says what does not fit."""
+    """Build the model after checking every size.
+
+    Raises
+    ------
+    ValueError
+        If an array or the network does not fit.
+    """
     topology = topology_from(archive)
     model = BlockModel(
         topology=topology,
@@ -395,7 +408,7 @@ def blocks_from(archive: Archive) -> BlockModel:
     )
     sizes = model.session.sizes
     frames = np.zeros((2 * sizes.length + 3, NUM_MELS), np.float32)
-    stream = model.stream()
+    stream = model.create_stream()
     block = Block(frames, 0, sizes.length, stream.past)
     outputs = model.session.run([block], stream.cache.rings[:, np.newaxis])
     new = (1, 2 * sizes.layers, sizes.heads, sizes.block, sizes.head_size)

@@ -6,7 +6,7 @@ the HTK book's eq. 7.2 (Young et al. 2009).
 ======== ========================================= =====================
 symbol   meaning                                   shape
 ======== ========================================= =====================
-x        normalised, rotated feature frame         (39,)
+x        normalized, rotated feature frame         (39,)
 A        rotation that decorrelates (STC)          (39, 39)
 w        mixture weights                           (states, mixtures)
 means    component means                           (states, mixtures, 39)
@@ -18,9 +18,9 @@ log b(x) = logsumexp_m [ log w_m - 1/2 sum_k (log 2 pi covars_mk + (x_k - means_
 computed as a product of [x^2, x, 1] with a precomputed matrix. All states share one rotation
 (Gales 1999, "Semi-tied covariance matrices").
 
-Vocal-tract-length normalisation raises the formants of low voices
-(:mod:`services.recognizer.front_end.vtln`). The front end measures the pitch of every frame; the
-stream gets only frames of speech, so only they count.
+Vocal-tract-length normalization raises the formants of low voices
+(:mod:`kouxing.services.recognizer.front_end.vtln`). The front end measures the pitch of every
+frame. The stream gets only speech frames, so only their pitch counts.
 """
 
 from __future__ import annotations
@@ -31,9 +31,14 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import Topology, Work, no_scores
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    Floats,
+    NetworkPosition,
+    Topology,
+    Work,
+    no_scores,
+)
 from kouxing.services.recognizer.acoustic.model_file import (
     Archive,
     topology_arrays,
@@ -61,11 +66,11 @@ _MIN_LOG_WEIGHT = -1e30  # of an absent component: finite, so that no NaN arises
 class GaussianMixtures:
     """The densities of all states."""
 
-    weights: NDArray[np.float32]  # (states, mixtures), rows sum to 1
-    means: NDArray[np.float32]  # (states, mixtures, 39)
-    covars: NDArray[np.float32]  # (states, mixtures, 39)
+    weights: Floats  # (states, mixtures), rows sum to 1
+    means: Floats  # (states, mixtures, 39)
+    covars: Floats  # (states, mixtures, 39)
 
-    def score_matrix(self) -> NDArray[np.float32]:
+    def score_matrix(self) -> Floats:
         """Return the matrix from [x^2, x, 1] to log densities, (79, states * mixtures)."""
         num_states, num_mixtures, num_features = self.means.shape
         covars = self.covars.astype(np.float64)
@@ -78,24 +83,10 @@ class GaussianMixtures:
         return np.ascontiguousarray(matrix.reshape(shape).T, dtype=np.float32)
 
 
-def mixture_scores(
-    frames: NDArray[np.float32], matrix: NDArray[np.float32], num_mixtures: int
-) -> NDArray[np.float32]:
-    """Compute the log densities of the states.
+def mixture_scores(frames: Floats, matrix: Floats, num_mixtures: int) -> Floats:
+    """Compute the log densities of the states, (n, 39) to (n, states).
 
-    Parameters
-    ----------
-    frames
-        Shape (n, 39).
-    matrix
-        From :meth:`GaussianMixtures.score_matrix`, shape (79, states * mixtures).
-    num_mixtures
-        Components of each state.
-
-    Returns
-    -------
-    NDArray
-        Shape (n, states).
+    ``matrix`` comes from :meth:`GaussianMixtures.score_matrix`.
     """
     ones = np.ones((len(frames), 1), dtype=np.float32)
     components = np.concatenate([frames * frames, frames, ones], axis=1) @ matrix
@@ -103,7 +94,7 @@ def mixture_scores(
     peak = components.max(axis=2)
     components -= peak[..., None]
     np.exp(components, out=components)
-    log_density: NDArray[np.float32] = peak + np.log(components.sum(axis=2))
+    log_density: Floats = peak + np.log(components.sum(axis=2))
     return log_density
 
 
@@ -113,10 +104,10 @@ class GmmModel:
 
     topology: Topology
     mixtures: GaussianMixtures
-    rotation: NDArray[np.float32]  # (39, 39)
-    prior_mean: NDArray[np.float32]  # (13,) cepstral mean of the training corpus
+    rotation: Floats  # (39, 39)
+    prior_mean: Floats  # (13,) cepstral mean of the training corpus
     half_width: int  # of the differences
-    acoustic_scale: float = 1.0  # weight of the log scores: neighbouring frames are correlated
+    acoustic_scale: float = 1.0  # weight of the log scores: neighboring frames are correlated
 
     @property
     def inventory(self) -> PhoneInventory:
@@ -124,23 +115,21 @@ class GmmModel:
         return self.topology.inventory
 
     @cached_property
-    def matrix(self) -> NDArray[np.float32]:
+    def matrix(self) -> Floats:
         """Matrix of the component densities, computed once for all streams."""
         return self.mixtures.score_matrix()
 
-    def front_end(self) -> PitchedLogMel:
-        """Start a front end for one session."""
+    def create_front_end(self) -> PitchedLogMel:
+        """Create the front end of one session."""
         return PitchedLogMel()
 
-    def stream(self) -> GmmStream:
-        """Start a stream of scores for one speaker."""
+    def create_stream(self, *, keep_positions: bool = False) -> GmmStream:
+        """Create the stream of one speaker; it has no positions."""
         return GmmStream(self)
 
-    def score(self, work: Sequence[Work]) -> list[NDArray[np.float32]]:
-        """Score the frames of several streams, each alone; None ends a stream's segment."""
-        return [
-            stream.finish() if frames is None else stream.accept(frames) for stream, frames in work
-        ]
+    def score(self, work: Sequence[Work]) -> list[Floats]:
+        """Score the frames of several streams, one stream at a time."""
+        return [stream.score(frames) for stream, frames in work]
 
     def save(self, path: Path) -> None:
         """Write the model as an npz file (arrays only, no pickle)."""
@@ -168,17 +157,26 @@ class GmmStream:
         self._differences = Differences(model.half_width)
         self.look_ahead_frames = self._differences.look_ahead_frames
         self.provisional = no_scores(model.topology.num_states)
+        self.positions: list[NetworkPosition] = []
 
-    def accept(self, frames: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take log-mel frames with their pitch, shape (n, 43); return the scores ready."""
-        log_mel = self._vtln.accept(frames[:, :-2], frames[:, -2], frames[:, -1])
-        return self._score(self._differences.accept(cepstra(log_mel)))
+    def score(self, frames: Floats | None) -> Floats:
+        """Score log-mel frames with their pitch, (n, 43); None ends the segment.
 
-    def finish(self) -> NDArray[np.float32]:
-        """End the segment; return its remaining scores. The speaker is remembered."""
-        scores = self._score(self._differences.finish())
-        self._differences = Differences(self._model.half_width)
-        return scores
+        The speaker's mean and pitch stay known in the next segment.
+        """
+        if frames is None:
+            features = self._differences.finish()
+            self._differences = Differences(self._model.half_width)
+        else:
+            log_mel = self._vtln.warp(frames[:, :-2], frames[:, -2], frames[:, -1])
+            features = self._differences.append(cepstra(log_mel))
+        normalized = self._mean.normalize(features)
+        scores = np.empty((len(features), self._model.topology.num_states), dtype=np.float32)
+        num_mixtures = self._model.mixtures.weights.shape[1]
+        for row in range(len(features)):  # row by row: a product's rounding depends on its height
+            frame = normalized[row : row + 1] @ self._model.rotation
+            scores[row] = mixture_scores(frame, self._model.matrix, num_mixtures)[0]
+        return scores * np.float32(self._model.acoustic_scale)
 
     def reset(self) -> None:
         """Forget the segment and the speaker."""
@@ -186,25 +184,22 @@ class GmmStream:
         self._vtln.reset()
         self._mean.reset()
 
-    def _score(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        normalised = self._mean.normalise(features)
-        scores = np.empty((len(features), self._model.topology.num_states), dtype=np.float32)
-        num_mixtures = self._model.mixtures.weights.shape[1]
-        for row in range(len(features)):  # row by row: a product's rounding depends on its height
-            frame = normalised[row : row + 1] @ self._model.rotation
-            scores[row] = mixture_scores(frame, self._model.matrix, num_mixtures)[0]
-        return scores * np.float32(self._model.acoustic_scale)
-
 
 def gmm_from(archive: Archive) -> GmmModel:
-    """Build the model after checking every size; ValueError says what does not fit."""
+    """Build the model after checking every size.
+
+    Raises
+    ------
+    ValueError
+        If an array does not fit.
+    """
     topology = topology_from(archive)
     num_mixtures = archive.array("weights", None).shape[-1]
     if not 1 <= num_mixtures <= _MAX_MIXTURES:
-        raise ValueError(f"{num_mixtures} mixture components")
+        raise ValueError(f"it has {num_mixtures} mixture components")
     half_width = int(archive.array("half_width", ()))
     if not 1 <= half_width <= _MAX_HALF_WIDTH:
-        raise ValueError(f"half width of the differences {half_width}")
+        raise ValueError(f"the half width of its differences is {half_width}")
     shape = (topology.num_states, num_mixtures)
     mixtures = GaussianMixtures(
         weights=archive.floats("weights", *shape),

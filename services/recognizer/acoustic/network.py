@@ -14,22 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats
 from kouxing.services.recognizer.acoustic.caches import CacheSizes, cache_names
 from kouxing.services.recognizer.front_end.whisper_mel import NUM_MELS
 from kouxing.services.recognizer.onnx_session import open_network
 
 NUM_INPUTS = NUM_MELS
-WINDOW = 128  # positions that one attends to, itself included
+WINDOW = 128  # positions that one attends to, including itself
 MAX_POSITIONS = 1500  # rows of the table of positions
-SEEN_FRAMES = 5  # feature frames that enter at one position
+SEEN_FRAMES = 5  # feature frames that a position takes as input
 FRAMES_PER_POSITION = 2  # feature frames from one position to the next
 
 _OUTPUTS = ["log_posteriors", "keys", "values"]
 _MIN_WIDTH, _MAX_WIDTH = 4, 4096
 _MAX_LAYERS = 64
 _LONGEST_WAVE = 10_000.0  # of the sinusoids, over 2 pi
-
-Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +56,7 @@ def position_table(width: int) -> Floats:
 def past_masks() -> Floats:
     """Return attention masks by the number of positions in a cache, shape (128, 1, 1, 128).
 
-    A mask is added to the products with the cached keys. The last slot is the position's own.
+    A mask is added to the products with the cached keys. The last slot is for the position itself.
     """
     slot = np.arange(WINDOW)
     is_empty = (slot >= np.arange(WINDOW)[:, None]) & (slot < WINDOW - 1)
@@ -70,10 +69,10 @@ def input_names(num_layers: int) -> list[str]:
 
 
 def open_session(file: NDArray[np.uint8]) -> Any:
-    """Open a model's ONNX file, given as its bytes; ValueError if it is none."""
+    """Open a model's ONNX file, given as bytes; ValueError if it is not an ONNX file."""
     try:
         return open_network(file.tobytes())
-    except Exception as error:  # onnxruntime's errors have no base of their own
+    except Exception as error:  # onnxruntime's errors have no common base
         raise ValueError(f"its network cannot be read ({error})") from error
 
 
@@ -88,7 +87,7 @@ class NetworkSession:
     Raises
     ------
     ValueError
-        If it is no network of this kind.
+        If it is not a network of this kind.
     """
 
     def __init__(self, file: NDArray[np.uint8]) -> None:
@@ -126,5 +125,5 @@ def _sizes_of(shapes: Mapping[str, Sequence[object]]) -> NetworkSizes:
     expected_shapes += [(heads, WINDOW, size)] * 2 * num_layers
     for (name, shape), expected in zip(shapes.items(), expected_shapes, strict=True):
         if tuple(shape[1:]) != expected:
-            raise ValueError(f"its network has {name} of {shape}, expected {expected} of each")
+            raise ValueError(f"its network has {name} of {shape}, expected {expected}")
     return NetworkSizes(width, num_layers, heads, size)

@@ -12,7 +12,7 @@ symbol           meaning                                                shape
 ================ ====================================================== ========================
 x                log-mel bands of the five frames at a position         (rows, 400)
 K, V             keys and values of the 127 positions before it, for    (sessions, heads, 128,
-                 each layer; the last slot is the position's own        size)
+                 each layer; the last slot is for the position itself   size)
 y                log posteriors of the states at two frames             (rows, 2, states)
 d                look-ahead, feature frames, 1 or more                  1
 prior            prior of the states, to a power below one              (states,)
@@ -21,10 +21,10 @@ acoustic_scale   weight of the log scores, chosen on development data   1
 
     log b(x) = acoustic_scale * (y - log prior)
 
-There is a position for every other frame. Position ``p`` of a segment has seen the frames up to
-``2 p + 2`` (zeros stand before the first) and scores the frames ``2 p + 2 - d`` and
-``2 p + 3 - d``. With ``d = 1`` no position scores frame 0, which gets the scores of frame 1. At the
-end of a segment, its last frame is repeated until all frames are scored.
+There is a position for every other frame. Position ``p`` of a segment has received the frames up to
+``2 p + 2`` (zeros precede the first frame). It scores the frames ``2 p + 2 - d`` and
+``2 p + 3 - d``. With ``d = 1`` no position scores frame 0, so it gets the scores of frame 1. At the
+end of a segment, the last frame is repeated until all frames are scored.
 
 A position attends to itself and to the ``WINDOW - 1`` positions before it, 2.5 seconds. The table
 of positions ends after 30 seconds. Longer speech without a pause starts again at the first row,
@@ -32,10 +32,9 @@ with an empty past.
 
 One network serves several look-aheads, each with its own output layer. Many sessions share one
 call. A matrix product with a single row may be summed in another order, so every product has at
-least two rows: a session's scores are the same to the last bit in any batch and any chunking. The
-caches of keys and values are rings, because attention does not depend on their order.
-
-A session's keys and values take 1 MB while it speaks, in 16 bits.
+least two rows. A session's scores are therefore the same to the last bit in any batch and any
+chunking. The caches of keys and values are rings, because attention does not depend on their order.
+They take 1 MB per speaking session, in 16 bits.
 """
 
 from __future__ import annotations
@@ -51,7 +50,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.acoustic_model import (
-    OnPosition,
+    Floats,
+    NetworkPosition,
     Topology,
     Work,
     no_scores,
@@ -68,7 +68,6 @@ from kouxing.services.recognizer.acoustic.network import (
     NUM_INPUTS,
     SEEN_FRAMES,
     WINDOW,
-    Floats,
     NetworkSession,
     past_masks,
     position_table,
@@ -83,7 +82,7 @@ FORMAT = "neural 6"
 _PAST = WINDOW - 1
 _PADDING = 2  # frames of zeros before a segment's first
 _MIN_ROWS = 2  # in a run
-_MAX_BATCH = 16  # sessions in a run; with more each takes no less time
+_MAX_BATCH = 16  # sessions in a run; more do not lower the time per session
 _MAX_LOOK_AHEAD = 100  # feature frames
 _PAST_MASKS = past_masks()
 
@@ -124,13 +123,13 @@ class NeuralModel:
         """Table of positions, shape (1500, width)."""
         return position_table(self.session.sizes.width)
 
-    def front_end(self) -> WhisperMel:
-        """Start a front end for one session."""
+    def create_front_end(self) -> WhisperMel:
+        """Create the front end of one session."""
         return WhisperMel()
 
-    def stream(self) -> NeuralStream:
-        """Start a stream of scores for one speaker."""
-        return NeuralStream(self)
+    def create_stream(self, *, keep_positions: bool = False) -> NeuralStream:
+        """Create the stream of one speaker."""
+        return NeuralStream(self, keep_positions=keep_positions)
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
         """Score frames of several streams in batches; None ends a stream's segment.
@@ -139,13 +138,13 @@ class NeuralModel:
         """
         streams = [cast(NeuralStream, stream) for stream, _ in work]
         for stream, (_, frames) in zip(streams, work, strict=True):
-            stream.take_frames(frames)
+            stream.append_frames(frames)
         while ready := [stream for stream in streams if stream.num_pending]:
             for numbers, rings in self.caches.runs([stream.cache for stream in ready]):
                 self._advance([ready[number] for number in numbers], rings)
         scores = []
         for stream, (_, frames) in zip(streams, work, strict=True):
-            rows = stream.new_log_posteriors(is_end=frames is None)
+            rows = stream.take_log_posteriors(is_end=frames is None)
             scores.append(np.float32(self.acoustic_scale) * (rows - self.log_prior))
             if frames is None:
                 stream.reset()
@@ -156,7 +155,7 @@ class NeuralModel:
         new = np.concatenate([keys, values], axis=1)
         for row, stream in enumerate(streams):
             rings[:, row, :, stream.slot] = new[row]
-            stream.take_outputs(log_posteriors[row], values[row])
+            stream.append_outputs(log_posteriors[row], values[row])
 
     def run(
         self, streams: Sequence[NeuralStream], rings: Halves, output_layer: int
@@ -166,11 +165,11 @@ class NeuralModel:
         Parameters
         ----------
         streams
-            Of some sessions.
+            The sessions' streams.
         rings
             Their caches, (2 layers, sessions, heads, 128, size).
         output_layer
-            Which one.
+            Index into ``look_aheads``.
 
         Returns
         -------
@@ -198,8 +197,10 @@ class NeuralModel:
         """
         offered = [float(frames * HOP_S * 1000) for frames in self.look_aheads]
         if look_ahead_ms not in offered:
-            known = ", ".join(f"{one:g}" for one in offered)
-            raise UserError(f"recognizer.look_ahead_ms is {look_ahead_ms:g}; give one of {known}")
+            choices = ", ".join(f"{choice:g}" for choice in offered)
+            raise UserError(
+                f"the neural model has no look-ahead of {look_ahead_ms:g} ms; choose {choices}"
+            )
         model = replace(self, output_layer=offered.index(look_ahead_ms))
         vars(model)["session"] = self.session  # opened once for all look-aheads
         return model
@@ -219,41 +220,32 @@ class NeuralModel:
 
 
 class NeuralStream:
-    """Scores of one speaker's speech, segment by segment.
+    """Scores and positions of one speaker's speech, segment by segment."""
 
-    Attributes
-    ----------
-    on_position
-        Is called for every position, in order; None: nobody asks.
-    """
-
-    def __init__(self, model: NeuralModel) -> None:
-        self.on_position: OnPosition | None = None
+    def __init__(self, model: NeuralModel, *, keep_positions: bool) -> None:
+        self.positions: list[NetworkPosition] = []
+        self._keep_positions = keep_positions
         self._model = model
         self.look_ahead_frames = model.look_ahead_frames
         self.provisional = no_scores(len(model.log_prior))
         self.cache = model.caches.open()  # what lies beyond a segment's positions is masked
         self.reset()
 
-    def accept(self, frames: Floats) -> Floats:
-        """Take frames, shape (n, 80); return the scores ready, (m, states)."""
+    def score(self, frames: Floats | None) -> Floats:
+        """Score frames, shape (n, 80); None ends the segment. Return the new scores."""
         return self._model.score([(self, frames)])[0]
 
-    def finish(self) -> Floats:
-        """End the segment; return its remaining scores."""
-        return self._model.score([(self, None)])[0]
-
     def reset(self) -> None:
-        """Forget the segment. Nothing is known of the speaker."""
+        """Forget the segment. The network has no memory of the speaker."""
         self._frames = np.zeros((_PADDING, NUM_INPUTS), np.float32)  # from the next position on
-        self._num_frames = 0  # accepted
+        self._num_frames = 0
         self._num_scored = 0
-        self._num_positions = 0  # done
-        self._rows: list[Floats] = []  # log posteriors not yet returned, one array a frame
+        self._num_positions = 0  # computed
+        self._rows: list[Floats] = []  # log posteriors not yet returned, one array per frame
 
     @property
     def num_pending(self) -> int:
-        """Number of positions whose frames are there."""
+        """Number of positions that have all their frames."""
         return max(0, (len(self._frames) - SEEN_FRAMES) // 2 + 1)
 
     @property
@@ -266,8 +258,8 @@ class NeuralStream:
         """Place of the next position in the cache."""
         return self.position % _PAST
 
-    def take_frames(self, frames: Floats | None) -> None:
-        """Take frames; None, at the end of the segment, repeats the last one as often as needed."""
+    def append_frames(self, frames: Floats | None) -> None:
+        """Append frames; None, the end of the segment, repeats the last frame as needed."""
         if frames is None:
             num_more = self._num_missing() if self._num_frames else 0
             frames = np.repeat(self._frames[-1:], num_more, axis=0)
@@ -276,7 +268,7 @@ class NeuralStream:
         self._frames = np.concatenate([self._frames, frames])
 
     def _num_missing(self) -> int:
-        """Frames that must still come so that all accepted frames are scored."""
+        """Count the frames that are still needed to score all frames so far."""
         last = max(0, math.ceil((self._num_frames + self.look_ahead_frames) / 2) - 2)  # position
         num_seen = 2 * self._num_positions - _PADDING + len(self._frames)
         return max(0, 2 * last + _PADDING + 1 - num_seen)
@@ -285,22 +277,28 @@ class NeuralStream:
         """Return the frames at the next position, shape (400,)."""
         return self._frames[:SEEN_FRAMES].reshape(-1)
 
-    def take_outputs(self, log_posteriors: Floats, values: Floats) -> None:
-        """Take the network's outputs at a position: log posteriors (2, states), and values.
+    def append_outputs(self, log_posteriors: Floats, values: Floats) -> None:
+        """Append the network's outputs at a position.
 
-        The values, (layers, heads, size), are in the cache already.
+        Parameters
+        ----------
+        log_posteriors
+            Shape (2, states).
+        values
+            Shape (layers, heads, size); the cache has them already.
         """
         first = 2 * self._num_positions + _PADDING - self.look_ahead_frames
         if first == 1 and self._num_positions == 0:
             self._rows.append(log_posteriors[0])  # frame 0, which no position scores
         self._rows += [row for number, row in enumerate(log_posteriors) if first + number >= 0]
-        if self.on_position:
-            self.on_position(self._frames[SEEN_FRAMES - 2 : SEEN_FRAMES], values)
+        if self._keep_positions:
+            newest = self._frames[SEEN_FRAMES - 2 : SEEN_FRAMES]
+            self.positions.append(NetworkPosition(newest, values))
         self._num_positions += 1
         self._frames = self._frames[2:]
 
-    def new_log_posteriors(self, *, is_end: bool) -> Floats:
-        """Return the new log posteriors, (m, states); at the end those of all frames left."""
+    def take_log_posteriors(self, *, is_end: bool) -> Floats:
+        """Return the new log posteriors, (m, states); at the end those of all remaining frames."""
         rows = self._rows[: self._num_frames - self._num_scored] if is_end else self._rows
         self._num_scored += len(rows)
         self._rows = []
@@ -308,16 +306,22 @@ class NeuralStream:
 
 
 def neural_from(archive: Archive) -> NeuralModel:
-    """Build the model after checking every size; ValueError says what does not fit."""
+    """Build the model after checking every size.
+
+    Raises
+    ------
+    ValueError
+        If an array or the network does not fit.
+    """
     topology = topology_from(archive)
     look_aheads = archive.array("look_aheads", None).astype(np.int64)
     if look_aheads.ndim != 1 or not len(look_aheads):
-        raise ValueError("it names no look-aheads")
+        raise ValueError("it has no look-aheads")
     if look_aheads.min() < 1 or look_aheads.max() > _MAX_LOOK_AHEAD:
-        raise ValueError(f"look-aheads {look_aheads.tolist()}")
+        raise ValueError(f"its look-aheads are {look_aheads.tolist()}")
     output_layer = int(archive.array("output_layer", ()))
     if not 0 <= output_layer < len(look_aheads):
-        raise ValueError(f"output layer {output_layer} of {len(look_aheads)}")
+        raise ValueError(f"it has no output layer {output_layer}, only {len(look_aheads)}")
     model = NeuralModel(
         topology=topology,
         network=archive.array("network", None).astype(np.uint8),
@@ -333,10 +337,10 @@ def neural_from(archive: Archive) -> NeuralModel:
 def _check_network(model: NeuralModel) -> None:
     """Run the network once with every output layer, and check what comes out."""
     sizes = model.session.sizes
-    stream = model.stream()
-    stream.take_frames(np.zeros((SEEN_FRAMES - _PADDING, NUM_INPUTS), np.float32))
-    own = (_MIN_ROWS, sizes.num_layers, sizes.num_heads, sizes.head_size)
-    expected = [(_MIN_ROWS, 2, model.topology.num_states), own, own]
+    stream = model.create_stream()
+    stream.append_frames(np.zeros((SEEN_FRAMES - _PADDING, NUM_INPUTS), np.float32))
+    cached = (_MIN_ROWS, sizes.num_layers, sizes.num_heads, sizes.head_size)
+    expected = [(_MIN_ROWS, 2, model.topology.num_states), cached, cached]
     for output_layer in range(len(model.look_aheads)):
         outputs = model.run([stream], stream.cache.rings[:, None], output_layer)
         if [array.shape for array in outputs] != expected:

@@ -1,9 +1,9 @@
-"""Two networks on the same frames: a causal one is early, another is late and knows better.
+"""Two networks on the same frames: a causal one answers early, a block network answers better.
 
-The late one's scores are settled, or provisional where it has less sound after a frame than it
-will have. For the newest frames, which it has not heard yet, the causal network's scores stand in.
-So a phone is told as soon as the causal network knows it, and corrected by the other. Lips from
-sound follow the causal network's positions.
+The block network's scores are settled, or provisional where it has less audio after a frame than it
+will have. The newest frames have not reached it yet: their provisional scores are the causal
+network's. So a phone is emitted as soon as the causal network detects it, and the block network
+corrects it. The lip predictor uses the causal network's positions.
 """
 
 from __future__ import annotations
@@ -14,15 +14,8 @@ from typing import cast
 
 import numpy as np
 
-from kouxing.services.recognizer.acoustic.acoustic_model import (
-    AcousticStream,
-    OnPosition,
-    Topology,
-    Work,
-    no_scores,
-)
+from kouxing.services.recognizer.acoustic.acoustic_model import Floats, Topology, Work, no_scores
 from kouxing.services.recognizer.acoustic.blocks import BlockModel
-from kouxing.services.recognizer.acoustic.network import Floats
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.front_end.whisper_mel import WhisperMel
 from kouxing.shared.phones.inventory import PhoneInventory
@@ -45,64 +38,51 @@ class TwoNetworks:
         """The language's phones."""
         return self.late.inventory
 
-    def front_end(self) -> WhisperMel:
-        """Start a front end for one session."""
-        return self.late.front_end()
+    def create_front_end(self) -> WhisperMel:
+        """Create the front end of one session."""
+        return self.late.create_front_end()
 
-    def stream(self) -> TwoNetworksStream:
-        """Start a stream of scores and positions for one speaker."""
-        return TwoNetworksStream(self)
+    def create_stream(self, *, keep_positions: bool = False) -> TwoNetworksStream:
+        """Create the stream of one speaker, with the causal network's positions if kept."""
+        return TwoNetworksStream(self, keep_positions=keep_positions)
 
     def score(self, work: Sequence[Work]) -> list[Floats]:
         """Score frames of several streams; None ends a stream's segment."""
         streams = [(cast(TwoNetworksStream, stream), frames) for stream, frames in work]
-        newest = self.early.score([(stream.early, frames) for stream, frames in streams])
+        early = self.early.score([(stream.early, frames) for stream, frames in streams])
         settled = self.late.score([(stream.late, frames) for stream, frames in streams])
-        for (stream, frames), *scores in zip(streams, newest, settled, strict=True):
-            stream.take_scores(*scores, is_end=frames is None)
+        for (stream, frames), *scores in zip(streams, early, settled, strict=True):
+            stream.update_provisional(*scores, is_end=frames is None)
         return settled
 
 
 class TwoNetworksStream:
     """Scores and positions of one speaker's speech, segment by segment."""
 
-    def __init__(self, model: TwoNetworks) -> None:
+    def __init__(self, model: TwoNetworks, *, keep_positions: bool) -> None:
         self._model = model
-        self.early = model.early.stream()
-        self.late: AcousticStream = model.late.stream()
+        self.early = model.early.create_stream(keep_positions=keep_positions)
+        self.late = model.late.create_stream()
+        self.positions = self.early.positions
         self.look_ahead_frames = self.late.look_ahead_frames
         self._no_scores = no_scores(model.topology.num_states)
         self.reset()
 
-    @property
-    def on_position(self) -> OnPosition | None:
-        """Is called for every position of the causal network, in order; None: nobody asks."""
-        return self.early.on_position
-
-    @on_position.setter
-    def on_position(self, called: OnPosition | None) -> None:
-        self.early.on_position = called
-
-    def accept(self, frames: Floats) -> Floats:
-        """Take frames, shape (n, 80); return the scores settled, (m, states)."""
+    def score(self, frames: Floats | None) -> Floats:
+        """Score frames, shape (n, 80); None ends the segment. Return the settled scores."""
         return self._model.score([(self, frames)])[0]
-
-    def finish(self) -> Floats:
-        """End the segment; return its remaining scores."""
-        return self._model.score([(self, None)])[0]
 
     def reset(self) -> None:
         """Forget the segment."""
         self.early.reset()
         self.late.reset()
-        self._stand_in = self.provisional = self._no_scores
+        self._early_scores = self.provisional = self._no_scores
 
-    def take_scores(self, newest: Floats, settled: Floats, *, is_end: bool) -> None:
-        """Take the scores of both networks, (m, states) each; the late one settles frames."""
+    def update_provisional(self, early: Floats, settled: Floats, *, is_end: bool) -> None:
+        """Combine the new scores of both networks, (m, states) each."""
         if is_end:
             self.reset()
-            return
-        if len(newest) or len(settled):
-            self._stand_in = np.concatenate([self._stand_in, newest])[len(settled) :]
-            known = self.late.provisional
-            self.provisional = np.concatenate([known, self._stand_in[len(known) :]])
+        elif len(early) or len(settled):
+            self._early_scores = np.concatenate([self._early_scores, early])[len(settled) :]
+            late = self.late.provisional
+            self.provisional = np.concatenate([late, self._early_scores[len(late) :]])

@@ -14,14 +14,16 @@ d, dd    first and second difference of c                (frames, 13)
 mu       live mean of c                                  (13,)
 ======== =============================================== ===========
 
-Deviations from the paper: log-mel bands have a floor, so that digital silence is finite without
-dither. A live cepstral mean is subtracted, because microphones differ (the paper's corpus came from
-one laboratory). The differences are computed first, so that the moving mean does not leak into
-them.
+Deviations from the paper:
+
+- Log-mel bands have a floor, so that digital silence is finite without dither.
+- A live cepstral mean is subtracted, because microphones differ. The paper's corpus was recorded in
+  one laboratory.
+- The differences are computed first, so that the moving mean does not affect them.
 
 Algorithmic delay: feature frame ``t`` needs samples up to ``t * 10 + 25`` ms and the
-``2 * half_width`` frames after it: 25 + 20 ms with ``half_width`` 1, 25 + 40 ms with the textbook's
-2.
+``2 * half_width`` frames after it. That is 25 + 20 ms with ``half_width`` 1, and 25 + 40 ms with
+the textbook's 2.
 """
 
 from __future__ import annotations
@@ -43,11 +45,11 @@ NUM_FEATURES = 3 * NUM_STATIC
 LOWEST_HZ, HIGHEST_HZ = 40.0, 7600.0  # edges of the filter bank
 MELS, MEL_KNEE_HZ = 1127.0, 700.0  # mel = 1127 ln(1 + f / 700)
 
-_FULL_SCALE = 32768.0  # the filter bank's energies are those of 16-bit samples
+_FULL_SCALE = 32768.0  # the filter bank expects the scale of 16-bit samples
 LOG_FLOOR = 6.0  # a few decibels above the noise of the least significant bit
 _MEAN_MEMORY_FRAMES = 1500.0  # the live mean forgets older speech
 _PRIOR_FRAMES = 100.0  # weight of the prior mean
-_ENERGY_PRIOR_FRAMES = 30.0  # fewer: a level is known sooner than a timbre
+_ENERGY_PRIOR_FRAMES = 30.0  # fewer: the level converges faster than the timbre
 _PEAK_DECAY = 0.005  # per frame, natural log of power: 2 dB a second
 _SPEECH_BELOW_PEAK = 6.9  # natural log of power (30 dB): the mean ignores quieter frames
 
@@ -63,7 +65,7 @@ def hz_of(mel: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 LOWEST_MEL, HIGHEST_MEL = mel_of(np.array([LOWEST_HZ, HIGHEST_HZ]))
-BAND_MEL = np.linspace(LOWEST_MEL, HIGHEST_MEL, NUM_BANDS + 2)[1:-1]  # centres of the bands
+BAND_MEL = np.linspace(LOWEST_MEL, HIGHEST_MEL, NUM_BANDS + 2)[1:-1]  # centers of the bands
 BAND_HZ = hz_of(BAND_MEL)
 
 
@@ -108,17 +110,9 @@ class LogMel:
         self._num_read = 0
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take samples in.
+        """Take samples, shape (n,), 16 kHz, in [-1, 1].
 
-        Parameters
-        ----------
-        samples
-            Shape (n,), 16 kHz, in [-1, 1].
-
-        Returns
-        -------
-        NDArray
-            The new feature frames, shape (frames, 41): log energy, 40 log-mel bands.
+        Returns the new feature frames, shape (frames, 41): log energy, 40 log-mel bands.
         """
         self._bank.accept_waveform(SAMPLE_RATE_HZ, (samples * _FULL_SCALE).tolist())
         num_ready = self._bank.num_frames_ready
@@ -131,20 +125,9 @@ class LogMel:
 
 
 def cepstra(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Compute log energy and cepstra 1 to 12.
-
-    Parameters
-    ----------
-    log_mel
-        Shape (frames, 41).
-
-    Returns
-    -------
-    NDArray
-        Shape (frames, 13).
-    """
+    """Compute log energy and cepstra 1 to 12, (frames, 41) to (frames, 13)."""
     static = np.empty((len(log_mel), NUM_STATIC), dtype=np.float32)
-    for row in range(len(log_mel)):  # one by one: rounding depends on the number of rows
+    for row in range(len(log_mel)):  # row by row: rounding depends on the number of rows
         static[row] = log_mel[row] @ _CEPSTRAL
     return static
 
@@ -155,7 +138,7 @@ class Differences:
     Parameters
     ----------
     half_width
-        Frames on each side in the regression: 2 is the textbook's, 1 halves the look-ahead.
+        Frames on each side in the regression: 2 in the textbook; 1 halves the look-ahead.
     """
 
     def __init__(self, half_width: int) -> None:
@@ -163,8 +146,8 @@ class Differences:
         self._half_width = half_width
         self._context: NDArray[np.float32] | None = None
 
-    def accept(self, static: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take static features, shape (n, 13); return the complete rows, (m, 39)."""
+    def append(self, static: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Append static features, shape (n, 13); return the complete rows, (m, 39)."""
         if len(static) == 0:
             return np.empty((0, NUM_FEATURES), dtype=np.float32)
         if self._context is None:  # the first frame is repeated before itself (HTK book, 5.9)
@@ -177,20 +160,14 @@ class Differences:
         """Return the remaining rows at the end, shape (look-ahead, 39)."""
         if self._context is None:
             return np.empty((0, NUM_FEATURES), dtype=np.float32)
-        return self.accept(np.repeat(self._context[-1:], self.look_ahead_frames, axis=0))
+        return self.append(np.repeat(self._context[-1:], self.look_ahead_frames, axis=0))
 
 
 def with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[np.float32]:
     """Append the differences of a whole recording: (frames, 13) to (frames, 39)."""
     look_ahead = 2 * half_width
-    padded = np.concatenate(
-        [
-            np.repeat(static[:1], look_ahead, axis=0),
-            static,
-            np.repeat(static[-1:], look_ahead, axis=0),
-        ]
-    )
-    return _with_differences(padded, half_width)
+    before, after = (np.repeat(edge, look_ahead, axis=0) for edge in (static[:1], static[-1:]))
+    return _with_differences(np.concatenate([before, static, after]), half_width)
 
 
 def cepstra_of_all(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -209,9 +186,9 @@ def _with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[n
     first = np.zeros((num_first, num_static), dtype=np.float32)
     for row in range(num_first):
         for step in range(1, half_width + 1):
-            centre = row + half_width
+            center = row + half_width
             for k in range(num_static):
-                difference = static[centre + step, k] - static[centre - step, k]
+                difference = static[center + step, k] - static[center - step, k]
                 first[row, k] += np.float32(step) / norm * difference
     out = np.zeros((num_rows, 3 * num_static), dtype=np.float32)
     for row in range(num_rows):
@@ -219,9 +196,9 @@ def _with_differences(static: NDArray[np.float32], half_width: int) -> NDArray[n
             out[row, k] = static[row + 2 * half_width, k]
             out[row, num_static + k] = first[row + half_width, k]
         for step in range(1, half_width + 1):
-            centre = row + half_width
+            center = row + half_width
             for k in range(num_static):
-                difference = first[centre + step, k] - first[centre - step, k]
+                difference = first[center + step, k] - first[center - step, k]
                 out[row, 2 * num_static + k] += np.float32(step) / norm * difference
     return out
 
@@ -241,10 +218,10 @@ class LiveMean:
         self._prior_frames[0] = _ENERGY_PRIOR_FRAMES
         self.reset()
 
-    def normalise(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return features, shape (n, k or more), without the running mean of the first k."""
+    def normalize(self, features: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Subtract the running mean from the first k features of each row, (n, k or more)."""
         out = features.copy()
-        _normalise(out, self._prior, self._prior_frames, self._state)
+        _normalize(out, self._prior, self._prior_frames, self._state)
         return out
 
     def reset(self) -> None:
@@ -254,7 +231,7 @@ class LiveMean:
 
 
 @numba.njit(cache=True)
-def _normalise(
+def _normalize(
     features: NDArray[np.float32],
     prior: NDArray[np.float64],
     prior_frames: NDArray[np.float64],

@@ -1,4 +1,4 @@
-"""Audio bytes to samples and back, in 20 ms slices."""
+"""Conversion of audio bytes to samples and back, and the level and pitch of 20 ms slices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.recognizer.front_end.pitch import Pitch
+from kouxing.services.recognizer.front_end.pitch import PitchTracker
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.phones.events import Progress
 
@@ -18,7 +18,7 @@ SLICE = 320  # samples at 16 kHz: 20 ms, one FAP frame
 
 
 class BadAudio(ValueError):
-    """Bytes that are not audio of the session's encoding."""
+    """Bytes that are not audio in the session's encoding."""
 
 
 def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float32]:
@@ -33,28 +33,27 @@ def samples_of(pcm: bytes, encoding: str, num_channels: int) -> NDArray[np.float
     if len(pcm) % frame_bytes:
         raise BadAudio(
             f"{len(pcm)} bytes are not a whole number of {encoding} frames of {num_channels} "
-            f"channels ({frame_bytes} bytes each); was another encoding or channel count opened?"
+            f"channels ({frame_bytes} bytes each); send the encoding and channels that the session "
+            "was opened with"
         )
     if encoding == "s16le":
         scaled = np.frombuffer(pcm, "<i2").astype(np.float32) / np.float32(FULL_SCALE)
         return scaled.reshape(-1, num_channels)
     samples = np.frombuffer(pcm, "<f4").astype(np.float32)
     if not np.isfinite(samples).all():
-        raise BadAudio("the chunk holds NaN or infinite samples; it was dropped")
+        raise BadAudio("the chunk was dropped: it contains NaN or infinite samples")
     return np.clip(samples, -1.0, 1.0).reshape(-1, num_channels)
 
 
 def slices(samples: NDArray[np.float32], num_before: int) -> Iterator[NDArray[np.float32]]:
-    """Cut samples where the stream's sample index is a multiple of 20 ms.
-
-    So the results at each multiple do not depend on the client's chunks.
+    """Cut samples at multiples of 20 ms of the stream, so that chunking does not affect results.
 
     Parameters
     ----------
     samples
         Shape (n,), 16 kHz.
     num_before
-        Samples of the stream before these.
+        Number of samples of the stream before these.
     """
     begin = 0
     while begin < len(samples):
@@ -79,7 +78,7 @@ def level_db(samples: NDArray[np.float32]) -> float:
 
 
 def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
-    """Return how often the samples change their sign, for each of them: 0 to 1.
+    """Return the number of sign changes per sample, 0 to 1.
 
     Source: Zhang et al. 2021, eq. 2, divided by the number of samples; 0 counts as positive.
     """
@@ -88,19 +87,19 @@ def zero_crossing_rate(samples: NDArray[np.float32]) -> float:
     return float(np.count_nonzero(np.diff(np.signbit(samples)))) / len(samples)
 
 
-def progress_at(media_time: int, newest: NDArray[np.float32], pitch: Pitch) -> Progress:
-    """Tell of the sound up to ``media_time`` by its newest slice, shape (320,)."""
+def progress_at(media_time: int, newest: NDArray[np.float32], pitch: PitchTracker) -> Progress:
+    """Measure the newest slice, shape (320,), which ends at ``media_time``."""
     return Progress(
         time_s=to_seconds(media_time),
         level_db=level_db(newest),
         zero_crossing_rate=zero_crossing_rate(newest),
-        pitch_hz=pitch.accept_slice(newest),
+        pitch_hz=pitch.track(newest),
     )
 
 
 def progress_of(samples: NDArray[np.float32]) -> list[Progress]:
-    """Return what a live recognizer tells of a whole sound, 16 kHz mono, every 20 ms."""
-    pitch = Pitch()
+    """Measure every 20 ms of a recording, 16 kHz mono, as the live recognizer does."""
+    pitch = PitchTracker()
     return [
         progress_at(end, samples[end - SLICE : end], pitch)
         for end in range(SLICE, len(samples) + 1, SLICE)

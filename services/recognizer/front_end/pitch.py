@@ -1,7 +1,7 @@
-"""Pitch of speech, slice by slice as it comes.
+"""Pitch of speech, slice by slice.
 
 Source: P. Ghahremani et al., "A pitch extraction algorithm tuned for automatic speech recognition",
-ICASSP 2014, as in kaldi-native-fbank.
+ICASSP 2014, as implemented in kaldi-native-fbank.
 """
 
 from __future__ import annotations
@@ -17,20 +17,21 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 
 _SLICE_MS = 20.0
 _FULL_SCALE = 32768.0  # Kaldi's samples are 16-bit integers
-# Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalised cross-correlation is over 0.8
+# Kaldi's feature (1.0001 - NCCF)^0.15 - 1, doubled: the normalized cross-correlation is over 0.8
 _VOICED = -0.43
-# A tracker keeps all that it has heard, 250 kB a second. So there are two, of which the younger one
-# takes over every so many slices.
-_TURN = 40
+# Kaldi's tracker keeps all its input, 250 kB a second. So there are two, and the younger one
+# replaces the older one after this number of slices.
+_REPLACE_AFTER = 40
 
 
-class Pitch:
-    """Follows the fundamental frequency of a voice.
+class PitchTracker:
+    """Tracks the fundamental frequency of a voice.
 
     Parameters
     ----------
     num_before
-        Slices of the session before the first: who begins later hears the same soon.
+        Number of slices of the session before the first. A tracker that starts later then soon
+        gives the same results.
     """
 
     def __init__(self, num_before: int = 0) -> None:
@@ -44,23 +45,23 @@ class Pitch:
         self._outputs.add_raw_log_pitch = True
         self._outputs.add_normalized_log_pitch = self._outputs.add_delta_pitch = False
         self._outputs.normalization_right_context = 0
-        self._trackers = [self._new_tracker() for _ in range(2)]  # the older first
+        self._trackers = [self._new_tracker() for _ in range(2)]  # the older one first
         self._num_slices = num_before
 
     def _new_tracker(self) -> Any:
         return kaldi_native_fbank.OnlinePitch(self._options, self._outputs)
 
-    def accept_slice(self, samples: NDArray[np.float32]) -> float:
-        """Take the next 20 ms, 16 kHz mono, shape (320,); return the pitch in Hz, 0 if unvoiced.
+    def track(self, samples: NDArray[np.float32]) -> float:
+        """Return the pitch in Hz after the next 20 ms, 16 kHz mono, shape (320,); 0 if unvoiced.
 
-        The pitch is that of some 10 ms before the end.
+        The pitch is that of about 10 ms before the end.
         """
-        heard = (samples * _FULL_SCALE).tolist()
+        scaled = (samples * _FULL_SCALE).tolist()
         for tracker in self._trackers:
-            tracker.accept_waveform(MEDIA_RATE_HZ, heard)
+            tracker.accept_waveform(MEDIA_RATE_HZ, scaled)
         older, younger = self._trackers
         self._num_slices += 1
-        if self._num_slices % _TURN == 0:
+        if self._num_slices % _REPLACE_AFTER == 0:
             self._trackers = [younger, self._new_tracker()]
         if older.num_frames_ready == 0:
             return 0.0

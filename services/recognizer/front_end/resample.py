@@ -1,4 +1,4 @@
-"""Resampling of any microphone's sound to 16 kHz, one channel, 32-bit float.
+"""Resampling of microphone audio to 16 kHz, one channel, 32-bit float.
 
 Windowed-sinc interpolation at rational positions (Crochiere and Rabiner 1983, "Multirate digital
 signal processing", chapter 2), with a table of the filter at every phase:
@@ -16,8 +16,8 @@ W        half width of the filter: 32 samples of the lower rate       samples
 ======== ============================================================ =================
 
 The delay is W: 2 ms for rates above 16 kHz, 4 ms from 8 kHz. The SoX library, which resamples
-training data and files elsewhere, works in blocks and would be up to 37 ms late from 48 kHz and
-115 ms from 8 kHz. The sums run in a fixed order, so the result does not depend on the chunks.
+training data and files elsewhere, works in blocks. It would add up to 37 ms of delay from 48 kHz,
+and 115 ms from 8 kHz. The sums run in a fixed order, so the result does not depend on the chunks.
 """
 
 from __future__ import annotations
@@ -59,21 +59,17 @@ class Resampler:
     def __init__(self, sample_rate_hz: int, num_channels: int = 1) -> None:
         if not MIN_RATE_HZ <= sample_rate_hz <= MAX_RATE_HZ:
             raise UserError(
-                f"sample rate {sample_rate_hz} Hz is out of range; "
-                f"give {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz"
+                f"the sample rate {sample_rate_hz} Hz is out of range; "
+                f"use {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz"
             )
         if not 1 <= num_channels <= MAX_CHANNELS:
-            raise UserError(f"{num_channels} channels are out of range; give 1 to {MAX_CHANNELS}")
+            raise UserError(f"{num_channels} channels are out of range; use 1 to {MAX_CHANNELS}")
         self._rate_hz = sample_rate_hz
         self._num_channels = num_channels
         self._filter = _filter_table(sample_rate_hz)
-        self.reset()
-
-    def reset(self) -> None:
-        """Start a new stream."""
         half = self._filter.shape[1] // 2
-        self._known = np.zeros(half, dtype=np.float32)  # still needed; zeros before the first
-        self._first = -half  # index of the first of them
+        self._known = np.zeros(half, dtype=np.float32)  # recent input, zeros at first
+        self._first = -half  # index of the first of these
         self._num_in = 0
         self._num_out = 0
 
@@ -83,7 +79,7 @@ class Resampler:
         Raises
         ------
         UserError
-            If the shape does not fit the channels or a sample is not finite.
+            If the shape does not match the channels, or a sample is not finite.
         """
         mono = self._mono(samples)
         self._num_in += len(mono)
@@ -119,7 +115,7 @@ class Resampler:
         if samples.shape not in (expected, (len(samples), self._num_channels)):
             raise UserError(f"samples have shape {samples.shape}; expected {expected}")
         if not np.isfinite(samples).all():
-            raise UserError("samples hold values that are not finite; send values in [-1, 1]")
+            raise UserError("some samples are not finite; send values in [-1, 1]")
         mono = samples.mean(axis=1) if self._num_channels > 1 else samples.reshape(-1)
         clipped: NDArray[np.float32] = np.clip(mono, -1.0, 1.0).astype(np.float32)
         return clipped
@@ -148,7 +144,7 @@ def _filter_table(rate_hz: int) -> NDArray[np.float32]:
     time = np.arange(up)[:, None] / up - offset
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(0, 1 - (time / half) ** 2)))
     table = np.sinc(_CUTOFF * lower * time) * window
-    table /= table.sum(axis=1, keepdims=True)  # a constant keeps its value at every phase
+    table /= table.sum(axis=1, keepdims=True)  # every phase keeps a constant signal
     rounded: NDArray[np.float32] = table.astype(np.float32)
     return rounded
 

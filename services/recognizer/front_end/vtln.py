@@ -1,8 +1,8 @@
-"""Vocal-tract-length normalisation (VTLN) of low voices, estimated from their pitch.
+"""Vocal-tract-length normalization (VTLN) of low voices, estimated from their pitch.
 
 Sources: Faria and Gelbart 2005, "Efficient pitch-based estimation of VTLN warp factors": a low
-voice usually comes from a long vocal tract, and a long tract has low formants. Pitch is tracked by
-the normalised cross-correlation of Talkin 1995, "A robust algorithm for pitch tracking", without
+voice usually comes from a long vocal tract, and a long tract has low formants. The pitch comes from
+the normalized cross-correlation of Talkin 1995, "A robust algorithm for pitch tracking", without
 its dynamic programming, because a mean over many frames tolerates single errors.
 
     phi[l] = sum_i y[i] y[i - l] / sqrt(sum_i y[i]^2 sum_i y[i - l]^2 + floor)
@@ -14,31 +14,36 @@ symbol   meaning                                                       unit, val
 ======== ============================================================= ====================
 x        samples at 16 kHz, in [-1, 1]                                 (n,)
 y        x below 900 Hz, every fourth sample: 4 kHz
-l        lag: 10 to 58, so peaks lie at 70 to 380 Hz                   samples of y
-phi      correlation at a lag: 1 if the last 20 ms repeat the sound    (49,)
-         a lag before
+l        lag: 10 to 58, so peaks are at 70 to 380 Hz                   samples of y
+phi      correlation at a lag: 1 if the last 20 ms repeat the audio    (49,)
+         one lag earlier
 f_ref    pitch of a voice that is not warped                           220 Hz
 f_mean   geometric mean of the speaker's pitch so far, starting        Hz
          from 20 frames of f_ref
 beta     part of the pitch ratio that is due to the tract              0.2
 a        warp factor: formants are multiplied by it                    1 to 1.3
-in, out  log-mel bands as functions of their centre frequency          (40,)
+in, out  log-mel bands as functions of their center frequency          (40,)
 ======== ============================================================= ====================
 
-Why: a recognizer trained mostly on high voices takes the low formants of a long tract for other
-vowels. With a small recurrent network, VTLN lowered the phone error rate of 14 unseen low voices
-from 35.4 to 32.1 %; that of high voices stayed about the same (24.8 and 24.3 %).
+Reason: a recognizer trained mostly on high voices mistakes the low formants of a long tract for
+other vowels. With a small recurrent network, VTLN lowered the phone error rate of 14 unseen low
+voices from 35.4 to 32.1 %. That of high voices stayed about the same (24.8 and 24.3 %).
 
-Deviations from the paper, which models the distribution of the factor given the pitch: the factor
-is a power of the pitch, so there is nothing to train. The mean is a running one with forgetting, as
-live use demands. Only low voices are warped, because only they are rare in the training data. The
-log-mel bands are interpolated; the filters do not move, because the sound is gone by then.
+Deviations from the paper:
 
-Only the Gaussian mixture model uses VTLN: the neural model has learnt low voices from data.
+- The paper models the distribution of the factor given the pitch. Here the factor is a power of the
+  pitch, so there is nothing to train.
+- The mean is a running mean with forgetting, as live use requires.
+- Only low voices are warped, because only they are rare in the training data.
+- The log-mel bands are interpolated. Their filters stay in place, because the audio is no longer
+  available.
 
-Cost: about 1 ms per second of sound. Delay: none beyond that of the features, because a frame's
-pitch depends on the samples up to the frame's end. The sums run in a fixed order, so the result
-does not depend on the chunks.
+Only the Gaussian mixture model uses VTLN: the neural models learned low voices from data. Kaldi's
+tracker (:mod:`.pitch`) gives other values than this one, which would change the model's scores.
+
+Cost: about 1 ms per second of audio. A frame's pitch depends on the samples up to the frame's end,
+so VTLN adds no delay to that of the features. The sums run in a fixed order, so the result does not
+depend on the chunks.
 """
 
 from __future__ import annotations
@@ -72,10 +77,10 @@ _MAX_LAG = 58
 _SPAN = _WINDOW + _MAX_LAG
 _HOP = round(HOP_S * _RATE_HZ)
 _FRAME = round(WINDOW_S * _RATE_HZ)
-_ENERGY_FLOOR = 1e-9  # squared energy: below -60 dB of full scale the strength tends to 0
-_PEAK_RATIO = 0.88  # to the highest peak: the first one above it is the period, not a multiple
+_ENERGY_FLOOR = 1e-9  # squared energy: below -60 dB of full scale, the strength approaches 0
+_PEAK_RATIO = 0.88  # of the highest peak: the first peak above it is the period, not a multiple
 
-VOICED_STRENGTH = 0.8  # frames above it count in the mean pitch
+VOICED_STRENGTH = 0.8  # only frames above it count in the mean pitch
 REFERENCE_HZ = 220.0
 MAX_FACTOR = 1.3
 _EXPONENT = 0.2
@@ -90,8 +95,8 @@ def _low_pass_taps() -> NDArray[np.float64]:
     """Return a windowed sinc of unit gain."""
     time = np.arange(_NUM_TAPS) - (_NUM_TAPS - 1) / 2
     taps = np.sinc(2 * _CUTOFF_HZ / SAMPLE_RATE_HZ * time) * np.hamming(_NUM_TAPS)
-    normalised: NDArray[np.float64] = taps / taps.sum()
-    return normalised
+    normalized: NDArray[np.float64] = taps / taps.sum()
+    return normalized
 
 
 _TAPS = _low_pass_taps()
@@ -104,25 +109,17 @@ class PitchTracker:
     """
 
     def __init__(self) -> None:
-        # Zeros before the first sample, so many that frame 0 ends at its last sample.
+        # The zeros before the first sample make frame 0 end at its last sample.
         self._samples = np.zeros(_NUM_TAPS - _DECIMATION, dtype=np.float32)
         self._low = np.zeros(_SPAN - _FRAME)
 
     def accept_waveform(
         self, samples: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Take samples in.
+        """Take samples, shape (n,), 16 kHz, in [-1, 1].
 
-        Parameters
-        ----------
-        samples
-            Shape (n,), 16 kHz, in [-1, 1].
-
-        Returns
-        -------
-        tuple
-            Of the new feature frames, each of shape (frames,): the pitch, 70 to 380 Hz, or 0 if
-            there is none; and its strength, 0 to 1, above ``VOICED_STRENGTH`` in voiced sound.
+        Returns the pitch of the new feature frames, (frames,), 70 to 380 Hz or 0 if unvoiced, and
+        its strength, (frames,), 0 to 1, above ``VOICED_STRENGTH`` in voiced sounds.
         """
         self._samples = np.concatenate([self._samples, samples.astype(np.float32, copy=False)])
         low = np.empty(max(0, (len(self._samples) - _NUM_TAPS) // _DECIMATION + 1))
@@ -138,13 +135,13 @@ class PitchTracker:
 
 
 class VocalTractNormalizer:
-    """Warps the mel bands of a low voice upwards, by the mean pitch so far.
+    """Warps the mel bands of a low voice upwards, depending on the mean pitch so far.
 
     Examples
     --------
     >>> log_mel, tracker, vtln = LogMel(), PitchTracker(), VocalTractNormalizer()
     >>> for chunk in speech:
-    ...     warped = vtln.accept(log_mel.accept_waveform(chunk), *tracker.accept_waveform(chunk))
+    ...     warped = vtln.warp(log_mel.accept_waveform(chunk), *tracker.accept_waveform(chunk))
     """
 
     def __init__(self) -> None:
@@ -152,31 +149,19 @@ class VocalTractNormalizer:
 
     @property
     def factor(self) -> float:
-        """Factor on the speaker's formants now, 1 to 1.3."""
+        """Current factor on the speaker's formants, 1 to 1.3."""
         return float(_factor(self._state))
 
-    def accept(
+    def warp(
         self,
         log_mel: NDArray[np.float32],
         pitch_hz: NDArray[np.float32],
         strength: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Warp feature frames of speech, given their pitch.
+        """Warp feature frames of speech, given their pitch and its strength, (n,) each.
 
-        Parameters
-        ----------
-        log_mel
-            Shape (n, 41): log energy, 40 log-mel bands.
-        pitch_hz
-            Shape (n,).
-        strength
-            Shape (n,), 0 to 1.
-
-        Returns
-        -------
-        NDArray
-            Shape (n, 41): the log energy unchanged, the bands warped by the factor at their frame.
-            A factor of 1 changes no bit.
+        Returns frames like ``log_mel``, (n, 41): the log energy unchanged, the bands warped by the
+        factor at their frame. A factor of 1 changes no bit.
 
         Raises
         ------
@@ -196,7 +181,7 @@ class VocalTractNormalizer:
 
     def reset(self) -> None:
         """Forget the speaker."""
-        self._state = np.zeros(2)  # sum of ln(f_ref / pitch) of voiced frames, their number
+        self._state = np.zeros(2)  # sum of ln(f_ref / pitch) over voiced frames; their number
 
 
 class PitchedLogMel:
@@ -207,25 +192,17 @@ class PitchedLogMel:
         self._pitch = PitchTracker()
 
     def accept_waveform(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Take samples in.
+        """Take samples, shape (n,), 16 kHz, in [-1, 1].
 
-        Parameters
-        ----------
-        samples
-            Shape (n,), 16 kHz, in [-1, 1].
-
-        Returns
-        -------
-        NDArray
-            The new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch in
-            Hz and its strength.
+        Returns the new feature frames, shape (frames, 43): log energy, 40 log-mel bands, the pitch
+        in Hz and its strength.
         """
         log_mel = self._log_mel.accept_waveform(samples)
         return np.column_stack([log_mel, *self._pitch.accept_waveform(samples)])
 
 
 def without_pitch(log_mel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Add an unknown pitch to log-mel frames, (n, 41) to (n, 43): the voice is not warped."""
+    """Add an unknown pitch to log-mel frames, (n, 41) to (n, 43), so that no band is warped."""
     return np.pad(log_mel, ((0, 0), (0, 2)))
 
 
@@ -253,7 +230,7 @@ def _track(
 
 @numba.njit(cache=True, nogil=True)
 def _correlation(low: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the normalised cross-correlation (Talkin 1995) of the last window at each lag."""
+    """Return the normalized cross-correlation (Talkin 1995) of the last window at each lag."""
     num_lags = _MAX_LAG - _MIN_LAG + 1
     low = low - low.mean()  # an offset would look like a pitch
     product = np.zeros(num_lags)
@@ -271,10 +248,10 @@ def _correlation(low: NDArray[np.float64]) -> NDArray[np.float64]:
 @numba.njit(cache=True, nogil=True)
 def _period(phi: NDArray[np.float64]) -> tuple[float, float]:
     """Return lag and height of the first good peak, interpolated by a parabola, or zeros."""
-    enough = _PEAK_RATIO * phi.max()
+    threshold = _PEAK_RATIO * phi.max()
     for k in range(1, len(phi) - 1):
         left, here, right = phi[k - 1], phi[k], phi[k + 1]
-        if here >= enough and here >= left and here >= right and here > 0.0:
+        if here >= threshold and here >= left and here >= right and here > 0.0:
             bend = left - 2.0 * here + right
             offset = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
             return _MIN_LAG + k + offset, here
@@ -291,11 +268,11 @@ def _factor(state: NDArray[np.float64]) -> float:
 def _warp(
     frames: NDArray[np.float32],
     voice: NDArray[np.float32],
-    centres_hz: NDArray[np.float64],
+    centers_hz: NDArray[np.float64],
     state: NDArray[np.float64],
 ) -> None:
     keep = 1.0 - 1.0 / _MEMORY_FRAMES
-    num_bands = len(centres_hz)
+    num_bands = len(centers_hz)
     for row in range(len(frames)):
         if voice[row, 1] > VOICED_STRENGTH:
             state[0] = keep * state[0] + math.log(REFERENCE_HZ / voice[row, 0])
@@ -303,9 +280,9 @@ def _warp(
         factor = _factor(state)
         if factor == 1.0:
             continue
-        # From the top down: a band is made of the bands at and below it, not yet overwritten.
+        # From the top down, because a band is computed from the old values at or below it.
         for k in range(num_bands - 1, -1, -1):
-            mel = MELS * math.log1p(centres_hz[k] / factor / MEL_KNEE_HZ)
+            mel = MELS * math.log1p(centers_hz[k] / factor / MEL_KNEE_HZ)
             at = max((mel - _LOWEST_MEL) / _STEP_MEL - 1.0, 0.0)
             below = min(int(at), num_bands - 2)
             share = np.float32(at - below)

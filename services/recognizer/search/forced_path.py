@@ -1,7 +1,6 @@
 """Forced alignment: the best path of known phones through a recording, with optional pauses.
 
-Source: the HTK book (Young et al. 2009), chapter 8. Li et al. 2011, section 3.2, scheme 1, align in
-the same way.
+Source: the HTK book (Young et al. 2009), chapter 8; used in Li et al. 2011, section 3.2, scheme 1.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ from kouxing.services.recognizer.search.decoder import Segment
 
 @dataclass(slots=True, kw_only=True)
 class UtteranceGraph:
-    """The states of an utterance in order. Pauses may be skipped."""
+    """The states of an utterance in order. Pauses are optional."""
 
     states: NDArray[np.int64]  # (nodes,) HMM state of each node
-    skip_from: NDArray[np.int64]  # (nodes,) node before a pause that may be skipped, or -1
+    skip_from: NDArray[np.int64]  # (nodes,) node before an optional pause, or -1
     phone_number: NDArray[np.int64]  # (nodes,) running number of the phone, pauses included
     phones: NDArray[np.int64]  # (running numbers,) indices into the inventory's phones
-    num_last: int  # nodes of the last pause, before which an utterance may also end
+    num_last: int  # number of nodes of the last pause, which is optional too
 
 
 def utterance_graph(
@@ -43,9 +42,9 @@ def utterance_graph(
     syllables
         Number of phones in each syllable.
     first_state
-        Of the topology.
+        First state of each phone, as in ``Topology``.
     silence
-        Index of the phone that stands for a pause.
+        Index of the phone for a pause.
     """
     states: list[int] = []
     skip_from: list[int] = []
@@ -94,13 +93,13 @@ def viterbi_path(
     graph
         The utterance.
     log_stay, log_leave
-        Log transition probabilities of all HMM states.
+        Log-probabilities of the transitions of all HMM states.
 
     Returns
     -------
     tuple
-        Node of every frame, shape (frames,), and the path's log likelihood; an empty array and
-        minus infinity if there are too few frames.
+        Node of every frame, shape (frames,), and the path's log-likelihood. With too few frames: an
+        empty array and minus infinity.
     """
     path, log_likelihood = _viterbi(
         scores,
@@ -126,7 +125,7 @@ def _viterbi(
     score = np.full(num_nodes, -np.inf)
     back = np.zeros((num_frames, num_nodes), dtype=np.int32)
     score[0] = scores[0, 0]
-    score[num_first] = scores[0, num_first]  # the first pause may be skipped
+    score[num_first] = scores[0, num_first]  # the first pause is optional
     for frame in range(1, num_frames):
         for node in range(num_nodes - 1, -1, -1):
             best, origin = score[node] + stay[node], node
@@ -141,7 +140,7 @@ def _viterbi(
                     best, origin = value, before
             score[node] = best + scores[frame, node]
             back[frame, node] = origin
-    # The last pause may be skipped too.
+    # The last pause is optional too.
     node = num_nodes - 1
     before = num_nodes - num_last - 1
     if score[before] + leave[before] > score[node] + leave[node]:
@@ -157,7 +156,7 @@ def _viterbi(
 
 
 def segments_of_path(path: NDArray[np.int64], graph: UtteranceGraph) -> list[Segment]:
-    """Return the phones with their frames, from the node of every frame."""
+    """Return the phones with their frames, given the node of every frame."""
     runs = graph.phone_number[path]
     starts = np.concatenate([[0], np.flatnonzero(np.diff(runs)) + 1])
     ends = np.concatenate([starts[1:], [len(path)]])

@@ -1,4 +1,4 @@
-"""Phone language model: how likely a phone is after the phones before it. Back-off n-grams.
+"""Phone language model: the probability of a phone given the phones before it. Back-off n-grams.
 
 Sources: Katz 1987, "Estimation of probabilities from sparse data" (back-off); Mohri, Pereira and
 Riley 2002, "Weighted finite-state transducers in speech recognition" (n-grams as a graph).
@@ -6,7 +6,7 @@ Riley 2002, "Weighted finite-state transducers in speech recognition" (n-grams a
 ======== ============================================================== ========
 symbol   meaning                                                        shape
 ======== ============================================================== ========
-h        context: the phones before, as many as the model keeps         contexts
+h        context: the previous phones, as many as the model keeps       contexts
 h'       back-off context: the longest known ending of h                contexts
 p(u|h)   probability of phone u after h, if the n-gram is kept          nodes
 b(h)     back-off weight of h'                                          contexts
@@ -14,10 +14,10 @@ b(h)     back-off weight of h'                                          contexts
 
     log p(u | h) = log b(h) + log p(u | h')    if the n-gram h u is not kept
 
-The n-grams are stored as a tree whose root is the empty context. A node is the last phone of an
-n-gram; its ancestors are the phones before it. The search walks a graph whose states are contexts:
-the nodes with children, and all single phones. A pause resets the context: n-grams begin with
-silence or do not contain it before their last phone.
+The n-grams are stored as a tree. The root is the empty context, and a node is the last phone of an
+n-gram whose other phones are the node's ancestors. The search uses a graph whose states are
+contexts: the nodes with children, and all single phones. A pause resets the context: an n-gram has
+silence only as its first or last phone.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,7 @@ from kouxing.shared.phones.inventory import PhoneInventory
 MAX_ORDER = 16  # phones in an n-gram
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Graph:
+class Graph(NamedTuple):
     """The contexts and the arcs between them, for the search. Context 0 is the empty one."""
 
     first_arc: NDArray[np.int32]  # (contexts + 1,) context c has arcs first_arc[c] to [c + 1]
@@ -80,9 +80,9 @@ class PhoneLanguageModel:
             at, phone = backoff_state[parent[first:end]], self.phone[first:end]
             left = np.arange(first, end)
             while len(left):
-                found = np.minimum(np.searchsorted(key, at * num_phones + phone), num_nodes - 1)
-                hit = key[found] == at * num_phones + phone
-                backoff_state[left[hit]] = found[hit]
+                node = np.minimum(np.searchsorted(key, at * num_phones + phone), num_nodes - 1)
+                hit = key[node] == at * num_phones + phone
+                backoff_state[left[hit]] = node[hit]
                 left, at, phone = left[~hit], backoff_state[at[~hit]], phone[~hit]
         is_context = children > 0
         is_context[: levels[2]] = True

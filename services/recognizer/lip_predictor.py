@@ -1,8 +1,8 @@
-"""Lips from sound: what the acoustic network knows of a sound, turned into the mouth that made it.
+"""The lip predictor: mouth shapes from the inner values of the acoustic network.
 
 Sources: Cho et al. 2014, "Learning phrase representations using RNN encoder-decoder" (gated
-recurrent unit); Hoerl and Kennard 1970, "Ridge regression". That the network's layers know lips
-better than its phones do was measured here (``models/lips.md``).
+recurrent unit); Hoerl and Kennard 1970, "Ridge regression". The network's layers predict lips
+better than its phones do, as measured in ``models/lips.md``.
 
 ======== ============================================================ ==================
 symbol   meaning                                                      shape
@@ -20,13 +20,13 @@ y        for each delay the FAPs, and log odds of closure and of      (delays, 1
 
     y = A X + B [h, u] + c
 
-A is a ridge regression, which carries over to strangers; B [h, u] follows known voices closer. The
-two are fitted apart and averaged, so A and B hold half of each. The odds of a closure are
-doubled: lips that should have met are seen more than lips that met too often.
+A is a ridge regression, which generalizes to unseen speakers. B [h, u] follows the training
+speakers more closely. The two are fitted separately and averaged, so A and B contain half of each.
+The odds of a closure are doubled, because a missed closure is more visible than a false one.
 
-There is a position every 20 ms while somebody speaks; outside speech there are no lips. A position
-that has seen the sound up to T gives, for every delay d, the mouth at T - d. The same sound gives
-the same lips in any chunking and beside any other sessions, because every position is one step.
+There is a position every 20 ms during speech, and no lip frames elsewhere. A position that has seen
+the audio up to T gives, for every delay d, the mouth at T - d. Every position is one step, so
+neither the chunking nor other sessions affect the lip frames.
 
 Cost: about 4 ms of one core per second of speech.
 """
@@ -41,9 +41,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel, Floats
 from kouxing.services.recognizer.acoustic.model_file import Archive, read_archive, write_archive
 from kouxing.services.recognizer.acoustic.network import FRAMES_PER_POSITION, NUM_INPUTS
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
@@ -54,11 +53,9 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame
 
-Floats = NDArray[np.float32]
-
 LIPS_PATH = Path(__file__).parent / "models" / "lips.npz"
 FORMAT = "lips 2"
-# FAPs that a camera tracks. Each of a pair on the left and on the right has the same value.
+# FAPs that a camera tracks. The left and the right FAP of a pair have the same value.
 LIP_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 OTHER_SIDE = {6: 7, 8: 9, 10: 11, 12: 13, 53: 54, 55: 56, 57: 58, 59: 60}
 CLOSURE, LIP_TO_TEETH = len(LIP_FAPS), len(LIP_FAPS) + 1  # columns of the outputs, after the FAPs
@@ -74,9 +71,9 @@ _PAIRS = [(MOUTH_FAPS.index(fap), MOUTH_FAPS.index(other)) for fap, other in OTH
 
 @dataclass(frozen=True, kw_only=True)
 class LipPredictor:
-    """A trained model of lips from sound, shared by any number of streams."""
+    """A trained lip predictor, shared by any number of streams."""
 
-    delays: Floats  # (delays,) seconds, rising; below 0 the mouth is foretold
+    delays: Floats  # (delays,) seconds, rising; a negative one is a forecast
     feature_mean: Floats  # (features,)
     projection: Floats  # (features, components)
     entry_weights: Floats  # (components, units): U
@@ -99,9 +96,9 @@ class LipPredictor:
         return {}
 
     def weights_of(self, delays: Sequence[int]) -> tuple[Floats, Floats]:
-        """Return A and B of some delays, for all streams that have these.
+        """Return A and B for some delays, (history components, delays 17), (2 units, delays 17).
 
-        Their shapes are (history components, delays 17) and (2 units, delays 17).
+        Streams with the same delays share them.
         """
         key = tuple(delays)
         if key not in self._of_delays:
@@ -113,8 +110,8 @@ class LipPredictor:
             self._of_delays[key] = history, output
         return self._of_delays[key]
 
-    def stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
-        """Start a session's lips with these of the delays.
+    def create_stream(self, delays_s: Sequence[float]) -> LipPredictorStream:
+        """Create a session's stream with some of the delays.
 
         Raises
         ------
@@ -123,9 +120,9 @@ class LipPredictor:
         """
         unknown = [delay_s for delay_s in delays_s if delay_s not in self.delays_s]
         if unknown:
-            known = ", ".join(f"{1e3 * one:g}" for one in self.delays_s)
+            choices = ", ".join(f"{1e3 * delay_s:g}" for delay_s in self.delays_s)
             raise UserError(
-                f"lips from sound: no delay of {1e3 * unknown[0]:g} ms; give one of {known}"
+                f"the lip predictor has no delay of {1e3 * unknown[0]:g} ms; choose {choices}"
             )
         return LipPredictorStream(self, [self.delays_s.index(delay_s) for delay_s in delays_s])
 
@@ -175,14 +172,14 @@ class LipPredictor:
 
 
 class LipPredictorStream:
-    """The lips of one session, from one segment of speech to the next.
+    """The lip frames of one session, one segment of speech after the other.
 
     Parameters
     ----------
     model
         The model of all streams.
     delays
-        Which of its delays are asked for.
+        Indices of the delays to predict.
 
     Attributes
     ----------
@@ -198,15 +195,15 @@ class LipPredictorStream:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the segment: the next speech starts a new one."""
+        """Start a new segment of speech."""
         history, components = self._model.history_weights.shape[:2]
         nothing = np.zeros(components, np.float32)
         self._history = deque([nothing] * history, maxlen=history)
         self._state = np.zeros(len(self._model.state_weights), np.float32)
         self.inner = np.zeros(len(self._model.output_weights), np.float32)
 
-    def accept(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
-        """Take what the network computes at a position; return the lip frames, one a delay.
+    def process_position(self, known_s: float, frames: Floats, values: Floats) -> list[LipFrame]:
+        """Return the lip frames that follow from a position, one for each delay.
 
         Parameters
         ----------
@@ -215,7 +212,7 @@ class LipPredictorStream:
         frames
             Its two newest log-mel frames, shape (2, 80).
         values
-            Of its layers, shape (layers, heads, size).
+            Attention values of its layers, shape (layers, heads, size).
         """
         outputs = self.step(features_at(frames, values))
         return [
@@ -230,10 +227,10 @@ class LipPredictorStream:
         ]
 
     def step(self, features: Floats) -> Floats:
-        """Take a position's features, shape (features,); return the outputs, (delays, 17)."""
+        """Compute the outputs, (delays, 17), from a position's features, (features,)."""
         model = self._model
-        centred = features - model.feature_mean
-        component = (centred @ model.projection).astype(np.float32, copy=False)
+        centered = features - model.feature_mean
+        component = (centered @ model.projection).astype(np.float32, copy=False)
         self._history.append(component)
         entered = np.maximum(component @ model.entry_weights + model.entry_bias, 0)
         from_input = entered @ model.input_weights + model.input_bias
@@ -251,12 +248,12 @@ class LipPredictorStream:
 
 
 def features_at(frames: Floats, values: Floats) -> Floats:
-    """Return a position's features, (160 + 2 width,), of what `LipPredictorStream.accept` takes."""
+    """Return a position's features, (160 + 2 width,), from its frames and values."""
     return np.concatenate([frames, values[-NUM_LAYERS:]], axis=None)
 
 
 def mouth_faps(lips: Floats) -> Floats:
-    """Return the FAPs of the mouth, (28,), from those that a camera tracks, (15,)."""
+    """Return all FAPs of the mouth, (28,), from the FAPs that a camera tracks, (15,)."""
     faps = np.zeros(len(MOUTH_FAPS), np.float32)
     faps[_COLUMNS] = lips
     for one, other in _PAIRS:
@@ -271,8 +268,8 @@ def _sigmoid(x: Floats) -> Floats:
     return probability
 
 
-def load_lips(path: Path = LIPS_PATH) -> LipPredictor:
-    """Read a model file.
+def load_lip_predictor(path: Path = LIPS_PATH) -> LipPredictor:
+    """Read a lip predictor's file.
 
     Raises
     ------
@@ -286,22 +283,28 @@ def load_lips(path: Path = LIPS_PATH) -> LipPredictor:
             raise ValueError(f"it has the format {form!r}, expected {FORMAT!r}")
         return lips_from(archive)
     except ValueError as error:
-        raise UserError(f"lips from sound, {path}: {error}; train it again") from error
+        raise UserError(f"lip predictor {path}: {error}; train it again") from error
 
 
-def lips_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | None:
-    """Read the model of lips that fits an acoustic model; None if it was trained on another one."""
+def lip_predictor_for(model: AcousticModel, path: Path = LIPS_PATH) -> LipPredictor | None:
+    """Read the predictor for an acoustic model; None if it was trained for another one."""
     network = model.early if isinstance(model, TwoNetworks) else model
     if not isinstance(network, NeuralModel):
         return None
-    lips, sizes = load_lips(path), network.session.sizes
+    lips, sizes = load_lip_predictor(path), network.session.sizes
     width = sizes.num_heads * sizes.head_size
     fits = len(lips.feature_mean) == FRAMES_PER_POSITION * NUM_INPUTS + NUM_LAYERS * width
     return lips if fits else None
 
 
 def lips_from(archive: Archive) -> LipPredictor:
-    """Build the model after checking every size; ValueError says what does not fit."""
+    """Build the predictor after checking every size.
+
+    Raises
+    ------
+    ValueError
+        If an array does not fit.
+    """
     delays = archive.floats("delays", *_sizes(archive, "delays", 1))
     if len(delays) > _MAX_DELAYS or np.abs(delays).max() > _MAX_DELAY_S:
         raise ValueError(f"its delays are {delays.tolist()}")
@@ -309,7 +312,7 @@ def lips_from(archive: Archive) -> LipPredictor:
         raise ValueError("its delays do not rise")
     num_features, num_components = _sizes(archive, "projection", 2)
     if num_features <= FRAMES_PER_POSITION * NUM_MELS:
-        raise ValueError(f"it takes {num_features} features of a position")
+        raise ValueError(f"it takes {num_features} features per position")
     _, units = _sizes(archive, "entry_weights", 2)
     history = _sizes(archive, "history_weights", 4)[0]
     if history > _MAX_HISTORY:

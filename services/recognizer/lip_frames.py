@@ -1,0 +1,69 @@
+"""The interface of a model that predicts lip frames from the audio.
+
+It gets what the acoustic network computes at every position, 50 times a second during speech, and
+predicts lip frames. A model offers several delays, of which the recognizer chooses one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.phones.events import LipFrame
+
+# Face frames are due every 20 ms of audio. The network's positions end this long before them: a
+# window of 25 ms in steps of 20 ms cannot end closer.
+POSITION_LAG_S = 0.005
+
+
+class LipFrameStream(Protocol):
+    """The lip frames of one session, one segment of speech after the other."""
+
+    def process_position(
+        self, known_s: float, frames: NDArray[np.float32], values: NDArray[np.float32]
+    ) -> list[LipFrame]:
+        """Return the lip frames that follow from what the network computes at a position.
+
+        Parameters
+        ----------
+        known_s
+            Media time of the last sample that the position has seen, seconds.
+        frames
+            Its two newest log-mel frames, shape (2, 80).
+        values
+            Attention values of its layers, shape (layers, heads, size).
+        """
+
+    def reset(self) -> None:
+        """Start a new segment of speech."""
+
+
+class LipFrameModel(Protocol):
+    """A trained model, shared by any number of streams."""
+
+    @property
+    def delays_s(self) -> Sequence[float]:
+        """Delays that it offers, seconds, rising."""
+
+    def create_stream(self, delays_s: Sequence[float]) -> LipFrameStream:
+        """Create a session's stream with some of the delays."""
+
+    def with_mouth_profile(self, content: bytes) -> Self:
+        """Adapt the model to the speaker of a mouth profile; ``UserError`` if it does not fit."""
+
+
+def delay_for(delays_s: Sequence[float], face_delay_s: float) -> float:
+    """Choose the longest delay whose lip frames are in time for the face.
+
+    Parameters
+    ----------
+    delays_s
+        Delays to choose from, seconds, rising; a negative one is a forecast.
+    face_delay_s
+        How much later than its audio a frame of the face is made.
+    """
+    in_time = [delay for delay in delays_s if delay + POSITION_LAG_S <= face_delay_s + 1e-6]
+    return max(in_time, default=min(delays_s))

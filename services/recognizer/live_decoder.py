@@ -1,0 +1,205 @@
+"""Live decoding: score events to phones, with first hypotheses and corrections.
+
+Source: Li et al. 2011, sections 1 and 2.2.
+
+The shortest delay from a phone's onset to its first hypothesis is
+25 ms window + L * 10 ms + (N - 1) * 10 ms, where L is the acoustic model's look-ahead in frames and
+N is ``num_stable_frames``: 35 ms with L = 1 and N = 1. A neural model scores two frames at a time,
+so half of the frames come 10 ms sooner. The paper has N = 3 and differences that look 40 ms ahead,
+so its delay is 85 ms; it ignores the window and the look-ahead and states 45 ms. When speech
+starts, the VAD adds up to 32 ms. For input above 16 kHz, the resampler adds 2 ms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+
+from kouxing.services.recognizer.acoustic.acoustic_model import (
+    FIRST,
+    INSIDE,
+    Floats,
+    Topology,
+    no_scores,
+)
+from kouxing.services.recognizer.front_end.features import HOP_S
+from kouxing.services.recognizer.search.decoder import Decoder, Segment, segments_after
+from kouxing.services.recognizer.search.output_rule import OutputRule, OutputRuleConfig
+from kouxing.services.recognizer.speech_scorer import (
+    FrameScores,
+    ScoreEvent,
+    SpeechEnd,
+    SpeechStart,
+    frame_time_s,
+)
+from kouxing.shared.phones.events import Phone, SoundEvent, SpeechChange, Waveform
+
+FINALIZE_AFTER_S = 0.2  # after a phone's end; waiting longer corrects nothing more
+_FINALIZE_AFTER_FRAMES = round(FINALIZE_AFTER_S / HOP_S)
+_DEFAULT_CONFIDENCE = 0.5  # of a phone that was not emitted before it was final
+
+StreamOutput: TypeAlias = SoundEvent | Waveform
+
+
+class LiveDecoder:
+    """Recognizes phones in score events.
+
+    A phone is first emitted with ``final`` false and its mean duration, as soon as the output rule
+    allows (Li 2011, eq. 4). There is a mean after a pause and one inside a phrase. At that time
+    nobody can tell whether the phone is the last before a pause, and therefore longer.
+
+    The paper never corrects an emitted phone. Here, whenever a phone is emitted, the best string
+    corrects the earlier ones. Such a phone is emitted again under its ``index``, with the measured
+    onset and duration, or with another symbol. Phones that the rule passed over are emitted
+    together with the next one. A surplus phone is withdrawn (``Phone.is_withdrawn``). The last
+    emission of a phone has ``final`` true and comes ``FINALIZE_AFTER_S`` after its end, or when
+    speech ends. Silence within speech is a phone like any other.
+
+    If the model has provisional scores, the search continues over them. When the next scores come,
+    it restarts from the last settled frame. The output rule gets each frame once, as soon as the
+    frame has a score of either kind. So phones are emitted early and corrected by better scores.
+
+    Parameters
+    ----------
+    topology
+        The phones' HMMs and the phone language model.
+    rule
+        The output rule.
+    """
+
+    def __init__(self, topology: Topology, rule: OutputRuleConfig) -> None:
+        self._topology = topology
+        self._inventory = topology.inventory
+        self._silence = self._inventory.index[self._inventory.silence]
+        self._settled = Decoder(topology)  # the search over settled scores
+        self._ahead: Decoder | None = None  # its continuation over provisional scores, if any
+        self._rule = OutputRule(rule, last_emitted=self._silence)
+        self._num_final = 0
+        self._start_speech(0)
+
+    def decode(self, events: Iterable[ScoreEvent]) -> list[StreamOutput]:
+        """Return the phones and speech changes of the next events; others are passed on."""
+        out: list[StreamOutput] = []
+        for event in events:
+            if isinstance(event, SpeechStart):
+                self._start_speech(event.frame)
+                out.append(SpeechChange(active=True, time_s=frame_time_s(event.frame)))
+            elif isinstance(event, SpeechEnd):
+                rest = segments_after(self._decoder.final_path(), self._done)
+                if self._open and len(rest) > 1 and rest[-1].phone == self._silence:
+                    rest.pop()  # the end of speech implies it
+                out += self._revise(rest, num_following=0)
+                out.append(SpeechChange(active=False, time_s=frame_time_s(event.frame)))
+            elif isinstance(event, FrameScores):
+                out += self._decode_frames(event)
+            else:
+                out.append(event)
+        return out
+
+    def _start_speech(self, frame: int) -> None:
+        self._start_frame = frame
+        self._done = 0  # the decoder's frame up to which phones are final
+        self._num_checked = 0  # frames that the output rule has had
+        self._provisional = no_scores(self._topology.num_states)  # the last ones searched
+        self._settled.reset()
+        self._decoder = self._settled
+        self._rule.reset()
+        self._last_final = self._silence  # index of the last final phone
+        self._open: list[Phone] = []  # emitted, not yet final
+
+    def _decode_frames(self, scores: FrameScores) -> list[Phone]:
+        known, self._provisional = self._provisional, scores.provisional
+        if len(scores.settled) or not np.array_equal(known, scores.provisional[: len(known)]):
+            known = known[:0]  # the search over provisional scores restarts
+        self._decoder = self._settled
+        out = self._search(scores.settled)
+        if len(scores.provisional):
+            self._ahead = self._decoder = self._ahead or Decoder(self._topology)
+            if not len(known):
+                self._settled.forget_before(self._done)
+                self._decoder.copy_state(self._settled)
+            out += self._search(scores.provisional[len(known) :])
+        return out
+
+    def _search(self, scores: Floats) -> list[Phone]:
+        """Continue the search; the output rule gets the frames that it has not had."""
+        num_checked = max(0, self._num_checked - self._decoder.num_frames)
+        self._decoder.advance(scores[:num_checked])
+        out: list[Phone] = []
+        for frame in range(num_checked, len(scores)):
+            self._decoder.advance(scores[frame : frame + 1])
+            out += self._emit_phone()
+        return out
+
+    def _emit_phone(self) -> list[Phone]:
+        """Return the last phone and corrections, if the output rule emits it at this frame."""
+        self._num_checked = self._decoder.num_frames
+        phone, start, confidence = self._decoder.last_phone
+        if not self._rule.update(phone, confidence):
+            return []
+        revised = self._revise(self._decoder.path_since(self._done), num_following=1)
+        before = self._index_of(self._open[-1]) if self._open else self._last_final
+        position = FIRST if before == self._silence else INSIDE
+        new = Phone(
+            index=self._num_final + len(self._open),
+            symbol=self._inventory.phones[phone],
+            onset_s=self._time_s(max(start, self._done)),
+            duration_s=float(self._topology.duration_mean_s[position, phone]),
+            confidence=confidence,
+            final=False,
+        )
+        self._open.append(new)
+        return [*revised, new]
+
+    def _revise(self, segments: list[Segment], num_following: int) -> list[Phone]:
+        """Replace the open phones by the best string; return those that are new or changed.
+
+        ``num_following`` phones follow the segments: one, or none if speech has ended.
+        """
+        num_before = len(self._open) - num_following
+        is_first = self._done == 0 and len(segments) > max(0, num_before)
+        if is_first and segments[0].phone == self._silence:
+            segments = segments[1:]  # silence before the first phone is not emitted
+        emitted: list[Phone] = []
+        while len(segments) < num_before:  # a surplus phone was emitted and is withdrawn
+            silence = self._inventory.silence
+            emitted.append(replace(self._open.pop(0), symbol=silence, duration_s=0.0, final=True))
+            self._num_final, num_before = self._num_final + 1, num_before - 1
+        final_until = self._decoder.num_frames - (_FINALIZE_AFTER_FRAMES if num_following else 0)
+        known = dict(enumerate(self._open))
+        self._open = []
+        first_index = self._num_final
+        for number, segment in enumerate(segments):
+            onset_s = self._time_s(segment.start)
+            phone = Phone(
+                index=first_index + number,
+                symbol=self._inventory.phones[segment.phone],
+                onset_s=onset_s,
+                duration_s=self._time_s(segment.end) - onset_s,
+                confidence=known[number].confidence if number in known else _DEFAULT_CONFIDENCE,
+                final=segment.end <= final_until,
+            )
+            if phone != known.get(number):
+                emitted.append(phone)
+            if phone.final:
+                self._finalize(phone)
+            else:
+                self._open.append(phone)
+        return emitted
+
+    def _finalize(self, phone: Phone) -> None:
+        """Count a phone as final."""
+        self._num_final += 1
+        self._last_final = self._index_of(phone)
+        end_s = phone.onset_s + phone.duration_s - self._time_s(0)
+        self._done = round(end_s / HOP_S)
+
+    def _index_of(self, phone: Phone) -> int:
+        return self._inventory.index[phone.symbol]
+
+    def _time_s(self, frame: int) -> float:
+        """Media time of the decoder's frame."""
+        return frame_time_s(self._start_frame + frame)
