@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 import secrets
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Self
@@ -19,8 +18,15 @@ from typing import Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from kouxing.shared.connection import BAN_FAULTS, KIB, Bounds, Connection
-from kouxing.shared.connections import Guard, Guarded
+from kouxing.shared.connections import (
+    KIB,
+    LONG_PENALTY_S,
+    PENALTY_S,
+    Connection,
+    ConnectionLimiter,
+    LimitedSocket,
+    Limits,
+)
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NOBODY, Guest, Key, Peer, may_follow
@@ -37,16 +43,13 @@ from kouxing.shared.zap import Zap, answer_handshakes
 QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames of a recording for a subscriber that pauses
 LIVE_BUFFER = 65_536  # bytes of the kernel: some seconds of FAP frames, over any distance
 AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
-# What a bound socket takes in: the largest message, and how many of a connection wait.
-# Of answers to audio few wait: not every client reads them.
-AUDIO = Bounds(message_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_slow=16, num_answers=100)
-COMMANDS = Bounds(message_bytes=MAX_COMMAND_BYTES, queue_length=2, num_slow=1, cost=1.0)
-PHONES = Bounds(message_bytes=4 * KIB, queue_length=64, num_slow=16)
-# ZeroMQ stores a subscription before it is received; a handshake takes most of the size. All that a
-# connection may hold has room while the service is busy.
-SUBSCRIPTIONS = Bounds(message_bytes=512, queue_length=32, num_slow=128, cost=1.0)
-REFUSAL_COST = 4.0  # that a refused message takes, and 1 more for each KiB of it
-ANSWER_COST = 0.25  # that each KiB of an answer takes: the longest status has 15 MB
+# Few answers to audio wait: not every client reads them.
+AUDIO = Limits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
+COMMANDS = Limits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
+PHONES = Limits(part_bytes=4 * KIB, queue_length=64)
+SUBSCRIPTIONS = Limits(part_bytes=512, queue_length=32, cost=1.0)  # most of it for the handshake
+ERROR_COST = 4.0  # of the sender's budget, for each message answered with an error
+ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report has 15 MB
 MAX_PARTS = 4
 MAX_DROPPED = 20_000  # parts of a message of too many, before other sockets get their turn
 MAX_BATCH = 200  # messages taken from one socket before the others get their turn
@@ -72,7 +75,7 @@ class Socket:
         raw: zmq.Socket[bytes],
         key: Key | None,
         zap: Zap | None = None,
-        guarded: Guarded | None = None,
+        limited: LimitedSocket | None = None,
         *,
         routes: bool = False,
         publishes: bool = False,
@@ -81,7 +84,7 @@ class Socket:
         self._raw = raw
         self._key = key
         self._zap = zap  # of a socket that is bound with a key
-        self._guarded = guarded  # where it is bound
+        self._limited = limited  # if it is bound
         self._routes = routes
         self._publishes = publishes
         self._on_joined = on_joined
@@ -89,7 +92,6 @@ class Socket:
         self._sender = NOBODY  # of it
         self._has_rest = False  # parts of it that nobody wants
         self._rest_from: Connection | None = None  # whose they are
-        self._refusal_cost = 0.0  # that refusing it takes
         self._name = secrets.token_hex(8)
 
     @property
@@ -105,23 +107,20 @@ class Socket:
     def send(self, message: Message, *, to: Peer = NOBODY) -> bool:
         """Send a message, on a ROUTER to one peer; return whether it could be queued.
 
-        What answers the message that is being handled is charged to its sender, by its size.
+        An answer to the message that is being handled reduces its sender's budget.
         """
         parts = encode(message)
-        num_bytes = sum(map(len, parts))
+        if self._connection is not None and to == self._sender:
+            cost = ERROR_COST if isinstance(message, Error) else 0.0
+            self._connection.spend(cost + ANSWER_COST * len(parts[-1]) / KIB)
         if self._routes:
             parts.insert(0, to.address)
-        if self._connection is not None and to == self._sender:
-            refusal_cost = self._refusal_cost if isinstance(message, Error) else 0.0
-            self._connection.charge(ANSWER_COST * len(parts[-1]) / KIB + refusal_cost)
         try:
             self._raw.send_multipart(parts, flags=zmq.DONTWAIT)
         except zmq.Again:
             return False
-        if self._guarded is not None and self._routes:
-            self._guarded.answered(to.connection, num_bytes)
-        elif self._guarded is not None:
-            self._guarded.published(parts[0], num_bytes)
+        if self._limited is not None:
+            self._limited.num_sent += 1
         return True
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
@@ -152,7 +151,7 @@ class Socket:
                     parts, key = self._take()
                 except zmq.Again:
                     if not self._has_rest:
-                        self.drained()
+                        self.note_empty()
                     return
                 if self._connection is not None and self._connection.is_cut:
                     continue
@@ -171,29 +170,29 @@ class Socket:
         finally:
             self._connection = None
 
-    def drop_stopped(self, kinds: Collection[type[Message]], sessions: Iterable[str]) -> None:
-        """End the connections of subscribers that stand still, to be called about once a second.
+    def disconnect_stalled(self, kinds: Collection[type[Message]], sessions: Iterable[str]) -> None:
+        """Disconnect subscribers that stopped reading. Call this about once a second.
 
-        Only of those that follow some kinds of message of one of some sessions: what is live is
-        worth nothing when it is late. A subscriber connects again by itself when it goes on.
+        This affects only subscribers to one of ``kinds`` of one of ``sessions``: late frames of a
+        live session are worthless. libzmq reconnects the subscriber when it continues.
         """
-        if self._guarded is not None:
+        if self._limited is not None:
             topics = [topic(kind, session) for session in sessions for kind in kinds]
-            self._guarded.cut_stopped(topics, time.monotonic())
+            self._limited.disconnect_stalled(topics)
 
-    def drained(self) -> None:
-        """Note that nothing more has arrived."""
-        if self._guarded is not None:
-            self._guarded.drained()
+    def note_empty(self) -> None:
+        """Note that all complete messages have been received."""
+        if self._limited is not None:
+            self._limited.num_polls += 1
 
     def is_open(self, connection: int) -> bool:
-        """Return whether the connection of a number, to this bound socket, has not ended."""
-        return self._guarded is not None and self._guarded.is_open(connection)
+        """Return whether a connection to this bound socket has not ended, by its number."""
+        return self._limited is not None and self._limited.has(connection)
 
     def ended(self) -> Iterator[int]:
-        """Yield the numbers of connections to this bound socket that have ended since."""
-        if self._guarded is not None:
-            yield from self._guarded.ended()
+        """Yield the numbers of connections that have ended since the last call."""
+        while self._limited is not None and self._limited.ended:
+            yield self._limited.ended.popleft()
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether something arrived within the time."""
@@ -256,13 +255,11 @@ class Socket:
             parts.append(frame.bytes)
         self._has_rest = frame.more
         key = "" if self._zap is None else _key(frame)
-        if self._guarded is not None:
-            num_bytes = sum(map(len, parts))
-            self._connection = self._guarded.delivered(descriptor, num_bytes, key)
-            self._refusal_cost = REFUSAL_COST + num_bytes / KIB
+        if self._limited is not None:
+            self._connection = self._limited.deliver(descriptor, key)
             if self._has_rest and self._connection is not None:
                 self._rest_from = self._connection
-                self._connection.cut("its message has too many parts")
+                self._connection.disconnect("its message has too many parts", PENALTY_S)
         return parts, key
 
     def _drop_rest(self) -> None:
@@ -279,17 +276,20 @@ class Socket:
             self._has_rest = self._raw.recv(zmq.DONTWAIT, False).more  # quicker than by keyword
         if self._has_rest:
             if self._rest_from is not None:
-                self._rest_from.cut("its message has very many parts", BAN_FAULTS)
+                self._rest_from.budget.block(LONG_PENALTY_S)
             raise zmq.Again
 
     def _on_subscription(self, parts: list[bytes], guest: Guest | None) -> None:
         if len(parts) != 1:  # nobody publishes here
             return
-        if self._connection is not None and self._guarded is not None:
-            self._guarded.subscribed(self._connection, parts[0])
+        verb, wanted = parts[0][:1], parts[0][1:]
+        if self._connection is not None and self._limited is not None:
+            if verb == b"\x01":
+                self._limited.subscribe(self._connection, wanted)
+            else:
+                self._connection.topics.discard(wanted)
             if self._connection.is_cut:
                 return
-        verb, wanted = parts[0][:1], parts[0][1:]
         may = guest is None or may_follow(guest, wanted)  # without keys everybody may
         if verb == b"\x00":
             self._raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
@@ -334,7 +334,7 @@ class Bus:
         Proves who this process is; its sockets accept only keys that are allowed. None: all is
         plain, to anybody.
     extra_connections
-        How many more others may have here than is usual.
+        Number of connections that are allowed in addition to the usual limit.
 
     Attributes
     ----------
@@ -352,9 +352,9 @@ class Bus:
     def __init__(self, key: Key | None = None, *, extra_connections: int = 0) -> None:
         self.connect_ms = CONNECT_MS
         self._context = zmq.Context()
-        self._guard = Guard(extra_connections)
+        self._limiter = ConnectionLimiter(extra_connections)
         self._key = key
-        self.zap = None if key is None else Zap(self._guard.cut_keys)
+        self.zap = None if key is None else Zap(self._limiter.disconnect_keys)
         self._answers_handshakes = False
         self._sockets: list[Socket] = []
 
@@ -364,9 +364,9 @@ class Bus:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def bind_router(self, endpoint: str, key: str, bounds: Bounds = AUDIO) -> Socket:
+    def bind_router(self, endpoint: str, key: str, limits: Limits = AUDIO) -> Socket:
         """Bind a socket that many peers send commands or data to."""
-        return self._bind(zmq.ROUTER, endpoint, key, bounds)
+        return self._bind(zmq.ROUTER, endpoint, key, limits)
 
     def bind_publisher(
         self, endpoint: str, key: str, on_joined: Callable[[str], None] = lambda session: None
@@ -423,7 +423,7 @@ class Bus:
 
     def close(self) -> None:
         """Close every socket and the context."""
-        self._guard.close()
+        self._limiter.close()
         for socket in self._sockets:
             socket.close()
         self._sockets.clear()
@@ -449,11 +449,11 @@ class Bus:
         kind: int,
         endpoint: str,
         key: str,
-        bounds: Bounds,
+        limits: Limits,
         on_joined: Callable[[str], None] = lambda session: None,
     ) -> Socket:
         split_endpoint(endpoint, key)
-        raw = self._open(kind, bounds.num_answers)
+        raw = self._open(kind, limits.num_answers)
         raw.setsockopt(zmq.IPV6, "[" in endpoint)
         raw.setsockopt_string(zmq.ZAP_DOMAIN, key)  # with one, libzmq refuses ZMTP 1 and 2
         if self._key is not None:
@@ -465,9 +465,9 @@ class Bus:
         if kind == zmq.ROUTER:
             raw.setsockopt(zmq.ROUTER_HANDOVER, 1)
         if not self._answers_handshakes:
-            answer_handshakes(self._context, self.zap, self._guard.is_shut_out)
+            answer_handshakes(self._context, self.zap, self._limiter.is_blocked)
             self._answers_handshakes = True
-        guarded = self._guard.watch(raw, bounds)
+        limited = self._limiter.limit(raw, limits)
         try:
             raw.bind(endpoint)
         except zmq.ZMQError as error:
@@ -476,12 +476,12 @@ class Bus:
                 f"{key}: cannot bind {endpoint}: {error.strerror or error}; "
                 "is another system running, or the address not this host's?"
             ) from None
-        guarded.port = int(raw.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+        limited.port = int(raw.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         socket = Socket(
             raw,
             self._key,
             self.zap,
-            guarded,
+            limited,
             routes=kind == zmq.ROUTER,
             publishes=kind == zmq.XPUB,
             on_joined=on_joined,
@@ -522,5 +522,5 @@ class Poller:
         ready = dict(self._poller.poll(max(0, int(timeout_s * 1000))))
         for raw, socket in self._sockets.items():
             if raw not in ready:
-                socket.drained()
+                socket.note_empty()
         return [socket for raw, socket in self._sockets.items() if raw in ready]

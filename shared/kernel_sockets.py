@@ -1,4 +1,4 @@
-"""What the kernel says of a socket of libzmq's, by its descriptor."""
+"""What the kernel reports about one of libzmq's sockets, given its file descriptor."""
 
 from __future__ import annotations
 
@@ -12,14 +12,29 @@ import struct
 import sys
 import termios
 from collections.abc import Iterator
+from typing import NamedTuple
 
-SEES_BYTES = sys.platform == "linux"  # how many bytes came and went
-# where struct tcp_info has tcpi_bytes_acked and tcpi_bytes_received
-_BYTES_ACKED, _BYTES_RECEIVED = 120, 128
+_IS_LINUX = sys.platform == "linux"
+_COUNTERS = struct.Struct("120x2Q")  # struct tcp_info: tcpi_bytes_acked, tcpi_bytes_received
+_SIOCOUTQNSD = 0x894B  # bytes that the kernel has not sent yet
+_RESET = struct.pack("ii", 1, 0)  # struct linger: on, no time
+_DISCARD = getattr(socket, "MSG_DONTWAIT", 0) | socket.MSG_TRUNC
+_SINK = bytearray(1024 * 1024)
+
+
+class Traffic(NamedTuple):
+    """Byte counts of one connection; all 0 where the kernel does not report them."""
+
+    read: int = 0
+    """received bytes that this process has read"""
+    acknowledged: int = 0
+    """sent bytes that the peer's kernel has accepted"""
+    unsent: int = 0
+    """bytes that wait because the peer's kernel accepts no more"""
 
 
 def inode_of(descriptor: int) -> int | None:
-    """Return the number of the socket that a descriptor stands for, None if it is no socket."""
+    """Return the inode of the socket behind a descriptor, None if it is not a socket."""
     try:
         status = os.fstat(descriptor)
     except OSError:
@@ -28,28 +43,29 @@ def inode_of(descriptor: int) -> int | None:
 
 
 def address_of(descriptor: int) -> str:
-    """Return the other end's address, empty if it is gone.
-
-    All that one host has at its hand counts as one: loopback, and an IPv6 network.
-    """
-    with contextlib.suppress(OSError), borrowed(descriptor) as connection:
+    """Return the peer's network (see ``network_of``), empty if the peer is gone."""
+    with contextlib.suppress(OSError), _borrow(descriptor) as connection:
         return network_of(str(connection.getpeername()[0]))
     return ""
 
 
 def port_of(descriptor: int) -> int:
-    """Return the port of this end, 0 if it has none."""
-    with contextlib.suppress(OSError), borrowed(descriptor) as connection:
+    """Return the local port, 0 if there is none."""
+    with contextlib.suppress(OSError), _borrow(descriptor) as connection:
         name = connection.getsockname()
         return int(name[1]) if isinstance(name, tuple) else 0
     return 0
 
 
 def network_of(host: str) -> str:
-    """Return what counts as one with a host: "loopback", an IPv6 network; else itself."""
+    """Return the addresses that one host controls as one name.
+
+    Loopback addresses become "loopback" and an IPv6 address its /64 network. Returns an empty
+    string if ``host`` is not an IP address.
+    """
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:  # the other end is gone
+    except ValueError:
         return ""
     if address.version == 6:
         address = address.ipv4_mapped or address
@@ -59,37 +75,42 @@ def network_of(host: str) -> str:
     return str(ipaddress.ip_network((address, prefix), strict=False).network_address)
 
 
-def bytes_read(descriptor: int) -> tuple[int, int]:
-    """Return how many bytes libzmq has read at least, and at most; the kernel has others still."""
-    with contextlib.suppress(OSError):
-        before = tcp_figure(descriptor, _BYTES_RECEIVED)
-        waiting = _kernel_figure(descriptor, termios.FIONREAD)
-        return before - waiting, tcp_figure(descriptor, _BYTES_RECEIVED) - waiting
-    return 0, 0
+def traffic_of(descriptor: int) -> Traffic:
+    """Return the byte counts of a TCP connection. Only Linux reports them."""
+    if not _IS_LINUX:
+        return Traffic()
+    try:
+        with _borrow(descriptor) as connection:
+            info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _COUNTERS.size)
+        acknowledged, received = _COUNTERS.unpack(info)
+        unread = _request(descriptor, termios.FIONREAD)
+        return Traffic(received - unread, acknowledged, _request(descriptor, _SIOCOUTQNSD))
+    except (OSError, struct.error):  # closed
+        return Traffic()
 
 
-def bytes_taken(descriptor: int) -> tuple[int, int]:
-    """Return how many bytes the peer has acknowledged, and how many it has still to."""
-    with contextlib.suppress(OSError):
-        waiting = _kernel_figure(descriptor, termios.TIOCOUTQ)
-        return tcp_figure(descriptor, _BYTES_ACKED), waiting
-    return 0, 0
+def reset(descriptor: int, inode: int) -> None:
+    """Reset a connection, unless the descriptor has been reused. Any thread may call this."""
+    with contextlib.suppress(OSError):  # closed already
+        copy = os.dup(descriptor)  # libzmq cannot close the copy
+        try:
+            if inode_of(copy) == inode:
+                with _borrow(copy) as connection:
+                    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+                    connection.shutdown(socket.SHUT_RDWR)
+                    while connection.recv_into(_SINK, 0, _DISCARD):  # or libzmq would read it
+                        pass
+        finally:
+            os.close(copy)
 
 
-def tcp_figure(descriptor: int, offset: int) -> int:
-    """Return a 64-bit figure of struct tcp_info."""
-    with borrowed(descriptor) as connection:
-        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, offset + 8)
-    return int(struct.unpack_from("Q", info, offset)[0])
-
-
-def _kernel_figure(descriptor: int, request: int) -> int:
+def _request(descriptor: int, request: int) -> int:
     return int(struct.unpack("i", fcntl.ioctl(descriptor, request, bytes(4)))[0])
 
 
 @contextlib.contextmanager
-def borrowed(descriptor: int) -> Iterator[socket.socket]:
-    """Yield a socket of Python for a descriptor that stays libzmq's."""
+def _borrow(descriptor: int) -> Iterator[socket.socket]:
+    """Yield a Python socket for a descriptor that libzmq owns."""
     connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, fileno=descriptor)
     try:
         yield connection

@@ -9,6 +9,7 @@ import zmq
 from zmq.utils import z85
 
 from kouxing.shared.errors import UserError
+from kouxing.shared.kernel_sockets import network_of
 from kouxing.shared.keys import Guests, guests_file, read_guests
 from kouxing.shared.logs import LOG
 
@@ -91,7 +92,7 @@ class Zap:
 def answer_handshakes(
     context: zmq.Context[zmq.Socket[bytes]],
     zap: Zap | None,
-    is_shut_out: Callable[[str], bool],
+    is_blocked: Callable[[str], bool],
 ) -> None:
     """Answer libzmq on a thread of its own, until the context ends.
 
@@ -104,14 +105,16 @@ def answer_handshakes(
         Of the sockets.
     zap
         Says which keys may connect; None: all is plain.
-    is_shut_out
-        Says whether nobody may connect from an address.
+    is_blocked
+        Returns whether a key or, without keys, an address cannot connect for now.
     """
     socket = context.socket(zmq.REP)
     socket.bind("inproc://zeromq.zap.01")
 
     def may_connect(address: str, domain: str, key: str) -> bool:
-        return not is_shut_out(address) and (zap is None or zap.may_connect(key, domain))
+        if zap is None:
+            return not is_blocked(network_of(address))
+        return not is_blocked(key) and zap.may_connect(key, domain)
 
     def answer() -> None:
         with socket:

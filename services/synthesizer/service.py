@@ -214,7 +214,7 @@ class SynthesizerService(Service):
         if now_s > self._dropped_s + 1.0:
             self._dropped_s = now_s
             live = [name for name, session in self._sessions.items() if session.start.paced]
-            self._faps.drop_stopped((FapFrame,), live)
+            self._faps.disconnect_stalled((FapFrame,), live)
         for session in self._sessions.values():
             session.receiver.tick()
             if session.start.paced and not session.finished and not session.waiting:

@@ -1,0 +1,287 @@
+"""Limits of connections over real sockets: hostile peers are disconnected, honest ones never."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from kouxing.evaluation.system.attackers import connected, frame
+from kouxing.shared import connections
+from kouxing.shared.bus import ERROR_COST, MAX_DROPPED, Bus, Received, Socket
+from kouxing.shared.connections import BUDGET, MAX_TOPIC, MAX_TOPICS
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.codec import encode
+from kouxing.shared.wire.face import FapFrame
+from kouxing.shared.wire.message import MAX_AUDIO_BYTES, Message
+from kouxing.shared.wire.session import Error
+from kouxing.shared.wire.speech import Progress
+
+pytestmark = pytest.mark.e2e
+
+LOCAL = "tcp://127.0.0.1:*"
+LIMIT_S = 60.0  # for what takes no time on an idle machine
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    with Bus() as made:
+        yield made
+
+
+def port_of(bound: Socket) -> int:
+    return int(bound.endpoint.rpartition(":")[2])
+
+
+def collect(bus: Bus, bound: Socket, is_enough: Callable[[list[Received]], bool]) -> list[Received]:
+    """Receive as a service's loop does, until it is enough."""
+    received: list[Received] = []
+    poller, end_s = bus.poller(), time.monotonic() + 30
+    poller.add(bound)
+    while not is_enough(received):
+        assert time.monotonic() < end_s
+        for ready in poller.wait(0.01):
+            received += ready.receive()
+    return received
+
+
+def chunk(sequence: int, num_bytes: int = MAX_AUDIO_BYTES, session: str = "s") -> Message:
+    return AudioChunk(session=session, token="t", sequence=sequence, pcm=bytes(num_bytes))
+
+
+def wire_bytes(message: Message) -> bytes:
+    topic, body = encode(message)
+    return frame(topic, more=True) + frame(body)
+
+
+def test_fast_senders_wait_while_nothing_is_received(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    senders = [bus.connect_dealer(audio.endpoint) for _ in range(16)]
+    num_chunks = 30
+    for name, sender in enumerate(senders):
+        for number in range(num_chunks):
+            assert sender.send(chunk(number, session=str(name)))
+    time.sleep(0.5)  # as when a service pauses a socket
+    received = collect(bus, audio, lambda all_: len(all_) == len(senders) * num_chunks)
+    numbers: dict[str, list[int]] = {}
+    for each in received:
+        assert isinstance(each.message, Message)
+        numbers.setdefault(each.message.session, []).append(each.message.sequence)
+    assert numbers == {str(name): [*range(num_chunks)] for name in range(len(senders))}
+
+
+def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    data = wire_bytes(chunk(1))
+    taken: list[Received] = []
+    with connected(port_of(audio)) as slow:
+        other = bus.connect_dealer(audio.endpoint)
+        for begin in range(0, len(data), len(data) // 4):
+            slow.sendall(data[begin : begin + len(data) // 4])
+            for number in range(20):  # others' messages are delivered meanwhile
+                other.send(Progress(sequence=number, level_db=0.0))
+                time.sleep(0.005)
+                taken += audio.receive()
+        slow.sendall(wire_bytes(chunk(2, 10)))
+        taken += collect(bus, audio, lambda all_: chunk(2, 10) in [r.message for r in all_])
+    assert chunk(1) in [each.message for each in taken]
+
+
+def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
+    faps = bus.bind_publisher(LOCAL, "faps")
+    num_topics = MAX_TOPICS // MAX_TOPIC + 100
+    with connected(port_of(faps), "SUB") as subscriber:
+        for number in range(num_topics):
+            topic = str(number).rjust(MAX_TOPIC, "x").encode()
+            subscriber.sendall(frame(b"\x01" + topic) + frame(b"\x00" + topic))
+            time.sleep(0.001)
+            list(faps.receive())
+        subscriber.sendall(frame(b"\x01fap-frame/") + frame(b"\x01joined/s/"))
+        subscriber.settimeout(0.002)
+        answer, end_s = b"", time.monotonic() + 20
+        while b"joined/s/" not in answer:
+            assert time.monotonic() < end_s
+            list(faps.receive())
+            try:
+                answer += subscriber.recv(1000)
+            except TimeoutError:
+                continue
+
+
+def test_disconnects_a_peer_with_too_many_subscriptions(bus: Bus) -> None:
+    faps = bus.bind_publisher(LOCAL, "faps")
+    honest = bus.connect_subscriber(faps.endpoint)
+    honest.subscribe(FapFrame, "s")
+    with connected(port_of(faps), "SUB") as hostile:
+        for number in range(MAX_TOPICS // MAX_TOPIC):
+            hostile.sendall(frame(b"\x01" + str(number).rjust(MAX_TOPIC, "x").encode()))
+        assert not is_cut(hostile, faps, num_looks=20)
+        hostile.sendall(frame(b"\x01x"))
+        assert is_cut(hostile, faps)
+    with connected(port_of(faps), "SUB") as hostile:
+        hostile.sendall(frame(b"\x01" + bytes(MAX_TOPIC + 1)))
+        assert is_cut(hostile, faps)
+    frame_ = FapFrame(session="s", values=b"\0" * 272, mask=b"\0" * 9)
+    faps.send(frame_)
+    assert honest.wait(20.0)
+
+
+def is_cut(connection: socket.socket, bound: Socket, num_looks: int = 500) -> bool:
+    """Whether a connection ends soon, while its other end's messages are received."""
+    for _ in range(num_looks):
+        list(bound.receive())
+        if has_ended(connection):
+            return True
+    return False
+
+
+def has_ended(connection: socket.socket) -> bool:
+    """Whether a connection ends now."""
+    connection.settimeout(0.02)
+    try:
+        return not connection.recv(65_536)
+    except TimeoutError:
+        return False
+    except OSError:
+        return True
+
+
+def test_disconnects_a_peer_whose_message_does_not_end(bus: Bus) -> None:
+    phones = bus.bind_router(LOCAL, "phones")
+    with connected(port_of(phones)) as hostile:
+        hostile.sendall(frame(b"", more=True) * 50_000)
+        assert is_cut(hostile, phones)
+
+
+def test_disconnects_a_peer_that_sends_only_bad_messages(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    with connected(port_of(audio)) as hostile:
+        hostile.settimeout(0.001)
+        bad = 10 * (frame(b"nothing/s/", more=True) + frame(b"\x80"))  # credit comes back meanwhile
+        unsent = bad
+        end_s = time.monotonic() + LIMIT_S
+        while time.monotonic() < end_s:
+            try:
+                unsent = unsent[hostile.send(unsent) :] or bad
+            except TimeoutError:
+                pass
+            except OSError:
+                return
+            for received in audio.receive():
+                audio.send(Error(code="bad-message", text="no"), to=received.sender)
+    raise AssertionError("it was not cut")
+
+
+def test_each_connection_has_its_own_number(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    port = port_of(audio)
+    with connected(port) as first, connected(port) as second:
+        numbers = []
+        for sequence, connection in enumerate((first, second, first, second)):
+            connection.sendall(wire_bytes(chunk(sequence, 10)))
+            (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
+            numbers.append(received.sender.connection)
+    assert numbers[:2] == numbers[2:]
+    assert len({*numbers, 0}) == 3
+
+
+def test_reports_the_end_of_a_connection(bus: Bus) -> None:
+    audio = bus.bind_router(LOCAL, "audio")
+    port = port_of(audio)
+    with connected(port) as lasting:
+        for _ in range(3):  # a descriptor is used again
+            with connected(port) as connection:
+                connection.sendall(wire_bytes(chunk(1, 10)))
+                (received,) = collect(bus, audio, lambda all_: len(all_) == 1)
+                assert not list(audio.ended())
+            end_s = time.monotonic() + 20
+            ended: list[int] = []
+            while not ended and time.monotonic() < end_s:
+                ended = list(audio.ended())
+            assert ended == [received.sender.connection]
+        lasting.sendall(wire_bytes(chunk(1, 10)))
+        assert collect(bus, audio, lambda all_: len(all_) == 1)
+
+
+def test_silent_connections_make_room_for_new_ones(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 40)
+    audio = bus.bind_router(LOCAL, "audio")
+    talker = bus.connect_dealer(audio.endpoint)
+    talker.send(chunk(1, 10))
+    collect(bus, audio, lambda all_: len(all_) == 1)
+    silent = [connected(port_of(audio)) for _ in range(60)]
+    late = bus.connect_dealer(audio.endpoint)
+    late.send(chunk(2, 10))
+    collect(bus, audio, lambda all_: len(all_) == 1)
+    talker.send(chunk(3, 10))
+    collect(bus, audio, lambda all_: late.send(chunk(3, 10)) and bool(all_))
+    assert all(is_cut(each, audio) for each in silent[: 60 - 40])
+    for each in silent:
+        each.close()
+
+
+def test_a_disconnected_address_is_blocked_for_a_while(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kouxing.shared.bus.LONG_PENALTY_S", 600.0)
+    audio = bus.bind_router(LOCAL, "audio")
+    talker = bus.connect_dealer(audio.endpoint)
+    talker.send(chunk(1, 10))
+    collect(bus, audio, lambda all_: len(all_) == 1)
+    with connected(port_of(audio)) as hostile:
+        hostile.sendall(frame(b"", more=True) * 2 * MAX_DROPPED + frame(b""))
+        assert is_cut(hostile, audio)
+    for host in ("127.0.0.1", "127.0.0.9"):  # the same host
+        with contextlib.suppress(ConnectionError), connected(port_of(audio), host=host) as other:
+            assert is_cut(other, audio, num_looks=50)
+    late = bus.connect_dealer(audio.endpoint)
+    for sequence in range(10, 20):  # the existing connection stays
+        time.sleep(0.02)
+        talker.send(chunk(sequence, 10))
+        received = collect(bus, audio, lambda all_: len(all_) >= 1)
+        assert received[-1].message == chunk(sequence, 10)
+    monkeypatch.setattr(connections, "BUDGET_PER_S", 1e9)  # recovered
+    collect(bus, audio, lambda all_: late.send(chunk(3, 10)) and bool(all_))
+
+
+@pytest.mark.parametrize("kind", ["DEALER", "SUB"])
+def test_drops_a_message_of_very_many_parts_step_by_step(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(connections, "LOOK_S", 600.0)  # the limiter comes too late
+    bound = (bus.bind_router if kind == "DEALER" else bus.bind_publisher)(LOCAL, "bound")
+    with connected(port_of(bound), kind) as hostile:
+        num_parts = 20 * MAX_DROPPED
+        hostile.sendall(frame(b"", more=True) * num_parts + frame(b""))
+        assert bound.wait(20.0)
+        turns = 0
+        while bound.wait(0.0):
+            list(bound.receive())
+            turns += 1
+    assert turns >= num_parts // MAX_DROPPED
+
+
+def test_a_new_connection_inherits_the_budget_of_the_previous_one(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "BUDGET_PER_S", 0.0)
+    audio = bus.bind_router(LOCAL, "audio")
+    bad = frame(b"nothing/s/", more=True) + frame(b"\x80")
+    num_refused = 0
+    for _ in range(4):
+        with contextlib.suppress(ConnectionError), connected(port_of(audio)) as hostile:
+            hostile.sendall(bad * 500)
+            num_left = 500
+            while num_left and not has_ended(hostile):
+                for received in audio.receive():
+                    audio.send(Error(code="bad-message", text="no"), to=received.sender)
+                    num_left -= 1
+                    num_refused += 1
+        while bus._limiter:
+            list(audio.receive())
+    assert num_refused < BUDGET / ERROR_COST + 10
