@@ -33,7 +33,7 @@ setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(HEADS)
 
 # Two processes begin with the tests that start services, a third with the others.
 test: .venv/installed-dev setup $(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR))
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --no-loadscope-reorder -rfER -m "not alone"
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile -m "not alone"
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m alone
 	$(NPM) $(PAGE) test
 

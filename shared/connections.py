@@ -181,6 +181,7 @@ class Connection:
         self.is_cut = True
         if penalty_s:
             self.budget.block(penalty_s)
+            self.socket.limiter.keep_budget(self)
         kernel_sockets.reset(self.descriptor, self.inode)
         if _WARNINGS.allows(reason):
             LOG.warning("disconnected a peer at %s: %s", self.address or "?", reason)
@@ -197,7 +198,7 @@ class LimitedSocket:
         self.num_sent = 0  # messages, to all peers
         self.num_polls = 0  # times that all complete messages had been delivered
         self.ended: deque[int] = deque(maxlen=MAX_CONNECTIONS)  # inodes of ended connections
-        self._limiter = limiter
+        self.limiter = limiter
         self._monitor = monitor
 
     def deliver(self, descriptor: int, key: str) -> Connection | None:
@@ -210,12 +211,12 @@ class LimitedSocket:
         key
             Public key of the sender, empty without keys.
         """
-        connection = self._limiter.find(descriptor, self)
+        connection = self.limiter.find(descriptor, self)
         if connection is None:
             return None
         if not connection.num_delivered:
             connection.key = key
-            self._limiter.inherit_budget(connection)
+            self.limiter.inherit_budget(connection)
         connection.num_delivered += 1
         connection.spend(self.limits.cost)
         return connection
@@ -228,12 +229,12 @@ class LimitedSocket:
         connection.topics.add(topic)
         if connection.topic_bytes > MAX_TOPICS:
             connection.disconnect("it has too many subscriptions", PENALTY_S)
-        self._limiter.limit_topics(len(topic))
+        self.limiter.limit_topics(len(topic))
 
     def disconnect_stalled(self, topics: Collection[bytes]) -> None:
         """Disconnect the subscribers to any of ``topics`` that stopped reading."""
         now_s = time.monotonic()
-        for connection in self._limiter.connections_to(self):
+        for connection in self.limiter.connections_to(self):
             prefixes = tuple(connection.topics)
             follows = any(topic.startswith(prefixes) for topic in topics)
             if follows and connection.is_stalled(now_s):
@@ -241,7 +242,7 @@ class LimitedSocket:
 
     def has(self, inode: int) -> bool:
         """Return whether a connection has not ended."""
-        return self._limiter.has(inode)
+        return self.limiter.has(inode)
 
     def accepted(self) -> Iterator[int]:
         """Yield the descriptors of new connections."""
@@ -324,6 +325,12 @@ class ConnectionLimiter:
         if connection.key and sum(not c.is_cut for c in same_key) > max_shared:
             connection.disconnect("its key has too many connections")
 
+    def keep_budget(self, connection: Connection) -> None:
+        """Keep what is left of a connection's budget for its owner's next connections."""
+        kept = self._budgets.get(connection.owner)
+        if connection.budget.left < (BUDGET if kept is None else kept.left):
+            self._budgets[connection.owner] = connection.budget
+
     def limit_topics(self, num_bytes: int) -> None:
         """Keep the size of all subscriptions below its limit after ``num_bytes`` more."""
         self._topic_bytes += num_bytes
@@ -397,9 +404,7 @@ class ConnectionLimiter:
             connection.socket.ended.append(connection.inode)
             if connection.is_cut or connection.unread:
                 self._trims_s = [now_s + delay_s for delay_s in TRIMS_S]
-            kept = self._budgets.get(connection.owner)
-            if connection.budget.left < (BUDGET if kept is None else kept.left):
-                self._budgets[connection.owner] = connection.budget
+            self.keep_budget(connection)
         for owner in [owner for owner, kept in self._budgets.items() if kept.left >= BUDGET]:
             del self._budgets[owner]
 
