@@ -111,7 +111,10 @@ def test_a_subscriber_may_follow_many_sessions_in_sequence(bus: Bus) -> None:
                 continue
 
 
-def test_disconnects_a_peer_with_too_many_subscriptions(bus: Bus) -> None:
+def test_disconnects_a_peer_with_too_many_subscriptions(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "PENALTY_S", 0.0)
     faps = bus.bind_publisher(LOCAL, "faps")
     honest = bus.connect_subscriber(faps.endpoint)
     honest.subscribe(FapFrame, "s")
