@@ -14,12 +14,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Self
 
+from kouxing_client import Client, KouxingError, Status
+
 from kouxing.services.kinds import KINDS, free_addresses
-from kouxing.shared.client import Client
 from kouxing.shared.config import variable
-from kouxing.shared.errors import UserError
 from kouxing.shared.keys import control_endpoint
-from kouxing.shared.wire.session import StatusReport
 
 ROOT = Path(__file__).parents[1]
 DEMO = ROOT / "shared" / "demo"
@@ -185,15 +184,13 @@ class System:
             lambda report: {state.service for state in report.services} >= set(self.processes)
         )
 
-    def wait_until(
-        self, condition: Callable[[StatusReport], bool], deadline_s: float = 110.0
-    ) -> None:
+    def wait_until(self, condition: Callable[[Status], bool], deadline_s: float = 110.0) -> None:
         """Wait until control reports what is wanted; no service may end meanwhile."""
         end_s = time.monotonic() + deadline_s
-        with Client(self.control, deadline_s=2.0) as client:
+        with Client(self.control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.assert_all_alive()
-                with contextlib.suppress(UserError):  # control may not run yet
+                with contextlib.suppress(KouxingError):  # control may not run yet
                     if condition(client.status()):
                         return
                 time.sleep(0.05)

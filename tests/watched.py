@@ -9,11 +9,11 @@ import time
 from pathlib import Path
 from typing import Self
 
+from kouxing_client import Client
 from rich.console import Console
 
 from kouxing.services.cli.supervisor import Supervisor
 from kouxing.services.kinds import more_workers, read_settings
-from kouxing.shared.client import Client
 from kouxing.shared.keys import control_endpoint
 from tests.system import own_environment
 

@@ -14,12 +14,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from random import Random
 
-import numpy as np
 import zmq
+from kouxing_client import Refused
 
-from kouxing.shared.client import Client
+from kouxing.shared import control_client
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Key, user_key
 
 # The first bytes of ZeroMQ's wire protocol, ZMTP 3.0, and the flags of its frames.
@@ -212,15 +211,19 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
     The session skips audio, which makes the synthesizer send many frames at once.
     """
     end_s = time.monotonic() + seconds
-    with Client(control) as client, zmq.Context() as context, contextlib.ExitStack() as stack:
+    with (
+        control_client.connect(control) as client,
+        zmq.Context() as context,
+        contextlib.ExitStack() as stack,
+    ):
         session = client.open_session(paced=False)
         for _ in range(NUM_SILENT_SUBSCRIBERS):
             raw = stack.enter_context(context.socket(zmq.SUB))
             raw.rcvhwm, raw.rcvbuf, raw.linger = 1, 4096, 0
-            connect(raw, session.opened.faps, user_key(), source)
+            connect(raw, session.endpoints["faps"], user_key(), source)
             raw.subscribe(f"fap-frame/{session.name}/")
         while time.monotonic() < end_s:
-            if session.send(np.zeros(320, np.int16)):
+            if session.try_push(bytes(640)):
                 session.skip(round(9.9 * MEDIA_RATE_HZ))
             time.sleep(seconds / 60)
         session.close()
@@ -229,8 +232,8 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
 def many_sessions(control: str, _source: str, seconds: float) -> None:
     """Open sessions until control refuses, and keep them."""
     end_s = time.monotonic() + seconds
-    with Client(control) as client:
-        with contextlib.suppress(UserError):  # refused
+    with control_client.connect(control) as client:
+        with contextlib.suppress(Refused):
             while time.monotonic() < end_s:
                 client.open_session()
         time.sleep(max(0.0, end_s - time.monotonic()))

@@ -32,7 +32,7 @@ from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.kinds import KINDS
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client import Client
+from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 
 PHASES = ("before", "during", "after")
@@ -116,7 +116,7 @@ def _damage(
     speech: NDArray[np.float32],
     rate_hz: int,
 ) -> Damage:
-    with Client(system.control) as client:
+    with connect(system.control) as client:
         services = client.status().services
     endpoints = {key: endpoint for state in services for key, endpoint in state.endpoints.items()}
     processes = {kind: system.supervisor.process_number(kind) for kind in KINDS}
@@ -139,7 +139,7 @@ def _damage(
 
 def _delays_ms(control: str, speech: NDArray[np.float32], rate_hz: int) -> dict[str, float | None]:
     """Stream a session through all phases; return the 95th percentile of its delays by phase."""
-    with Client(control) as client:
+    with connect(control) as client:
         times_s, delays_s, _ = stream(client, speech, rate_hz, SynthesizerConfig().delay_ms / 1e3)
     phase_ends_s = np.array([PHASE_S, 2 * PHASE_S + 2 * SESSION_START_S])
     phase = np.digitize(times_s, phase_ends_s)

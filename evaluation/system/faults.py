@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from kouxing_client import Client, KouxingError, Refused, Session
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -35,12 +36,12 @@ from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, Loca
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client import Client, Refused, Session
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
 from kouxing.shared.config import COMMON, variable
+from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
-from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
+from kouxing.shared.phones.inventory import load_inventory
 
 NUM_SESSIONS = 16
 SPIN = """
@@ -337,12 +338,12 @@ def _outcome(
     with (
         _system(fault, folder, timing, console) as system,
         system.on_client(),
-        Client(system.control, key=system.key) as client,
+        connect(system.control, key=system.key) as client,
     ):
         if len(sound) not in undisturbed:
             undisturbed[len(sound)] = speak_undisturbed(client, sound)
         sessions, num_refused = _open_all(client, fault.num_sessions)
-        silence = load_inventory(sessions[0].opened.facts.language or DEFAULT_LANGUAGE).silence
+        silence = load_inventory(sessions[0].endpoints["facts"]["language"]).silence
         publishers = [
             each.endpoints["faps"] for each in client.status().services if "faps" in each.endpoints
         ]
@@ -361,7 +362,7 @@ def _outcome(
         load = os.getloadavg()[0]
         wire.close()
         for session in sessions:
-            with contextlib.suppress(UserError):  # gone already
+            with contextlib.suppress(KouxingError):  # gone already
                 session.close()
     failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
     faces = [

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from kouxing_client import Client
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -27,9 +28,8 @@ from rich.table import Table
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client import Client
+from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
 
 CHUNK_S = 0.02
 END_LIMIT_S = 30.0  # the last frame must come within this time
@@ -59,7 +59,7 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
     with (
         tempfile.TemporaryDirectory() as folder,
         LocalSystem(Path(folder), console) as system,
-        Client(system.control) as client,
+        connect(system.control) as client,
     ):
         before = _cpu_s(client)
         delays = [
@@ -101,34 +101,27 @@ def stream(
     session = client.open_session(
         encoding="f32le", sample_rate_hz=rate_hz, num_channels=samples.shape[1]
     )
-    output = session.subscribe(FapFrame, EndOfFaps)
+    output = session.frames()
     chunk = round(CHUNK_S * rate_hz)
     sent_s: list[float] = []
     arrived: list[tuple[float, float]] = []  # media time, arrival
 
-    def take() -> bool:
-        now_s = time.perf_counter()
-        for received in output.receive():
-            if isinstance(received.message, EndOfFaps):
-                return True
-            if isinstance(received.message, FapFrame):
-                arrived.append((received.message.media_time / 16000, now_s))
-        return False
+    def receive(timeout_s: float) -> None:
+        for frame in output.available(timeout_s):
+            arrived.append((frame.time_s, time.perf_counter()))
 
     begin_s = time.perf_counter()
     for number, begin in enumerate(range(0, len(samples) - chunk + 1, chunk), start=1):
         while (left_s := begin_s + number * CHUNK_S - time.perf_counter()) > 0:
-            if left_s > 0.001:
-                output.wait(left_s)
-            take()
-        if not session.send(samples[begin : begin + chunk]):
+            receive(left_s)
+        if not session.try_push(samples[begin : begin + chunk].astype("<f4").tobytes()):
             raise UserError("the recognizer takes no audio; this machine is too busy to measure on")
         sent_s.append(time.perf_counter())
     live_until_s = time.perf_counter()
     session.finish()
     end_s = time.perf_counter() + END_LIMIT_S
-    while not take():
-        output.wait(1.0)
+    while not output.has_ended:
+        receive(1.0)
         if time.perf_counter() > end_s:
             raise UserError("the last frame did not come; this machine is too busy to measure on")
     session.close()

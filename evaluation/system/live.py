@@ -7,15 +7,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from kouxing_client import Client, FapFrame, KouxingError, Phone, Session, Speech
 from numpy.typing import NDArray
 
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.client import Client, Session
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import Key
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
-from kouxing.shared.wire.speech import Phone, Speech
+from kouxing.shared.wire import face
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
 END_LIMIT_S = 15.0  # after the last sample the last frame must come within this time
@@ -79,7 +78,7 @@ class Wire:
     def __init__(self, session: Session, endpoints: Sequence[str], key: Key) -> None:
         self._bus = Bus(key)
         self._socket: Socket = self._bus.connect_subscriber(*endpoints)
-        self._socket.subscribe(FapFrame, session.name)
+        self._socket.subscribe(face.FapFrame, session.name)
         self._epoch = 0
         self.num_old = 0  # frames that came after the first of a later epoch
 
@@ -87,7 +86,7 @@ class Wire:
         """Take what has come."""
         for received in self._socket.receive():
             frame = received.message
-            if isinstance(frame, FapFrame):
+            if isinstance(frame, face.FapFrame):
                 self.num_old += frame.epoch < self._epoch
                 self._epoch = max(self._epoch, frame.epoch)
 
@@ -142,8 +141,9 @@ def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
 class _Speaker:
     def __init__(self, session: Session, sound: NDArray[np.float32], *, paced: bool) -> None:
         self._session = session
-        self._output = session.subscribe(FapFrame, EndOfFaps, Phone, Speech)
-        self._chunks = [sound[at : at + CHUNK] for at in range(0, len(sound), CHUNK)]
+        self._output = session.results(FapFrame, Phone, Speech, keep_all=True)
+        pcm, size = sound.astype("<f4").tobytes(), 4 * CHUNK
+        self._chunks = [pcm[at : at + size] for at in range(0, len(pcm), size)]
         self._num_sent = 0
         self._paced = paced
         self._has_finished = False
@@ -159,24 +159,27 @@ class _Speaker:
 
     def step(self, wait_s: float) -> None:
         """Send what is due, and take what has come."""
-        while self._num_sent < self._num_due() and self._session.send(self._chunks[self._num_sent]):
-            self._num_sent += 1
-        if self._num_sent == len(self._chunks) and not self._has_finished:
-            self._has_finished = self._session.finish()
-        for error in self._session.errors():
-            self.seen.error = f"{error.code}: {error.text}"
-        self._output.wait(wait_s)
-        now_s = time.monotonic()
-        for received in self._output.receive():
-            match received.message:
-                case FapFrame() as frame:
-                    self.seen.frames.append((now_s, frame))
-                case Phone() as phone:
-                    self.seen.phones.append(phone)
-                case Speech() as speech:
-                    self.seen.speech.append(speech)
-                case EndOfFaps():
-                    self.seen.ended = True
+        try:
+            for error in self._session.take_errors():
+                self.seen.error = str(error)
+            while self._num_sent < self._num_due():
+                if not self._session.try_push(self._chunks[self._num_sent]):
+                    break
+                self._num_sent += 1
+            if self._num_sent == len(self._chunks) and not self._has_finished:
+                self._session.finish()
+                self._has_finished = True
+            for result in self._output.available(wait_s):
+                match result:
+                    case FapFrame():
+                        self.seen.frames.append((time.monotonic(), result))
+                    case Phone():
+                        self.seen.phones.append(result)
+                    case Speech():
+                        self.seen.speech.append(result)
+        except KouxingError as error:
+            self.seen.error = str(error)
+        self.seen.ended = self._output.has_ended
 
     def _num_due(self) -> int:
         if not self._paced:

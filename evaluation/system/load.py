@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from kouxing_client import Client
 from rich.console import Console
 from rich.table import Table
 
@@ -26,7 +27,7 @@ from kouxing.evaluation.system.speakers import Crowd, read_text
 from kouxing.evaluation.system.systems import LocalSystem
 from kouxing.services.kinds import read_settings
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.client import Client
+from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 
 LIMIT_MS = 60.0  # that 95 % of the frames must come within
@@ -139,7 +140,7 @@ def step_sizes(most: int) -> list[int]:
 
 
 def _step(control: str, text: Any, number: int, step_s: float, delay_s: float) -> Step:
-    with Client(control) as client:
+    with connect(control) as client:
         crowd = Crowd(client, text, number)
         crowd.start()
         from_s = time.perf_counter() + SETTLE_S

@@ -8,21 +8,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from kouxing_client import Client, FapFrame, Refused, Session
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.live import CHUNK
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client import Client, Refused, Session
 from kouxing.shared.clock import MEDIA_RATE_HZ
-from kouxing.shared.errors import UserError
-from kouxing.shared.follower import PollingLoop, SessionFollower
-from kouxing.shared.wire.face import FapFrame
 
 CHUNK_S = CHUNK / MEDIA_RATE_HZ
 VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, times those of the recording
 _PLACE = 0.618  # of the text, from one speaker to the next: no two are near each other
-_SHORT_S = 0.001  # which a poll cannot wait
 
 
 def read_text(paths: Sequence[Path]) -> NDArray[np.float32]:
@@ -65,7 +61,7 @@ class Spoken:
         size = 2 * CHUNK
         at = self.num_sent * size % (len(self.sound) // size * size)
         self.num_sent += 1
-        if not self.session.send_pcm(self.sound[at : at + size], CHUNK):
+        if not self.session.try_push(self.sound[at : at + size]):
             self.session.skip(CHUNK)
             self.num_full += 1
 
@@ -83,7 +79,7 @@ class Spoken:
         come count as if they had come at its end. A chunk counts as spoken when it is due, so a
         client or a service that is late is not excused.
         """
-        rate_hz = self.session.opened.facts.frame_rate_hz or 50.0
+        rate_hz = self.session.endpoints["facts"]["frame_rate_hz"]
         for number in range(int((until_s - self.begin_s) * rate_hz)):
             media_time = round(number / rate_hz * MEDIA_RATE_HZ)
             needed = -(-(media_time + round(delay_s * MEDIA_RATE_HZ)) // CHUNK)  # chunks
@@ -115,9 +111,6 @@ class Crowd:
     """
 
     def __init__(self, client: Client, text: NDArray[np.float32], num_speakers: int) -> None:
-        self._client = client
-        self._loop = PollingLoop(client.bus)
-        self._followers: list[SessionFollower] = []
         self.spoken: list[Spoken] = []
         self.refusals: dict[str, int] = {}
         self.lateness_s: list[float] = []
@@ -129,23 +122,12 @@ class Crowd:
                 self.refusals[refusal.code] = self.refusals.get(refusal.code, 0) + 1
                 continue
             self.spoken.append(self._follow(session, voiced(text, number)))
-        self._wait_until_followed()
 
     def _follow(self, session: Session, sound: NDArray[np.float32]) -> Spoken:
         pcm = np.round(np.clip(sound, -1.0, 1.0) * 32767).astype("<i2").tobytes()
         spoken = Spoken(session, pcm)
-        follower = SessionFollower(self._loop, session.name, {FapFrame: spoken.take})
-        opened = session.opened
-        follower.start(opened.epoch, {"phones": opened.phones, "faps": opened.faps})
-        self._followers.append(follower)
+        session.results(FapFrame, on_result=spoken.take)
         return spoken
-
-    def _wait_until_followed(self, limit_s: float = 10.0) -> None:
-        end_s = time.monotonic() + limit_s
-        while not all(each.is_complete for each in self._followers):
-            if time.monotonic() > end_s:
-                raise UserError("a synthesizer did not confirm a subscription")
-            self._loop.step(0.1)
 
     def start(self) -> None:
         """Let all begin to speak."""
@@ -161,23 +143,17 @@ class Crowd:
                 return
             speaker = self.spoken[self._turn]  # all chunks are equally long
             left_s = min(speaker.due_s, end_s) - now_s
-            if left_s > _SHORT_S:
-                self._loop.step(left_s)
-            elif left_s > 0.0:
+            if left_s > 0.0:
                 time.sleep(left_s)
             else:
                 self.lateness_s.append(now_s - speaker.due_s)
                 speaker.send()
                 self._turn = (self._turn + 1) % len(self.spoken)
                 if self._turn == 0:
-                    for each in self.spoken:
-                        for _ in each.session.errors():
-                            pass  # what was refused is missing among the frames
-                    self._loop.step(0.0)
+                    for spoken in self.spoken:
+                        spoken.session.take_errors()  # refused audio is missing among the frames
 
     def close(self) -> None:
         """End all sessions."""
-        for follower in self._followers:
-            follower.close()
         for each in self.spoken:
             each.session.close()

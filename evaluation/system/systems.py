@@ -11,15 +11,15 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol, Self
 
+from kouxing_client import Status
 from rich.console import Console
 
 from kouxing.services.cli.supervisor import Supervisor
 from kouxing.services.kinds import KINDS, free_addresses, more_workers, read_settings
-from kouxing.shared.client import Client
 from kouxing.shared.config import variable
+from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT, Key, control_endpoint, read_key, user_key
-from kouxing.shared.wire.session import StatusReport
 
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 60.0
@@ -264,9 +264,9 @@ def wait_until_ready(system: System, instances: Iterable[str]) -> None:
         time.sleep(0.1)
 
 
-def status(system: System) -> StatusReport:
+def status(system: System) -> Status:
     """Return what control says."""
-    with system.on_client(), Client(system.control, key=system.key, deadline_s=2.0) as client:
+    with system.on_client(), connect(system.control, key=system.key, timeout_s=2.0) as client:
         return client.status()
 
 

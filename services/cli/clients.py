@@ -164,11 +164,11 @@ def express(
     control: Control = "",
 ) -> None:
     """Let the face of a session show expressions for a while; none ends those before."""
-    from kouxing.shared.client import Client
+    from kouxing.shared.control_client import connect
 
     strengths = dict(map(_strength, expressions or ()))
     check_expressions(strengths, hold)
-    with Client(control_address(control)) as client:
+    with connect(control_address(control)) as client:
         client.set_face(_session_name(session), expressions=strengths, hold_s=hold)
 
 
@@ -182,9 +182,9 @@ def _strength(text: str) -> tuple[str, float]:
 
 def status(control: Control = "", json_file: JsonFile = None) -> None:
     """Show services, sessions, rates and latencies."""
-    from kouxing.shared.client import Client
+    from kouxing.shared.control_client import connect
 
-    with Client(control_address(control), deadline_s=3.0) as client:
+    with connect(control_address(control), timeout_s=3.0) as client:
         report = client.status()
     out = Console()
     services = Table("service", "state", "answered", "figures", box=box.SIMPLE)

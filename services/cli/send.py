@@ -1,27 +1,23 @@
-"""Sends the face of a running session to other programs, until the user interrupts."""
+"""Sends the face of a running session to other programs until the user interrupts."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
 import threading
+import time
 from collections.abc import Iterable
 
 import numpy as np
+from kouxing_client import Client, FapFrame, KouxingError, Results, Session, SessionState
 
-from kouxing.services.cli.follow import OPEN_POLL_S, find_session
 from kouxing.services.senders.senders import Senders
 from kouxing.services.senders.target import Target
-from kouxing.shared.client import Client
-from kouxing.shared.clock import to_seconds
-from kouxing.shared.errors import UserError
-from kouxing.shared.follower import PollingLoop, SessionFollower
+from kouxing.shared.control_client import connect
 from kouxing.shared.terminal import print_message
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.session import SessionState
 
+SEARCH_PERIOD_S = 0.2
 STEP_S = 0.05
-SEARCH_LIMIT_S = 1.0
 
 
 def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_seed: int) -> None:
@@ -29,10 +25,14 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
 
     Parameters
     ----------
+    targets
+        Programs that receive the face.
     session
-        Its name; empty: the newest at any time.
+        Session name. If empty, the newest session at any time.
+    control
+        Where control takes commands.
     idle_motion_seed
-        Of the face that is sent while there are no frames.
+        Seed of the face's idle motion, which is sent while there are no frames.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
     """
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
     with (
-        Client(control) as client,
+        connect(control) as client,
         contextlib.closing(Senders(idle_motion_seed, _report)) as senders,
         contextlib.suppress(KeyboardInterrupt),
     ):
@@ -49,23 +49,23 @@ def send_to(targets: Iterable[Target], session: str, control: str, idle_motion_s
         for target in targets:
             senders.start(target)
             print_message(f"sending {target.contents} to {target.url}; Ctrl-C ends")
-        with _Search(session, control) as search:
-            _follow(search, client, senders)
+        with _Search(session, client) as search:
+            _send_frames(search, client, senders)
 
 
 class _Search:
-    """Asks control for the session to follow, in a thread: answers may take their time.
+    """Asks control for the session to follow, in a thread because answers may take long.
 
     Attributes
     ----------
-    found
-        What control said last, if there was one.
+    newest
+        The session that control reported last; None if there was none.
     """
 
-    def __init__(self, session: str, control: str) -> None:
-        self.found: SessionState | None = None
+    def __init__(self, session: str, client: Client) -> None:
+        self.newest: SessionState | None = None
         self._session = session
-        self._control = control
+        self._client = client
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -78,35 +78,41 @@ class _Search:
         self._thread.join()
 
     def _run(self) -> None:
-        with Client(self._control, deadline_s=SEARCH_LIMIT_S) as client:
-            while not self._ended.wait(OPEN_POLL_S):
-                with contextlib.suppress(UserError):  # control may start again
-                    self.found = find_session(self._session, client) or self.found
+        while not self._ended.wait(SEARCH_PERIOD_S):
+            with contextlib.suppress(KouxingError):  # no such session, or control restarts
+                published = [
+                    state
+                    for state in self._client.status(self._session).sessions
+                    if "faps" in state.endpoints
+                ]
+                self.newest = min(published, key=lambda state: state.age_s, default=self.newest)
 
 
-def _follow(search: _Search, client: Client, senders: Senders) -> None:
-    """Send the frames of the session that was found last, for ever."""
-
-    def accept(frame: FapFrame) -> None:
-        values = np.frombuffer(frame.values, "<f4").astype(np.float32)
-        senders.accept(to_seconds(frame.media_time), values)
-
-    loop = PollingLoop(client.bus)
-    follower: SessionFollower | None = None
-    before: SessionState | None = None
+def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
+    """Send the frames of the session that was found last, forever."""
+    state: SessionState | None = None
+    session: Session | None = None
+    frames: Results[FapFrame] | None = None
     while True:
-        found = search.found
-        if found is not None and found is not before:
-            if follower is None or before is None or _is_another(found, before):
-                if follower is not None:
-                    follower.close()
-                follower = SessionFollower(loop, found.session, {FapFrame: accept})
-                follower.start(0, found.endpoints)
-                print_message(f"following session {found.session}")
-            elif found.endpoints != before.endpoints:
-                follower.start(0, found.endpoints)
-            before = found
-        loop.step(STEP_S)
+        newest = search.newest
+        if newest is not None and (state is None or _is_another(newest, state)):
+            if session is not None:
+                session.close()
+            state = None
+            with contextlib.suppress(KouxingError):  # it is closed already, or control restarts
+                session = client.follow(newest.session)
+                frames = session.frames()
+                print_message(f"following session {newest.session}")
+                state = newest
+        else:
+            state = newest
+        frame: FapFrame | None = None
+        with contextlib.suppress(KouxingError):  # the session was closed before its last frame
+            frame = None if frames is None else frames.get(STEP_S)
+        if frame is not None:
+            senders.accept(frame.time_s, np.array(frame.values, np.float32))
+        elif frames is None or frames.has_ended:
+            time.sleep(STEP_S)
 
 
 def _is_another(session: SessionState, before: SessionState) -> bool:

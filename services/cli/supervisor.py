@@ -14,11 +14,12 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO
 
+from kouxing_client import KouxingError
 from rich.console import Console
 
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
 from kouxing.services.kinds import KINDS, kind_of
-from kouxing.shared.client import Client
+from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.service import DRAIN_LIMIT_S
 
@@ -86,10 +87,10 @@ class Supervisor:
             If a service cannot start, or the deadline passes.
         """
         end_s = time.monotonic() + deadline_s
-        with Client(control, deadline_s=2.0) as client:
+        with connect(control, timeout_s=2.0) as client:
             while time.monotonic() < end_s:
                 self.check()
-                with contextlib.suppress(UserError):
+                with contextlib.suppress(KouxingError):  # control does not run yet
                     ready = Counter(service.service for service in client.status().services)
                     if ready >= Counter(map(kind_of, self._names)):
                         return
@@ -99,7 +100,7 @@ class Supervisor:
     @staticmethod
     def page_address(control: str) -> str:
         """Return the address of the gateway's page, including its token."""
-        with Client(control) as client:
+        with connect(control) as client:
             services = client.status().services
         gateway = next(service for service in services if service.service == "gateway")
         return gateway.endpoints["page"].removesuffix("/")

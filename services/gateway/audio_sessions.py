@@ -9,10 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
-from dataclasses import asdict
 
 from kouxing_client import AsyncClient, AsyncSession, KouxingError, Refused
-from kouxing_client import Key as ClientKey
 
 from kouxing.services.gateway import wire
 from kouxing.shared.errors import UserError
@@ -121,7 +119,7 @@ class AudioSessions:
         if self._client is None:
             self._client = AsyncClient(
                 self._control,
-                key=None if self._key is None else ClientKey(**asdict(self._key)),
+                key=self._key,
                 insecure=self._key is None,
                 timeout_s=CONTROL_TIMEOUT_S,
             )

@@ -6,19 +6,28 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+from kouxing_client import Client, FapFrame, Phone, Result, Results, Session, Sound, Speech
+from kouxing_client.messages import Floats
 from numpy.typing import NDArray
 
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.bus import Received
-from kouxing.shared.client import Client, Session, Subscription
-from kouxing.shared.wire.audio import Sound
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
-from kouxing.shared.wire.message import Message
-from kouxing.shared.wire.speech import Lips, Phone, Speech
 
-KINDS: tuple[type[Message], ...] = (FapFrame, EndOfFaps, Phone, Lips, Speech, Sound)
+
+class Lips(Result, frozen=True, kw_only=True):
+    """The mouth from a lip model that works on the audio itself."""
+
+    kind: ClassVar[str] = "lips"
+
+    values: Floats
+    delay: int
+    closure: float
+    lip_to_teeth: float
+
+
+KINDS: tuple[type[Result], ...] = (FapFrame, Phone, Lips, Speech, Sound)
 
 
 @dataclass
@@ -28,23 +37,20 @@ class Collected:
     lips: list[Lips] = field(default_factory=list)
     speech: list[Speech] = field(default_factory=list)
     sounds: list[Sound] = field(default_factory=list)
-    ended: bool = False
 
-    def add(self, received: Iterable[Received]) -> None:
-        for each in received:
-            match each.message:
-                case FapFrame() as frame:
-                    self.frames.append(frame)
-                case Phone() as phone:
-                    self.phones.append(phone)
-                case Lips() as lips:
-                    self.lips.append(lips)
-                case Speech() as speech:
-                    self.speech.append(speech)
-                case Sound() as sound:
-                    self.sounds.append(sound)
-                case EndOfFaps():
-                    self.ended = True
+    def add(self, results: Iterable[Result]) -> None:
+        for result in results:
+            match result:
+                case FapFrame():
+                    self.frames.append(result)
+                case Phone():
+                    self.phones.append(result)
+                case Lips():
+                    self.lips.append(result)
+                case Speech():
+                    self.speech.append(result)
+                case Sound():
+                    self.sounds.append(result)
 
     @property
     def faps(self) -> NDArray[np.float32]:
@@ -99,7 +105,7 @@ def stream_into(
     paced: bool = False,
 ) -> Collected:
     """Stream samples into an open session and wait for the last frame."""
-    output = session.subscribe(*KINDS)
+    output = session.results(*KINDS, keep_all=True)
     collected = Collected()
     send(session, samples, output, collected, chunk=chunk, rate_hz=rate_hz, paced=paced)
     finish(session, output, collected)
@@ -109,35 +115,29 @@ def stream_into(
 def send(
     session: Session,
     samples: NDArray[np.float32],
-    output: Subscription,
+    output: Results[Any],
     collected: Collected,
     *,
     chunk: int = 320,
     rate_hz: int = 16000,
     paced: bool = False,
 ) -> None:
-    """Send samples, collecting what comes out meanwhile."""
+    """Send samples, and collect results at the same time."""
     begin_s = time.monotonic()
     for begin in range(0, len(samples), chunk):
-        while not session.send(samples[begin : begin + chunk]):
-            output.wait(0.02)
-            collected.add(output.receive())
-        if paced:
-            due_s = begin_s + (begin + chunk) / rate_hz
-            while time.monotonic() < due_s:
-                output.wait(max(0.001, due_s - time.monotonic()))
-                collected.add(output.receive())
+        session.push(samples[begin : begin + chunk])
+        due_s = begin_s + (begin + chunk) / rate_hz if paced else 0.0
+        collected.add(output.available())
+        while (left_s := due_s - time.monotonic()) > 0:
+            collected.add(output.available(left_s))
 
 
-def finish(session: Session, output: Subscription, collected: Collected) -> None:
-    """End the audio and collect the rest; the recognizer must have no complaint."""
-    while not session.finish():
-        output.wait(0.02)
-        collected.add(output.receive())
+def finish(session: Session, output: Results[Any], collected: Collected) -> None:
+    """End the audio and collect the rest; the recognizer must not complain."""
+    session.finish()
     end_s = time.monotonic() + 60
-    while not collected.ended:
+    while not output.has_ended:
         assert time.monotonic() < end_s, "the last frame did not come"
-        output.wait(0.2)
-        collected.add(output.receive())
-        assert list(session.errors()) == []
-    collected.add(output.receive())
+        collected.add(output.available(0.2))
+        assert session.take_errors() == []
+    collected.add(output.available())

@@ -9,10 +9,10 @@ import aiohttp
 import aioice
 import pytest
 from aiortc import RTCConfiguration, RTCPeerConnection
+from kouxing_client import Client, Refused
 
 from kouxing.evaluation.system.live import speak
 from kouxing.services.control.load import NUM_SURE, RETRY_AFTER_S
-from kouxing.shared.client import Client, Refused
 from tests.e2e.following import samples_of_file, stream
 from tests.scripted_system import Gateway
 from tests.system import VOWELS_FILE, System, free_port

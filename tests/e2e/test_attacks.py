@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from kouxing_client import Session
 
 from kouxing.evaluation.system import attackers
 from kouxing.evaluation.system.attackers import ATTACKS, BUSY_PROCESSOR
 from kouxing.evaluation.system.memory import Memory
-from kouxing.shared.client import Session
 from tests.raw_bytes import pour
 from tests.system import System
 

@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zmq
+from kouxing_client import Client, Refused, Session, Sound
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.client import Client, Refused, Session
 from kouxing.shared.keys import own_key, user_key
-from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
+from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import Message
@@ -39,10 +39,10 @@ def answers(socket: Socket, deadline_s: float = 60.0) -> Iterator[Error]:
                 yield received.message
 
 
-def first_error(session: Session) -> Error:
+def first_error(session: Session) -> Refused:
     end_s = time.monotonic() + 60
     while time.monotonic() < end_s:
-        for error in session.errors():
+        for error in session.take_errors():
             return error
         time.sleep(0.02)
     raise AssertionError("no error came")
@@ -50,11 +50,11 @@ def first_error(session: Session) -> Error:
 
 def test_nan_is_refused_and_the_session_goes_on(client: Client, witness: Session) -> None:
     session = client.open_session(encoding="f32le")
-    session.send(np.array([0.0, np.nan, 0.0], np.float32))
+    session.push(np.array([0.0, np.nan, 0.0], np.float32))
     assert first_error(session).code == "bad-audio"
-    output = session.subscribe(FapFrame)
-    session.send(np.zeros(8000, np.float32))
-    assert output.wait(60.0)
+    output = session.frames()
+    session.push(np.zeros(8000, np.float32))
+    assert output.get(60.0) is not None
     session.close()
 
 
@@ -62,11 +62,11 @@ def test_a_bad_mouth_profile_is_refused_and_the_session_goes_on(
     client: Client, witness: Session
 ) -> None:
     session = client.open_session(encoding="f32le", mouth_profile=b"no profile")
-    output = session.subscribe(FapFrame)
-    session.send(np.zeros(8000, np.float32))
+    output = session.frames()
+    session.push(np.zeros(8000, np.float32))
     error = first_error(session)
     assert (error.code, "not a mouth profile" in error.text) == ("bad-mouth-profile", True)
-    assert output.wait(60.0)
+    assert output.get(60.0) is not None
     session.close()
     with pytest.raises(Refused, match="bad-message"):
         client.open_session(mouth_profile=bytes(70_000))
@@ -74,7 +74,7 @@ def test_a_bad_mouth_profile_is_refused_and_the_session_goes_on(
 
 def test_half_a_sample_is_refused(client: Client, witness: Session) -> None:
     session = client.open_session(encoding="s16le", num_channels=2)
-    session.send_pcm(b"\0" * 6, 1)
+    session.push(b"\0" * 6)
     error = first_error(session)
     assert error.code == "bad-audio"
     assert "2 channels" in error.text
@@ -83,67 +83,68 @@ def test_half_a_sample_is_refused(client: Client, witness: Session) -> None:
 
 def test_empty_chunks_and_silence_and_clipping_are_taken(client: Client, witness: Session) -> None:
     session = client.open_session(encoding="f32le", paced=False)
-    output = session.subscribe(FapFrame)
-    session.send(np.zeros(0, np.float32))
-    session.send(np.zeros(8000, np.float32))
-    session.send(np.full(8000, 1e9, np.float32))
+    output = session.frames()
+    session.push(np.zeros(0, np.float32))
+    session.push(np.zeros(8000, np.float32))
+    session.push(np.full(8000, 1e9, np.float32))
     end_s = time.monotonic() + 60
     newest = -1
     while newest < 12000:
         assert time.monotonic() < end_s
-        output.wait(0.1)
-        for received in output.receive():
-            assert isinstance(received.message, FapFrame)
-            assert np.isfinite(np.frombuffer(received.message.values, "<f4")).all()
-            newest = received.message.media_time
-    assert list(session.errors()) == []
+        for frame in output.available(0.1):
+            assert np.isfinite(frame.values).all()
+            newest = frame.media_time
+    assert session.take_errors() == []
     session.close()
 
 
-def test_an_unknown_session_is_named(system: System, client: Client, witness: Session) -> None:
-    audio = client.bus.connect_dealer(witness.opened.audio)
+def test_an_unknown_session_is_named(
+    system: System, client: Client, bus: Bus, witness: Session
+) -> None:
+    audio = bus.connect_dealer(witness.endpoints["audio"])
     audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))
     error = next(answers(audio))
     assert (error.code, error.session) == ("unknown-session", "nobody")
     with pytest.raises(Refused, match="nobody") as caught:
-        client.close_session("nobody", "t")
+        client.request("close-session", "nobody", token="t")
     assert caught.value.code == "unknown-session"
 
 
-def test_a_foreign_token_is_refused_and_a_replay_dropped(client: Client, witness: Session) -> None:
-    thief = client.bus.connect_dealer(witness.opened.audio)
+def test_a_foreign_token_is_refused_and_a_replay_dropped(
+    client: Client, bus: Bus, witness: Session
+) -> None:
+    thief = bus.connect_dealer(witness.endpoints["audio"])
     thief.send(AudioChunk(session=witness.name, token="guess", sequence=1, pcm=b""))
     thief.send(AudioChunk(session=witness.name, token="guess", sequence=2, last=True))
     codes = answers(thief)
     assert [next(codes).code, next(codes).code] == ["bad-token", "bad-token"]
     with pytest.raises(Refused) as caught:
-        client.close_session(witness.name, "guess")
+        client.request("close-session", witness.name, token="guess")
     assert caught.value.code == "bad-token"
-    token = witness.opened.token
-    output = witness.subscribe(Sound)
-    witness.send(np.zeros(320, np.float32))
-    assert output.wait(60.0)
-    list(output.receive())
+    token = witness.endpoints["token"]
+    output = witness.results(Sound)
+    witness.push(np.zeros(320, np.float32))
+    assert list(output.available(60.0))
     replay = AudioChunk(session=witness.name, token=token, sequence=1, pcm=bytes(1280))
     thief.send(replace(replay, acknowledge=True))
     assert thief.wait(60.0)
     (answer,) = thief.receive()
     assert isinstance(answer.message, AcknowledgeAudio)
     assert answer.message.sequence == 1
-    assert not output.wait(0.2)
+    assert output.get(0.2) is None
 
 
 def test_a_second_client_with_the_same_name_is_refused(
     system: System, client: Client, witness: Session
 ) -> None:
     with Client(system.control) as other, pytest.raises(Refused, match="choose another name"):
-        other.open_session(session=witness.name)
+        other.open_session(name=witness.name)
 
 
 def test_audio_after_the_end_is_refused(client: Client, witness: Session) -> None:
     session = client.open_session(encoding="f32le")
     session.finish()
-    session.send(np.zeros(320, np.float32))
+    session.push(np.zeros(320, np.float32))
     assert first_error(session).code == "finished"
     session.close()
 
@@ -160,9 +161,9 @@ def test_audio_after_the_end_is_refused(client: Client, witness: Session) -> Non
     ],
 )
 def test_what_the_wire_cannot_carry_is_refused(
-    client: Client, witness: Session, system: System, fields: dict[str, object]
+    client: Client, bus: Bus, witness: Session, system: System, fields: dict[str, object]
 ) -> None:
-    socket = client.bus.connect_dealer(system.control)
+    socket = bus.connect_dealer(system.control)
     socket.send(OpenSession(request="r", **fields))  # type: ignore[arg-type]
     error = next(answers(socket))
     assert error.code == "bad-message"
@@ -246,11 +247,11 @@ def test_messages_of_other_sockets_are_refused_kindly(system: System, witness: S
     system.assert_all_alive()
 
 
-def test_a_gap_in_media_time_keeps_the_new_time(client: Client, witness: Session) -> None:
+def test_a_gap_in_media_time_keeps_the_new_time(client: Client, bus: Bus, witness: Session) -> None:
     session = client.open_session(encoding="f32le", paced=False)
-    output = session.subscribe(FapFrame)
-    token, pcm = session.opened.token, np.zeros(1600, "<f4").tobytes()
-    audio = client.bus.connect_dealer(session.opened.audio)
+    output = session.frames()
+    token, pcm = session.endpoints["token"], np.zeros(1600, "<f4").tobytes()
+    audio = bus.connect_dealer(session.endpoints["audio"])
     for sequence, media_time in ((1, 0), (2, 1600), (5, 160_000), (6, 161_600), (7, 163_200)):
         audio.send(
             AudioChunk(
@@ -264,35 +265,33 @@ def test_a_gap_in_media_time_keeps_the_new_time(client: Client, witness: Session
     newest, end_s = 0, time.monotonic() + 60
     while newest < 162_000:
         assert time.monotonic() < end_s, newest
-        output.wait(0.1)
-        for received in output.receive():
-            assert isinstance(received.message, FapFrame)
-            newest = received.message.media_time
+        for frame in output.available(0.1):
+            newest = frame.media_time
     session.close()
 
 
-def test_a_wall_clock_for_media_time_is_refused(client: Client, witness: Session) -> None:
+def test_a_wall_clock_for_media_time_is_refused(client: Client, bus: Bus, witness: Session) -> None:
     session = client.open_session(encoding="f32le")
-    audio = client.bus.connect_dealer(session.opened.audio)
-    token = session.opened.token
+    audio = bus.connect_dealer(session.endpoints["audio"])
+    token = session.endpoints["token"]
     audio.send(AudioChunk(session=session.name, token=token, sequence=1, media_time=2**53, pcm=b""))
     assert next(answers(audio)).code == "bad-audio"
     session.close()
 
 
 def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
-    client: Client, witness: Session
+    client: Client, bus: Bus, witness: Session
 ) -> None:
     session = client.open_session(encoding="f32le", paced=False)
-    output = session.subscribe(FapFrame)
-    audio = client.bus.connect_dealer(session.opened.audio)
+    output = session.frames()
+    audio = bus.connect_dealer(session.endpoints["audio"])
     later = 2**39
     pcm = np.zeros(8000, "<f4").tobytes()
     for sequence, media_time in ((1, 0), (2, later)):
         audio.send(
             AudioChunk(
                 session=session.name,
-                token=session.opened.token,
+                token=session.endpoints["token"],
                 sequence=sequence,
                 media_time=media_time,
                 pcm=pcm,
@@ -302,12 +301,7 @@ def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
     end_s = time.monotonic() + 60
     while not times or times[-1] < later:
         assert time.monotonic() < end_s
-        output.wait(0.1)
-        times += [
-            received.message.media_time
-            for received in output.receive()
-            if isinstance(received.message, FapFrame)
-        ]
+        times += [frame.media_time for frame in output.available(0.1)]
     assert len(times) < 100
     session.close()
 
@@ -370,5 +364,5 @@ def test_an_observer_that_never_answers_delays_no_session(
 
 def test_a_client_that_goes_away_leaves_no_trace(system: System, witness: Session) -> None:
     with Client(system.control) as vanishing:
-        vanishing.open_session(session="ghost", encoding="f32le").send(np.zeros(320, np.float32))
-    assert stream(system.control, np.zeros(3200, np.float32)).ended
+        vanishing.open_session(name="ghost", encoding="f32le").push(np.zeros(320, np.float32))
+    assert stream(system.control, np.zeros(3200, np.float32)).frames

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from kouxing_client import Client
 
-from kouxing.shared.client import Client
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import Heartbeat
 from tests.browser import Browser

@@ -9,11 +9,10 @@ from collections.abc import Callable
 import av
 import numpy as np
 import pytest
+from kouxing_client import Client, FapFrame, Results
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.shared.client import Client, Subscription
 from kouxing.shared.phones.inventory import load_inventory
-from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import Collected, samples_of_file, stream, stream_into
 from tests.system import DEMO, VOWELS_FILE, System
 
@@ -120,16 +119,16 @@ def test_a_stalled_stream_leads_to_rest_and_then_goes_on(system: System) -> None
     samples = samples_of_file(DEMO / "hello-female.wav")
     with Client(system.control) as client:
         session = client.open_session(encoding="f32le")
-        output = session.subscribe(FapFrame)
-        session.send(samples[:8000])
-        session.send(samples[8000:16000])
+        output = session.results(FapFrame, keep_all=True)
+        session.push(samples[:8000])
+        session.push(samples[8000:16000])
         spoken = _frames_until(output, lambda frame: _opening(frame) > 50)
         still = _frames_until(output, lambda frame: _opening(frame) < 1)
         assert still[-1].media_time == still[-5].media_time, (
             "media time stands still with the sound"
         )
         assert spoken[0].media_time < still[-1].media_time <= 16000
-        session.send(samples[16000:24000])
+        session.push(samples[16000:24000])
         _frames_until(output, lambda frame: frame.media_time > 20000)
         session.close()
 
@@ -138,14 +137,14 @@ def test_a_flush_returns_to_rest_within_150_ms(system: System) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")
     with Client(system.control) as client:
         session = client.open_session(encoding="f32le", paced=False)
-        output = session.subscribe(FapFrame)
+        output = session.results(FapFrame, keep_all=True)
         for begin in range(0, 24000, 8000):
-            session.send(samples[begin : begin + 8000])
+            session.push(samples[begin : begin + 8000])
         before = _frames_until(output, lambda frame: frame.media_time >= 24000 - DELAY)
         assert _opening(before[-1]) > 50, "the mouth is open in mid-sentence"
         session.flush()
         client.open_session().close()  # every service has what control told it before
-        session.send(np.zeros(8000, np.float32))
+        session.push(np.zeros(8000, np.float32))
         after = _frames_until(output, lambda frame: frame.media_time >= 32000 - 3200)
         session.close()
     assert max(_opening(frame) for frame in after[8:]) < 1, "150 ms are 7.5 frames"
@@ -156,17 +155,15 @@ def _opening(frame: FapFrame) -> float:
     return float(np.abs(np.frombuffer(frame.values, "<f4")[2:13]).max())
 
 
-def _frames_until(output: Subscription, last: Callable[[FapFrame], bool]) -> list[FapFrame]:
+def _frames_until(output: Results[FapFrame], last: Callable[[FapFrame], bool]) -> list[FapFrame]:
     """Return the frames up to the first that ``last`` holds for."""
     frames: list[FapFrame] = []
     end_s = time.monotonic() + 60
     while time.monotonic() < end_s:
-        output.wait(0.1)
-        for received in output.receive():
-            if isinstance(received.message, FapFrame):
-                frames.append(received.message)
-                if last(received.message):
-                    return frames
+        for frame in output.available(0.1):
+            frames.append(frame)
+            if last(frame):
+                return frames
     raise AssertionError("the frame did not come")
 
 

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kouxing_client import Client
 from numpy.typing import NDArray
 
-from kouxing.shared.client import Client
 from kouxing.shared.face.shapes import SHAPE_SETS
 from tests import sync
 from tests.browser import Browser
@@ -376,11 +376,11 @@ def speech(system: System) -> Iterator[None]:
     samples = np.resize(samples_of_file(SPEECH)[:24000], 240_000)
     ended = threading.Event()
     with Client(system.control) as client:
-        session = client.open_session(session="seen", encoding="f32le")
+        session = client.open_session(name="seen", encoding="f32le")
 
         def speak() -> None:
             for begin in range(0, len(samples), 1600):
-                session.send(samples[begin : begin + 1600])
+                session.push(samples[begin : begin + 1600])
                 if ended.wait(0.1):
                     return
 

@@ -16,12 +16,11 @@ import av
 import numpy as np
 import pytest
 import soundfile
+from kouxing_client import Client, FapFrame, Refused, Results
 
-from kouxing.shared.client import Client, Refused, Subscription
 from kouxing.shared.face.fap_file import read_fap
 from kouxing.shared.face.faps import FAP_NUMBER
 from kouxing.shared.face.shapes import ARKIT
-from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file, stream_into
 from tests.system import ROOT, VOWELS_FILE, System, free_port, kouxing
 
@@ -218,7 +217,7 @@ def test_listen_waits_for_a_session_and_ends_with_it(system: System, tmp_path: P
     shaper = listening(system.control, "heard", "--as", "arkit", "-o", table, says=waits)
     printer = listening(system.control, "heard", "--show", "syllables", says=waits)
     with Client(system.control) as client:
-        session = client.open_session(session="heard", encoding="f32le", paced=False)
+        session = client.open_session(name="heard", encoding="f32le", paced=False)
         for listener in (recorder, shaper, printer):
             assert listener.stderr is not None
             assert listener.stderr.readline() == "following session heard\n"
@@ -247,10 +246,10 @@ def test_listen_without_a_name_follows_the_newest_session(tmp_path: Path) -> Non
     with System(services, tmp_path) as own, Client(own.control) as client:
         phones = ("--show", "phones")
         first = listening(own.control, *phones, says="waiting for a session to open")
-        older = client.open_session(session="older", encoding="f32le")
+        older = client.open_session(name="older", encoding="f32le")
         assert first.stderr is not None
         assert first.stderr.readline() == "following session older\n"
-        newer = client.open_session(session="newer", encoding="f32le")
+        newer = client.open_session(name="newer", encoding="f32le")
         second = listening(own.control, *phones, says="following session newer")
         for session, listener in ((newer, second), (older, first)):
             session.close()
@@ -284,21 +283,19 @@ def test_a_running_system_is_not_asked_for_what_cannot_be(
     assert word in result.stderr
 
 
-def wait_for_corner(faces: Subscription, low: float, high: float) -> None:
+def wait_for_corner(faces: Results[FapFrame], low: float, high: float) -> None:
     """Wait until the corner of the mouth is raised by so much, in FAP units."""
     corner = FAP_NUMBER["raise_l_cornerlip"] - 1
-    while faces.wait(60.0):
-        for received in faces.receive():
-            assert isinstance(received.message, FapFrame)
-            if low < np.frombuffer(received.message.values, "<f4")[corner] < high:
-                return
+    while (frame := faces.get(60.0)) is not None:
+        if low < frame.values[corner] < high:
+            return
     raise TimeoutError
 
 
 def test_a_face_shows_what_another_program_asks_for(system: System) -> None:
     with Client(system.control) as client:
-        session = client.open_session(session="smiling")
-        faces = session.subscribe(FapFrame)
+        session = client.open_session(name="smiling")
+        faces = session.results(FapFrame, keep_all=True)
         asked = kouxing("express", "smiling", "joy=1", "--hold", 600, control=system.control)
         assert asked.returncode == 0, asked.stderr
         wait_for_corner(faces, 300.0, 400.0)  # the frames of a face at rest go on without sound

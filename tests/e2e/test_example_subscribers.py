@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kouxing_client import Client
 
-from kouxing.shared.client import Client
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream_into
 from tests.scripted_system import Gateway
 from tests.system import ROOT, VOWELS_FILE, System, free_port
@@ -48,7 +48,7 @@ def test_they_follow_a_face_to_its_end(system: System, programs: list[list[str]]
             )
             for program in programs
         ]
-        session = client.open_session(session=name, encoding="f32le", paced=False)
+        session = client.open_session(name=name, encoding="f32le", paced=False)
         for each in running:
             assert each.stdout is not None
             assert each.stdout.readline() == f"following {name}\n"
@@ -82,7 +82,7 @@ def test_they_follow_a_face_that_another_synthesizer_makes(
         for each in running:
             assert each.stdout is not None
             assert each.stdout.readline() == f"following {session.name}\n"
-        output = session.subscribe(*KINDS)
+        output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:16000], output, collected, paced=True)
         system.start_beside("synthesizer", "other")
@@ -91,7 +91,7 @@ def test_they_follow_a_face_that_another_synthesizer_makes(
         lost.wait()
         send(session, samples[16000:], output, collected, paced=True)
         finish(session, output, collected)
-        assert session.opened.epoch > 1
+        assert session.endpoints["epoch"] > 1
         outputs = [each.communicate(timeout=60)[0].splitlines() for each in running]
         session.close()
     assert [each.returncode for each in running] == [0, 0, 0]
@@ -129,11 +129,11 @@ def open_jaw(client: Client, name: str, follower: subprocess.Popen[str]) -> floa
     """Speak in a session until a program that follows it prints that the jaw is open."""
     assert follower.stdout is not None
     assert follower.stdout.readline() == "0.00\n", "a face at rest"
-    session = client.open_session(session=name, encoding="f32le", paced=False)
+    session = client.open_session(name=name, encoding="f32le", paced=False)
     samples = samples_of_file(VOWELS_FILE)
     jaw = 0.0
     while jaw <= 0.2:
-        session.send(samples[:1600])
+        session.push(samples[:1600])
         samples = np.roll(samples, -1600)
         jaw = float(follower.stdout.readline())
     session.close()

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kouxing_client import Client
 
 from kouxing.evaluation.system.chromium import wait_until
 from kouxing.services.driver.head.glb_export import export_glb
-from kouxing.shared.client import Client
 from kouxing.shared.face.shapes import ARKIT
 from tests import heads
 from tests.browser import Browser
@@ -103,7 +103,7 @@ def test_an_avatar_in_the_browser_takes_on_a_face(
         browser.wait_for("window.avatar !== undefined")
         rest = browser.image()
         with Client(system.address) as client:
-            session = client.open_session(session="seen")
+            session = client.open_session(name="seen")
             shown = ARKIT.faps(np.eye(52, dtype=np.float32)[ARKIT.names.index("jawOpen")])
             system.talk("seen", shown, "a")
             browser.wait_for("avatar.vrm.expressionManager.getValue('jawOpen') > 0.9")

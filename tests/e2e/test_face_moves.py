@@ -10,10 +10,10 @@ import msgpack
 import numpy as np
 import pytest
 import zmq
+from kouxing_client import Client
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.client import Client
 from kouxing.shared.keys import user_key
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream
 from tests.system import DEMO, System
@@ -75,10 +75,10 @@ def test_whoever_follows_sees_every_frame_once(tmp_path: Path, blow: signal.Sign
         session = client.open_session(encoding="f32le")
         place = next(each for each in client.status().sessions if each.session == session.name)
         lost = system.processes["other" if place.workers["faps"] == "other" else "synthesizer"]
-        stranger = Stranger(session.name, session.opened.faps, session.opened.events)
+        stranger = Stranger(session.name, session.endpoints["faps"], session.endpoints["events"])
         following = threading.Thread(target=stranger.follow_to_the_end)
         following.start()
-        output = session.subscribe(*KINDS)
+        output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:32000], output, collected, paced=True)
         lost.send_signal(blow)
@@ -90,7 +90,7 @@ def test_whoever_follows_sees_every_frame_once(tmp_path: Path, blow: signal.Sign
         session.close()
 
     times = [frame.media_time for frame in undisturbed.frames]
-    assert session.opened.epoch > 1
+    assert session.endpoints["epoch"] > 1
     spoken = [frame for frame in collected.frames if frame.media_time in set(times)]
     assert sorted({frame.media_time for frame in spoken}) == times
     assert list(stranger.frames) == times

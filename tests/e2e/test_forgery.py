@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, find_key
 
 from kouxing.services.control.registry import MAX_SERVICES_OF_KEY
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.client import Client, Refused, Session
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_guest, key_folder, own_key, revoke_guest, user_key
 from kouxing.shared.wire.control import Event, Heartbeat, SessionInput
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
 from kouxing.shared.wire.speech import AudioState, Phone, Progress, Speech
@@ -74,7 +73,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
         assert answer(stranger, Error).code == "not-allowed"
     assert {each.instance for each in client.status().services} == before
     session = client.open_session(paced=False)
-    assert session.opened.audio == witness.opened.audio
+    assert session.endpoints["audio"] == witness.endpoints["audio"]
     session.close()
 
 
@@ -96,14 +95,13 @@ def test_only_a_sessions_own_worker_says_that_it_is_idle(
 def test_only_a_services_own_messages_become_events(
     system: System, client: Client, witness: Session
 ) -> None:
-    events = client.bus.connect_subscriber(witness.opened.events)
-    events.subscribe(Event, None)
+    events = witness.events()
     with Bus(user_key()) as bus:
         stranger = bus.connect_dealer(system.control)
         end_s = time.monotonic() + 20
-        while not events.wait(0.05):  # until the subscription is in effect
+        while events.get(0.05) is None:  # until the subscription is in effect
             assert time.monotonic() < end_s
-            client.open_session().close()
+            witness.flush()
         for message in (
             Event(session=witness.name, name="recorded", detail="/etc/passwd"),
             Speech(session=witness.name, epoch=1, active=True),
@@ -113,18 +111,14 @@ def test_only_a_services_own_messages_become_events(
         names = set()
         while "session-flushed" not in names:
             witness.flush()
-            names |= {
-                received.message.name
-                for received in events.receive()
-                if isinstance(received.message, Event)
-            }
+            names |= {event.name for event in events.available()}
     assert not names & {"recorded", "speech-start", "error"}
 
 
 def test_only_the_sessions_recognizer_moves_its_face(
     system: System, client: Client, witness: Session
 ) -> None:
-    output = witness.subscribe(FapFrame, EndOfFaps)
+    output = witness.frames()
     forged: list[Message] = [
         Phone(index=0, symbol="a", duration=9, confidence=1.0, final=True),
         Progress(level_db=0.0),
@@ -137,15 +131,13 @@ def test_only_the_sessions_recognizer_moves_its_face(
             stranger.send(
                 replace(message, session=witness.name, epoch=1, sequence=number, media_time=123_200)
             )
-        witness.send(samples_of_file(DEMO / "hello-female.wav")[:16000])
+        witness.push(samples_of_file(DEMO / "hello-female.wav")[:16000])
         frames: list[FapFrame] = []
         end_s = time.monotonic() + 20
         while len(frames) < 30:
             assert time.monotonic() < end_s
-            output.wait(0.1)
-            for received in output.receive():
-                assert isinstance(received.message, FapFrame), "a false end"
-                frames.append(received.message)
+            frames += output.available(0.1)
+            assert not output.has_ended, "a false end"
         assert max(frame.media_time for frame in frames) <= 16000
         assert not stranger.wait(0.1), "it is told no sequence number"
     with Bus(user_key()) as bus:
@@ -160,8 +152,8 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
         there.setenv("XDG_STATE_HOME", str(tmp_path))
         key_folder().mkdir(mode=0o700)
         (tmp_path / "laptop.key").rename(key_folder() / "client.key")
-        key = user_key()
-    with Client(system.control, key=key, deadline_s=5.0) as made:
+        key = find_key()
+    with Client(system.control, key=key, timeout_s=5.0) as made:
         yield made
     with contextlib.suppress(UserError):  # revoked already
         revoke_guest("laptop")
@@ -178,26 +170,23 @@ def test_a_key_may_do_what_its_roles_say(keyed: Client, client: Client, witness:
 def test_a_revoked_key_is_cut_while_it_follows(
     system: System, keyed: Client, client: Client
 ) -> None:
-    shown = client.open_session(session="shown", encoding="f32le", paced=False)
-    followed = keyed.bus.connect_subscriber(shown.opened.faps)
-    followed.subscribe_session([FapFrame], "shown")
-    assert followed.wait(20.0), "joined"
-    list(followed.receive())
+    shown = client.open_session(name="shown", encoding="f32le", paced=False)
+    followed = keyed.follow("shown").frames()
     samples = samples_of_file(DEMO / "hello-female.wav")
-    shown.send(samples[:16000])
-    assert followed.wait(20.0)
+    shown.push(samples[:16000])
+    assert followed.get(20.0) is not None
     revoke_guest("laptop")
-    own = shown.subscribe(FapFrame)
-    with contextlib.suppress(UserError):
+    frames = shown.frames()
+    with contextlib.suppress(KouxingError):
         while keyed.status():  # until control has seen it
             pass
-    with pytest.raises(UserError, match="does not accept"):
+    with pytest.raises(KouxingError, match="does not accept"):
         keyed.status()
-    while followed.wait(0.5):
-        list(followed.receive())
-    shown.send(samples[16000:32000])
-    assert own.wait(20.0)
-    assert not followed.wait(0.5)
+    while list(followed.available(0.5)):
+        pass
+    shown.push(samples[16000:32000])
+    assert frames.get(20.0) is not None
+    assert followed.get(0.5) is None
     shown.close()
 
 

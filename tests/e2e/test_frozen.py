@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from kouxing_client import Client
 from rich.console import Console
 
 from kouxing.evaluation.system.faults import SPIN
 from kouxing.evaluation.system.systems import LocalSystem
-from kouxing.shared.client import Client
+from kouxing.shared.bus import Bus
 from kouxing.shared.wire.face import FapFrame
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import Phone
@@ -29,19 +30,19 @@ SETTINGS = {"KOUXING_CONTROL_LOST_AFTER_S": "1"}
 
 @pytest.mark.parametrize("service", ["recognizer", "synthesizer"])
 def test_one_that_thaws_does_not_publish_beside_the_one_in_its_place(
-    tmp_path: Path, service: str
+    tmp_path: Path, bus: Bus, service: str
 ) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")[:112000]
     with System(SERVICES, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
         session = client.open_session(encoding="f32le")
-        output = session.subscribe(*KINDS)
+        output = session.results(*KINDS, keep_all=True)
         kind: type[Message]
         kind, endpoint = (
-            (Phone, session.opened.phones)
+            (Phone, session.endpoints["phones"])
             if service == "recognizer"
-            else (FapFrame, session.opened.faps)
+            else (FapFrame, session.endpoints["faps"])
         )
-        witness = client.bus.connect_subscriber(endpoint)
+        witness = bus.connect_subscriber(endpoint)
         witness.subscribe(kind, session.name)
         collected = Collected()
         system.start_beside(service, "other")
@@ -49,7 +50,7 @@ def test_one_that_thaws_does_not_publish_beside_the_one_in_its_place(
         frozen = system.processes[service].pid
         os.kill(frozen, signal.SIGSTOP)
         until_moved = 24000
-        while session.opened.epoch == 1:
+        while session.endpoints["epoch"] == 1:
             assert until_moved < 80000, "it was not replaced"
             piece = samples[until_moved : until_moved + 1600]
             send(session, piece, output, collected, paced=True)
@@ -74,7 +75,7 @@ def test_the_only_recognizer_goes_on_with_its_sessions_after_it_stood_still(
     samples = samples_of_file(DEMO / "hello-female.wav")[:64000]
     with System(SERVICES, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
         session = client.open_session(encoding="f32le")
-        output = session.subscribe(*KINDS)
+        output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:24000], output, collected, paced=True)
         frozen = system.processes["recognizer"].pid
@@ -84,7 +85,7 @@ def test_the_only_recognizer_goes_on_with_its_sessions_after_it_stood_still(
         os.kill(frozen, signal.SIGCONT)
         send(session, samples[24000:], output, collected, paced=True)
         finish(session, output, collected)
-        assert session.opened.epoch == 1
+        assert session.endpoints["epoch"] == 1
         session.close()
 
     numbers = [frame.sequence for frame in collected.frames]
@@ -118,7 +119,7 @@ def test_the_only_worker_is_ended_and_started_again_when_it_hangs(
     with Client(supervised.control) as client:
         undisturbed = stream(supervised.control, samples)
         session = client.open_session(encoding="f32le")
-        output = session.subscribe(*KINDS)
+        output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:24000], output, collected, paced=True)
         frozen = supervised.process_of(session.name, service)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import soundfile
+from kouxing_client import Client
 from PIL import Image
 
 from kouxing.evaluation.system.chromium import wait_until
@@ -21,7 +22,6 @@ from kouxing.services.driver.head.head import neutral_faps
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.mouth_profiles.face_landmarks import LANDMARKS
 from kouxing.services.mouth_profiles.landmark_file import landmark_file
-from kouxing.shared.client import Client
 from kouxing.shared.wire.face import FaceSettings
 from tests import heads
 from tests.browser import Browser

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kouxing_client import Client, Phone, Speech
 
-from kouxing.shared.client import Client
-from kouxing.shared.wire.speech import Phone, Speech
 from tests.e2e.following import KINDS, Collected, finish, samples_of_file, send, stream
 from tests.system import DEMO, System
 
@@ -35,8 +34,8 @@ def test_a_session_goes_on_when_its_worker_ends(
     with System(services, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
         undisturbed = final_phones(stream(system.control, samples))
         session = client.open_session(encoding="f32le")
-        before = session.opened
-        output = session.subscribe(*KINDS)
+        before = session.endpoints
+        output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:24000], output, collected, paced=True)
         system.start_beside(service, "other")
@@ -46,18 +45,18 @@ def test_a_session_goes_on_when_its_worker_ends(
             ended.wait()
         send(session, samples[24000:], output, collected, paced=True)
         finish(session, output, collected)
-        after = session.opened
+        after = session.endpoints
         session.close()
         assert ended.wait(60) == (0 if how == signal.SIGTERM else -how)
         system.assert_all_alive()
         assert "session moved to" in system.log("control")
 
-    assert before.epoch == 1 < after.epoch
+    assert before["epoch"] == 1 < after["epoch"]
     endpoints = ("audio", "phones", "faps")
-    assert moved == {name for name in endpoints if getattr(before, name) != getattr(after, name)}
+    assert moved == {name for name in endpoints if before[name] != after[name]}
     assert missing_samples(collected, len(samples)) == 0, "the lost audio was not sent again"
     assert_same(final_phones(collected), undisturbed)
-    frames = [frame for frame in collected.frames if frame.epoch == after.epoch]
+    frames = [frame for frame in collected.frames if frame.epoch == after["epoch"]]
     assert max(np.frombuffer(frame.values, "<f4")[OPEN_JAW] for frame in frames) > 100
     assert frames[-1].media_time >= len(samples)
 

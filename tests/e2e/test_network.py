@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from kouxing_client import Client
 
 from kouxing.evaluation.system.live import Seen, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link, Network
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, Hosts, HostsSystem
-from kouxing.shared.client import Client
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
 from tests.e2e.following import samples_of_file

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kouxing_client import Client
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
@@ -20,7 +21,6 @@ from kouxing.services.recognizer.lip_frames import delay_for
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.load import load_lip_model
-from kouxing.shared.client import Client
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.face.lip_models import LipModelName
@@ -108,8 +108,17 @@ def test_services_send_the_frames_of_the_chain_with_chosen_lips(
 
 
 def lips_of(sent: Collected) -> list[Lips]:
-    """Lip frames without what is the session's own."""
-    return [replace(each, session="", epoch=0, sequence=0) for each in sent.lips]
+    """Lip frames without session, epoch and sequence."""
+    return [
+        Lips(
+            media_time=lips.media_time,
+            values=lips.values.tobytes(),
+            delay=lips.delay,
+            closure=lips.closure,
+            lip_to_teeth=lips.lip_to_teeth,
+        )
+        for lips in sent.lips
+    ]
 
 
 @contextlib.contextmanager

@@ -20,10 +20,10 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from kouxing_client import Client, Session
 from numpy.typing import NDArray
 
 from kouxing.evaluation.system.chromium import wait_until
-from kouxing.shared.client import Client, Session
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.wire.face import FaceSettings
 from tests import sync
@@ -112,7 +112,7 @@ def load(browser: Browser, gateway: Gateway) -> None:
 def session(system: System, gateway: Gateway) -> Iterator[Session]:
     with Client(system.address) as client:
         wait_until(lambda: len(client.status().services) == 4, 60)
-        yield client.open_session(session="seen")
+        yield client.open_session(name="seen")
 
 
 def colour(image: NDArray[np.uint8]) -> NDArray[np.int_]:

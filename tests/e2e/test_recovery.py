@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kouxing_client import Client, KouxingError, Session
 from numpy.typing import NDArray
 from rich.console import Console
 
 from kouxing.services.cli.supervisor import Supervisor
-from kouxing.shared.client import Client, Session
 from kouxing.shared.errors import UserError
-from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO
 from tests.watched import Watched
@@ -31,19 +30,16 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
 
 def moves(session: Session, samples: NDArray[np.float32]) -> bool:
     """Stream samples in real time; return whether the mouth opens and frames keep coming."""
-    output = session.subscribe(FapFrame)
+    output = session.frames()
     opening = 0.0
     begin, end_s = 0, time.monotonic() + 60
     while begin < len(samples) or (opening <= 100 and time.monotonic() < end_s):
         if begin < len(samples):
-            session.send(samples[begin : begin + 320])
+            session.push(samples[begin : begin + 320])
             begin += 320
-        assert list(session.errors()) == []  # asks for the answers, so the session follows a move
-        output.wait(0.02)
-        for received in output.receive():
-            if isinstance(received.message, FapFrame):
-                values = np.frombuffer(received.message.values, "<f4")
-                opening = max(opening, float(np.abs(values[2:13]).max()))
+        assert session.take_errors() == []
+        for frame in output.available(0.02):
+            opening = max(opening, *map(abs, frame.values[2:13]))
     return opening > 100
 
 
@@ -71,7 +67,7 @@ def test_the_driver_and_the_gateway_come_back_too(watched: Watched) -> None:
 
 
 def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
-    with Client(watched.control, deadline_s=2.0) as client:
+    with Client(watched.control, timeout_s=2.0) as client:
         watched.kill("control")
         time.sleep(0.1)
         end_s = time.monotonic() + 100
@@ -79,7 +75,7 @@ def test_control_comes_back_and_new_sessions_open(watched: Watched) -> None:
             try:
                 session = client.open_session(encoding="f32le")
                 break
-            except UserError:
+            except KouxingError:
                 assert time.monotonic() < end_s
                 time.sleep(0.2)
         assert moves(session, samples_of_file(DEMO / "hello-female.wav")[:32000])

@@ -9,8 +9,8 @@ import subprocess
 import sys
 
 import pytest
+from kouxing_client import Client
 
-from kouxing.shared.client import Client
 from tests.e2e.following import samples_of_file, stream_into
 from tests.receivers import read_osc
 from tests.system import ROOT, VOWELS_FILE, System, kouxing
@@ -36,7 +36,7 @@ def test_each_session_of_a_name_moves_the_avatar(system: System) -> None:
         assert program.recv(2000)  # a face at rest
         with Client(system.control) as client:
             for _ in range(2):
-                session = client.open_session(session="sent", encoding="f32le", paced=False)
+                session = client.open_session(name="sent", encoding="f32le", paced=False)
                 assert sender.stderr.readline() == "following session sent\n"
                 stream_into(session, samples, chunk=320)
                 while jaw_opening(program) < 0.1:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import signal
 import subprocess
@@ -15,9 +14,8 @@ from typing import IO
 
 import numpy as np
 import pytest
+from kouxing_client import Client, FapFrame, Results, Session
 
-from kouxing.shared.client import Client, Session, Subscription
-from kouxing.shared.wire.face import FapFrame
 from tests.e2e.following import samples_of_file
 from tests.system import DEMO, System
 
@@ -27,24 +25,14 @@ MAX_OLD = 10  # frames
 RATE_HZ = 50
 FOLLOWER = """
 import sys
-from kouxing.shared.bus import Bus
-from kouxing.shared.follower import PollingLoop, SessionFollower
-from kouxing.shared.keys import user_key
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
+from kouxing_client import Client, FapFrame
 
-session, endpoint, is_live = sys.argv[1:]
-with Bus(user_key()) as bus:
-    loop = PollingLoop(bus)
-    follower = SessionFollower(
-        loop,
-        session,
-        {FapFrame: lambda frame: print(frame.sequence, flush=True), EndOfFaps: lambda end: None},
-        live=is_live == "True",
-        on_complete=lambda: print(0, flush=True),
-    )
-    follower.start(0, {"faps": endpoint})
-    while not follower.has_ended:
-        loop.step(0.1)
+control, session = sys.argv[1:]
+with Client(control) as client:
+    frames = client.follow(session).results(FapFrame, keep_all=True)
+    print(0, flush=True)
+    for frame in frames:
+        print(frame.sequence, flush=True)
 """
 
 
@@ -61,8 +49,8 @@ class Other:
 
 
 @contextmanager
-def another(session: Session, *, paced: bool) -> Iterator[Other]:
-    command = [sys.executable, "-c", FOLLOWER, session.name, session.opened.faps, str(paced)]
+def another(control: str, session: Session) -> Iterator[Other]:
+    command = [sys.executable, "-c", FOLLOWER, control, session.name]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         other = Other(process, process.stdout)
@@ -76,12 +64,11 @@ def another(session: Session, *, paced: bool) -> Iterator[Other]:
             reader.join()
 
 
-def newest_of(output: Subscription) -> int:
+def newest_of(output: Results[FapFrame]) -> int:
     """Return the number of the newest frame that has come."""
     number = 0
-    while received := list(output.receive()):
-        assert isinstance(received[-1].message, FapFrame)
-        number = received[-1].message.sequence
+    for frame in output.available():
+        number = frame.sequence
     return number
 
 
@@ -95,9 +82,9 @@ def until(is_so: Callable[[], bool], otherwise: str) -> None:
 def test_of_a_live_face_few_old_frames_come(system: System) -> None:
     with Client(system.control) as client:
         session = client.open_session(encoding="f32le")
-        output = session.subscribe(FapFrame)
-        session.send(np.zeros(320, np.float32))  # then frames of rest go on and on
-        with another(session, paced=True) as other:
+        output = session.results(FapFrame, keep_all=True)
+        session.push(np.zeros(320, np.float32))  # then frames of rest go on and on
+        with another(system.control, session) as other:
             until(lambda: len(other.numbers) > RATE_HZ, "no frames come")
             os.kill(other.process.pid, signal.SIGSTOP)
             time.sleep(STOPPED_S)
@@ -115,11 +102,11 @@ def test_of_a_recording_every_frame_comes(system: System) -> None:
     samples = np.tile(samples_of_file(DEMO / "hello-female.wav")[:48000], 4)
     with Client(system.control) as client:
         session = client.open_session(encoding="f32le", paced=False)
-        with another(session, paced=False) as other:
+        with another(system.control, session) as other:
             os.kill(other.process.pid, signal.SIGSTOP)
             for chunk in np.split(samples, len(samples) // 3200):
-                until(functools.partial(session.send, chunk), "no room")
-            until(session.finish, "no room")
+                session.push(chunk)
+            session.finish()
             time.sleep(STOPPED_S)
             os.kill(other.process.pid, signal.SIGCONT)
             until(lambda: other.process.poll() is not None, "the end does not come")

@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kouxing_client import Client, FapFrame
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from kouxing.shared.audio_file import read_audio
-from kouxing.shared.client import Client
 from kouxing.shared.config import variable
-from kouxing.shared.wire.face import EndOfFaps, FapFrame
 from tests.raw_bytes import pour
 from tests.system import ROOT, VOWELS_FILE, System, free_port
 
@@ -39,12 +38,11 @@ def families(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, lis
     with System(SERVICES, folder, settings=settings) as system, Client(system.control) as client:
         samples, rate_hz = read_audio(VOWELS_FILE)
         session = client.open_session(encoding="f32le", sample_rate_hz=rate_hz, paced=False)
-        output = session.subscribe(FapFrame, EndOfFaps)
+        output = session.results(FapFrame, keep_all=True)
         for part in np.array_split(samples, NUM_CHUNKS):
-            assert session.send(part)
+            session.push(part)
         session.finish()
-        while not any(isinstance(each.message, EndOfFaps) for each in output.receive()):
-            assert output.wait(60.0)
+        assert list(output)
         before = _heartbeats(client)
         system.wait_until(lambda _: _heartbeats(client) > before + 2)  # they set the gauges
         for port in ports.values():

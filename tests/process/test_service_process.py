@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 
 import pytest
+from kouxing_client import Client
 
 from kouxing.services.kinds import KINDS
-from kouxing.shared.client import Client
 from kouxing.shared.config import variable
 from tests.system import ROOT, System, own_addresses
 

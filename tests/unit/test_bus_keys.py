@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 import zmq
+from kouxing_client import Client
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared import connections, kernel_sockets
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.client import Client
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
@@ -163,7 +163,7 @@ def test_who_hangs_does_not_answer_and_refuses_nobody() -> None:
         control.send_signal(signal.SIGSTOP)
         try:
             with (
-                Client(endpoint, key=key, deadline_s=0.5) as client,
+                Client(endpoint, key=key, timeout_s=0.5) as client,
                 pytest.raises(UserError, match="does not answer"),
             ):
                 client.status()

@@ -283,7 +283,7 @@ def test_results_come_once_and_follow_a_move(stage: Stage) -> None:
     stage.phones[0].send(phone(1))
     first = {type(found): found for found in itertools.islice(results, 2)}
     assert set(first) == {FapFrame, Phone}
-    assert list(first[FapFrame].values) == [1.0] * 68  # type: ignore[attr-defined]
+    assert list(first[FapFrame].values) == [1.0] * 68
     assert first[FapFrame].time_s == 0.02
     stage.move(next_sequence=0)
     while not stage.phones[1].wait(0.01):  # the subscriptions reach the new publisher
@@ -449,7 +449,7 @@ def test_requests_are_answered_at_once_while_audio_streams(stage: Stage) -> None
     async def run() -> list[float]:
         async with AsyncClient(stage.commands.endpoint, insecure=True) as client:
             session = await client.open_session()
-            times_s = []
+            times_s: list[float] = []
 
             async def stream() -> None:
                 while len(times_s) < num_flushes:

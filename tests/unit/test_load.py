@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
+from array import array
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 import pytest
+from kouxing_client import FapFrame, Session
 from typer.testing import CliRunner
 
 from kouxing.evaluation.commands import bench_app
 from kouxing.evaluation.system import latency
 from kouxing.evaluation.system.load import Load, Step, step_sizes
 from kouxing.evaluation.system.speakers import Spoken, voiced
-from kouxing.shared.client import Session
-from kouxing.shared.wire.face import FapFrame
-from kouxing.shared.wire.session import SessionFacts, SessionOpened
 
 pytestmark = pytest.mark.unit
 
 
 class _Session:
-    opened = SessionOpened(
-        request="1",
-        token="t",
-        audio="a",
-        phones="p",
-        faps="f",
-        events="e",
-        facts=SessionFacts(frame_rate_hz=50.0),
-    )
+    endpoints: ClassVar = {"facts": {"frame_rate_hz": 50.0}}
 
 
 def _spoken(arrived_s: dict[int, float]) -> Spoken:
@@ -51,7 +42,7 @@ def test_frames_that_do_not_come_count_as_late() -> None:
 
 def test_a_frame_of_rest_is_no_arrival() -> None:
     spoken = _spoken({})
-    frame = FapFrame(media_time=320, values=bytes(272), mask=bytes(9))
+    frame = FapFrame(media_time=320, values=array("f", bytes(272)))
     spoken.take(frame)
     arrived_s = dict(spoken.arrived_s)
     spoken.take(frame)
@@ -60,7 +51,7 @@ def test_a_frame_of_rest_is_no_arrival() -> None:
 
 def test_rest_before_a_speaker_begins_is_not_counted() -> None:
     spoken = _spoken({})
-    frame = FapFrame(media_time=0, values=bytes(272), mask=bytes(9))
+    frame = FapFrame(media_time=0, values=array("f", bytes(272)))
     for _ in range(3):
         spoken.take(frame)
     assert spoken.num_rest == 0

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
     LAST_ANSWER_S,
+    NOT_JOINED,
     BaseClient,
     BaseResults,
     BaseSession,
     FaceSettings,
     open_fields,
 )
-from kouxing_client.errors import Refused
+from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.messages import Event, FapFrame, Fields, Phone, Result, Shapes, Status
 from kouxing_client.session_core import Inbox, SessionCore
 from kouxing_client.thread import ClientThread
@@ -152,9 +153,11 @@ class AsyncSession(BaseSession):
         """Return weights of blend shapes from now on, as ``Session.shapes``."""
         return await self._join((Shapes,), name)
 
-    async def results(self, *classes: type[Result], shapes: str = "") -> AsyncResults[Result]:
+    async def results(
+        self, *classes: type[Result], shapes: str = "", keep_all: bool = False
+    ) -> AsyncResults[Any]:
         """Return results of several classes from now on, as ``Session.results``."""
-        return await self._join(classes, shapes)
+        return await self._join(classes, shapes, keep_all)
 
     def events(self) -> AsyncResults[Event]:
         """Return control's events about the session, as ``Session.events``."""
@@ -162,10 +165,13 @@ class AsyncSession(BaseSession):
         return AsyncResults(inbox, self._stop_events(inbox))
 
     async def _join(
-        self, classes: tuple[type[Result], ...], shape_set: str = ""
+        self, classes: tuple[type[Result], ...], shape_set: str = "", keep_all: bool = False
     ) -> AsyncResults[Any]:
-        subscription, joined = self._subscribe(classes, shape_set)
-        await asyncio.wrap_future(joined)
+        subscription, joined = self._subscribe(classes, shape_set, keep_all)
+        try:
+            await asyncio.wait_for(asyncio.wrap_future(joined), self._thread.timeout_s)
+        except TimeoutError:
+            raise KouxingError(NOT_JOINED) from None
         if added := self._add_shapes(shape_set):
             await asyncio.wrap_future(added)
         return AsyncResults(subscription.inbox, self._unsubscribe(subscription))

@@ -10,7 +10,7 @@ from typing import Any, TypedDict
 from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
 from kouxing_client.core import new_future
 from kouxing_client.errors import KouxingError, Refused
-from kouxing_client.keys import Key, find_key
+from kouxing_client.keys import KeyPair, find_key
 from kouxing_client.messages import Fields, Result
 from kouxing_client.session_core import Inbox, SessionCore, Signal, Subscription
 from kouxing_client.thread import ClientThread
@@ -20,6 +20,7 @@ CHUNK_BYTES = 32_000  # largest chunk in one message
 MAX_LIVE = 100  # unread results of a live session
 MAX_EVENTS = 1000  # unread events of a session
 MAX_UNACKNOWLEDGED = 500  # messages; then the sender waits
+NOT_JOINED = "a publisher did not confirm the subscription; do all services run?"
 LAST_ANSWER_S = 2.0  # for the recognizer to receive the end of the audio before a session closes
 
 
@@ -65,7 +66,7 @@ class BaseClient:
         self,
         control: str | None = None,
         *,
-        key: Key | None = None,
+        key: KeyPair | None = None,
         insecure: bool = False,
         timeout_s: float = 10.0,
     ) -> None:
@@ -194,6 +195,7 @@ class BaseSession:
         self,
         classes: tuple[type[Result], ...],
         shape_set: str,
+        keep_all: bool,
         on_result: Callable[[Any], None] | None = None,
     ) -> tuple[Subscription, Future[None]]:
         """Start a subscription; the future is done once it is in effect."""
@@ -205,7 +207,8 @@ class BaseSession:
             else:
                 joined.set_exception(failure)
 
-        inbox = Inbox(self._thread.make_signal(), MAX_LIVE if self._core.is_live else None)
+        is_limited = self._core.is_live and not keep_all
+        inbox = Inbox(self._thread.make_signal(), MAX_LIVE if is_limited else None)
         subscription = Subscription(self._core, classes, shape_set, inbox, on_joined, on_result)
         self._thread.call(lambda: self._core.subscribe(subscription))
         return subscription, joined

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import TimeoutError as FutureTimeout
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from kouxing_client.base import (
     LAST_ANSWER_S,
+    NOT_JOINED,
     BaseClient,
     BaseResults,
     BaseSession,
@@ -101,9 +103,9 @@ class Client(BaseClient):
         Raises
         ------
         Refused
-            If there is no session of this name.
+            If there is no such session.
         KouxingError
-            If there is no session at all, or control does not answer.
+            If control does not answer.
         """
         core = self._thread.submit(lambda: self._thread.core.follow(name)).result()
         return Session(self._thread, core, None)
@@ -221,13 +223,23 @@ class Session(BaseSession):
         self,
         *classes: type[Result],
         shapes: str = "",
+        keep_all: bool = False,
         on_result: Callable[[Any], None] | None = None,
-    ) -> Results[Result]:
+    ) -> Results[Any]:
         """Return results of several classes from now on; raises as ``frames``.
 
-        If ``on_result`` is given, the client's thread calls it with each result instead.
+        Parameters
+        ----------
+        classes
+            Such as ``FapFrame`` and ``Phone``.
+        shapes
+            Name of the set of blend shapes, if the classes include ``Shapes``.
+        keep_all
+            Whether all unread results of a live session are kept, not only the newest 100.
+        on_result
+            Called with each result by the client's thread; nothing is left to read then.
         """
-        return self._join(classes, shapes, on_result)
+        return self._join(classes, shapes, keep_all, on_result)
 
     def events(self) -> Results[Event]:
         """Return control's events about the session from now on, even after it is closed."""
@@ -238,10 +250,14 @@ class Session(BaseSession):
         self,
         classes: tuple[type[Result], ...],
         shape_set: str = "",
+        keep_all: bool = False,
         on_result: Callable[[Any], None] | None = None,
     ) -> Results[Any]:
-        subscription, joined = self._subscribe(classes, shape_set, on_result)
-        joined.result()
+        subscription, joined = self._subscribe(classes, shape_set, keep_all, on_result)
+        try:
+            joined.result(self._thread.timeout_s)
+        except FutureTimeout:
+            raise KouxingError(NOT_JOINED) from None
         if added := self._add_shapes(shape_set):
             added.result()
         return Results(subscription.inbox, self._unsubscribe(subscription))
@@ -273,3 +289,15 @@ class Results(BaseResults, Generic[T]):
         """
         self._signal.wait(self._has_news, timeout_s)
         return cast("T | None", self._take())
+
+    def available(self, timeout_s: float = 0.0) -> Iterator[T]:
+        """Yield the results that have arrived, waiting up to the timeout for the first one.
+
+        Raises
+        ------
+        KouxingError
+            As ``get``.
+        """
+        while (result := self.get(timeout_s)) is not None:
+            yield result
+            timeout_s = 0.0

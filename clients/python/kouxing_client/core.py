@@ -72,7 +72,7 @@ class ClientCore:
         timeout_s: float,
         make_signal: Callable[[], Signal],
     ) -> None:
-        self.sessions: dict[str, SessionCore] = {}
+        self.sessions: list[SessionCore] = []
         self._sockets = sockets
         self._control = control
         self._timeout_s = timeout_s
@@ -121,7 +121,8 @@ class ClientCore:
 
     def follow(self, name: str) -> Future[SessionCore]:
         """Follow a session that another program opened; if the name is empty, the newest."""
-        return then(self.status(name), lambda status: self._add(newest_session(status), None))
+        # Only the status of the whole system has the endpoint of control's events.
+        return then(self.status(""), lambda status: self._add(newest_session(status, name), None))
 
     def add_inbox(self, session: str, inbox: Inbox) -> None:
         """Pass a session's events to an inbox, even after the session has ended."""
@@ -142,7 +143,7 @@ class ClientCore:
                 self._requests.pop(name).answer.set_exception(KouxingError(self._no_answer()))
             elif now_s >= request.retry_s:
                 self._send(request)
-        for session in list(self.sessions.values()):
+        for session in list(self.sessions):
             session.tick()
             if session.is_over:
                 self._remove(session)
@@ -153,7 +154,7 @@ class ClientCore:
         """End all sessions, and answer all requests with a failure."""
         for request in self._requests.values():
             request.answer.set_exception(failure)
-        for session in self.sessions.values():
+        for session in self.sessions:
             session.end(failure)
         for inboxes in self._inboxes.values():
             for inbox in inboxes:
@@ -191,13 +192,13 @@ class ClientCore:
         session = SessionCore(self._sockets, opened, options, self._make_signal())
         if self._events is None:
             self._events = self._sockets.connect_events(opened["events"], self._on_event)
-        self.sessions[session.name] = session
+        self.sessions.append(session)
         self._watch(session.name, on=True)
         session.connect()
         return session
 
     def _remove(self, session: SessionCore) -> None:
-        del self.sessions[session.name]
+        self.sessions.remove(session)
         self._asked_s.pop(session.name, None)
         self._watch(session.name, on=False)
 
@@ -215,7 +216,7 @@ class ClientCore:
 
         def place(answer: Future[Status]) -> None:
             try:
-                state = newest_session(answer.result())
+                state = newest_session(answer.result(), session.name)
             except Refused as refusal:
                 if refusal.code == "unknown-session":
                     session.end(None)
@@ -250,25 +251,34 @@ class ClientCore:
             return
         for inbox in self._inboxes.get(event.session, ()):
             inbox.add(event)
-        if event.name == "session-closed" and event.session in self.sessions:
-            self.sessions[event.session].close_soon(event.detail)
+        if event.name == "session-closed":
+            for session in self._sessions_called(event.session):
+                session.close_soon(event.detail)
 
     def _on_moved(self, fields: Fields) -> None:
-        if session := self.sessions.get(fields["session"]):
+        for session in self._sessions_called(fields["session"]):
             session.move(fields)
 
+    def _sessions_called(self, name: str) -> list[SessionCore]:
+        return [session for session in self.sessions if session.name == name]
 
-def newest_session(status: Status) -> Fields:
-    """Return name and endpoints of the newest session that is published.
+
+def newest_session(status: Status, name: str) -> Fields:
+    """Return name and endpoints of the newest session of a name (if empty, of any name).
 
     Raises
     ------
-    KouxingError
+    Refused
         If there is no such session.
     """
-    sessions = [state for state in status.sessions if "faps" in state.endpoints]
+    sessions = [
+        state
+        for state in status.sessions
+        if "faps" in state.endpoints and name in ("", state.session)
+    ]
     if not sessions:
-        raise KouxingError("there is no session to follow")
+        text = f"there is no session {name!r}" if name else "there is no session to follow"
+        raise Refused("unknown-session", text)
     newest = min(sessions, key=lambda state: state.age_s)
     endpoints: dict[str, str] = {}
     for service in status.services:

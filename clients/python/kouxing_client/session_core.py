@@ -76,7 +76,7 @@ class Subscription:
     classes
         Results to subscribe to.
     shape_set
-        Name of the set of blend shapes, if ``classes`` has ``Shapes``.
+        Name of the set of blend shapes, if ``classes`` has ``Shapes``; if empty, all sets.
     inbox
         Ends with the session.
     on_joined

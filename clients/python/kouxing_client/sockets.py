@@ -14,7 +14,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from kouxing_client.errors import KouxingError
-from kouxing_client.keys import Key
+from kouxing_client.keys import KeyPair
 from kouxing_client.messages import Decoders, Joined, Message, topic
 
 QUEUE = 20_000  # messages
@@ -51,7 +51,7 @@ class Sockets:
         When this process last resumed after it was suspended; minus infinity if never.
     """
 
-    def __init__(self, key: Key | None) -> None:
+    def __init__(self, key: KeyPair | None) -> None:
         self.connect_ms = CONNECT_MS
         self.resumed_at_s = -math.inf
         self._key = key

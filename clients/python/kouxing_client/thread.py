@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from kouxing_client.core import ClientCore, new_future
 from kouxing_client.errors import KouxingError
-from kouxing_client.keys import Key
+from kouxing_client.keys import KeyPair
 from kouxing_client.session_core import SessionCore, Signal
 from kouxing_client.sockets import Sockets
 
@@ -39,10 +39,11 @@ class ClientThread:
     """
 
     def __init__(
-        self, control: str, key: Key | None, timeout_s: float, make_signal: Callable[[], Signal]
+        self, control: str, key: KeyPair | None, timeout_s: float, make_signal: Callable[[], Signal]
     ) -> None:
         if key is not None and " " not in control:
             control = f"{control} {key.control}"
+        self.timeout_s = timeout_s
         self._sockets = Sockets(key)
         self._tick_s = 0.0
         self._is_stopping = False
@@ -65,6 +66,8 @@ class ClientThread:
             else:
                 answer.set_result(asked.result())
 
+        if not self._thread.is_alive():
+            raise KouxingError("the client is closed")
         self._sockets.call(lambda: function().add_done_callback(pass_on))
         return answer
 
@@ -102,7 +105,7 @@ class ClientThread:
             self._sockets.close()
 
     def _step(self) -> None:
-        is_busy = any(session.is_blocked for session in self.core.sessions.values())
+        is_busy = any(session.is_blocked for session in self.core.sessions)
         period_s = BUSY_TICK_S if is_busy else TICK_S
         now_s = self._sockets.now_s
         self._tick_s = min(self._tick_s, now_s + period_s)

@@ -1,0 +1,33 @@
+"""Connects a command to a running system."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+from kouxing_client import Client, KouxingError
+
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import Key
+
+
+@contextlib.contextmanager
+def connect(control: str, *, key: Key | None = None, timeout_s: float = 10.0) -> Iterator[Client]:
+    """Connect to control; on leaving, raise a ``KouxingError`` as a ``UserError``.
+
+    Parameters
+    ----------
+    control
+        Where control takes commands, as ``control_endpoint`` returns it: the address and, unless
+        nothing is encrypted, its public key.
+    key
+        Key of the client; None: the user's own key.
+    timeout_s
+        Time limit for an answer.
+    """
+    try:
+        insecure = " " not in control
+        with Client(control, key=key, insecure=insecure, timeout_s=timeout_s) as client:
+            yield client
+    except KouxingError as error:
+        raise UserError(str(error)) from error
