@@ -70,8 +70,8 @@ class AudioStream:
         numbered = {**fields, "sequence": self.sequence, "media_time": self.media_time}
         self._kept.append({**numbered, "acknowledge": True})
         self._sent_s.append((self.sequence, now_s))
-        self._num_frames += num_frames
         oldest = self.media_time - RESEND_S * MEDIA_RATE_HZ
+        self._num_frames += num_frames
         while self._kept[0]["sequence"] <= self.acknowledged:
             if self._kept[0]["media_time"] >= oldest:
                 break

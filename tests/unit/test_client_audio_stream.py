@@ -1,0 +1,92 @@
+"""Which audio a client sends, sends again and forgets."""
+
+from __future__ import annotations
+
+import pytest
+
+from kouxing_client.audio_stream import NEAREST_MS, RESEND_S, AudioStream
+
+pytestmark = pytest.mark.unit
+CHUNK = 1600  # samples: 100 ms
+
+
+def stream_of(num_chunks: int) -> AudioStream:
+    """Return a stream whose chunks are sent at intervals of 100 ms."""
+    stream = AudioStream(16000, is_paced=True)
+    for number in range(num_chunks):
+        stream.add({}, CHUNK, number / 10)
+        sent(stream)
+    return stream
+
+
+def sent(stream: AudioStream) -> list[int]:
+    """Send what is unsent; return the sequence numbers."""
+    return [message["sequence"] for message in stream.unsent()]
+
+
+def test_numbers_messages_and_counts_media_time_at_16_khz() -> None:
+    stream = AudioStream(48000, is_paced=True)
+    for _ in range(2):
+        stream.add({}, 4800, 0.0)
+    stream.skip(2400)
+    stream.add({"last": True}, 0, 0.0)
+    messages = list(stream.unsent())
+    assert [message["sequence"] for message in messages] == [1, 2, 3]
+    assert [message["media_time"] for message in messages] == [0, 1600, 4000]
+    assert sent(stream) == []
+
+
+def test_a_moved_session_resends_what_the_new_recognizer_needs() -> None:
+    stream = stream_of(5)
+    stream.move(3, 1.0)
+    assert sent(stream) == [3, 4, 5]
+
+
+def test_keeps_acknowledged_audio_for_a_limited_time() -> None:
+    stream = stream_of(149)
+    stream.acknowledge(149, 15.0)
+    stream.add({}, CHUNK, 15.0)
+    stream.move(1, 15.0)
+    num_kept = round(RESEND_S / 0.1) + 1
+    assert sent(stream) == list(range(151 - num_kept, 151))
+
+
+def test_resends_what_is_not_acknowledged_in_time_and_waits_longer_each_time() -> None:
+    stream = stream_of(5)
+    stream.acknowledge(2, 1.0)
+    assert not stream.is_stuck(1.5)
+    assert stream.is_stuck(1.7)
+    stream.resend(1.7)
+    assert sent(stream) == [3, 4, 5]
+    assert not stream.is_stuck(2.8)
+    assert stream.is_stuck(3.0)
+    stream.acknowledge(5, 3.0)
+    assert not stream.is_stuck(30.0)
+
+
+def test_a_recognizer_that_never_acknowledges_gets_audio_once() -> None:
+    assert not stream_of(3).is_stuck(100.0)
+
+
+def test_the_shortest_round_trip_limits_new_connections() -> None:
+    stream = stream_of(1)
+    assert stream.connect_ms(300) == 300
+    stream.acknowledge(1, 0.1)
+    assert stream.connect_ms(300) == 200
+    stream.add({}, CHUNK, 1.0)
+    stream.acknowledge(2, 1.001)
+    assert stream.connect_ms(300) == NEAREST_MS
+    for _ in range(3):
+        stream.resend(2.0)
+    assert stream.connect_ms(300) == 300, "the recognizer may be further away now"
+
+
+def test_flushed_audio_is_not_sent_but_the_end_is() -> None:
+    stream = stream_of(3)
+    stream.add({}, CHUNK, 0.3)
+    stream.flush()
+    assert sent(stream) == []
+    stream.add({"last": True}, 0, 0.4)
+    stream.flush()
+    stream.move(2, 0.5)
+    assert sent(stream) == [5]
