@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from kouxing_client import Client
+from kouxing_client import Client, KouxingError
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared import connections, kernel_sockets
@@ -164,7 +164,7 @@ def test_who_hangs_does_not_answer_and_refuses_nobody() -> None:
         try:
             with (
                 Client(endpoint, key=key, timeout_s=0.5) as client,
-                pytest.raises(UserError, match="does not answer"),
+                pytest.raises(KouxingError, match="does not answer"),
             ):
                 client.status()
         finally:

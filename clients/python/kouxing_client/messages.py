@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from array import array
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
@@ -152,12 +153,15 @@ class Event(Message, frozen=True, kw_only=True):
     detail: str = ""
 
 
-class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class ServiceState:
     """One service, as its last heartbeat described it."""
 
     service: str
     """``recognizer``, ``synthesizer``, ..."""
     instance: str
+    role: str
+    """``control``, ``worker`` (placed in sessions) or ``observer`` (takes part in all)"""
     state: str
     """``ready`` or ``draining``"""
     age_s: float
@@ -168,7 +172,8 @@ class ServiceState(msgspec.Struct, frozen=True, kw_only=True):
     metrics: dict[str, float]
 
 
-class SessionFacts(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class SessionFacts:
     """What the workers of a session state about their results."""
 
     language: str | None = None
@@ -181,7 +186,8 @@ class SessionFacts(msgspec.Struct, frozen=True, kw_only=True):
     """lip model of a face whose settings name none"""
 
 
-class SessionState(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class SessionState:
     """One session, as control knows it."""
 
     session: str
@@ -196,7 +202,8 @@ class SessionState(msgspec.Struct, frozen=True, kw_only=True):
     facts: SessionFacts
 
 
-class Status(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, kw_only=True)
+class Status:
     """The state of a system."""
 
     services: list[ServiceState]
