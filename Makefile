@@ -1,13 +1,24 @@
-# make run    sets everything up, then a sample sentence drives the face, live in the browser and as a video
-# make demo   the same up to the video, then stops (for servers)
-# make test   all tests           make quick  those to run while editing, under a minute
-# make check  style, types and import rules
-# make lock   renews the locked versions of all Python packages
+# make run          sets everything up, then speaks a sample sentence: live in the browser and as a video
+# make demo         the same, without a browser; stops after the video (for servers)
+# make wheel        builds dist/kouxing-*.whl, which needs no npm
+# make test         all tests
+# make quick        the tests to run while editing, under a minute
+# make check        style, types and import rules
+# make check-wheel  installs the wheel in an empty environment, and runs it
+# make lock         updates the locked versions of all Python packages
+#
+# test and check run all their stages, report each failure, and then exit with an error.
 PYTHON ?= python3
 BIN := .venv/bin
 PAGE := services/gateway/page
-HEADS := $(PAGE)/head.glb $(patsubst %,$(PAGE)/head-%.glb,man elder child ada leo rosa mika)
-EXPORT := services/driver/head/glb_export.py services/driver/render/shaders.py
+HEADS := $(PAGE)/head.glb
+HEAD_SOURCES := $(wildcard services/driver/head/assets/*) services/driver/head/glb_export.py \
+	services/driver/render/shaders.py
+# The modules that the page loads, and their licenses; make check-wheel finds missing ones.
+PAGE_MODULES := three/LICENSE three/build/three.core.js three/build/three.module.js \
+	three/examples/jsm/controls/OrbitControls.js three/examples/jsm/loaders/GLTFLoader.js \
+	three/examples/jsm/utils/BufferGeometryUtils.js three/examples/jsm/utils/SkeletonUtils.js \
+	@mediapipe/face_mesh
 MOS := evaluation/mos/page
 CLIENT := proto/node
 JAVASCRIPT := clients/javascript
@@ -21,7 +32,12 @@ PIP := $(BIN)/python -m pip install --quiet
 NPM := PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/npm --no-audit --no-fund --loglevel=error --prefix
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: run demo setup test quick blender check lock clean
+TEST_STAGES := test-python test-alone test-page
+CHECK_STAGES := $(addprefix check-,ruff format types imports godot page mos javascript compose docker)
+STAGES = $(MAKE) --keep-going --no-print-directory
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+.PHONY: run demo setup wheel test quick blender check check-wheel lock clean $(TEST_STAGES) $(CHECK_STAGES)
 
 run: setup
 	$(BIN)/kouxing run --play $(SAMPLE)
@@ -31,32 +47,70 @@ demo: setup
 
 setup: .venv/installed $(PAGE)/node_modules/.package-lock.json $(HEADS)
 
-# Two processes begin with the tests that start services, a third with the others.
+# The page's modules are in the package only while the wheel is built.
+wheel: .venv/installed $(PAGE)/node_modules/.package-lock.json
+	rm -rf build dist $(PAGE)/vendor
+	mkdir $(PAGE)/vendor
+	tar -C $(PAGE)/node_modules -cf - $(PAGE_MODULES) | tar -C $(PAGE)/vendor -xf -
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .; status=$$?; \
+		rm -rf build $(PAGE)/vendor; exit $$status
+	ls -l dist
+
 test: .venv/installed-dev setup $(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR))
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile -m "not alone"
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m alone
+	$(STAGES) $(TEST_STAGES)
+
+test-python:
+	$(PYTEST) -n 3 --dist loadfile -m "not alone"
+
+test-alone:
+	$(PYTEST) -m alone
+
+test-page:
 	$(NPM) $(PAGE) test
 
 quick: .venv/installed-dev
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n auto --maxprocesses 4 \
-		-m "(unit or property or contract) and not slow"
+	$(PYTEST) -q -n auto --maxprocesses 4 -m "(unit or property or contract) and not slow"
 
 blender: $(BLENDER)/installed
 
 check: .venv/installed-dev $(PAGE)/node_modules/.bin/eslint
+	$(STAGES) $(CHECK_STAGES)
+
+check-ruff:
 	$(BIN)/ruff check .
+
+check-format:
 	$(BIN)/ruff format --check .
+
+check-types:
 	$(BIN)/mypy
+
+check-imports:
 	$(BIN)/lint-imports
+
+check-godot:
 	$(BIN)/gdlint examples/godot/*.gd
 	$(BIN)/gdformat --check --diff examples/godot/*.gd
+
+check-page:
 	$(NPM) $(PAGE) run lint
+
+check-mos:
 	cd $(MOS) && PATH="$(CURDIR)/$(BIN):$$PATH" $(CURDIR)/$(PAGE)/node_modules/.bin/eslint --max-warnings 0 -c $(CURDIR)/$(PAGE)/eslint.config.mjs .
+
+check-javascript:
 	$(NPM) $(JAVASCRIPT) run lint
+
+check-compose:
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
+
+check-docker:
 	$(BIN)/hadolint deploy/Dockerfile
 
-# One lock for every system and Python >= 3.11; torch keeps its version, which training depends on.
+check-wheel: wheel
+	$(PYTHON) deploy/check_wheel.py dist/kouxing-*.whl
+
+# One lock for every system and Python >= 3.11. The version of torch is fixed: training depends on it.
 lock: .venv/installed
 	$(PIP) uv
 	echo '$(TORCH)' | $(BIN)/uv pip compile --quiet --upgrade --universal --python-version 3.11 --all-extras \
@@ -64,7 +118,7 @@ lock: .venv/installed
 
 clean:
 	rm -rf .venv $(BLENDER) $(PAGE)/node_modules $(CLIENT)/node_modules \
-		$(JAVASCRIPT)/node_modules $(AVATAR)/node_modules $(HEADS) out
+		$(JAVASCRIPT)/node_modules $(AVATAR)/node_modules $(PAGE)/head*.glb build dist out
 
 .venv/installed: pyproject.toml $(LOCK) deploy/system_packages.sh
 	sh deploy/system_packages.sh run
@@ -91,14 +145,11 @@ $(patsubst %,%/node_modules/.package-lock.json,$(CLIENT) $(JAVASCRIPT) $(AVATAR)
 	$(NPM) $* ci
 	touch $@
 
-# Blender wants Python 3.11 and an older numpy; its test is left out where it is not installed.
+# Blender needs Python 3.11 and an older numpy. Without it, its test is skipped.
 $(BLENDER)/installed:
 	$(PYTHON) -m venv $(BLENDER)
 	$(BLENDER)/bin/python -m pip install --quiet bpy==4.5.15
 	touch $@
 
-$(PAGE)/head.glb: $(wildcard services/driver/head/assets/*) $(EXPORT) | .venv/installed
-	$(BIN)/kouxing head export $@
-
-$(PAGE)/head-%.glb: services/driver/head/assets/%.npz $(EXPORT) | .venv/installed
-	$(BIN)/kouxing head export --head $* $@
+$(HEADS): $(HEAD_SOURCES) | .venv/installed
+	$(BIN)/kouxing head export --all $(PAGE)

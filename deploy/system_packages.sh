@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs the system libraries that pip cannot bring, or prints the command that does.
+# Installs the system libraries that pip cannot install, or prints the command for it.
 # usage: system_packages.sh run|test
 set -eu
 
@@ -9,9 +9,9 @@ if [ "$1" = test ]; then
     packages="$packages mono-mcs mono-runtime"
 fi
 
-if [ "$(uname)" = Darwin ]; then exit 0; fi # macOS brings OpenGL
+if [ "$(uname)" = Darwin ]; then exit 0; fi # macOS includes OpenGL
 if ! command -v apt-get >/dev/null; then
-    echo "not a Debian system: the equivalents of these packages are needed: $packages" >&2
+    echo "this is not a Debian system; install the equivalents of these packages: $packages" >&2
     exit 0
 fi
 missing=""
@@ -30,7 +30,7 @@ if [ "$(id -u)" = 0 ]; then
     fi
     rm -f "$log"
 else
-    echo "system libraries are missing; type this, then make again:" >&2
+    echo "system libraries are missing; run this command, then make again:" >&2
     echo "    sudo $install" >&2
     exit 1
 fi

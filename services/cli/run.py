@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kouxing.services.cli.options import ConfigFile, HeadName
+from kouxing.services.cli.options import ConfigFile, HeadName, ServiceAssignments
+from kouxing.services.cli.page_heads import ensure_page_heads
 from kouxing.services.cli.running_system import announce, find_control
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.driver.config import DriverConfig
@@ -26,36 +27,34 @@ from kouxing.shared.terminal import CONSOLE, command_name, print_message
 if TYPE_CHECKING:
     from kouxing.shared.audio_file import AudioSource
 
+BOUND_CONTROL = variable("control", "control")
+
 
 def run(
     config: ConfigFile = None,
     play: Annotated[
-        Path | None, typer.Option(help="Speak this file first, recorded as out/demo.mp4.")
+        Path | None, typer.Option(help="Speak this file first, and record it as out/demo.mp4.")
     ] = None,
     stop_after: Annotated[
-        bool, typer.Option("--stop-after", help="Stop once the file has been played.")
+        bool, typer.Option("--stop-after", help="Stop when the file has been played.")
     ] = False,
     head: HeadName = "",
     browser: Annotated[bool, typer.Option(help="Open the page in a browser.")] = True,
     port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Port of the page, instead of 8080.")
+        int | None, typer.Option(min=0, max=65535, help="Port of the page; by default 8080.")
     ] = None,
     workers: Annotated[
         int,
         typer.Option(
             min=1,
             max=64,
-            help="Recognizers and synthesizers; of two or more one that fails is replaced at once.",
+            help="Number of recognizers and of synthesizers. With two or more, another worker"
+            " takes over at once if one fails.",
         ),
     ] = 1,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="SERVICE.KEY=VALUE", help="Set one key of a service; repeatable."
-        ),
-    ] = None,
+    assignments: ServiceAssignments = None,
 ) -> None:
-    """Run all services on this machine and restart those that crash."""
+    """Run all services on this machine, and restart those that crash."""
     from kouxing.services.cli.supervisor import Supervisor
     from kouxing.shared.audio_file import open_audio
 
@@ -64,33 +63,34 @@ def run(
         given["gateway.port"] = str(port)
     settings = read_settings(config, given)
     for kind in KINDS.values():
-        settings.load(kind.config_type)  # nothing starts where any key is wrong
+        settings.load(kind.config_type)  # if a key is wrong, nothing starts
     sample = None if play is None else open_audio(play)
     driver = settings.load(DriverConfig)
     arguments = ["--config", str(config)] if config else []
     out = Path(driver.out)
     addresses = available_addresses(settings)
-    bound_control = addresses.get(
-        variable("control", "control"), settings.load(ControlConfig).bound_control
-    )
+    control_config = settings.load(ControlConfig)
+    bound_control = addresses.get(BOUND_CONTROL, control_config.bound_control)
     control = _control_address(bound_control)
     environment = {
         **_assigned_environment(given),
         **head_environment(head or driver.head, out),
         **addresses,
         variable(COMMON, "control"): control,
-        variable("control", "control"): bound_control,
+        BOUND_CONTROL: bound_control,
     }
-    insecure = settings.load(ControlConfig).insecure
-    client_control = control_endpoint(control, insecure=insecure)
+    client_control = control_endpoint(control, insecure=control_config.insecure)
     more = more_workers(settings, workers)
     supervisor = Supervisor(arguments, out / "logs", CONSOLE, environment, more=more)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's background processes ignore it
     for remark in _remarks_on_ports(settings, addresses, control):
         print_message(remark)
     try:
         with CONSOLE.status(f"starting {', '.join(KINDS)}"):
+            ensure_page_heads()
             supervisor.start()
             supervisor.wait_ready(client_control)
         supervisor.watch()
@@ -105,8 +105,8 @@ def run(
             if stop_after:
                 return
             print_message(
-                "ready: use the microphone on the page, or, in another terminal,"
-                f" {command_name()} speak my.wav; Ctrl-C ends"
+                "ready: use the microphone on the page, or run in another terminal:"
+                f" {command_name()} speak my.wav; press Ctrl-C to stop"
             )
             supervisor.wait()
     except KeyboardInterrupt:
@@ -116,21 +116,21 @@ def run(
 
 
 def head_environment(name: str, out: Path) -> dict[str, str]:
-    """Return the environment in which window, videos and page show a head.
+    """Return the environment in which the driver and the page show a head.
 
     Parameters
     ----------
     name
         A head of the package, or a file.
     out
-        Folder for the GLB that is made for the page.
+        Folder for the GLB that the page loads.
 
     Raises
     ------
     UserError
         If there is no such head, or the GLB cannot be written.
     """
-    environment = {"KOUXING_DRIVER_HEAD": name}
+    environment = {variable("driver", "head"): name}
     if name == DriverConfig().head:
         return environment
     from kouxing.services.driver.head.glb_export import export_glb
@@ -140,42 +140,42 @@ def head_environment(name: str, out: Path) -> dict[str, str]:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f"{out}: cannot be made: {error.strerror}") from None
+        raise UserError(f"{out}: cannot create the folder: {error.strerror}") from None
     export_glb(load_head(name), page_head)
-    return environment | {"KOUXING_GATEWAY_HEAD": str(page_head)}
+    return environment | {variable("gateway", "head"): str(page_head)}
 
 
 def _assigned_environment(assignments: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment that gives services what ``--set`` says, whatever else does."""
+    """Return the environment that passes on ``--set``, so that it overrides all other sources."""
     environment = {}
     for name, value in assignments.items():
         table, _, key = name.partition(".")
-        for each in (COMMON, *KINDS) if table == COMMON else (table,):
-            environment[variable(each, key)] = value
+        for service in (COMMON, *KINDS) if table == COMMON else (table,):
+            environment[variable(service, key)] = value
     return environment
 
 
 def _control_address(bound: str) -> str:
-    """Return where services and clients of this machine find control."""
+    """Return the address by which services and clients on this machine reach control."""
     host, _ = split_endpoint(bound, "control.control")
     return with_host(bound, "127.0.0.1") if host in WILDCARDS else bound
 
 
 def _remarks_on_ports(settings: Settings, moved: Mapping[str, str], control: str) -> Iterator[str]:
-    """Yield what a user is told of default ports that are taken."""
+    """Yield messages about default ports that are in use."""
     taken = [
-        str(each.value)
+        setting.text
         for kind in KINDS.values()
-        for each in settings.describe(kind.config_type)
-        if each.is_default and variable(kind.name, each.key) in moved
+        for setting in settings.describe(kind.config_type)
+        if setting.is_default and variable(kind.name, setting.key) in moved
     ]
     if taken:
-        yield f"taken by other programs: {', '.join(taken)}; free ports are used instead"
-    if variable("control", "control") in moved:
+        yield f"other programs use {', '.join(taken)}; free ports are used instead"
+    if BOUND_CONTROL in moved:
         if running := find_control():
-            where, _, _ = running.partition(" ")
-            yield f"kouxing runs already, with control at {where}; this is one more"
-        yield f"your kouxing commands find this one; other programs: KOUXING_CONTROL={control}"
+            address, _, _ = running.partition(" ")
+            yield f"another kouxing is already running, with control at {address}"
+        yield f"your kouxing commands use this one; for other programs, KOUXING_CONTROL={control}"
 
 
 def _play_sample(sample: AudioSource, control: str) -> None:

@@ -16,6 +16,7 @@ import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.connection_quota import ConnectionQuota
 from kouxing.shared.logs import LOG
+from kouxing.shared.page_heads import page_heads_folder
 
 PAGE = Path(__file__).parent / "page"
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl")  # shared with the driver
@@ -174,11 +175,8 @@ def _find(folder: Path, name: str, suffixes: Collection[str]) -> Path:
 
 
 def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamResponse:
-    if name in ("head.glb", "head-woman.glb"):
-        path = Path(head_file) if head_file and name == "head.glb" else PAGE / "head.glb"
-        if not path.is_file():
-            text = f"{path} does not exist; create it with 'kouxing head export {path}'\n"
-            raise web.HTTPNotFound(text=text)
+    if name.endswith(".glb"):
+        path = Path(head_file) if head_file and name == "head.glb" else _page_head(name)
     else:
         path = LIGHT if name == LIGHT.name else _find(PAGE, name, _PAGE_SUFFIXES)
     response = web.FileResponse(path)
@@ -187,6 +185,17 @@ def _page_file(name: str, head_file: str, frame_ancestors: str) -> web.StreamRes
     elif name == FACE_MESH_FRAME:
         response.headers.update(_FACE_MESH_POLICIES)
     return response
+
+
+def _page_head(name: str) -> Path:
+    """Return the file of a head, from the page's folder or from the cache folder."""
+    file = "head.glb" if name == "head-woman.glb" else name
+    for folder in (PAGE, page_heads_folder()):
+        with contextlib.suppress(web.HTTPNotFound):
+            return _find(folder, file, {".glb"})
+    folder = page_heads_folder()
+    text = f"there is no head {file}; create all heads with 'kouxing head export --all {folder}'\n"
+    raise web.HTTPNotFound(text=text)
 
 
 def _content_policy(index: Path, frame_ancestors: str) -> str:

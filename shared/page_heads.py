@@ -1,0 +1,12 @@
+"""Where the page's heads are, if the package has no GLB files of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def page_heads_folder() -> Path:
+    """Return ``$XDG_CACHE_HOME/kouxing/heads``, by default ``~/.cache/kouxing/heads``."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "kouxing" / "heads"
