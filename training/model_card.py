@@ -21,24 +21,11 @@ def write_card(
     chosen: SearchWeights | None,
     measure: str = "phone error rate",
 ) -> None:
-    """Write the card of a model.
+    """Write the card of the model in ``output``, with the suffix ``.md``.
 
-    Parameters
-    ----------
-    output
-        The model's file; the card gets the suffix ``.md``.
-    title
-        First line of the card.
-    details
-        How the model was trained, as part of a sentence.
-    examples
-        Training recordings; the card lists them by license.
-    errors
-        Rows that were skipped; the card counts them.
-    chosen
-        Search weights, if they were chosen on development data.
-    measure
-        The meaning of ``chosen.error_rate``.
+    ``details`` describe the training as part of a sentence. The card lists the training examples by
+    license and counts the skipped rows. ``chosen`` are the search weights, if they were chosen on
+    development data, and ``measure`` names their error rate.
     """
     by_license: dict[str, list[Example]] = defaultdict(list)
     for example in examples:

@@ -72,7 +72,7 @@ def choose_search_weights(
     rate: ErrorRate = offline_error_rate,
     report: Report = print,
 ) -> SearchWeights | None:
-    """Choose the weights with the lowest error rate on the split ``dev``.
+    """Choose the weights with the lowest error rate on the split ``dev``; None if it is empty.
 
     Parameters
     ----------
@@ -88,13 +88,6 @@ def choose_search_weights(
         Compute the features with the model's front end instead of from cached log-mel features.
     rate
         Error rate to minimize.
-    report
-        Receives lines of progress.
-
-    Returns
-    -------
-    SearchWeights or None
-        None if the corpora have no recordings of the split ``dev``.
     """
     dev = load_dev(corpora, model.inventory, shipping=shipping, with_samples=with_samples)
     if not dev:

@@ -72,27 +72,9 @@ def load_examples(
 ) -> list[Example]:
     """Read the recordings of one split, with their log-mel features and weights.
 
-    Parameters
-    ----------
-    corpora
-        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads.
-    errors
-        Receives a message for every row that cannot be used.
-    inventory
-        The corpora's language.
-    split
-        Split to read.
-    shipping
-        Exclude rows whose license does not allow distributing the model.
-    synthetic_weight
-        Weight of synthetic relative to real speech.
-    with_samples
-        Also load the samples.
-
-    Raises
-    ------
-    UserError
-        If no recording can be used.
+    ``errors`` receives a message for every row that cannot be used. ``shipping`` excludes rows
+    whose license does not allow distributing the model. ``with_samples`` also loads the samples.
+    Raises UserError if no recording can be used.
     """
     utterances: list[Utterance] = []
     log_mels: list[NDArray[np.float16] | None] = []
@@ -159,22 +141,8 @@ def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[f
 def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArray[np.int16]]:
     """Read recordings without text, in any language, except those held out for measuring.
 
-    Parameters
-    ----------
-    folders
-        Folders with audio files, at any depth.
-    errors
-        Receives a message for every file that cannot be used.
-
-    Returns
-    -------
-    list
-        Samples at 16 kHz, trimmed and cut into pieces of up to 20 s.
-
-    Raises
-    ------
-    UserError
-        If a folder contains no audio files, or none of them can be used.
+    Returns samples at 16 kHz, trimmed and cut into pieces of up to 20 s. ``errors`` receives a
+    message for every file that cannot be used. Raises UserError if no file can be used.
     """
     pieces = []
     for folder in folders:

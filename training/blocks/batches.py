@@ -142,12 +142,9 @@ def _frames(
 
 
 def _hurry(frames: Floats, rng: np.random.Generator) -> tuple[Floats, NDArray[np.int64]]:
-    """Shorten steady sounds, as fast speakers do: vowels and pauses more than consonants.
+    """Shorten steady sounds, like fast speakers.
 
-    Returns
-    -------
-    tuple
-        The new frames, (m, k), and their source frames, (m,).
+    Return frames, (m, k), and their source frames, (m,).
     """
     change = np.abs(np.diff(frames[:, :NUM_MELS], axis=0, prepend=frames[:1, :NUM_MELS]))
     change = uniform_filter1d(change.mean(axis=1), _STEADY_FRAMES)

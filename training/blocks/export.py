@@ -50,15 +50,7 @@ def onnx_of(
     right_context: int = RIGHT_CONTEXT,
     past: int = PAST,
 ) -> NDArray[np.uint8]:
-    """Export a network as the bytes of an ONNX file with the inputs and outputs above.
-
-    Parameters
-    ----------
-    encoder, readout
-        The network.
-    block_length, right_context, past
-        B, R, PAST, positions.
-    """
+    """Export a network as the bytes of an ONNX file with the inputs and outputs above."""
     return _BlockGraph(encoder, readout, block_length, right_context, past).file_of_block()
 
 

@@ -48,24 +48,8 @@ def label(
 ) -> list[Recording]:
     """Align and label a random selection of recordings.
 
-    Parameters
-    ----------
-    examples
-        Recordings with text and samples.
-    untranscribed
-        Folders of recordings without text.
-    draw
-        How much to draw of both.
-    aligner
-        A model of the examples' language.
-    encoder
-        Whisper's encoder, for the teacher.
-    errors
-        Receives a message for every file that cannot be used.
-    seed
-        Seed of the draw and of the teacher's training.
-    report
-        Receives lines of progress.
+    ``examples`` have text and samples, in the language of ``aligner``. ``untranscribed`` are
+    folders of recordings without text. ``encoder`` is Whisper's, for the teacher.
     """
     rng = np.random.default_rng(seed)
     drawn: list[Example] = []

@@ -70,24 +70,9 @@ def train_readout(
     checkpoint: Path,
     report: Report,
 ) -> Readout:
-    """Train a readout.
+    """Train a readout of states on windows.
 
-    Parameters
-    ----------
-    encoder
-        Whisper's encoder.
-    recordings
-        Recordings with soft targets.
-    num_states
-        Number of target states.
-    seed
-        Seed of windows, augmentation and new weights.
-    num_steps
-        Number of batches of 70 s of audio.
-    checkpoint
-        File for the state of training. If it exists, training resumes from it.
-    report
-        Receives lines of progress.
+    Training saves its state in ``checkpoint``, and resumes from it if the file exists.
     """
     torch.manual_seed(seed)
     batches = Batches(encoder, recordings, seed)

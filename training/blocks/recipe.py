@@ -58,36 +58,11 @@ def train_blocks(
     shipping: bool = True,
     report: Report = print,
 ) -> None:
-    """Train the block model, and write the model and its card.
+    """Train the block model, and write it with its card.
 
-    Parameters
-    ----------
-    corpora
-        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads; splits ``train`` and
-        ``dev``.
-    output
-        The ``.npz`` file to write; the card gets the suffix ``.md``.
-    whisper
-        Folder with Whisper base, see :mod:`kouxing.training.neural.whisper_weights`.
-    start
-        Neural model that aligns, and whose HMMs, phone language model and prior are used. Without
-        it, the shipped one.
-    untranscribed
-        Folders of recordings in any language, which the teacher labels. Their licenses are
-        unknown, so name only folders that may be used.
-    seed
-        Seed of the draw of recordings, new weights, excerpts and disturbances.
-    num_readout_steps, num_steps
-        Number of batches for the first readout, and for tuning.
-    shipping
-        Exclude rows whose license does not allow distributing the model.
-    report
-        Receives lines of progress.
-
-    Raises
-    ------
-    UserError
-        If there is nothing to train on, ``start`` is not a neural model, or a file cannot be read.
+    The arguments are the options of ``kouxing train blocks``; ``shipping`` excludes rows whose
+    license does not allow distributing the model. Raises UserError if there is nothing to train on,
+    ``start`` is not a neural model, or a file cannot be read.
     """
     start = start or NEURAL_PATH
     before = load_model(start)

@@ -69,22 +69,8 @@ def train_network(
 ) -> BlockNetwork:
     """Train the network in place; return one with the running mean of its weights.
 
-    Parameters
-    ----------
-    network
-        Network with Whisper's weights and a trained readout.
-    teacher
-        Whisper's encoder.
-    recordings
-        Recordings with soft targets.
-    seed
-        Seed of excerpts and disturbances.
-    num_steps
-        Number of batches of 32 s of audio.
-    checkpoint
-        File for the state of training. If it exists, training resumes from it.
-    report
-        Receives lines of progress.
+    ``network`` has Whisper's weights and a trained readout, ``teacher`` is Whisper's encoder.
+    Training saves its state in ``checkpoint``, and resumes from it if the file exists.
     """
     optimizer = Optimizer(
         network,

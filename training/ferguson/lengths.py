@@ -77,12 +77,8 @@ def influence_levels(
 ) -> tuple[dict[str, int], dict[str, float]]:
     """Group finals by their initials' share; return level and factor of each.
 
-    Parameters
-    ----------
-    share
-        Mean fraction of the syllable that is the initial, for at least ``NUM_LEVELS`` finals.
-    weight
-        Weight of each final.
+    ``share`` is the mean fraction of the syllable that is the initial, for at least ``NUM_LEVELS``
+    finals.
     """
     finals = sorted(share, key=lambda final: (-share[final], final))
     values = np.array([share[final] for final in finals])

@@ -39,10 +39,7 @@ def train_ferguson(
 ) -> None:
     """Learn the table from the training clips and recordings.
 
-    Raises
-    ------
-    UserError
-        If nothing may be used, or the file cannot be written.
+    Raises UserError if no data may be used, or the file cannot be written.
     """
     model = load_model()
     inventory = model.inventory
@@ -92,10 +89,7 @@ def training_rows(
 ) -> list[Utterance]:
     """Read sentences of the training split, at most ``_MAX_OF_SPEAKER`` of each speaker.
 
-    Raises
-    ------
-    UserError
-        If there are no usable sentences.
+    Raises UserError if there are no usable sentences.
     """
     chosen: list[Utterance] = []
     of_speaker: dict[str, int] = {}

@@ -22,10 +22,7 @@ def decorrelate(
 ) -> tuple[Hmm, NDArray[np.float32]]:
     """Rotate the features, in place, so that diagonal covariances fit best (Gales 1999, eq. 20-24).
 
-    Returns
-    -------
-    tuple
-        The rotated model and the rotation, shape (39, 39): ``x @ rotation``.
+    Returns the rotated model and the rotation, (39, 39), for ``x @ rotation``.
     """
     scatter, counts = _component_covariances(frames, hmm)
     num = NUM_FEATURES

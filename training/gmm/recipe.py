@@ -49,35 +49,11 @@ def train_gmm(
     shipping: bool = True,
     report: Report = print,
 ) -> None:
-    """Train the Gaussian mixture recognizer and write the model and its card.
+    """Train the Gaussian mixture recognizer, and write the model with its card.
 
-    Parameters
-    ----------
-    corpora
-        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads; splits ``train`` and
-        ``dev``.
-    output
-        The ``.npz`` file to write; the card gets the suffix ``.md``.
-    inventory
-        The corpora's language.
-    seed
-        Seed of the augmentation.
-    phone_lm
-        File with a phone language model. Without it, the model is estimated from the corpora's
-        texts.
-    num_mixtures
-        Gaussians per state, a power of two.
-    synthetic_weight
-        Weight of synthetic relative to natural speech.
-    shipping
-        Exclude rows whose license does not allow distributing the model.
-    report
-        Receives lines of progress.
-
-    Raises
-    ------
-    UserError
-        If there is nothing to train on, or the number of mixtures is not a power of two.
+    The arguments are the options of ``kouxing train gmm``; ``shipping`` excludes rows whose license
+    does not allow distributing the model. Raises UserError if there is nothing to train on, or the
+    number of mixtures is not a power of two.
     """
     if num_mixtures < 1 or num_mixtures & (num_mixtures - 1):
         raise UserError(f"{num_mixtures} mixtures is not a power of two; give 1, 2, 4, 8, 16...")

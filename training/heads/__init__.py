@@ -1,1 +1,1 @@
-"""Build the heads' assets from MakeHuman data: ``python -m kouxing.training.heads``."""
+"""Builds the heads from MakeHuman data: ``python -m kouxing.training.heads``."""

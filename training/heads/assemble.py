@@ -1,7 +1,7 @@
-"""Put a head together.
+"""Assemble a head.
 
 Every head is a shape of one mesh. Zones, texture, teeth, tongue and hair are laid out by hand on
-the reference head, in dm, and carried over to the same vertices of the other heads.
+the reference head, in dm, and transferred to the same vertices of the other heads.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from kouxing.training.heads import paint, paint_parts, parts
 from kouxing.training.heads.asset import Piece, write
 from kouxing.training.heads.eyes_and_mouth import eye_pieces, teeth_pieces, tongue_piece
 from kouxing.training.heads.feature_points import FEATURE_POINTS
-from kouxing.training.heads.hair import Crop, coarse_locks
+from kouxing.training.heads.hair import coarse_locks
+from kouxing.training.heads.hair_styles import Crop
 from kouxing.training.heads.makehuman import PIVOT, MakeHuman
 from kouxing.training.heads.measures import (
     eye_sockets,
@@ -41,8 +42,8 @@ from kouxing.training.heads.zones import (
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-LOWEST = 3.1  # dm, where the bust ends
-# the band round the neck, as rings about the garment's edge: outwards and up, dm
+LOWEST = 3.1  # lower end of the bust, dm
+# the neckband, as rings around the garment's edge: outward and up, dm
 _NECKBAND = (
     (0.036, 0.000),
     (0.046, 0.014),
@@ -51,7 +52,7 @@ _NECKBAND = (
     (0.010, 0.03),
     (0.0, -0.04),
 )
-# the front edge of the left upper eyelid, from the nose outwards
+# the front edge of the left upper eyelid, from the nose outward
 LEFT_LID = (6886, 6844, 6841, 6838, 6785, 6784, 6790, 6793, 6796, 6799)
 LEFT_LOWER_LID = (
     6886, 6850, 6853, 6856, 6837, 11695, 6834, 6831, 6828, 6825, 6820, 6817, 6814, 6808
@@ -59,7 +60,7 @@ LEFT_LOWER_LID = (
 
 
 class Builder:
-    """Makes heads out of MakeHuman's data."""
+    """Makes heads from MakeHuman's data."""
 
     def __init__(self, source: MakeHuman) -> None:
         self._source = source
@@ -78,7 +79,7 @@ class Builder:
         self._map = self._face_map()
 
     def _shaped(self, targets: Shape, face_units: Shape) -> Float:
-        """Shape the mesh (19158, 3) and move its pivot to where all have it."""
+        """Shape the mesh (19158, 3), and move its pivot to the common place."""
         vertices = self._mesh.vertices.copy()
         for name, amount in targets:
             vertices += amount * self._source.target(name)
@@ -89,12 +90,12 @@ class Builder:
         return shaped
 
     def _skin(self, vertices: Float) -> Skin:
-        """Make the skin, with room for hair and mouth, and the lips closed."""
+        """Make the skin with room for hair and mouth, and close the lips."""
         skin = subdivided(vertices, self._face)
         x, y, z = self._layout.T
         top = np.clip((y - 6.48) / 0.15, 0, 1)
         normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))
-        # the mouth's lining keeps away from its corners
+        # keep the mouth's lining away from its corners
         corner = np.clip((np.abs(x) - 0.13) / 0.05, 0, 1) * (z > 1.0) * self._cavity
         skin.vertices[:] -= 0.05 * top[:, None] * normals + 0.012 * corner[:, None] * [0, 0, 1]
         close_lips(skin)
@@ -119,7 +120,7 @@ class Builder:
         write(output, pieces, self._textures(person), skin, self._tongue, fapu, cel=person.look.cel)
 
     def _face_fields(self, fapu: dict[str, float]) -> Fields:
-        """Fields of the skin."""
+        """Compute the fields of the skin."""
         blink, squint = (
             (self._carried(unit + "Left"), self._carried(unit + "Right"))
             for unit in ("eyeBlink", "eyeSquint")
@@ -127,7 +128,7 @@ class Builder:
         return FaceFields(self.reference, self._cavity, blink, squint, fapu).fields
 
     def _carried(self, unit: str) -> Float:
-        """Displacements (V, 3) of the skin by a face unit."""
+        """Return the displacements (V, 3) of the skin by a face unit."""
         return self.reference.carry(self._source.face_unit(unit))
 
     def _skin_piece(self, skin: Skin, person: Person, fields: Fields) -> Piece:
@@ -135,13 +136,13 @@ class Builder:
         covered = person.hair.hidden(layout) & ~self._cavity
         covered |= layout[:, 1] < neckline_height(layout[:, 2]) - 0.15
 
-        def seen(quads: Index) -> Index:
+        def visible(quads: Index) -> Index:
             triangles = surface.triangles_of(quads)
-            shown: Index = triangles[~covered[triangles].all(axis=1)]
-            return shown
+            uncovered: Index = triangles[~covered[triangles].all(axis=1)]
+            return uncovered
 
         part = parts.Part(
-            skin.vertices, seen(skin.quads), paint.skin_uv(layout), np.ones_like(layout)
+            skin.vertices, visible(skin.quads), paint.skin_uv(layout), np.ones_like(layout)
         )
         return Piece(
             "skin",
@@ -151,11 +152,11 @@ class Builder:
             skin.matrix @ head_weight(self._source)[skin.base],
             fields,
             coarse_vertices=len(skin.base),
-            coarse_triangles=seen(skin.coarse_quads),
+            coarse_triangles=visible(skin.coarse_quads),
         )
 
     def _garment(self, vertices: Float) -> Piece:
-        """Make a round-necked top: the torso, a little larger, cut off round the neck."""
+        """Make a round-necked top: the torso, slightly enlarged, cut off around the neck."""
         torso, plain = (subdivided(shape, self._torso) for shape in (vertices, self._plain))
         smooth, layout = (skin.vertices[: len(skin.base)] for skin in (torso, plain))
         triangles = surface.triangles_of(torso.coarse_quads)
@@ -163,19 +164,19 @@ class Builder:
         height = layout[:, 1] - neckline_height(layout[:, 2])
         cut, triangles, rim = surface.clip(height, triangles, np.hstack([smooth, normals]))
         points, normals = cut[:, :3], cut[:, 3:]
-        # the edge is folded in towards the neck
+        # fold the edge toward the neck
         ring, local = np.unique(rim, return_inverse=True)
         local = local.reshape(rim.shape)
         folds = [points[ring] + out * normals[ring] + [0, up, 0] for out, up in _NECKBAND]
         strips = []
-        before = rim
+        previous = rim
         for step in range(len(folds)):
-            after = local + len(points) + step * len(ring)
+            following = local + len(points) + step * len(ring)
             strips += [
-                np.stack([before[:, 1], before[:, 0], after[:, 0]], axis=1),
-                np.stack([before[:, 1], after[:, 0], after[:, 1]], axis=1),
+                np.stack([previous[:, 1], previous[:, 0], following[:, 0]], axis=1),
+                np.stack([previous[:, 1], following[:, 0], following[:, 1]], axis=1),
             ]
-            before = after
+            previous = following
         everything = np.concatenate([points + 0.034 * normals, *folds])
         used, compact = np.unique(np.concatenate([triangles, *strips]), return_inverse=True)
         everything = everything[used]
@@ -188,22 +189,22 @@ class Builder:
         return Piece("garment", part, "cloth", 0.9, np.zeros(len(everything)))
 
     def _mouth_pieces(self, skin: Skin, fapu: dict[str, float], raised: float) -> list[Piece]:
-        """Teeth and tongue, which keep their place behind the lips."""
+        """Make teeth and tongue, and place them behind the lips."""
         lips = ("2.2", "2.3")
-        middle, wanted = (
-            whose.vertices[whose.points(*lips)].mean(axis=0) for whose in (self.reference, skin)
+        middle, target = (
+            one.vertices[one.points(*lips)].mean(axis=0) for one in (self.reference, skin)
         )
         corners = self.reference.points("8.3", "8.4")
         size = np.ptp(skin.vertices[corners, 0]) / np.ptp(self.reference.vertices[corners, 0])
         pieces = [*teeth_pieces(fapu), tongue_piece(self._tongue, fapu)]
         for piece in pieces:
-            piece.part.vertices = (piece.part.vertices - middle) * size + wanted
+            piece.part.vertices = (piece.part.vertices - middle) * size + target
             if piece.name != "teeth_upper":
                 piece.part.vertices[:, 1] += raised
         return pieces
 
     def _hair(self, skin: Skin, person: Person) -> list[Piece]:
-        """Make the hair and let it follow the skin under it."""
+        """Make the hair, and warp it with the skin under it."""
         layout = self.reference.vertices
         outer = np.flatnonzero((layout[:, 1] > 4.7) & ~self._cavity)[::5]
         warp = interpolate.RBFInterpolator(
@@ -214,27 +215,29 @@ class Builder:
         for name, part in person.hair.parts(layout).items():
             part.vertices = part.vertices + warp(part.vertices)
             count = len(part.vertices)
-            # long locks need all their bends
-            fewer = name == "hair_tips" and isinstance(person.hair, Crop)
-            coarse = coarse_locks(count) if fewer else None
+            # long locks need all their rows
+            is_short = name == "hair_tips" and isinstance(person.hair, Crop)
+            coarse = coarse_locks(count) if is_short else None
             pieces.append(Piece(name, part, "hair", 0.7, np.ones(count), coarse_triangles=coarse))
         return pieces
 
     def _lashes(self, skin: Skin, fields: Fields, length: float) -> Piece:
-        """Grow two ribbons of lashes out of the edges of the upper eyelids."""
+        """Make two ribbons of lashes along the edges of the upper eyelids."""
         columns, rows = 25, 4
         layout = self.reference.vertices[: len(skin.base)]
         pieces = []
-        moved: list[Fields] = []
+        fields_of_sides: list[Fields] = []
         for side in (1.0, -1.0):
             lid = skin.number[np.array(LEFT_LID)]
             if side < 0:
                 mirror = layout[lid] * [-1, 1, 1]
                 lid = np.array([np.argmin(((layout - p) ** 2).sum(1)) for p in mirror])
             edge = skin.vertices[lid]
-            walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))])
-            at = np.linspace(0.06, 1.0, columns) * walked[-1]
-            root = interpolate.make_interp_spline(walked, edge, 3)(at)
+            length_along = np.concatenate(
+                [[0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))]
+            )
+            at = np.linspace(0.06, 1.0, columns) * length_along[-1]
+            root = interpolate.make_interp_spline(length_along, edge, 3)(at)
             sideways = (np.linspace(-0.55, 1.0, columns) * side)[:, None] * [1.0, 0, 0]
             out = np.array([0.0, 0.0, 1.0]) + 0.75 * sideways
             grow = np.sin(np.pi * np.linspace(0.12, 0.80, columns))[:, None] * 0.060 * length
@@ -253,10 +256,10 @@ class Builder:
             )
             triangles = parts.grid_triangles(rows, columns)
             pieces.append(parts.Part(points, triangles, uv, np.ones_like(points)))
-            moved.append(
+            fields_of_sides.append(
                 {
                     fap: np.tile(
-                        interpolate.make_interp_spline(walked, shift[lid], 3)(at), (rows, 1)
+                        interpolate.make_interp_spline(length_along, shift[lid], 3)(at), (rows, 1)
                     )
                     for fap, shift in fields.items()
                     if np.abs(shift[lid]).max() > 1e-6
@@ -271,14 +274,14 @@ class Builder:
             np.ones((2 * count, 3)),
         )
         both: Fields = {}
-        for half, own in enumerate(moved):
-            for fap, shift in own.items():
+        for half, side_fields in enumerate(fields_of_sides):
+            for fap, shift in side_fields.items():
                 whole = both.setdefault(fap, np.zeros((2 * count, 3)))
                 whole[half * count : (half + 1) * count] = shift
         return Piece("lashes", part, "lashes", 0.9, np.ones(2 * count), both)
 
     def _face_map(self) -> paint.FaceMap:
-        """Lay the texture of the skin out on the reference head."""
+        """Lay out the texture of the skin on the reference head."""
         skin = self.reference
         uv = paint.skin_uv(skin.vertices)
         normals = surface.vertex_normals(skin.vertices, surface.triangles_of(skin.quads))

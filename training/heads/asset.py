@@ -1,4 +1,4 @@
-"""The file format of a head: what ``kouxing.services.driver.head.head`` reads."""
+"""Write a head in the file format that ``services.driver.head.head`` reads."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from numpy.typing import NDArray
 from kouxing.services.driver.head.head import FORMAT
 from kouxing.training.heads import parts
 from kouxing.training.heads.feature_points import FEATURE_POINTS
-from kouxing.training.heads.makehuman import METRES_PER_UNIT, PIVOT
+from kouxing.training.heads.makehuman import METERS_PER_UNIT, PIVOT
 from kouxing.training.heads.zones import Fields, Skin
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-
 
 TRANSPARENT = ("hair_tips", "lashes")
 
 
 @dataclass(slots=True)
 class Piece:
-    """A part with what the asset stores beside its shape."""
+    """A part with its material and motion."""
 
     name: str
     part: parts.Part
@@ -32,7 +31,7 @@ class Piece:
     roughness: float
     head_weight: Float  # (V,)
     fields: Fields = field(default_factory=dict)  # FAP -> (V, 3), dm at 1 FAPU or 1 rad
-    coarse_vertices: int = 0  # so many vertices make the coarse part; 0: there is one level
+    coarse_vertices: int = 0  # 0: there is only one level of detail
     coarse_triangles: Index | None = None
 
 
@@ -46,10 +45,10 @@ def write(
     *,
     cel: bool,
 ) -> None:
-    """Write a head; lengths come in dm and are stored in m; ``cel`` as in ``Head``."""
+    """Write a head, converting dm to m; ``cel`` as in ``Head``."""
 
-    def metres(points: Float) -> NDArray[np.float32]:
-        return np.asarray((points - PIVOT) * METRES_PER_UNIT, dtype=np.float32)
+    def meters(points: Float) -> NDArray[np.float32]:
+        return np.asarray((points - PIVOT) * METERS_PER_UNIT, dtype=np.float32)
 
     first = np.cumsum([0] + [len(p.part.vertices) for p in pieces])
     start = {p.name: int(at) for p, at in zip(pieces, first, strict=False)}
@@ -84,24 +83,24 @@ def write(
         at_edge, at_root = parts.middle_of_teeth(piece.part)
         points |= {edge: start[piece.name] + at_edge, root: start[piece.name] + at_root}
     vertices = np.concatenate([p.part.vertices for p in pieces])
-    fapu = {name: value * METRES_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
+    fapu = {name: value * METERS_PER_UNIT for name, value in fapu.items()} | {"AU": 1e-5}
 
     faps, units, bounds, moved, shifts = [], [], [0], [], []
     for fap in sorted({fap for piece in pieces for fap in piece.fields}):
         for piece in pieces:
             if fap in piece.fields:
-                shift = piece.fields[fap] * METRES_PER_UNIT
+                shift = piece.fields[fap] * METERS_PER_UNIT
                 rows = np.flatnonzero(np.abs(shift).max(axis=1) > 2e-6)
                 moved.append(rows + start[piece.name])
                 shifts.append(shift[rows])
         faps.append(fap)
         units.append(1e5 if fap == 47 else 1024.0)
         bounds.append(sum(len(rows) for rows in moved))
-    centres = metres(np.stack([(e.vertices.max(0) + e.vertices.min(0)) / 2 for e in eyes]))
+    centers = meters(np.stack([(e.vertices.max(0) + e.vertices.min(0)) / 2 for e in eyes]))
     arrays: dict[str, Any] = {
         "format": np.array(FORMAT),
         "cel": np.array(cel),
-        "vertices": metres(vertices),
+        "vertices": meters(vertices),
         "uv": np.round(np.concatenate([p.part.uv for p in pieces]) * 65535).astype(np.uint16),
         "colors": np.round(
             np.sqrt(np.clip(np.concatenate([p.part.colors for p in pieces]), 0, 1)) * 255
@@ -121,7 +120,7 @@ def write(
         "fapu": np.array(list(fapu.values())),
         "feature_point_names": np.array(list(points)),
         "feature_points": np.array(list(points.values())),
-        "eye_centres": centres,
+        "eye_centres": centers,
         "field_faps": np.array(faps, dtype=np.int64),
         "field_units": np.array(units),
         "field_bounds": np.array(bounds),

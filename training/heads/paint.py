@@ -1,7 +1,7 @@
 """Bake the skin into a texture.
 
-The two halves of the face share one texture: its columns count the angle round a vertical axis
-inside the head (0 in front, pi behind), its rows the height. Colours are sRGB, 0 to 1.
+Both halves of the face share one texture. Its columns are the angle around a vertical axis inside
+the head (0 in front, pi behind), its rows the height. Colors are sRGB, 0 to 1.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import interpolate, ndimage, spatial
 
-from kouxing.training.heads.hair import Hair
+from kouxing.training.heads.hair_styles import Hair
 from kouxing.training.heads.texture import Color, mix, noise
 
 Float = NDArray[np.float64]
 
-AXIS_Z = 0.35  # dm, of the vertical axis the angle is counted about
+AXIS_Z = 0.35  # dm, of the vertical axis
 TOP_Y, BOTTOM_Y = 6.85, 4.15  # dm
 SKIN_SIZE = (1280, 832)  # rows, columns
 _ANGLES = np.radians([0.0, 70.0, 110.0, 180.0])
@@ -25,7 +25,7 @@ _COLUMNS = np.array([0.0, 0.80, 0.92, 1.0])
 
 
 def skin_uv(vertices: Float) -> Float:
-    """Texture coordinates (V, 2) of points (V, 3)."""
+    """Return the texture coordinates (V, 2) of points (V, 3)."""
     angle = np.abs(np.arctan2(np.abs(vertices[:, 0]), vertices[:, 2] - AXIS_Z))
     u = np.interp(angle, _ANGLES, _COLUMNS)
     v = (TOP_Y - vertices[:, 1]) / (TOP_Y - BOTTOM_Y)
@@ -35,7 +35,7 @@ def skin_uv(vertices: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class FaceMap:
-    """Where the texels of the skin lie on the neutral face."""
+    """Positions of the skin's texels on the neutral face."""
 
     x: Float  # (H, W) dm, distance from the middle plane
     y: Float
@@ -44,7 +44,7 @@ class FaceMap:
 
 
 def face_map(vertices: Float, uv: Float) -> FaceMap:
-    """Carry positions from the outer skin's vertices to the texels."""
+    """Interpolate positions from the outer skin's vertices to the texels."""
     rows, columns = SKIN_SIZE
     v, u = np.meshgrid(
         (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
@@ -53,7 +53,7 @@ def face_map(vertices: Float, uv: Float) -> FaceMap:
     nearest = interpolate.NearestNDInterpolator(uv, values)
     linear = interpolate.LinearNDInterpolator(uv, values)(u, v)
     values = np.where(np.isfinite(linear), linear, nearest(u, v))
-    # points that a fold hides under others leave specks
+    # remove specks from points that a fold hides
     values = ndimage.median_filter(values, (9, 9, 1))
     values = ndimage.gaussian_filter(values, (2, 2, 0))
     return FaceMap(
@@ -67,7 +67,7 @@ def face_map(vertices: Float, uv: Float) -> FaceMap:
 def _spot(
     face: FaceMap, x: float, y: float, width: float, height: float, until: float = 1.5
 ) -> Float:
-    """Soft spot (H, W) of height 1 at a place of the face; none beyond the angle ``until``."""
+    """Make a soft spot (H, W) at a place of the face, up to the angle ``until``."""
     spot = np.exp(-(((face.x - x) / width) ** 2) - ((face.y - y) / height) ** 2)
     front: Float = spot * np.clip((until - face.angle) / 0.25, 0, 1)
     return front
@@ -75,7 +75,7 @@ def _spot(
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Colours (sRGB) and how strongly they are laid on."""
+    """Colors (sRGB) and their strengths."""
 
     skin: Color = (0.890, 0.725, 0.625)
     lip: Color = (0.720, 0.405, 0.385)
@@ -91,29 +91,14 @@ class Look:
     iris_size: float = 1.0
     lash_line: float = 1.0  # width of the dark edge of the upper lid
     cloth: Color = (0.20, 0.29, 0.38)
-    cel: bool = False  # plain colours, light and shade
+    cel: bool = False  # cel shading: plain colors, light and shade
 
 
 def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: Hair) -> Float:
-    """Paint the skin.
+    """Paint the skin, sRGB (H, W, 3).
 
-    Parameters
-    ----------
-    face
-        Where the texels lie.
-    brow
-        Middle line of a brow from the nose outwards (3, 2), x and y in dm.
-    lid
-        Edges of the eyelids from the nose outwards (N, 3): x, height of the upper and of the lower
-        one in dm.
-    lips
-        From the middle outwards (N, 3): x, height of the upper and of the lower outline in dm.
-    look, hair
-        Whose skin it is.
-
-    Returns
-    -------
-    sRGB (H, W, 3).
+    ``brow`` is the middle line of a brow (3, 2), x and y. ``lid`` and ``lips`` are outlines (N, 3):
+    x, upper and lower height. All run outward, in dm.
     """
     shape = face.x.shape
     image = np.broadcast_to(np.array(look.skin), (*shape, 3)).copy()
@@ -123,7 +108,7 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: 
         return red * look.skin[0], green * look.skin[1], blue * look.skin[2]
 
     blotch = noise(shape, 26, 1)
-    # the neck is thin: there the texture is squeezed, and grain would turn into streaks
+    # the texture is squeezed at the thin neck, where grain would become streaks
     grain = np.clip((face.y - 4.70) / 0.25, 0.1, 1) * (not look.cel)
     image *= 1 + 0.010 * (grain * blotch)[..., None] * np.array([0.6, 1.0, 1.2])
     fine = 0.010 * noise(shape, 1.1, 2) + 0.006 * noise(shape, 3.5, 3)
@@ -148,7 +133,7 @@ def skin(face: FaceMap, brow: Float, lid: Float, lips: Float, look: Look, hair: 
 
 
 def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lips: Float) -> Float:
-    """Grey the shaven parts of the face: upper lip, chin, jaw and sideburns."""
+    """Tint the shaven parts of the face: upper lip, chin, jaw and sideburns."""
     top = np.interp(
         face.angle, [0.0, 0.30, 0.55, 0.95, 1.25, 1.45], [5.10, 5.12, 5.16, 5.28, 5.55, 5.70]
     )
@@ -162,8 +147,8 @@ def _paint_stubble(image: Float, face: FaceMap, amount: float, color: Color, lip
     return mix(image, color, amount * np.maximum(jaw * soul, lip) * dots)
 
 
-# lines of an old face as x and y in dm, and their depth: forehead, between the brows, outer corner
-# of the eye, under the eye, beside the mouth, chin
+# wrinkles as x and y in dm, and their depth: forehead, between the brows, outer corner of the eye,
+# under the eye, around the mouth, chin, neck
 _WRINKLES = (
     (((0.0, 6.335), (0.15, 6.345), (0.33, 6.32)), 0.45),
     (((0.0, 6.255), (0.20, 6.27), (0.40, 6.23)), 0.65),
@@ -182,7 +167,7 @@ _WRINKLES = (
 
 
 def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
-    """Draw wrinkles, each a dark groove with a light rim below, and brown spots."""
+    """Draw wrinkles, dark grooves with a light rim below, and brown spots."""
     texels = np.stack([face.x, face.y], axis=-1)
     waver = 0.004 * noise(face.x.shape, 9, 22)
     for points, depth in _WRINKLES:
@@ -194,7 +179,7 @@ def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
         away, at = spatial.cKDTree(curve).query(texels[near])
         above = (texels[near] - curve[at])[:, 1]
         fade = np.sin(np.pi * np.clip(0.02 + 0.96 * steps[at], 0, 1))
-        if line[0, 0] == 0.0:  # goes on over the middle
+        if line[0, 0] == 0.0:  # it continues across the middle
             fade = np.cos(np.pi / 2 * steps[at])
         across = away + waver[near]
         groove = np.exp(-((across / 0.009) ** 2)) + 0.45 * np.exp(-((across / 0.028) ** 2))
@@ -208,11 +193,11 @@ def _paint_age(image: Float, face: FaceMap, amount: float) -> Float:
 
 
 def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
-    """Tint what lies between the two lip outlines."""
+    """Tint the area between the lip outlines."""
     upper, lower = (np.interp(face.x, lips[:, 0], lips[:, column]) for column in (1, 2))
     upper = upper - 0.012 * np.exp(-((face.x / 0.024) ** 2))  # Cupid's bow
     edge = 0.0065
-    inset = np.clip((lips[-1, 0] - face.x) / 0.07, 0, 1)  # none at the corner
+    inset = np.clip((lips[-1, 0] - face.x) / 0.07, 0, 1)  # 0 at the corner
     inside = 1 / (1 + np.exp((face.y - upper + 0.004 * inset) / edge))
     inside *= 1 / (1 + np.exp((lower + 0.012 * inset - face.y) / edge))
     inside *= 1 / (1 + np.exp((face.x - lips[-1, 0] + 0.004) / 0.006))
@@ -226,7 +211,7 @@ def _paint_lips(image: Float, face: FaceMap, lips: Float, look: Look) -> Float:
 
 
 def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, width: float) -> Float:
-    """Darken the edges of the lids, where the lashes grow, and the upper lid's fold."""
+    """Darken the edges of the lids and the upper lid's fold."""
     edge = np.interp(face.x, lid[:, 0], lid[:, 1])
     inside = 1 / (1 + np.exp(-(face.x - lid[0, 0] - 0.01) / 0.008))
     inside *= 1 / (1 + np.exp((face.x - lid[-1, 0] - 0.02) / 0.012))
@@ -240,9 +225,9 @@ def _paint_eye_lines(image: Float, face: FaceMap, lid: Float, lower: Float, widt
     return mix(image, (0.60, 0.41, 0.36), 0.32 * fold)
 
 
-# a calm, friendly brow: from the nose outwards it rises, and falls less at its tail; share of its
-# length, height about the mean of its feature points, half of its breadth, both in dm, and the
-# direction of its hairs against its line, rad
+# a calm, friendly brow, from the nose outward: fraction of its length, height relative to the mean
+# of its feature points and half of its breadth, both in dm, and direction of its hairs relative to
+# its line, rad
 _BROW = np.array(
     [
         [0.00, -0.031, 0.014, 1.20],
@@ -256,7 +241,7 @@ _BROW = np.array(
 
 
 def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
-    """Draw a brow hair by hair along a spindle, over a soft ground."""
+    """Draw a brow hair by hair over a soft ground."""
     nose, temple = brow[0, 0] - 0.012, brow[-1, 0] + 0.015
     line = interpolate.PchipInterpolator(_BROW[:, 0], _BROW[:, 1:])
     near = (face.x > nose - 0.05) & (face.x < temple + 0.08) & (face.angle < 1.4)
@@ -274,7 +259,7 @@ def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
         reach *= look.brow_width
         off = rng.uniform(-0.9, 0.7) * reach
         slope = float(line(root, 1)[0]) / (temple - nose)
-        # hairs above the line lean down to it, those below it up
+        # hairs lean toward the line from above and below
         turn = np.arctan(slope) + lean * (0.75 - 0.45 * off / reach) + rng.normal(0, 0.10)
         length = rng.uniform(0.035, 0.060) * (0.6 + 0.4 * look.brow_width)
         foot = np.array([nose + root * (temple - nose), height + off])
@@ -290,7 +275,7 @@ def _paint_brow(image: Float, face: FaceMap, brow: Float, look: Look) -> Float:
 
 
 def _paint_roots(image: Float, face: FaceMap, look: Look, hair: Hair) -> Float:
-    """Let the hair begin on the skin."""
+    """Paint the roots of the hair on the skin."""
     shape = face.x.shape
     ragged = 0.04 * noise(shape, (14, 1.3), 6) + 0.08 * noise(shape, (30, 12), 7)
     inside = hair.roots(face.x, face.y, face.z) + ragged

@@ -1,4 +1,4 @@
-"""Paint eyes, teeth, tongue, cloth, hair and lashes. Colours are sRGB, 0 to 1."""
+"""Paint eyes, teeth, tongue, cloth, hair and lashes. Colors are sRGB, 0 to 1."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Float = NDArray[np.float64]
 
 
 def eye(color: Color, iris_size: float = 1.0, size: int = 256) -> Float:
-    """Paint an eyeball; the distance from the middle counts the angle from the pupil.
+    """Paint an eyeball; the distance from the center is the angle from the pupil.
 
-    ``color`` is the iris's where it is lightest, ``iris_size`` its size and the pupil's.
+    ``color`` is the lightest color of the iris, ``iris_size`` scales iris and pupil.
     """
     place = (np.arange(size) + 0.5) / size * 2 - 1
     x, y = np.meshgrid(place, place)
@@ -33,7 +33,7 @@ def eye(color: Color, iris_size: float = 1.0, size: int = 256) -> Float:
     within = np.clip((angle - PUPIL_ANGLE) / (IRIS_ANGLE - PUPIL_ANGLE), 0, 1)
     bright = 0.55 + 0.30 * (1 - np.abs(2 * within - 0.9)) + 0.45 * np.clip(y / 0.3, -0.5, 1)
     iris = np.array(color) * (bright * (1 + 0.10 * spokes))[..., None]
-    iris *= np.clip(1.25 - within**4, 0.25, 1)[..., None]  # a dark ring about it
+    iris *= np.clip(1.25 - within**4, 0.25, 1)[..., None]  # a dark ring around it
     soft = 0.016
     image = _mix_images(image, iris, 1 / (1 + np.exp((angle - IRIS_ANGLE) / soft)))
     pupil = np.array([0.02, 0.016, 0.016])
@@ -46,7 +46,7 @@ def _mix_images(low: Float, high: Float, amount: Float) -> Float:
 
 
 def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Float:
-    """Paint a row of teeth: gum at the top of the texture, cutting edge at 0.7, back below."""
+    """Paint a row of teeth: gum at the top, cutting edge at 0.7, back at the bottom."""
     rows, columns = size
     v, u = np.meshgrid(
         (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
@@ -68,7 +68,7 @@ def teeth(widths: tuple[float, ...], size: tuple[int, int] = (128, 768)) -> Floa
 
 
 def tongue(size: int = 128) -> Float:
-    """Paint the tongue, seen from above, its tip at the bottom: papillae, and a groove."""
+    """Paint the tongue from above, with its tip at the bottom: papillae and a groove."""
     rough = 0.06 * noise((size, size), 0.8, 9) + 0.02 * noise((size, size), 4.0, 10)
     across = (np.arange(size) + 0.5) / size - 0.5
     groove = 0.22 * np.exp(-((across / 0.035) ** 2))
@@ -83,14 +83,14 @@ def cloth(color: Color, size: int = 16) -> Float:
 
 
 def hair(color: Color, size: tuple[int, int] = (256, 96)) -> Float:
-    """Paint strands that run down the texture, in bands: one closed, and some that thin out (RGBA).
+    """Paint vertical strands in bands, one opaque and the others thinning out (RGBA).
 
     ``size`` is a band's. Roots fade in at the top, tips thin out at the bottom.
     """
     rows, columns = size
     v = ((np.arange(rows) + 0.5) / rows)[:, None]
-    edge = 1 - np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :]  # 0 at the band's
-    contrast = 0.22 - 0.14 * max(color)  # light hair shows its shadows more
+    edge = 1 - np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :]  # 0 at the band's edge
+    contrast = 0.22 - 0.14 * max(color)  # shadows are more visible in light hair
     bands = []
     for band in range(NUM_BANDS):
         strands = 0.8 * noise(size, (60, 0.9), 16 + band) + 0.5 * noise(size, (80, 3.5), 30 + band)
@@ -103,14 +103,14 @@ def hair(color: Color, size: tuple[int, int] = (256, 96)) -> Float:
             alpha *= np.clip((edge - 0.08) / 0.30 + 0.35 * ragged, 0, 1) * (edge > 0.06)
         bands.append(np.concatenate([image, alpha[..., None]], axis=2))
     painted: Float = np.clip(np.concatenate(bands, axis=1), 0, 1)
-    # few levels pack well
+    # few levels compress well
     painted[..., :3] = np.round(painted[..., :3] * 100) / 100
     painted[..., 3] = np.round(painted[..., 3] * 20) / 20
     return painted
 
 
 def lashes(size: tuple[int, int] = (64, 256)) -> Float:
-    """Paint lashes that grow from the bottom row of the texture and thin out (RGBA)."""
+    """Paint lashes that grow from the bottom row and thin out (RGBA)."""
     rows, columns = size
     rng = np.random.default_rng(15)
     alpha = np.zeros(size)

@@ -1,10 +1,10 @@
-"""Who is built: shapes out of MakeHuman's targets, colours and hair."""
+"""The people to build: shapes from MakeHuman's targets, colors and hair."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kouxing.training.heads.hair import Bob, Crop, Hair
+from kouxing.training.heads.hair_styles import Bob, Crop, Hair
 from kouxing.training.heads.paint import Look
 
 Shape = tuple[tuple[str, float], ...]
@@ -14,21 +14,21 @@ Shape = tuple[tuple[str, float], ...]
 class Person:
     """A head to build."""
 
-    targets: Shape  # of MakeHuman and how much of each
+    targets: Shape  # MakeHuman targets and their amounts
     face_units: Shape
     look: Look
     hair: Hair
     lashes: float = 1.0  # length
-    raised: float = 0.0  # tongue and lower teeth, beside where the lips put them, decimetres
+    raised: float = 0.0  # offset of tongue and lower teeth, dm
 
 
 def _both(name: str, amount: float) -> Shape:
-    """Apply a target to the left and to the right."""
+    """Apply a target on both sides."""
     folder, target = name.split("/")
     return (f"{folder}/l-{target}", amount), (f"{folder}/r-{target}", amount)
 
 
-# the lips closed, which the plain targets leave apart
+# closes the lips, which the plain targets leave apart
 _REST: Shape = (
     ("mouthPressLeft", 0.12),
     ("mouthPressRight", 0.12),
@@ -37,8 +37,7 @@ _REST: Shape = (
     ("mouthSmileRight", 0.06),
 )
 
-# The head on which zones, texture and hair are laid out; the others share its mesh, vertex by
-# vertex, and take all of that over.
+# The head on which zones, texture and hair are laid out. The others share its mesh.
 REFERENCE: tuple[Shape, Shape] = (
     (
         ("macrodetails/asian-female-young", 1.0),
@@ -56,7 +55,7 @@ REFERENCE: tuple[Shape, Shape] = (
     _REST,
 )
 
-# the corners of the mouth and the cheeks a little up
+# raises the corners of the mouth and the cheeks a little
 _FRIENDLY: Shape = (
     *_REST,
     ("mouthSmileLeft", 0.30),

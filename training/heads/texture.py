@@ -1,4 +1,4 @@
-"""What all textures are made of: smooth noise, mixing, encoding. Colours are sRGB, 0 to 1."""
+"""Shared parts of all textures: smooth noise, mixing, encoding. Colors are sRGB, 0 to 1."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Color = tuple[float, float, float]
 
 
 def noise(shape: tuple[int, int], sigma: float | tuple[float, float], seed: int) -> Float:
-    """Smooth noise of unit variance."""
+    """Make smooth noise of unit variance."""
     white = np.random.default_rng(seed).standard_normal(shape)
     smooth: Float = ndimage.gaussian_filter(white, sigma, mode="wrap")
     smooth /= smooth.std()
@@ -24,12 +24,12 @@ def noise(shape: tuple[int, int], sigma: float | tuple[float, float], seed: int)
 
 
 def mix(image: Float, color: Color, amount: Float) -> Float:
-    """Lay a colour over an image (H, W, 3) where ``amount`` (H, W) says."""
+    """Blend a color into an image (H, W, 3) by an amount (H, W)."""
     return image + (np.array(color) - image) * np.clip(amount, 0, 1)[..., None]
 
 
-def encode(image: Float, quality: int = 3) -> bytes:
-    """Encode (H, W, 3) as JPEG (``quality`` 2 is best, 31 worst), (H, W, 4) as PNG."""
+def encode(image: Float) -> bytes:
+    """Encode (H, W, 3) as JPEG, (H, W, 4) as PNG."""
     pixels = np.ascontiguousarray(np.round(image * 255).astype(np.uint8))
     if pixels.shape[2] == 4:
         return _png(pixels)
@@ -37,15 +37,15 @@ def encode(image: Float, quality: int = 3) -> bytes:
     codec.height, codec.width = pixels.shape[:2]
     codec.pix_fmt = "yuvj444p"
     codec.time_base = Fraction(1, 25)
-    codec.options = {"qmin": str(quality), "qmax": str(quality)}
+    codec.options = {"qmin": "3", "qmax": "3"}  # 2 is best, 31 worst
     frame = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(format="yuvj444p")
     return b"".join(bytes(packet) for packet in [*codec.encode(frame), *codec.encode(None)])
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:
-    """Write the bare chunks: FFmpeg's own add some that a glTF must not have."""
+    """Encode as PNG without the further chunks of FFmpeg, which glTF does not allow."""
     rows, columns, channels = pixels.shape
-    # filter 2 (difference from the row above) suits strands that run down
+    # filter 2 (difference from the row above) suits vertical strands
     above = np.concatenate([np.zeros_like(pixels[:1]), pixels[:-1]])
     lines = np.concatenate(
         [np.full((rows, 1), 2, np.uint8), (pixels - above).reshape(rows, columns * channels)],

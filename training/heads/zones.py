@@ -1,17 +1,17 @@
 """Displacement fields of the FAPs over the skin, the tongue, the teeth and the eyes.
 
-A field holds what its FAP does at one FAPU (1024 FAP units; 1 rad for the roll of the tongue), in
-dm. Along its FAP's axis every feature point lands where the FAP says. Across it the standard is
-silent: corners of the mouth slide along the curve of the lips, eyelids go round the eyeball, puffed
-cheeks come forward.
+A field is the displacement, in dm, by its FAP at one FAPU (1024 FAP units; 1 rad for the roll of
+the tongue). Along the FAP's axis, every feature point moves exactly as far as the FAP says. The
+standard does not define the motion across it: corners of the mouth slide along the curve of the
+lips, eyelids move around the eyeball, puffed cheeks come forward.
 
-- most FAPs move a zone whose weight falls as a raised cosine of the distances along the surface to
-  the moving and to the fixed vertices (Li 2011, section 2.1; ``surface.Geodesics.zone``);
-- lips and brows have many feature points side by side: there the field is the smoothest one
-  (least squared Laplacian) that is 1 at its own point, 0 at the other points and 0 round about,
-  as in A. Jacobson et al., "Bounded biharmonic weights", SIGGRAPH 2011, but unbounded;
-- eyelids follow MakeHuman's face units eyeBlink and eyeSquint, scaled to their feature points;
-- the jaw's own motion at the lips' feature points is taken out of FAPs 3, 14 and 15 again.
+- Most FAPs move a zone whose weight falls as a raised cosine of the distances along the surface to
+  the moving and to the fixed vertices (Li 2011, section 2.1; ``surface.Geodesics.zone``).
+- Lips and brows have many adjacent feature points. Their field is the smoothest one (least squared
+  Laplacian) that is 1 at its point, 0 at the other points and 0 around them, as in A. Jacobson et
+  al., "Bounded biharmonic weights", SIGGRAPH 2011, but unbounded.
+- Eyelids follow MakeHuman's face units eyeBlink and eyeSquint, scaled to their feature points.
+- The jaw's motion at the lips' feature points is subtracted from FAPs 3, 14 and 15.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LIP_RING = (
     7206, 7266, 7265, 7264, 523, 517, 518, 519, 446, 445, 3708, 435, 434, 3731, 436, 420, 421, 516,
     5360, 515, 514, 522, 521,
 )  # fmt: skip
-_HINGE_Z = 0.35  # dm; the jaw turns about an axis here
+_HINGE_Z = 0.35  # of the jaw's axis, dm
 
 
 @dataclass(slots=True)
@@ -52,9 +52,9 @@ class Skin:
     base: Index  # base mesh vertex of each coarse vertex
 
     def carry(self, target: Float) -> Float:
-        """Carry displacements (19158, 3) of the base mesh to the fine vertices."""
-        carried: Float = self.matrix @ target[self.base]
-        return carried
+        """Transfer displacements (19158, 3) of the base mesh to the fine vertices."""
+        transferred: Float = self.matrix @ target[self.base]
+        return transferred
 
     def point(self, name: str) -> int:
         """Find the vertex of a feature point."""
@@ -66,7 +66,7 @@ class Skin:
 
 
 def subdivided(vertices: Float, quads: Index) -> Skin:
-    """Pick the quads out of the base mesh and subdivide them once."""
+    """Subdivide some quads of the base mesh once."""
     base, compact = np.unique(quads, return_inverse=True)
     coarse = compact.reshape(quads.shape)
     number = np.full(len(vertices), -1)
@@ -76,9 +76,9 @@ def subdivided(vertices: Float, quads: Index) -> Skin:
 
 
 def close_lips(skin: Skin, overlap: float = 0.002) -> None:
-    """Move both lips so that they meet along the whole ring, ``overlap`` dm pressed together.
+    """Move both lips so that they meet along the whole ring, and overlap by ``overlap`` dm.
 
-    Subdivision rounds the lips off and would leave a slit.
+    Subdivision rounds the lips off, which would leave a slit.
     """
     ring = skin.number[np.array(LIP_RING)]
     corner = int(np.argmax(skin.vertices[ring, 0]))
@@ -88,22 +88,22 @@ def close_lips(skin: Skin, overlap: float = 0.002) -> None:
     for half in (upper, lower):
         order = np.argsort(skin.vertices[half, 0])
         height.append(skin.vertices[half[order]][:, :2].T)
-    wanted = {}
+    shifts = {}
     for half, sign in ((upper, -1.0), (lower, 1.0)):
         for vertex in half:
             at = skin.vertices[vertex, 0]
             up, low = (np.interp(at, *curve) for curve in height)
-            wanted[int(vertex)] = (up + low) / 2 + sign * overlap - skin.vertices[vertex, 1]
+            shifts[int(vertex)] = (up + low) / 2 + sign * overlap - skin.vertices[vertex, 1]
     for vertex in (ring[corner], ring[-corner]):
-        wanted[int(vertex)] = 0.0
-    points = np.array(list(wanted))
+        shifts[int(vertex)] = 0.0
+    points = np.array(list(shifts))
     far = surface.Geodesics(skin.vertices, skin.quads).distance(points) > 0.10
     field = smoothest(skin, points, np.flatnonzero(far))
-    skin.vertices[:, 1] += field @ np.array(list(wanted.values()))
+    skin.vertices[:, 1] += field @ np.array(list(shifts.values()))
 
 
 def axis_of(fap: int) -> tuple[int, float]:
-    """Axis (0 x, 1 y, 2 z) and sign of a displacement FAP."""
+    """Return axis (0 x, 1 y, 2 z) and sign of a displacement FAP."""
     return AXES[FAPS[fap - 1].direction]
 
 
@@ -113,7 +113,7 @@ def smoothest(skin: Skin, points: Index | list[Index], fixed: Index) -> Float:
 
 
 def _along(fap: int, weight: Float) -> Float:
-    """Field (V, 3) that moves along the axis of a FAP."""
+    """Make a field (V, 3) along the axis of a FAP."""
     axis, sign = axis_of(fap)
     field = np.zeros((len(weight), 3))
     field[:, axis] = sign * weight
@@ -121,18 +121,10 @@ def _along(fap: int, weight: Float) -> Float:
 
 
 class FaceFields:
-    """All fields of the skin.
+    """Computes all fields of the skin.
 
-    Parameters
-    ----------
-    skin
-        The face, fine.
-    cavity
-        Which vertices line the mouth (V,).
-    blink, squint
-        Displacements (V, 3) of the face units, for the left and the right eye.
-    fapu
-        Lengths ``MNS MW ENS ES IRISD`` in dm.
+    ``cavity`` (V,) are the vertices that line the mouth. ``blink`` and ``squint`` are displacements
+    (V, 3) of the face units of the left and the right eye. ``fapu`` are lengths in dm.
     """
 
     def __init__(
@@ -165,8 +157,8 @@ class FaceFields:
         skin = self.skin
         x, y, z = skin.vertices.T
         nose = (y > 5.325) & (np.abs(x) < 0.28) & ~self.cavity
-        around = self._far(INNER + OUTER, 0.34) | nose | ((y < 4.87) & ~self.cavity)
-        fixed = np.flatnonzero(around | (self.cavity & (z < 1.08)))
+        outside = self._far(INNER + OUTER, 0.34) | nose | ((y < 4.87) & ~self.cavity)
+        fixed = np.flatnonzero(outside | (self.cavity & (z < 1.08)))
         names = INNER + OUTER
         points = skin.points(*names)
         fixed = np.setdiff1d(fixed, points)
@@ -177,7 +169,7 @@ class FaceFields:
             (57, "8.7"), (58, "8.8"), (59, "8.3"), (60, "8.4"),
         ):  # fmt: skip
             self._add(fap, self.lip_y[name])
-        # halfway points follow their corner by half, so that a narrowed mouth keeps its shape
+        # points halfway to a corner follow it by half, so that a narrowed mouth keeps its shape
         corners = ("2.4", "2.5", "8.3", "8.4")
         halfway = (("2.6", "2.8"), ("2.7", "2.9"), ("8.5", "8.7"), ("8.6", "8.8"))
         middles = ("2.2", "2.3", "8.1", "8.2")
@@ -188,7 +180,7 @@ class FaceFields:
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
             self.lip_x[name] = single[:, row] + 0.45 * half
             self._add(fap, self.lip_x[name])
-            # a corner slides along the curve of the lips: outwards is backwards
+            # a corner slides along the curve of the lips, outward and backward
             self.fields[fap][:, 2] = -CORNER_SLOPE * self.lip_x[name] * self.fapu["MW"]
         pushed = smoothest(skin, skin.points("2.3", "2.2", *corners), fixed)[:, :2]
         self.lip_z = dict(zip(("2.3", "2.2"), pushed.T, strict=True))
@@ -216,7 +208,7 @@ class FaceFields:
             left = weight / weight[skin.point("2.1")]
             for name, field in taken_out.items():
                 left = left - left[skin.point(name)] * field
-            if fap == 15:  # no FAP moves the lips' middle aside: the lower lip follows the jaw half
+            if fap == 15:  # the lower lip follows the jaw half
                 for name in ("2.3", "2.8", "2.9", "8.2", "8.7", "8.8"):
                     left = left - 0.5 * left[skin.point(name)] * self.lip_y[name]
             self._add(fap, left)
@@ -236,7 +228,7 @@ class FaceFields:
         fixed = np.flatnonzero((y < 5.87) | (y > 6.42) | (z < 0.75) | self.cavity)
 
         def bars(*names: str) -> list[Index]:
-            """Take the hairs above and below a point along, so that a brow keeps its breadth."""
+            """Group each point with the hairs above and below, so that a brow keeps its breadth."""
             groups = []
             for point in self.skin.points(*names):
                 near = (np.abs(x - x[point]) < 0.022) & (np.abs(y - y[point]) < 0.050) & (z > 0.75)
@@ -255,7 +247,7 @@ class FaceFields:
         nose = self.skin.points("9.1", "9.2", "9.3", "9.4", "9.5", "9.15")
         lips = np.concatenate([self.skin.points(*INNER), self.skin.points(*OUTER)])
         self._zone(18, "2.10", 0.02, 0.26, chin)
-        # a puffed cheek comes forward, too, and a lifted one swells
+        # a puffed cheek also comes forward, and a lifted one swells
         for fap, name, reach, forward in (
             (39, "5.1", 0.46, 0.5), (40, "5.2", 0.46, 0.5),
             (41, "5.3", 0.36, 0.25), (42, "5.4", 0.36, 0.25),
@@ -279,30 +271,30 @@ class FaceFields:
         """Swell a cheek smoothly between lips, nose and eyelids."""
         _, y, _ = self.skin.vertices.T
         lids = ("3.3", "3.4", "3.7", "3.8", "3.11", "3.12")
-        held = self._far((name,), reach) | self.cavity | (y > 5.80)
+        fixed = self._far((name,), reach) | self.cavity | (y > 5.80)
         for others, margin in (
             (INNER + OUTER, 0.07),
             (("9.1", "9.2", "9.15"), 0.10),
             (lids, 0.07),
         ):
-            held |= ~self._far(others, margin)
+            fixed |= ~self._far(others, margin)
         top = np.flatnonzero(~self._far((name,), 0.08))
-        bump: Float = smoothest(self.skin, [top], np.flatnonzero(held))[:, 0]
+        bump: Float = smoothest(self.skin, [top], np.flatnonzero(fixed))[:, 0]
         return bump
 
     def _zone(
         self, fap: int, names: str | tuple[str, ...], core: float, reach: float, fixed: Index
     ) -> None:
-        """Move what lies within ``core`` of the points, hold what lies beyond ``reach``."""
+        """Move vertices within ``core`` of the points, fix those beyond ``reach``."""
         points = self.skin.points(*([names] if isinstance(names, str) else names))
         near = self._geodesics.distance(points)
         moving = np.setdiff1d(np.flatnonzero(near <= core), fixed)
-        held = np.union1d(np.flatnonzero(near > reach), fixed)
-        self._add(fap, self._geodesics.zone(moving, held))
+        all_fixed = np.union1d(np.flatnonzero(near > reach), fixed)
+        self._add(fap, self._geodesics.zone(moving, all_fixed))
 
 
 def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
-    """Fields (V, 3) of the tongue, with its share of the jaw's motion."""
+    """Compute the fields (V, 3) of the tongue, including its share of the jaw's motion."""
     geodesics = surface.Geodesics(tongue.vertices, tongue.quads)
     tip, body = tongue.points("6.1"), tongue.points("6.2")
     edges = tongue.points("6.3", "6.4")
@@ -317,7 +309,7 @@ def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
     half = np.abs(tongue.vertices[edges, 0]).mean()
     roll = np.zeros_like(tongue.vertices)
     reach = np.clip((z - z.min()) / (0.5 * length), 0, 1)
-    roll[:, 1] = reach * np.abs(x) * (np.abs(x) / half)  # lever times angle, growing outwards
+    roll[:, 1] = reach * np.abs(x) * (np.abs(x) / half)  # lever times angle, growing outward
     fields[47] = roll
     forward = np.clip((z - z.min()) / (0.45 * length), 0, 1)
     return fields | jaw_fields(tongue.vertices, forward**2 * (3 - 2 * forward), fapu)
@@ -326,7 +318,7 @@ def tongue_fields(tongue: Skin, fapu: dict[str, float]) -> Fields:
 def jaw_fields(
     vertices: Float, share: Float, fapu: dict[str, float], chin_z: float = 1.104
 ) -> Fields:
-    """Fields (V, 3) of what moves with the jaw: lower teeth, tongue."""
+    """Compute the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
     lever = share * np.maximum(vertices[:, 2] - _HINGE_Z, 0) / (chin_z - _HINGE_Z)
     return {
         3: _along(3, lever) * fapu["MNS"],

@@ -38,18 +38,10 @@ def write_card(
     clips: Sequence[LipClip],
     speech: Mapping[str, Sequence[Speech]],
 ) -> None:
-    """Write the card.
+    """Write the card of the model in ``output``, with the suffix ``.md``.
 
-    Parameters
-    ----------
-    output
-        The model's file; the card gets the suffix ``.md``.
-    trained
-        The model.
-    clips
-        All clips, including those that are held out.
-    speech
-        Stretches of speech of each clip.
+    ``clips`` are all clips, including those that are held out, and ``speech`` their stretches of
+    speech.
     """
     held = [clip for clip in clips if clip.part == "held"]
     known_speakers = {clip.speaker for clip in trained.clips}

@@ -93,22 +93,7 @@ def train_lips(
 ) -> None:
     """Train the lip model, and write it with its card.
 
-    Parameters
-    ----------
-    folder
-        Clips with tracked lips.
-    output
-        The ``.npz`` file to write; the card gets the suffix ``.md``.
-    speech
-        Folders of recordings in any language, which the teacher labels. Their licenses are
-        unknown, so name only folders that may be used.
-    whisper
-        Folder with Whisper base, see :func:`training.neural.whisper_weights.load_whisper`, for the
-        teacher.
-    seed
-        The same seed gives the same model.
-    any_licence
-        Also train on clips whose license does not allow distributing the model.
+    The arguments are the options of ``kouxing train lips``.
 
     Raises
     ------
@@ -211,18 +196,8 @@ def fit(
 ) -> tuple[LipPredictor, list[float]]:
     """Fit a model; return it and the mean loss of each epoch.
 
-    Parameters
-    ----------
-    examples
-        Filmed stretches.
-    labeled
-        Stretches that the teacher labeled. The ridge regression uses as many positions of them.
-    basis
-        Components and units of the examples.
-    seed
-        The same seed gives the same model.
-    num_epochs
-        Number of epochs of the network.
+    ``labeled`` are stretches that the teacher labeled. The ridge regression uses as many of their
+    positions as of the filmed ``examples``.
     """
     network, losses = train_network(examples, labeled, num_epochs=num_epochs, seed=seed)
     every = max(1, round(_num_positions(labeled) / _num_positions(examples)))

@@ -95,18 +95,8 @@ def train_network(
 ) -> tuple[LipNetwork, list[float]]:
     """Train; return the network and the mean loss of each epoch.
 
-    Parameters
-    ----------
-    examples
-        Every epoch uses all of them.
-    labeled
-        Every epoch uses another share of these, three times as long as the examples.
-    num_epochs
-        Number of epochs.
-    seed
-        The same seed gives the same network.
-    both_ways
-        Whether the recurrent layer runs both ways.
+    Every epoch uses all ``examples``, and another share of the ``labeled`` ones, three times as
+    long. ``both_ways`` makes the recurrent layer bidirectional.
     """
     torch.manual_seed(seed)
     torch.set_num_threads(1)

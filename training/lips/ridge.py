@@ -30,20 +30,10 @@ def history_of(components: NDArray[np.floating]) -> Floats:
 
 
 def fit_ridge(histories: Sequence[Floats], targets: Sequence[Floats]) -> Array:
-    """Fit targets that may be unknown (NaN).
+    """Fit targets, (positions, delays, outputs), to histories, (positions, n), of stretches.
 
-    Parameters
-    ----------
-    histories
-        History of each stretch of speech, shape (positions, n).
-    targets
-        Targets of each stretch, shape (positions, delays, outputs). A position counts for an
-        output if its targets are known for all delays.
-
-    Returns
-    -------
-    NDArray
-        Weights, shape (n, delays, outputs).
+    Targets may be NaN. A position counts for an output if its targets are known for all delays.
+    Returns the weights, (n, delays, outputs).
     """
     history, target = np.concatenate(list(histories)), np.concatenate(list(targets))
     known = ~np.isnan(target).any(axis=1)  # (positions, outputs)

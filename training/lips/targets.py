@@ -77,10 +77,8 @@ def targets_at(
 
     Parameters
     ----------
-    clip
-        The clip.
-    phones
-        Its phones; None if the recognizer does not support its language.
+    clip, phones
+        The clip and its phones; None if the recognizer does not support its language.
     touch
         Limits of its speaker.
     known_s

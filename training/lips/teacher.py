@@ -71,10 +71,7 @@ T = TypeVar("T", bound=np.generic)
 def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
     """Draw recordings, at most an hour from each folder, without those that models are measured on.
 
-    Raises
-    ------
-    UserError
-        If a folder contains no recordings, or one of them cannot be read.
+    Raises UserError if a folder contains no recordings, or one of them cannot be read.
     """
     rng = np.random.default_rng(seed)
     drawn = []
@@ -117,13 +114,7 @@ def _read_recording(path: Path) -> LipClip:
 
 
 def load_encoder(whisper: Path) -> WholeEncoder:
-    """Load Whisper's encoder from the folder of Whisper base.
-
-    Raises
-    ------
-    UserError
-        If it cannot be read.
-    """
+    """Load Whisper's encoder from the folder of Whisper base; UserError if it cannot be read."""
     encoder = WholeEncoder(Shape(num_states=0, look_aheads=(), layers=NUM_LAYERS), _LAYERS)
     load_whisper(encoder, whisper)
     return encoder.eval()
@@ -174,18 +165,10 @@ class Teacher:
         delays_s: Sequence[float],
         speaker: int,
     ) -> list[Example]:
-        """Label the stretches of a recording.
+        """Label the stretches of a recording's augmented copy.
 
-        Parameters
-        ----------
-        speech
-            Stretches of its augmented copy.
-        components
-            Components of each stretch, (positions, components).
-        delays_s
-            Delays of the labels, seconds.
-        speaker
-            Speaker number of the examples.
+        ``components`` are the live model's components of each stretch, (positions, components). The
+        examples get this ``speaker`` number, and labels of these delays.
         """
         if not speech:
             return []
@@ -211,18 +194,9 @@ def train_teacher(
 ) -> Teacher:
     """Train a teacher on filmed speech.
 
-    Parameters
-    ----------
-    encoder
-        Whisper's encoder.
-    speech
-        Stretches of clips and of their augmented copies. The teacher's input is the clean clip.
-    examples
-        Example of each stretch; `TAUGHT_DELAY_S` is one of its delays.
-    delays_s
-        Delays of the examples' targets, seconds.
-    num_epochs, seed
-        As for :func:`kouxing.training.lips.recurrent.train_network`.
+    ``speech`` are stretches of clips and of their augmented copies, with an example for each. The
+    teacher's input is always the clean clip. `TAUGHT_DELAY_S` must be one of ``delays_s``, the
+    delays of the examples' targets.
     """
     clips = {stretch.clip.name: stretch.clip for stretch in speech}
     whole = {
@@ -258,23 +232,9 @@ def label_recordings(
 ) -> list[Example]:
     """Label recordings; the components of the examples come from augmented copies.
 
-    Parameters
-    ----------
-    teacher
-        Labels the clean recordings.
-    model
-        The acoustic model.
-    recordings
-        Audio files.
-    components
-        Computes the components of a stretch, (positions, components).
-    delays_s, speaker
-        Delays of the labels, seconds, and speaker number of the examples.
-
-    Raises
-    ------
-    UserError
-        If a recording cannot be read.
+    ``components`` computes the live model's components of a stretch, (positions, components). The
+    examples get this ``speaker`` number, and labels of these delays. Raises UserError if a
+    recording cannot be read.
     """
     augmented = speech_of(model, map(_read_recording, recordings), copy=1)
     return [

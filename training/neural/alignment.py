@@ -81,21 +81,8 @@ def align_all(
 ) -> list[AlignedExample]:
     """Align each recording with its text; drop recordings that do not fit.
 
-    Parameters
-    ----------
-    scores
-        Scores of each recording, shape (frames, states).
-    topology
-        HMMs of the scores, with any number of states per phone.
-    examples
-        The recordings.
-    report
-        Receives lines of progress.
-
-    Raises
-    ------
-    UserError
-        If no recording fits its text.
+    ``topology`` has the HMMs of the scores, (frames, states) of each recording, with any number of
+    states per phone. Raises UserError if no recording fits its text.
     """
     aligned = []
     inventory = topology.inventory

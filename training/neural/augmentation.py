@@ -60,19 +60,9 @@ _MAX_MASKS, _MAX_MASKED_FRAMES, _MAX_MASKED_BANDS = 2, 12, 14
 
 
 def augment_samples(samples: Samples, rng: np.random.Generator) -> tuple[Samples, float]:
-    """Augment a recording at random.
+    """Augment samples, (n,) at 16 kHz, at random.
 
-    Parameters
-    ----------
-    samples
-        Shape (n,), 16 kHz.
-    rng
-        Draws all changes.
-
-    Returns
-    -------
-    tuple
-        The new samples, shape (n / speed,), and the speed.
+    Return the new ones, (n / speed,), and the speed.
     """
     sound, speed = change_speed(samples, rng)
     return disturb(sound, rng), speed

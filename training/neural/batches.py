@@ -93,16 +93,9 @@ def augment(recording: Recording, rng: np.random.Generator) -> tuple[NDArray[np.
 def batches_of(
     draw: Callable[[], Sample], num_rows: int, rng: np.random.Generator
 ) -> Iterator[Batch]:
-    """Yield batches of about ``num_rows`` rows without end; a batch's samples are similarly long.
+    """Yield batches of about ``num_rows`` rows, including padding; ``draw`` draws a sample.
 
-    Parameters
-    ----------
-    draw
-        Draws a sample.
-    num_rows
-        Rows of all samples in a batch, padding included.
-    rng
-        Draws the order of the batches.
+    The samples of a batch have similar lengths. ``rng`` draws the order of the batches.
     """
     while True:
         pool: list[Sample] = []

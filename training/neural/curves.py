@@ -15,16 +15,9 @@ _SMOOTHED_STEPS = 20
 def draw_curves(
     losses: Sequence[tuple[int, float]], error_rates: Sequence[tuple[int, float]], path: Path
 ) -> None:
-    """Draw cross-entropy and dev phone error rate over the steps.
+    """Draw cross-entropy (nats a frame) and dev phone error rate over the steps.
 
-    Parameters
-    ----------
-    losses
-        Steps with their cross-entropy, nats a frame.
-    error_rates
-        Steps with the dev phone error rate; may be empty.
-    path
-        The picture to write.
+    Both are pairs of step and value. There may be no error rates.
     """
     figure = new_figure(6.0, 3.2)
     left = figure.add_subplot()

@@ -51,12 +51,7 @@ from kouxing.training.neural.onnx_graph import (
 def onnx_of(network: Network, *, exact: bool = False) -> NDArray[np.uint8]:
     """Export a network as the bytes of an ONNX file with the inputs and outputs above.
 
-    Parameters
-    ----------
-    network
-        The network.
-    exact
-        Keep the weights as floats. The file is then four times as large, and slower.
+    ``exact`` keeps the weights as floats. The file is then four times as large, and slower.
     """
     return _NetworkGraph(network, exact=exact).file_of_network()
 
@@ -64,17 +59,8 @@ def onnx_of(network: Network, *, exact: bool = False) -> NDArray[np.uint8]:
 def network_of(file: NDArray[np.uint8], look_aheads: Sequence[int]) -> Network:
     """Read the network from an ONNX file of :func:`onnx_of`, to train it further.
 
-    Parameters
-    ----------
-    file
-        Bytes of the file.
-    look_aheads
-        Look-aheads of the output layers, feature frames.
-
-    Raises
-    ------
-    KeyError
-        If :func:`onnx_of` did not write the file.
+    ``look_aheads`` are those of the output layers, feature frames. Raises KeyError if
+    :func:`onnx_of` did not write the file.
     """
     stored = tensors_in(file)
     biases = {name: array for name, array in stored.items() if name.endswith(".bias")}

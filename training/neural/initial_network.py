@@ -29,10 +29,7 @@ def init_network(
 ) -> Network:
     """Make the network to train, with the weights of Whisper or of an earlier model.
 
-    Raises
-    ------
-    UserError
-        If there are no weights, or the model has other states or output layers.
+    Raises UserError if there are no weights, or the model has other states or output layers.
     """
     num_states = STATES_PER_PHONE * len(inventory)
     if before is None:
@@ -69,10 +66,7 @@ def init_encoder(whisper: Path, num_states: int) -> WholeEncoder:
 def all_look_aheads(main_ms: float) -> tuple[int, ...]:
     """Return the look-aheads of all output layers, ascending, feature frames.
 
-    Raises
-    ------
-    UserError
-        If the main one is not a multiple of 10 ms, or out of range.
+    Raises UserError if the main one is not a multiple of 10 ms, or out of range.
     """
     main = main_ms / FRAME_MS
     if not (1 <= main <= _MAX_LOOK_AHEAD and main == round(main)):

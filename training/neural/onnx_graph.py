@@ -208,13 +208,7 @@ def tensors_in(file: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
 
 
 def weight_in(stored: Mapping[str, NDArray[Any]], name: str, shape: Sequence[int]) -> Floats:
-    """Read a parameter of a given shape from the constants of a file.
-
-    Raises
-    ------
-    KeyError
-        If the file does not have it.
-    """
+    """Read a parameter of a given shape from the constants of a file; KeyError if it is missing."""
     if name in stored:
         return np.asarray(stored[name], dtype=np.float32)
     product = name.removesuffix(".weight")

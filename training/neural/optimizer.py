@@ -97,12 +97,7 @@ def rise_and_fall(step: int, num_steps: int, warm_up_steps: int, falling: float)
 def cross_entropy(log_posteriors: Tensor, states: Tensor, probs: Tensor) -> Tensor:
     """Mean cross-entropy over the frames with targets, nats.
 
-    Parameters
-    ----------
-    log_posteriors
-        Output of a network, shape (..., states).
-    states, probs
-        Target states and their probabilities, shape (..., k).
+    ``log_posteriors`` have the shape (..., states), target ``states`` and their ``probs`` (..., k).
     """
     return -(log_posteriors.gather(-1, states) * probs).sum() / probs.sum().clamp(min=1.0)
 

@@ -142,45 +142,13 @@ def train_neural(
     shipping: bool = True,
     report: Report = print,
 ) -> None:
-    """Train the neural recognizer and write the model, its card and its training curves.
+    """Train the neural recognizer, and write the model with its card and training curves.
 
-    The language is that of the model that aligns.
-
-    Parameters
-    ----------
-    corpora
-        Folders that :func:`kouxing.corpora.speech_corpus.read_corpus` reads; splits ``train`` and
-        ``dev``.
-    output
-        The ``.npz`` file to write; the card gets the suffix ``.md``, the curves ``.png``.
-    aligner
-        Model that aligns until the network does, such as a Gaussian mixture model. Without it,
-        ``start`` aligns.
-    whisper
-        Folder with Whisper base, see :mod:`kouxing.training.neural.whisper_weights`, for the
-        teacher. Without it, the network learns only the alignment.
-    start
-        Model of this function to train further, for example on your own speakers. Without it, the
-        network starts with Whisper's weights.
-    untranscribed
-        Folders of recordings in any language, which the teacher labels. Their licenses are
-        unknown, so name only folders that may be used.
-    phone_lm
-        File with a phone language model. Without it, the model is estimated from the corpora's
-        texts.
-    look_ahead_ms
-        Look-ahead of the main output layer, a multiple of 10 ms.
-    seed
-        Seed of new weights, order and augmentation. The same seed and number of threads give the
-        same model on the same kind of processor.
-    num_steps
-        Number of batches of 30 s of audio.
-    num_threads
-        Number of threads; None uses all cores.
-    shipping
-        Exclude rows whose license does not allow distributing the model.
-    report
-        Receives lines of progress.
+    The arguments are the options of ``kouxing train neural``. The language is that of the model
+    that aligns: ``aligner``, or else ``start``. Without ``whisper`` there is no teacher, and the
+    network starts with the weights of ``start``. ``shipping`` excludes rows whose license does not
+    allow distributing the model. The same seed and number of threads give the same model on the
+    same kind of processor.
 
     Raises
     ------

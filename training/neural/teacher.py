@@ -95,18 +95,7 @@ class WholeEncoder(Encoder):
 
     @torch.no_grad()
     def features(self, samples: NDArray[np.int16]) -> NDArray[np.float16]:
-        """Encode a recording.
-
-        Parameters
-        ----------
-        samples
-            Shape (n,), 16 kHz.
-
-        Returns
-        -------
-        NDArray
-            Features of each two frames, shape (ceil(frames / 2), 3 width).
-        """
+        """Encode samples, (n,) at 16 kHz; two frames share a row, (ceil(frames / 2), 3 width)."""
         pieces = []
         num_frames = frames_in(len(samples))
         for start in range(0, num_frames, _PIECE_FRAMES):
@@ -128,13 +117,7 @@ class Teacher:
 
     @torch.no_grad()
     def targets_of(self, samples: NDArray[np.int16]) -> Targets:
-        """Find the likeliest states of a recording's frames; their probabilities sum to one.
-
-        Parameters
-        ----------
-        samples
-            Shape (n,), 16 kHz, 25 ms or more.
-        """
+        """Find the likeliest states of the frames of samples, (n,) at 16 kHz, 25 ms or longer."""
         features = torch.from_numpy(self.encoder.features(samples)).float()
         log_posteriors = self.readout(features[None])[0, : frames_in(len(samples))]
         best, states = log_posteriors.topk(min(_NUM_TARGETS, log_posteriors.shape[-1]))
@@ -149,19 +132,10 @@ def train_teacher(
     seed: int,
     report: Report,
 ) -> Teacher:
-    """Train a readout.
+    """Train a readout on recordings whose targets are the states of an alignment.
 
-    Parameters
-    ----------
-    encoder
-        Encoder with Whisper's weights.
-    recordings
-        Recordings whose targets are the states of an alignment. Their features stay in memory,
-        150 KB a second with Whisper base.
-    seed
-        Seed of the order. New weights, dropout and noise draw from PyTorch's own generator.
-    report
-        Receives lines of progress.
+    Their features stay in memory, 150 KB a second with Whisper base. ``seed`` determines the order.
+    New weights, dropout and noise draw from PyTorch's own generator.
     """
     rng = np.random.default_rng(seed)
     sampling = sampling_probs(recordings)

@@ -52,18 +52,10 @@ _OTHER_OUTPUT_WEIGHT = 0.5  # of the loss of the other output layer
 
 
 class Trainer:
-    """Trains a network step by step.
+    """Trains a network in place, step by step.
 
-    Parameters
-    ----------
-    network
-        The network; trained in place.
-    recordings
-        Recordings with the targets of their frames.
-    main_output
-        Output layer that is trained in every step; another one is trained in turn.
-    seed
-        Seed of order and augmentation. Dropout draws from PyTorch's own generator.
+    Every step trains the output layer ``main_output``, and another one in turn. ``seed`` determines
+    order and augmentation. Dropout draws from PyTorch's own generator.
     """
 
     def __init__(
@@ -149,20 +141,8 @@ def shift_targets(
 ) -> tuple[Tensor, Tensor]:
     """Find the targets of each position's two output frames.
 
-    Parameters
-    ----------
-    states, probs
-        Targets of the frames, shape (batch, frames, k).
-    num_positions
-        Of the network.
-    look_ahead_frames
-        Of the output layer.
-
-    Returns
-    -------
-    tuple
-        States and probabilities, shape (batch, positions, 2, k); the probabilities of frames
-        outside the recording are 0.
+    States and probabilities, (batch, frames, k), become (batch, positions, 2, k). The probabilities
+    of frames outside the recording are 0.
     """
     num_frames = states.shape[1]
     frames = output_frames(num_positions, look_ahead_frames)

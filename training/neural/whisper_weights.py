@@ -63,17 +63,8 @@ _OF_LAYER = {
 def load_whisper(network: Encoder, folder: Path) -> None:
     """Load the weights of Whisper's convolutions and of as many layers as the network has.
 
-    Parameters
-    ----------
-    network
-        A network of the Whisper model's width.
-    folder
-        Folder with ``model.bin`` in CTranslate2's format.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, invalid, or for another kind or size of model.
+    ``folder`` contains ``model.bin`` in CTranslate2's format. Raises UserError if the file is
+    missing, invalid, or for another kind or size of model.
     """
     path = folder / _FILE_NAME
     try:

@@ -65,14 +65,9 @@ def estimate_phone_lm(
     inventory
         The texts' language.
     order
-        Phones in the longest n-grams, 2 or more.
+        Phones in the longest n-grams, 2 or more. UserError if it is too high for 64-bit codes.
     max_ngrams
         Approximate number of n-grams to keep.
-
-    Raises
-    ------
-    UserError
-        If ``order`` is too high for the number of phones.
     """
     num_phones = len(inventory)
     if num_phones**order > _MAX_CODE:

@@ -61,25 +61,10 @@ class _Level:
 def draw_phones(
     ngrams: Path, dictionary: Path, inventory: PhoneInventory, *, num_words: int, seed: int = 0
 ) -> Stream:
-    """Draw words; return their phones, with pauses between sentences.
+    """Draw about ``num_words`` words; return their phones, with pauses between sentences.
 
-    Parameters
-    ----------
-    ngrams
-        The output of ``tslminfo -v``.
-    dictionary
-        The file ``pydict_sc.bin``.
-    inventory
-        The words' language.
-    num_words
-        Approximate number of words.
-    seed
-        The same seed draws the same words.
-
-    Raises
-    ------
-    UserError
-        If a file is missing or not of this kind.
+    ``ngrams`` is output of ``tslminfo -v``, ``dictionary`` the file ``pydict_sc.bin``. The same
+    seed draws the same words. Raises UserError if a file is missing or invalid.
     """
     words = _words(dictionary)
     levels = _levels(ngrams)

@@ -36,30 +36,12 @@ def train_phone_lm(
     max_ngrams: int = 1_000_000,
     report: Report = print,
 ) -> None:
-    """Estimate a phone language model and write it to a file.
+    """Estimate a phone language model, and write it to a file.
 
-    Parameters
-    ----------
-    corpora
-        Folders of speech. Non-synthetic sentences of the split ``train`` get about a hundredth of
-        the texts' weight.
-    texts
-        Text files, UTF-8.
-    output
-        The ``.npz`` file to write.
-    inventory
-        The language of corpora and texts.
-    drawn
-        Phones from :func:`kouxing.training.phone_lm.open_gram.draw_phones`.
-    order, max_ngrams
-        See :func:`kouxing.training.phone_lm.estimation.estimate_phone_lm`.
-    report
-        Receives lines of progress.
-
-    Raises
-    ------
-    UserError
-        If a file cannot be read, or there is nothing to count.
+    Texts are counted, and with about a hundredth of their weight the natural sentences of the
+    corpora's split ``train``. ``drawn`` are phones from ``open_gram.draw_phones``; ``order`` and
+    ``max_ngrams`` are explained in ``estimation.estimate_phone_lm``. Raises UserError if a file
+    cannot be read, or there is nothing to count.
     """
     errors = RowErrors()
     streams = [stream_of(_sentences(text, inventory), inventory) for text in texts]
@@ -96,10 +78,7 @@ def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> Phone
 def load_phone_lm(path: Path, inventory: PhoneInventory) -> PhoneLanguageModel:
     """Read a file of :func:`train_phone_lm`, or the phone language model of a recognizer's model.
 
-    Raises
-    ------
-    UserError
-        If the file is missing, contains no phone language model or is for another language.
+    Raises UserError if there is none in the file, or it is for another language.
     """
     try:
         phone_lm = phone_lm_from(read_archive(path))

@@ -36,13 +36,7 @@ class Frames:
 def frames_of(
     clips: Sequence[LipClip], labels: Sequence[list[Phone]], inventory: PhoneInventory
 ) -> Frames:
-    """Find the nearest visemes and silences of each frame.
-
-    Raises
-    ------
-    UserError
-        If no clip has speech.
-    """
+    """Find the nearest visemes and silences of each frame; UserError if no clip contains speech."""
     parts = []
     for clip, phones in zip(clips, labels, strict=True):
         timeline = _padded(build_timeline(phones, inventory))

@@ -105,10 +105,7 @@ def _lead(parameters: VisemeParameters) -> VisemeParameters:
 def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> None:
     """Train viseme parameters on the training clips of a folder.
 
-    Raises
-    ------
-    UserError
-        If no clip may be used, or the file cannot be written.
+    Raises UserError if no clip may be used, or the file cannot be written.
     """
     clips = read_clips(folder, any_licence=any_licence)
     used = [clip for clip in clips if clip.part == "train"]
