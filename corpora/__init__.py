@@ -1,1 +1,1 @@
-"""Corpora, error counts and pictures: what training and evaluation share."""
+"""Speech corpora, clips of lips and error counts, for training and evaluation."""

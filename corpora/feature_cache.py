@@ -1,8 +1,8 @@
-"""Log-mel features and samples of corpora, kept on disk so that a second run starts at once.
+"""Log-mel features and samples of corpora, cached on disk.
 
-One file per corpus and kind, of 16-bit floats or integers, in the user's cache folder
-(``$XDG_CACHE_HOME/kouxing`` or ``~/.cache/kouxing``). It is memory-mapped, so it may be larger than
-the memory. Deleting it is always safe.
+There is one file per corpus and kind, with 16-bit floats or integers, in the user's cache folder
+(``$XDG_CACHE_HOME/kouxing`` or ``~/.cache/kouxing``). It is memory-mapped, so it may exceed the
+memory. Deleting it is always safe.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from kouxing.corpora.speech_corpus import RowErrors, Utterance
 from kouxing.services.recognizer.front_end.features import NUM_BANDS, LogMel
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 
-_FORMAT = "3"  # raise when the front end's log-mel stage changes
-_FULL_SCALE = 32768.0  # samples are kept as 16-bit sound files keep them
+_FORMAT = "3"  # increase it when the front end's log-mel stage changes
+_FULL_SCALE = 32768.0
 
 
 def cache_folder() -> Path:
-    """Return the cache folder, which holds nothing that cannot be computed again."""
+    """Return the cache folder; everything in it can be computed again."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "kouxing"
     folder.mkdir(parents=True, exist_ok=True)
@@ -35,13 +35,7 @@ def cache_folder() -> Path:
 
 
 def read_audio(path: Path) -> NDArray[np.float32]:
-    """Read a recording as 16 kHz mono.
-
-    Raises
-    ------
-    ValueError
-        If the file is no audio that libsndfile reads.
-    """
+    """Read a recording as 16 kHz mono; ValueError if libsndfile cannot read it."""
     try:
         samples, rate_hz = soundfile.read(path, dtype="float32", always_2d=True)
     except (soundfile.LibsndfileError, OSError) as error:
@@ -52,17 +46,14 @@ def read_audio(path: Path) -> NDArray[np.float32]:
 def log_mel_of(
     utterances: Sequence[Utterance], errors: RowErrors
 ) -> list[NDArray[np.float16] | None]:
-    """Log-mel features of every utterance, from the cache or computed.
+    """Return the log-mel features of every utterance, (frames, 41), cached or computed.
 
-    Returns
-    -------
-    list
-        Shape (frames, 41) each; None where the audio cannot be read (noted in ``errors``).
+    None for audio that cannot be read, which is reported in ``errors``.
     """
     out: list[NDArray[np.float16] | None] = []
-    none = np.empty((0, 1 + NUM_BANDS), dtype=np.float16)
+    empty = np.empty((0, 1 + NUM_BANDS), dtype=np.float16)
     for utterance, block in zip(
-        utterances, _cached(utterances, "log_mel", none, _log_mel), strict=True
+        utterances, _cached(utterances, "log_mel", empty, _log_mel), strict=True
     ):
         if len(block) == 0:
             errors.add(utterance.utterance_id, f"no audio in {utterance.path}")
@@ -71,7 +62,7 @@ def log_mel_of(
 
 
 def samples_of(utterances: Sequence[Utterance]) -> list[NDArray[np.int16]]:
-    """Return the samples of every utterance, 16 kHz; none where the audio cannot be read."""
+    """Return the samples of every utterance, 16 kHz; empty if the audio cannot be read."""
     return _cached(utterances, "samples", np.empty(0, dtype=np.int16), as_integers)
 
 
@@ -85,7 +76,7 @@ def _log_mel(samples: NDArray[np.float32]) -> NDArray[np.float16]:
 
 
 def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Convert samples in [-1, 1] to those that the cache keeps."""
+    """Convert samples in [-1, 1] to 16-bit integers, as in the cache."""
     whole = np.clip(np.rint(samples * _FULL_SCALE), -_FULL_SCALE, _FULL_SCALE - 1)
     integers: NDArray[np.int16] = whole.astype(np.int16)
     return integers
@@ -94,26 +85,13 @@ def as_integers(samples: NDArray[np.float32]) -> NDArray[np.int16]:
 def _cached(
     utterances: Sequence[Utterance],
     kind: str,
-    none: NDArray[Any],
+    empty: NDArray[Any],
     block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
 ) -> list[NDArray[Any]]:
-    """Blocks of every utterance, from the cache or computed.
+    """Return a memory-mapped block of every utterance, from the cache or computed.
 
-    Parameters
-    ----------
-    utterances
-        Recordings; the cache knows them by path, size and time.
-    kind
-        Part of the file's name: one file per kind of block.
-    none
-        A block without rows, for a recording that cannot be read.
-    block_of
-        Computes a block from the samples at 16 kHz, shape (n,).
-
-    Returns
-    -------
-    list
-        A memory-mapped block per utterance, its rows as those of ``none``.
+    ``kind`` names the file. ``block_of`` computes a block from samples at 16 kHz, (n,). ``empty``
+    is the block of audio that cannot be read. Utterances are identified by path, size and time.
     """
     if not utterances:
         return []
@@ -124,53 +102,53 @@ def _cached(
     stem = cache_folder() / f"{kind}_{key.hexdigest()[:20]}"
     rows, bounds = stem.with_suffix(".npy"), stem.with_suffix(".bounds.npy")
     if not (rows.is_file() and bounds.is_file()):
-        _write(rows, bounds, utterances, none, block_of)
+        _write(rows, bounds, utterances, empty, block_of)
     ends = np.load(bounds, allow_pickle=False)
     starts = np.concatenate([[0], ends[:-1]])
     if not ends[-1]:
-        return [none] * len(ends)
-    kept = np.load(rows, mmap_mode="r", allow_pickle=False)
-    return [kept[start:end] for start, end in zip(starts, ends, strict=True)]
+        return [empty] * len(ends)
+    blocks = np.load(rows, mmap_mode="r", allow_pickle=False)
+    return [blocks[start:end] for start, end in zip(starts, ends, strict=True)]
 
 
 def _write(
     rows: Path,
     bounds: Path,
     utterances: Sequence[Utterance],
-    none: NDArray[Any],
+    empty: NDArray[Any],
     block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
 ) -> None:
-    """Write all blocks one after the other, and the row where each ends."""
+    """Write all blocks in sequence, and the row where each ends."""
     ends = []
     num_rows = 0
     with rows.open("wb") as file:
-        _write_header(file, none, 0)  # numpy pads it, so that any number of rows fits later
+        _write_header(file, empty, 0)  # numpy pads it for any number of rows
         for utterance in track(utterances, description=rows.stem.rpartition("_")[0]):
-            block = _computed(utterance, none, block_of)
+            block = _compute(utterance, empty, block_of)
             file.write(np.ascontiguousarray(block).tobytes())
             num_rows += len(block)
             ends.append(num_rows)
         file.seek(0)
-        _write_header(file, none, num_rows)
+        _write_header(file, empty, num_rows)
     np.save(bounds, np.array(ends, dtype=np.int64))
 
 
-def _write_header(file: BinaryIO, none: NDArray[Any], num_rows: int) -> None:
+def _write_header(file: BinaryIO, empty: NDArray[Any], num_rows: int) -> None:
     header = {
-        "descr": np.lib.format.dtype_to_descr(none.dtype),
+        "descr": np.lib.format.dtype_to_descr(empty.dtype),
         "fortran_order": False,
-        "shape": (num_rows, *none.shape[1:]),
+        "shape": (num_rows, *empty.shape[1:]),
     }
     np.lib.format.write_array_header_1_0(file, header)
 
 
-def _computed(
+def _compute(
     utterance: Utterance,
-    none: NDArray[Any],
+    empty: NDArray[Any],
     block_of: Callable[[NDArray[np.float32]], NDArray[Any]],
 ) -> NDArray[Any]:
     try:
         samples = read_audio(utterance.path)
     except ValueError:
-        return none
+        return empty
     return block_of(samples)

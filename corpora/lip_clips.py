@@ -1,13 +1,13 @@
-"""Clips of real lips with their sound: tracked video, or an animator's rig.
+"""Clips of lip motion with audio: tracked video, or an animator's rig.
 
-A folder of clips holds for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame
-with ``t`` in seconds) and ``<clip>.json`` (licence, speaker, language, transcript). Columns are
-FAPs of a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig
-(``mouth_stretch_c``). A clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
+A folder contains for each clip ``<clip>.flac``, ``<clip>.csv`` (a row for each video frame with
+``t`` in seconds) and ``<clip>.json`` (licence, speaker, language, transcript). Columns are FAPs of
+a tracked video (``F5_raise_b_midlip``) or weights of FACEGOOD's face rig (``mouth_stretch_c``). A
+clip's source is the first part of its name: ``cmlr`` of ``cmlr_s1_3``.
 
-Every clip serves one purpose only: to learn parameters from (``train``), to choose settings with
-(``choice``), or to score with (``held``). The rule `part_of` decides, so that nobody picks clips;
-``held.txt`` in the folder names further clips and speakers to hold out.
+Every clip has one part: training (``train``), choosing settings (``choice``), or scoring
+(``held``). The rule `part_of` decides, so clips cannot be picked by hand. ``held.txt`` in the
+folder names further clips and speakers to hold out.
 """
 
 from __future__ import annotations
@@ -37,19 +37,18 @@ from kouxing.shared.phones.events import Phone
 Array = NDArray[np.float64]
 
 SAMPLE_RATE_HZ = 16_000
-_OUT_OF_SYNC_GRADES = ("C",)  # the sound was recorded or processed apart from the picture
+_OUT_OF_SYNC_GRADES = ("C",)  # audio and video were recorded or processed separately
 
 # Change of these FAPs for a weight of 1 of FACEGOOD's rig, measured on the ARKit shape of the same
-# name of MakeHuman's face (CC0), left and right of a pair together. The rig's jaw opens wider than
-# a speaker's, so it is scaled: its continuous clip opens as far as filmed speakers do. Its pursed
-# lips are scaled to half a centimetre. Real pursed lips nearly touch, those of the shapes do not:
-# their lip heights are those of the filmed speakers' u. The jaw's swing backwards is left to the
-# head.
+# name of MakeHuman's face (CC0), both sides of a pair together. The rig's jaw opens wider than a
+# speaker's, so it is scaled to the opening of filmed speakers. Pursed lips are scaled to half a
+# centimeter. Real pursed lips nearly touch, unlike those of the shapes, so their heights are those
+# of the filmed speakers' u. The head adds the backward swing of the jaw.
 _RIG_FAPS = (3, 4, 5, 6, 8, 10, 12, 16, 17, 51, 52, 53, 55, 57, 59)
 _JAW_SCALE = 0.6
 _DEPTH_SCALE = 0.6
 _DEPTH_FAPS = (16, 17)
-_RIG_DELAY_S = 0.04  # by which its lips lag behind those of filmed speakers
+_RIG_DELAY_S = 0.04  # lag of its lips behind those of filmed speakers
 _RIG = {
     "mouth_stretch_c": [
         _JAW_SCALE * value
@@ -85,15 +84,15 @@ class LipClip:
     licence: str
     language: str  # "zh", "en", ...
     part: str  # "train", "choice" or "held"
-    is_in_sync: bool  # else shapes may be compared, but not times
-    transcript: str  # empty where unknown
+    is_in_sync: bool  # otherwise only shapes can be compared, not times
+    transcript: str  # empty if unknown
     time_s: Array  # (num_frames,)
-    faps: Array  # (num_frames, num_mouth_faps), FAP units, NaN where not measured
+    faps: Array  # (num_frames, num_mouth_faps), FAP units, NaN if not measured
     samples: NDArray[np.float32]  # 16 kHz mono
 
     @property
     def source(self) -> str:
-        """Where the clip comes from: the first part of its name."""
+        """The first part of the clip's name."""
         return self.name.partition("_")[0]
 
     def filmed_speech(self) -> FilmedSpeech:
@@ -102,9 +101,9 @@ class LipClip:
 
 
 def part_of(name: str, *, may_train: bool) -> str:
-    """Decide a clip's purpose by the CRC-32 of its name modulo 4.
+    """Return a clip's part, by the CRC-32 of its name modulo 4.
 
-    2: held. Odd: train, if the licence allows it. All others: choice.
+    2 is ``held``, odd values are ``train`` if the license allows it, all others are ``choice``.
     """
     remainder = zlib.crc32(name.encode()) % 4
     if remainder == 2:
@@ -115,75 +114,59 @@ def part_of(name: str, *, may_train: bool) -> str:
 def read_clips(
     folder: Path, *, any_licence: bool = False, language: str | None = "zh"
 ) -> list[LipClip]:
-    """Read all clips of a folder in one language.
+    """Read the clips of a folder in one language, or in all with None.
 
-    Parameters
-    ----------
-    folder : Path
-    any_licence : bool
-        Train also on clips whose licence forbids giving the parameters away.
-    language : str, optional
-        None: clips in all languages.
-
-    Raises
-    ------
-    UserError
-        The folder holds no clips, or one of them cannot be read.
+    ``any_licence`` also trains on clips whose license does not allow distribution. Raises UserError
+    if there are no clips, or one of them cannot be read.
     """
     held = folder / "held.txt"
-    left_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
+    held_out = set(held.read_text(encoding="utf-8").split()) if held.is_file() else set()
     clips = [
         clip
         for path in sorted(folder.glob("*.json"))
-        if (clip := _read_clip(path, language, any_licence=any_licence, left_out=left_out))
+        if (clip := _read_clip(path, language, any_licence=any_licence, held_out=held_out))
     ]
     if not clips:
         what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
-        raise UserError(f"no {what} in {folder}; give a folder of .flac, .csv and .json")
+        raise UserError(f"no {what} in {folder}; give a folder with .flac, .csv and .json files")
     return clips
 
 
 def read_clip(path: Path) -> LipClip:
-    """Read one clip by the path of its ``.json``.
-
-    Raises
-    ------
-    UserError
-        If it cannot be read.
-    """
+    """Read one clip by the path of its ``.json``; UserError if it cannot be read."""
     clip = _read_clip(path.with_suffix(".json"), None, any_licence=True)
     assert clip is not None  # noqa: S101 - in any language
     return clip
 
 
 def _read_clip(
-    path: Path, language: str | None, *, any_licence: bool, left_out: Collection[str] = ()
+    path: Path, language: str | None, *, any_licence: bool, held_out: Collection[str] = ()
 ) -> LipClip | None:
     """Read a clip; None if it is in another language."""
     try:
         about = json.loads(path.read_text(encoding="utf-8"))
-        spoken = str(about.get("language", "zh"))[:2]
-        if language not in (None, spoken):
+        clip_language = str(about.get("language", "zh"))[:2]
+        if language not in (None, clip_language):
             return None
         licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
         with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         if not rows or None in rows[0]:
-            raise ValueError("its table has no rows, or rows longer than its head")
+            raise ValueError("its table has no rows, or rows longer than its header")
         values = {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
         if not (np.diff(values["t"]) > 0.0).all() or not np.isfinite(values["t"]).all():
-            raise ValueError("its times do not rise")
+            raise ValueError("its times do not ascend")
         is_rig = "mouth_stretch_c" in values
         faps = _rig_faps(values) if is_rig else _tracked_faps(values)
         if np.isnan(faps).all():
-            raise ValueError("it measures no FAP of the mouth")
+            raise ValueError("it contains no FAP of the mouth")
         part = part_of(path.stem, may_train=any_licence or may_ship(licence))
         return LipClip(
             name=path.stem,
             speaker=speaker,
             licence=licence,
-            language=spoken,
-            part="held" if {path.stem, speaker} & {*left_out} else part,
+            language=clip_language,
+            part="held" if {path.stem, speaker} & {*held_out} else part,
             is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,
             transcript=about.get("transcript") or "",
             time_s=values["t"] - (_RIG_DELAY_S if is_rig else 0.0),
@@ -193,7 +176,7 @@ def _read_clip(
     except KeyError as error:
         raise UserError(f"cannot read the clip {path.stem}: it lacks {error}") from error
     except OSError as error:
-        raise UserError(f"{error.filename}: cannot be read: {error.strerror}") from error
+        raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
     except (ValueError, AttributeError, csv.Error) as error:
         raise UserError(f"cannot read the clip {path.stem}: {error}") from error
 
@@ -212,7 +195,7 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
     faps = np.full((len(tracks["t"]), NUM_MOUTH_FAPS), np.nan)
     faps[:, columns(_RIG_FAPS)] = 0.0
     for shape, effect in _RIG.items():
-        # up to three letters name the side: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
+        # up to three letters are the side: mouth_suck_dl, mouth_press_l, mouth_funnel_dr
         sides = [
             values
             for name, values in tracks.items()
@@ -224,7 +207,7 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
         faps[:, columns(_RIG_FAPS)] += weight[:, None] * np.array(effect, dtype=float)
     faps[:, columns(_DEPTH_FAPS)] *= _DEPTH_SCALE
     for upper, lower in columns((4, 5)), columns((8, 10)):
-        # lips that meet do not pass through each other
+        # lips do not pass through each other
         crossed = np.maximum(faps[:, upper] + faps[:, lower], 0.0)
         faps[:, upper] -= 0.5 * crossed
         faps[:, lower] -= 0.5 * crossed
@@ -234,7 +217,7 @@ def _rig_faps(tracks: dict[str, Array]) -> Array:
 
 
 def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
-    """Phones of a clip by its text; None if it has none, or none in the model's language."""
+    """Align a clip with its text; None if it has no text in the model's language."""
     if not clip.transcript or clip.language != model.inventory.code:
         return None
     try:
@@ -244,5 +227,5 @@ def aligned_phones(model: AcousticModel, clip: LipClip) -> list[Phone] | None:
 
 
 def label_clip(model: AcousticModel, clip: LipClip) -> list[Phone]:
-    """Phones of a clip: aligned where its text is known, else recognised."""
+    """Find the phones of a clip: aligned if its text is known, otherwise recognized."""
     return aligned_phones(model, clip) or recognize(model, clip.samples, SAMPLE_RATE_HZ)

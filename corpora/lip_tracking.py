@@ -1,4 +1,4 @@
-"""From a video of a speaker to a lip clip: the sound and the motion of the lips, no picture."""
+"""Track the lips in a video: a clip with audio and lip motion, but without images."""
 
 from __future__ import annotations
 
@@ -21,38 +21,31 @@ from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 
 
 def track_video(video: Path, clip: Path) -> tuple[int, int]:
-    """Track the lips in a video; write the clip's ``.flac``, ``.csv`` and ``.json``.
+    """Write the clip of a video as ``.flac``, ``.csv`` and ``.json``.
 
-    Returns
-    -------
-    tuple
-        Pictures with a face, and all pictures.
-
-    Raises
-    ------
-    UserError
-        If the video cannot be read, or shows too little of a face.
+    Returns the number of images with a face, and of all images. Raises UserError if the video
+    cannot be read, or a face is rarely visible.
     """
     mesh = FaceMesh()
     times: list[float] = []
-    found: list[NDArray[np.float32] | None] = []
+    tracked: list[NDArray[np.float32] | None] = []
 
-    def take(time_s: float, picture: NDArray[np.uint8]) -> None:
-        landmarks = mesh.accept(picture)
+    def track_image(time_s: float, image: NDArray[np.uint8]) -> None:
+        landmarks = mesh.track(image)
         times.append(time_s)
-        found.append(None if landmarks is None else landmarks[list(LANDMARKS)])
+        tracked.append(None if landmarks is None else landmarks[list(LANDMARKS)])
 
-    samples = read_video(video, take)
-    seen = np.array([landmarks is not None for landmarks in found])
+    samples = read_video(video, track_image)
+    seen = np.array([landmarks is not None for landmarks in tracked])
     if seen.sum() < MIN_FRAMES:
         raise UserError(
-            f"{video}: a face is seen in {seen.sum()} pictures only; film it from the front, in "
-            "light, for 20 s or more"
+            f"{video}: a face was found in only {seen.sum()} images; film it from the front in "
+            "good light, for 20 s or more"
         )
     time_s = np.array(times)
     faps = np.full((len(seen), len(MOUTH_FAPS)), np.nan)
     levels = np.array(level_track(samples))
-    landmarks = np.stack([each for each in found if each is not None])
+    landmarks = np.stack([one for one in tracked if one is not None])
     faps[seen] = mouth_faps(landmarks, np.interp(time_s[seen], levels[:, 0], levels[:, 1]))
     soundfile.write(clip.with_suffix(".flac"), samples, SAMPLE_RATE_HZ)
     _write_tracks(clip.with_suffix(".csv"), time_s, faps)
@@ -71,12 +64,12 @@ def track_video(video: Path, clip: Path) -> tuple[int, int]:
 
 
 def _write_tracks(path: Path, time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> None:
-    tracked = [index for index in range(faps.shape[1]) if not np.isnan(faps[:, index]).all()]
-    names = [f"F{MOUTH_FAPS[index]}_{FAPS[MOUTH_FAPS[index] - 1].name}" for index in tracked]
+    columns = [index for index in range(faps.shape[1]) if not np.isnan(faps[:, index]).all()]
+    names = [f"F{MOUTH_FAPS[index]}_{FAPS[MOUTH_FAPS[index] - 1].name}" for index in columns]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["t", "ok", *names])
-        for time, row in zip(time_s, faps[:, tracked], strict=True):
+        for time, row in zip(time_s, faps[:, columns], strict=True):
             is_seen = not np.isnan(row).any()
             values = [f"{value:.1f}" if is_seen else "" for value in row]
             writer.writerow([f"{time:.4f}", int(is_seen), *values])

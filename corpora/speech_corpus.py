@@ -1,16 +1,15 @@
-"""Speech corpora: rows with audio and phones, in three layouts.
+"""Speech corpora: recordings with phones, in three layouts.
 
-Layouts, told apart by the files in the folder:
+The files in the folder determine the layout:
 
-- ``manifest.tsv``: columns ``utt_id path speaker source licence split seconds text pinyin``;
-  ``pinyin`` gives the pronunciation where the text leaves it open, and either of the two columns
-  may be missing;
-- a Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``); one called ``dev`` or ``test`` is that
-  split;
+- ``manifest.tsv``: columns ``utt_id path speaker source licence split seconds text pinyin``. Only
+  one of ``text`` and ``pinyin`` is required; ``pinyin`` takes precedence.
+- A Kaldi data folder (``wav.scp``, ``text``, ``utt2spk``). If its name is ``dev`` or ``test``, it
+  is that split.
 - AISHELL-1 (``transcript/aishell_transcript_v0.8.txt`` and ``wav/<split>/<speaker>/*.wav``).
 
-The inventory of the corpus's language turns text into phones. Bad rows are reported by row,
-skipped and counted, never fatal: a corpus of a thousand hours always has some.
+The inventory of the corpus's language converts text to phones. Bad rows are reported, counted and
+skipped, because large corpora always contain some.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from pathlib import Path
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
-# Licences that allow a model trained on the data to be given away.
+# Licenses that allow distributing a model trained on the data.
 _FREE_LICENCE = re.compile(
     r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
 )
-# Exceptions to a licence, and footage that is not its repository's to give, close it, too.
+# Exceptions in a license, and footage by third parties, exclude it.
 _CLOSED_LICENCE = re.compile(
     r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
 )
@@ -66,7 +65,7 @@ class RowErrors:
     messages: list[str] = field(default_factory=list)
 
     def add(self, place: str, what: str) -> None:
-        """Note one bad row."""
+        """Add a bad row."""
         self.messages.append(f"{place}: {what}; row skipped")
 
     def print_to(self, report: Callable[[str], None]) -> None:
@@ -77,18 +76,18 @@ class RowErrors:
             report(f"{len(self.messages)} rows skipped")
 
     def nothing_left(self, where: str) -> UserError:
-        """Make the error that no recording can be used; it says why the last one cannot."""
+        """Make the error that no recording can be used, with the reason for the last one."""
         last = f" (the last of them: {self.messages[-1]})" if self.messages else ""
         return UserError(f"no usable recordings {where}{last}; give others")
 
 
 def may_ship(licence: str) -> bool:
-    """Whether a model trained on rows under this licence may be given away."""
+    """Return whether a model trained on data under this license may be distributed."""
     return bool(_FREE_LICENCE.search(licence)) and not _CLOSED_LICENCE.search(licence)
 
 
 def is_synthetic(licence: str) -> bool:
-    """Whether rows under this licence are synthetic speech."""
+    """Return whether data under this license is synthetic speech."""
     return "synthetic" in licence.lower()
 
 
@@ -100,7 +99,7 @@ def read_corpus(
     split: str | None = None,
     audio: Path | None = None,
 ) -> list[Utterance]:
-    """Read a corpus folder in any of the three layouts.
+    """Read a corpus folder, or a manifest, in any of the three layouts.
 
     Parameters
     ----------
@@ -111,14 +110,14 @@ def read_corpus(
     inventory
         The corpus's language.
     split
-        Read only the rows of this split; None reads all.
+        Split to read; None reads all.
     audio
-        The folder that a manifest's paths start from; None is the manifest's own.
+        Base folder of a manifest's paths; by default the manifest's folder.
 
     Raises
     ------
     UserError
-        If the folder holds none of the layouts, or a list is missing or no UTF-8 text.
+        If the folder has none of the layouts, or a list is missing or not UTF-8 text.
     """
     if folder.suffix == ".tsv" and folder.is_file():
         rows = _manifest_rows(folder, audio)
@@ -130,7 +129,7 @@ def read_corpus(
         rows = _aishell_rows(folder)
     else:
         raise UserError(
-            f"{folder} holds no corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
+            f"{folder} is not a corpus; give a folder with manifest.tsv, with Kaldi's wav.scp and "
             "text, or with AISHELL's wav and transcript folders"
         )
     try:
@@ -138,17 +137,17 @@ def read_corpus(
     except UnicodeDecodeError as error:
         raise UserError(f"{folder}: its list is not UTF-8 text ({error}); convert it") from error
     except OSError as error:
-        raise UserError(f"{error.filename}: cannot be read: {error.strerror}") from error
+        raise UserError(f"cannot read {error.filename}: {error.strerror}") from error
     utterances = [_utterance(place, row, errors, inventory) for place, row in chosen]
     return [utterance for utterance in utterances if utterance]
 
 
 def audio_files(folder: Path) -> list[Path]:
-    """Find the recordings below a folder, in order of their names; UserError if there is none."""
-    found = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
-    if not found:
-        raise UserError(f"{folder} holds no wav, flac, ogg or opus files; give another folder")
-    return found
+    """Find the recordings in a folder, at any depth, sorted; UserError if there are none."""
+    files = [path for path in sorted(folder.rglob("*")) if path.suffix in _AUDIO_SUFFIXES]
+    if not files:
+        raise UserError(f"{folder} contains no wav, flac, ogg or opus files; give another folder")
+    return files
 
 
 def _split_of(row: dict[str, str]) -> str:
@@ -189,8 +188,8 @@ def _utterance(
 
 
 def duration_s(path: Path) -> float:
-    """Return the length of a recording; ValueError if the file is none that libsndfile reads."""
-    import soundfile  # noqa: PLC0415  (manifests state the length; only bare layouts need to ask)
+    """Return the length of a recording; ValueError if libsndfile cannot read the file."""
+    import soundfile  # noqa: PLC0415  (only needed if no manifest states the length)
 
     try:
         return float(soundfile.info(path).duration)
@@ -216,7 +215,7 @@ def _manifest_rows(path: Path, audio: Path | None) -> Iterator[tuple[str, dict[s
 def _kaldi_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
     if (folder / "segments").is_file():
         raise UserError(
-            f"{folder} cuts its recordings with 'segments'; write each segment as a file"
+            f"{folder} has a file 'segments', which is not supported; write each segment as a file"
         )
     split = folder.name if folder.name in _KALDI_SPLITS else "train"
     speakers = dict(_pairs(folder / "utt2spk")) if (folder / "utt2spk").is_file() else {}
@@ -248,7 +247,7 @@ def _aishell_rows(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
                     "speaker": path.parent.name,
                     "source": "AISHELL-1",
                     "licence": "Apache-2.0",
-                    # A missing file has no known split: it is reported once, under train.
+                    # The split of a missing file is unknown; it is reported once, under train.
                     "split": path.relative_to(folder / "wav").parts[0]
                     if utterance_id in audio
                     else "train",

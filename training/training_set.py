@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.feature_cache import log_mel_of, samples_of
-from kouxing.corpora.kept_back import is_kept_back
+from kouxing.corpora.held_out import is_held_out
 from kouxing.corpora.speech_corpus import (
     RowErrors,
     Utterance,
@@ -146,7 +146,7 @@ def load_untranscribed(folders: Sequence[Path], errors: RowErrors) -> list[NDArr
     """
     pieces = []
     for folder in folders:
-        files = [_file_without_text(path) for path in audio_files(folder) if not is_kept_back(path)]
+        files = [_file_without_text(path) for path in audio_files(folder) if not is_held_out(path)]
         sounds = samples_of(files)
         for file, log_mel, sound in zip(files, log_mel_of(files, errors), sounds, strict=True):
             if log_mel is None:

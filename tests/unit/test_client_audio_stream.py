@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-
 from kouxing_client.audio_stream import NEAREST_MS, RESEND_S, AudioStream
 
 pytestmark = pytest.mark.unit

@@ -6,10 +6,10 @@ from array import array
 from typing import Any
 
 import pytest
-
 from kouxing_client import FapFrame, KouxingError, Sound
 from kouxing_client.follower import CATCH_UP_S, KEEP_S, MAX_OLD, RETRY_S, Follower
 from kouxing_client.messages import EndOfFaps, Joined, Message
+
 from tests.fake_sockets import FakeConnection, FakeSockets
 
 pytestmark = pytest.mark.unit

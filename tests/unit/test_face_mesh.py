@@ -26,31 +26,31 @@ def picture(name: str) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("name", MEDIAPIPE)
-def test_landmarks_are_those_of_mediapipe(name: str) -> None:
-    landmarks = FaceMesh().accept(picture(name))
+def test_finds_mediapipes_landmarks(name: str) -> None:
+    landmarks = FaceMesh().track(picture(name))
     assert landmarks is not None
     for point, expected in MEDIAPIPE[name].items():
         np.testing.assert_allclose(landmarks[point, :2], expected, atol=0.8)
 
 
-def test_a_picture_on_its_side_has_its_landmarks_on_their_side() -> None:
+def test_finds_a_rotated_face() -> None:
     upright = picture("woman_a")
-    landmarks, turned = (FaceMesh().accept(each) for each in (upright, np.rot90(upright)))
+    landmarks, turned = (FaceMesh().track(each) for each in (upright, np.rot90(upright)))
     assert landmarks is not None
     assert turned is not None
     back = np.stack([upright.shape[1] - turned[:, 1], turned[:, 0]], axis=1)
     np.testing.assert_allclose(back, landmarks[:, :2], atol=2.0)
 
 
-def test_a_face_that_moves_is_followed_and_one_that_is_gone_is_found_again() -> None:
+def test_tracks_a_moving_face_and_recovers_a_lost_one() -> None:
     mesh = FaceMesh()
-    first = mesh.accept(picture("woman_a"))
+    first = mesh.track(picture("woman_a"))
     moved = np.roll(picture("woman_a"), 6, axis=1)
-    second = mesh.accept(moved)
+    second = mesh.track(moved)
     assert first is not None
     assert second is not None
     np.testing.assert_allclose(second[:, 0] - first[:, 0], 6, atol=1.5)
-    assert mesh.accept(np.zeros_like(moved)) is None
-    found = mesh.accept(moved)
+    assert mesh.track(np.zeros_like(moved)) is None
+    found = mesh.track(moved)
     assert found is not None
     np.testing.assert_allclose(found, second, atol=1.5)

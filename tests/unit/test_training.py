@@ -10,7 +10,7 @@ import pytest
 import soundfile
 
 from kouxing.corpora import feature_cache
-from kouxing.corpora.kept_back import CONVERSATION, is_kept_back
+from kouxing.corpora.held_out import CONVERSATION, is_held_out
 from kouxing.corpora.speech_corpus import RowErrors, may_ship, read_corpus
 from kouxing.services.recognizer.acoustic.acoustic_model import FIRST, INSIDE, LAST
 from kouxing.services.recognizer.acoustic.load import load_model
@@ -122,8 +122,8 @@ def test_the_conversation_manifest_is_readable_and_held_out(tmp_path: Path) -> N
     assert not errors.messages
     assert len(rows) == len(lines) == 17
     assert len({row.speaker for row in rows}) == 6
-    assert all(is_kept_back(row.path) for row in rows)
-    assert not is_kept_back(tmp_path / "websdk-java-demo_16k_10_00.ogg")
+    assert all(is_held_out(row.path) for row in rows)
+    assert not is_held_out(tmp_path / "websdk-java-demo_16k_10_00.ogg")
 
 
 def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_reads_a_kaldi_folder(tmp_path: Path) -> None:
     assert "line 3 (u3): no text" in errors.messages[1]
     assert read_corpus(held_out, RowErrors(), MANDARIN, split="train") == []
     (held_out / "text").unlink()
-    with pytest.raises(UserError, match="text: cannot be read"):
+    with pytest.raises(UserError, match=r"cannot read .*text: "):
         read_corpus(held_out, RowErrors(), MANDARIN)
     (held_out / "segments").write_text("u1-1 u1 0 1\n")
     with pytest.raises(UserError, match="segments"):
@@ -169,7 +169,7 @@ def test_reads_an_aishell_folder(tmp_path: Path) -> None:
 
 
 def test_rejects_folders_without_a_corpus(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="holds no corpus"):
+    with pytest.raises(UserError, match="is not a corpus"):
         read_corpus(tmp_path, RowErrors(), MANDARIN)
     (tmp_path / "manifest.tsv").write_text("utt_id\tpath\n")
     with pytest.raises(UserError, match="lacks the columns pinyin or text"):

@@ -36,7 +36,7 @@ from rich.progress import track
 from scipy.special import expit
 
 from kouxing.corpora.feature_cache import as_integers, read_audio
-from kouxing.corpora.kept_back import is_kept_back
+from kouxing.corpora.held_out import is_held_out
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip
 from kouxing.corpora.speech_corpus import audio_files, duration_s
 from kouxing.services.mouth_profiles.positions import POSITION_S
@@ -76,7 +76,7 @@ def draw_recordings(folders: Sequence[Path], seed: int) -> list[Path]:
     rng = np.random.default_rng(seed)
     drawn = []
     for folder in folders:
-        files = [file for file in audio_files(folder) if not is_kept_back(file)]
+        files = [file for file in audio_files(folder) if not is_held_out(file)]
         total_s = 0.0
         for number in rng.permutation(len(files)):
             if total_s >= _MAX_FOLDER_S:
