@@ -55,4 +55,6 @@ def _solve(histories: Floats, targets: Floats) -> Array:
     ridge = np.full(histories.shape[1], RIDGE * len(histories))
     ridge[-1] = _TINY
     products = (histories.T @ histories).astype(np.float64)
-    return np.linalg.solve(products + np.diag(ridge), (histories.T @ targets).astype(np.float64))
+    with_targets = (histories.T @ targets).astype(np.float64)
+    weights: Array = np.linalg.solve(products + np.diag(ridge), with_targets)
+    return weights
