@@ -25,9 +25,9 @@ class FakeConnection:
     topics: set[bytes] = field(default_factory=set)
     unread: deque[Any] = field(default_factory=deque)
 
-    def answer(self, kind: str, session: str = "s", **fields: object) -> None:
-        """Deliver a message from the server."""
-        self.on_message(encode(kind, session, fields))
+    def answer(self, kind: str, **fields: object) -> None:
+        """Deliver a message about the session ``s`` from the server."""
+        self.on_message(encode(kind, "s", fields))
 
 
 class FakeSockets:

@@ -99,7 +99,7 @@ def test_what_is_tested_of_the_python_package_holds_for_the_built_one(
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     for command in (
         ["-c", find, str(tmp_path / "kouxing_client")],
-        ["-m", "pytest", *own, "tests/unit/test_client_package.py"],
+        ["-m", "pytest", *own, "tests/process/test_client.py", "tests/unit/test_client_core.py"],
     ):
         result = subprocess.run(
             [sys.executable, *command],
@@ -117,7 +117,7 @@ def test_the_python_package_brings_its_types_and_needs_two_packages(python: Path
     site = python.parent.parent / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"
     assert (site / "kouxing_client" / "py.typed").is_file()
     installed = {path.name.partition("-")[0] for path in site.glob("*.dist-info")}
-    assert installed == {"kouxing_client", "msgpack", "pyzmq"}
+    assert installed == {"kouxing_client", "msgspec", "pyzmq"}
 
 
 @pytest.fixture(scope="module")

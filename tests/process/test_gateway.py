@@ -7,13 +7,11 @@ import base64
 import csv
 import json
 import os
-import queue
 import signal
 import socket
 import struct
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,12 +27,12 @@ from pythonosc.osc_bundle import OscBundle
 
 from kouxing.services.gateway.sample import SAMPLE_FILE, SAMPLE_TEXT
 from kouxing.services.gateway.wire import FAP_TYPE, REST_SHAPES_TYPE, REST_TYPE, SHAPES_TYPE
-from kouxing.shared.bus import AUDIO_QUEUE_LENGTH, Bus
+from kouxing.shared.bus import AUDIO_QUEUE_LENGTH
 from kouxing.shared.clock import now_ns
 from kouxing.shared.face.faps import MASK_BYTES, MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.face.shapes import VRM
 from kouxing.shared.keys import Peer
-from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
+from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import (
     Heartbeat,
     HeartbeatReply,
@@ -46,24 +44,17 @@ from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import (
     CloseSession,
-    Done,
-    Error,
     FlushSession,
     OpenSession,
-    ServiceState,
     SessionFacts,
-    SessionOpened,
-    StatusReport,
-    StatusRequest,
 )
 from kouxing.shared.wire.speech import Phone, Speech
+from tests.fake_control import TOKEN, FakeControl
 from tests.system import DEMO, free_port
 
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).parents[2]
-LOCAL = "tcp://127.0.0.1:*"
-TOKEN = "token"  # noqa: S105 - not a secret, but what the protocol calls so
 EPOCH = 3
 PATIENT = """
 from kouxing.services.gateway import audio_sessions
@@ -74,16 +65,10 @@ run_module("gateway")
 FACE = struct.pack(f"<{NUM_FAPS}f", *range(NUM_FAPS))
 
 
-class ScriptedSystem:
-    """Plays control, recognizer and synthesizer on a thread of its own."""
+class ScriptedSystem(FakeControl):
+    """Control that also serves a gateway, which it waits for when a session opens."""
 
     def __init__(self) -> None:
-        self.bus = Bus()
-        self.commands = self.bus.bind_router(LOCAL, "commands")
-        self.audio = self.bus.bind_router(LOCAL, "audio")
-        self.phones = self.bus.bind_publisher(LOCAL, "phones")
-        self.faps = self.bus.bind_publisher(LOCAL, "faps")
-        self.audio_endpoint = self.audio.endpoint  # that clients are given
         self.page = ""
         self.gateway = Peer()
         self.started: list[str] = []  # sessions that the gateway has confirmed
@@ -92,41 +77,24 @@ class ScriptedSystem:
         self.chosen: list[tuple[str, str]] = []  # session, lip model
         self.expressions: list[SetFace] = []
         self.amounts: list[tuple[str, float]] = []  # session, expressiveness
-        self.voices: list[bytes] = []  # of the sessions opened
-        self.audio_messages: list[Message] = []
-        self.forget()
+        self.profiles: list[bytes] = []  # of the mouths of the sessions opened
         self._openings: dict[str, tuple[OpenSession, Peer]] = {}
-        self._jobs: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        self._stop = False
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._stop = True
-        self._thread.join()
-        self.bus.close()
+        super().__init__()
 
     def forget(self) -> None:
         self.running = ["recognizer", "synthesizer"]
         self.refuse = False
-        for received in (self.started, self.closed, self.flushed, self.audio_messages):
+        for received in (
+            self.started,
+            self.closed,
+            self.flushed,
+            self.audio_messages,
+            self.chosen,
+            self.expressions,
+            self.amounts,
+            self.profiles,
+        ):
             received.clear()
-        self.chosen.clear()
-        self.expressions.clear()
-        self.amounts.clear()
-        self.voices.clear()
-
-    def do(self, job: Callable[[], object]) -> None:
-        """Run something on the thread that owns the sockets, and wait for it."""
-        done = threading.Event()
-        self._jobs.put(job)
-        self._jobs.put(done.set)
-        assert done.wait(60)
-
-    def bind_audio(self) -> None:
-        """Have a recognizer at the address that clients are given."""
-        self.audio = self.bus.bind_router(self.audio_endpoint, "audio")
-        self._poller.add(self.audio)
 
     def start(self, session: str, epoch: int = EPOCH) -> None:
         message = StartSession(
@@ -168,73 +136,36 @@ class ScriptedSystem:
             )
         )
 
-    def _run(self) -> None:
-        self._poller = self.bus.poller()
-        for socket_ in (self.commands, self.audio, self.phones, self.faps):
-            self._poller.add(socket_)
-        while not self._stop:
-            while not self._jobs.empty():
-                self._jobs.get()()
-            for socket_ in self._poller.wait(0.005):
-                for received in socket_.receive():
-                    if socket_ is self.commands:
-                        self._on_command(received.message, received.sender)
-                    elif isinstance(received.message, Message):
-                        self.audio_messages.append(received.message)
-                        taken = AcknowledgeAudio(
-                            session=received.message.session, sequence=received.message.sequence
-                        )
-                        self.audio.send(taken, to=received.sender)
+    def on_open(self, opening: OpenSession, client: Peer) -> None:
+        self.profiles.append(opening.mouth_profile or b"")
+        session = opening.session or f"s{len(self._openings)}"
+        self._openings[session] = (opening, client)
+        self.start(session)
 
-    def _on_command(self, message: object, sender: Peer) -> None:
-        answer: Message | None = None
+    def on_message(self, message: Message, sender: Peer) -> None:
         match message:
             case Heartbeat():
                 self.gateway = sender
                 self.page = message.endpoints["page"]
                 now = now_ns()
-                answer = HeartbeatReply(
+                reply = HeartbeatReply(
                     sent_ns=message.sent_ns, received_ns=now, replied_ns=now, control="control-1"
                 )
+                self.commands.send(reply, to=sender)
             case SessionStarted():
                 self.started.append(message.session)
                 if message.session in self._openings:
-                    self._opened(*self._openings[message.session], message.session)
-            case OpenSession() if self.refuse:
-                answer = Error(code="no-service", text="start one", request=message.request)
-            case OpenSession():
-                self.voices.append(message.mouth_profile or b"")
-                session = message.session or f"s{len(self._openings)}"
-                self._openings[session] = (message, sender)
-                self.start(session)
+                    self.answer_open(*self._openings[message.session], message.session)
             case CloseSession():
                 self.closed.append(message.session)
                 self.commands.send(StopSession(session=message.session), to=self.gateway)
-                answer = Done(session=message.session, request=message.request)
             case FlushSession():
                 self.flushed.append(message.session)
-                answer = Done(session=message.session, request=message.request)
             case SetFace():
-                answer = self._on_set_face(message)
-            case StatusRequest():
-                states = [
-                    ServiceState(
-                        service=name,
-                        role="worker",
-                        instance=name,
-                        state="ready",
-                        age_s=0,
-                        clock_offset_ms=0,
-                        endpoints={},
-                        metrics={},
-                    )
-                    for name in self.running
-                ]
-                answer = StatusReport(request=message.request, services=states, sessions=[])
-        if answer is not None:
-            self.commands.send(answer, to=sender)
+                self._on_set_face(message)
+        super().on_message(message, sender)
 
-    def _on_set_face(self, message: SetFace) -> Message | None:
+    def _on_set_face(self, message: SetFace) -> None:
         face = message.face
         if face.lips is not None:
             self.chosen.append((message.session, face.lips))
@@ -243,24 +174,6 @@ class ScriptedSystem:
         if face.expressions is not None:
             self.expressions.append(message)
         self.commands.send(message, to=self.gateway)
-        if message.request is None:
-            return None
-        return Done(session=message.session, request=message.request)
-
-    def _opened(self, opening: OpenSession, client: Peer, session: str) -> None:
-        self.commands.send(
-            SessionOpened(
-                session=session,
-                request=opening.request,
-                token=TOKEN,
-                audio=self.audio_endpoint,
-                phones=self.phones.endpoint,
-                faps=self.faps.endpoint,
-                events=self.faps.endpoint,
-                facts=SessionFacts(),
-            ),
-            to=client,
-        )
 
 
 class GatewayProcess:
@@ -832,7 +745,7 @@ def test_the_microphone_sends_the_mouth_profile(
             await receive_json(browser, "opened")
 
     asyncio.run(speak())
-    assert system.voices == [profile]
+    assert system.profiles == [profile]
 
 
 def test_the_page_sends_the_newest_face_to_another_program(

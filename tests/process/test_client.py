@@ -1,0 +1,190 @@
+"""The package ``kouxing-client`` over real sockets: plain and asyncio programs.
+
+The other end is the product's own, so it checks what the package sends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from kouxing_client import (
+    AsyncClient,
+    Client,
+    FapFrame,
+    KouxingError,
+    Phone,
+    Refused,
+    Shapes,
+    core,
+    find_key,
+)
+
+from kouxing.shared.keys import user_key
+from kouxing.shared.wire import face, speech
+from kouxing.shared.wire.control import Event
+from kouxing.shared.wire.face import SetFace
+from kouxing.shared.wire.session import CloseSession, Error
+from tests.fake_control import FakeControl
+
+pytestmark = pytest.mark.process
+CHUNK = bytes(3200)  # 100 ms
+
+
+@pytest.fixture
+def control() -> Iterator[FakeControl]:
+    with FakeControl() as made:
+        yield made
+
+
+@pytest.fixture
+def client(control: FakeControl) -> Iterator[Client]:
+    with Client(control.commands.endpoint, insecure=True) as made:
+        yield made
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    end_s = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def frame(sequence: int) -> face.FapFrame:
+    return face.FapFrame(
+        session="s",
+        epoch=1,
+        sequence=sequence,
+        media_time=320 * sequence,
+        values=np.full(68, sequence, "<f4").tobytes(),
+        mask=bytes(9),
+        shapes={"vrm": np.array([0.5, *[0] * 11], "<f4").tobytes()},
+    )
+
+
+PHONE = speech.Phone(
+    session="s", epoch=1, index=0, symbol="a", duration=1600, confidence=1.0, final=True
+)
+END = face.EndOfFaps(session="s", epoch=1, sequence=9)
+
+
+def test_finds_the_key_that_commands_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    key = user_key()
+    assert find_key() == type(find_key())(key.public, key.secret, key.control)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with pytest.raises(KouxingError, match="kouxing keys add"):
+        Client()
+    (tmp_path / "kouxing").mkdir()
+    (tmp_path / "kouxing" / "client.key").write_text('{"public": "short"}')
+    with pytest.raises(KouxingError, match="is not a key file"):
+        Client()
+
+
+def test_streams_audio_and_receives_results(control: FakeControl, client: Client) -> None:
+    with client.open_session("s", sample_rate_hz=48000, num_channels=2) as session:
+        results = session.results(FapFrame, Phone, Shapes, shapes="vrm")
+        session.push(bytes(4 * 12000))
+        session.finish()
+        wait_until(lambda: len(control.audio_messages) == 3)
+        control.publish(control.phones, PHONE)
+        assert isinstance(results.get(), Phone)
+        control.publish(control.faps, frame(1), frame(2), END)
+        found = list(results)
+        assert results.has_ended
+        with pytest.raises(KouxingError, match="whole samples"):
+            session.push(bytes(6))
+    frames = [result for result in found if isinstance(result, FapFrame)]
+    shapes = [result for result in found if isinstance(result, Shapes)]
+    assert [frame.values for frame in frames] == [array("f", [n] * 68) for n in (1.0, 2.0)]
+    assert frames[0].time_s == 0.02
+    assert [one.by_name["aa"] for one in shapes] == [0.5, 0.5]
+    assert [len(chunk.pcm) for chunk in control.audio_messages] == [32000, 16000, 0]
+    assert [chunk.media_time for chunk in control.audio_messages] == [0, 2666, 4000]
+    assert control.sessions_of(SetFace) == ["s"], "shapes are requested"
+    assert control.sessions_of(CloseSession) == ["s"]
+    with pytest.raises(KouxingError, match="closed"):
+        session.push(CHUNK)
+
+
+def test_reports_refusals_of_requests_and_of_audio(control: FakeControl, client: Client) -> None:
+    session = client.open_session("s")
+    session.push(CHUNK)
+    wait_until(lambda: control.audio_messages)
+    error = Error(session="s", code="bad-audio", text="x")
+    control.do(lambda: control.audio.send(error, to=control.audio_sender))
+    wait_until(lambda: session._core.errors)
+    with pytest.raises(Refused, match="bad-audio: x"):
+        session.push(CHUNK)
+    session.push(CHUNK)
+    control.refuse = True
+    with pytest.raises(Refused, match="no-service: start one") as caught:
+        client.open_session()
+    assert caught.value.code == "no-service"
+
+
+def test_a_session_that_control_closes_ends(control: FakeControl, client: Client) -> None:
+    session = client.open_session("s")
+    events, frames = session.events(), session.frames()
+    closed = Event(session="s", name="session-closed", detail="idle")
+    while (event := events.get(0.05)) is None:  # until the subscription is in effect
+        control.publish(control.events, closed)
+    assert (event.name, event.detail) == ("session-closed", "idle")
+    with pytest.raises(KouxingError, match="control has closed the session: idle"):
+        list(frames)
+
+
+def test_without_control_the_error_names_the_remedy() -> None:
+    with (
+        Client("tcp://127.0.0.1:9", insecure=True, timeout_s=0.2) as client,
+        pytest.raises(KouxingError, match="Start it with 'kouxing run'"),
+    ):
+        client.status()
+
+
+def test_asyncio_does_the_same(control: FakeControl) -> None:
+    async def run() -> list[float]:
+        async with AsyncClient(control.commands.endpoint, insecure=True) as client:
+            assert [state.service for state in (await client.status()).services]
+            session = await client.open_session("s")
+            frames = await session.frames()
+            await session.push(CHUNK)
+            await session.set_face(lips="learnt")
+            await asyncio.to_thread(control.publish, control.faps, frame(1), frame(2), END)
+            values = [result.values[0] async for result in frames]
+            with pytest.raises(KouxingError, match="whole samples"):
+                await session.push(b"\0")
+            await session.close()
+            return values
+
+    assert asyncio.run(run()) == [1.0, 2.0]
+
+
+def test_requests_are_answered_at_once_while_audio_streams(control: FakeControl) -> None:
+    """One thread reads the sockets, so no answer is lost among the acknowledgements of audio."""
+    num_flushes = 20
+
+    async def run() -> list[float]:
+        times_s: list[float] = []
+        async with AsyncClient(control.commands.endpoint, insecure=True) as client:
+            session = await client.open_session("s")
+
+            async def stream() -> None:
+                while len(times_s) < num_flushes:
+                    session.try_push(CHUNK)
+                    session.take_errors()
+                    await asyncio.sleep(0.0005)
+
+            streaming = asyncio.create_task(stream())
+            for _ in range(num_flushes):
+                begin_s = time.monotonic()
+                await session.flush()
+                times_s.append(time.monotonic() - begin_s)
+            await streaming
+        return times_s
+
+    assert max(asyncio.run(run())) < core.RETRY_S

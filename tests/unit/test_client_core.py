@@ -1,0 +1,315 @@
+"""A client's core: requests, sessions that move, lost connections; without sockets."""
+
+from __future__ import annotations
+
+from array import array
+from concurrent.futures import Future
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from kouxing_client import SHAPE_NAMES, FapFrame, KouxingError, Phone, Refused, Result
+from kouxing_client.audio import to_pcm
+from kouxing_client.audio_stream import ANSWER_S
+from kouxing_client.core import RETRY_S, ClientCore
+from kouxing_client.messages import Joined
+from kouxing_client.session_core import (
+    LAST_S,
+    MOVE_LIMIT_S,
+    REJOIN_S,
+    SILENT_S,
+    Inbox,
+    SessionCore,
+    Subscription,
+)
+
+from kouxing.shared.face.shapes import SHAPE_SETS
+from tests.fake_sockets import FakeConnection, FakeSockets
+
+pytestmark = pytest.mark.unit
+OPENED = {
+    "epoch": 1,
+    "token": "t",
+    "audio": "audio 1",
+    "phones": "phones 1",
+    "faps": "faps 1",
+    "events": "events",
+}
+MOVED = {"epoch": 2, "audio": "audio 2", "phones": "phones 2", "faps": "faps 1"}
+STATE = {"state": "open", "age_s": 1.0, "speaking": False, "workers": {}, "facts": {}}
+CONTROL_STATE = {
+    "service": "control",
+    "instance": "control",
+    "role": "control",
+    "state": "ready",
+    "age_s": 0.0,
+    "clock_offset_ms": 0.0,
+    "endpoints": {"events": "events"},
+    "metrics": {},
+}
+
+
+class NoSignal:
+    def notify(self) -> None:
+        pass
+
+
+class Scene:
+    """A core with one session."""
+
+    def __init__(self, *, paced: bool = True) -> None:
+        self.sockets = FakeSockets()
+        self.core = ClientCore(cast(Any, self.sockets), "control", 10.0, NoSignal)
+        opening = self.core.open_session({"sample_rate_hz": 16000, "paced": paced})
+        self.answer("session-opened", **OPENED)
+        self.session: SessionCore = opening.result()
+
+    @property
+    def commands(self) -> FakeConnection:
+        (connection,) = self.sockets.at("control")
+        return connection
+
+    def answer(self, kind: str, **fields: object) -> None:
+        """Answer the newest request."""
+        _, request = self.commands.sent[-1]
+        self.commands.answer(kind, request=request["request"], **fields)
+
+    def audio(self, number: int = 1) -> FakeConnection:
+        (connection,) = self.sockets.at(f"audio {number}")
+        return connection
+
+    def push(self, count: int) -> None:
+        for _ in range(count):
+            self.session.add_audio(1600, {"pcm": b""})
+
+    def pass_time(self, seconds: float) -> None:
+        self.sockets.now_s += seconds
+        self.core.tick()
+
+    def subscribe(self, *classes: type[Result]) -> tuple[Inbox, list[KouxingError | None]]:
+        """Return an inbox, and the outcomes of joining."""
+        inbox, joined = Inbox(NoSignal(), None), list[KouxingError | None]()
+        subscription = Subscription(self.session, classes, "", inbox, joined.append)
+        self.session.subscribe(subscription)
+        return inbox, joined
+
+    def confirm(self) -> None:
+        """Confirm the newest subscription, at as many publishers as it needs."""
+        for name in ("a", "b"):
+            self.sockets.connections[-1].on_message(Joined(publisher=name))
+
+
+def sequences(connection: FakeConnection) -> list[int]:
+    return [fields["sequence"] for _, fields in connection.sent]
+
+
+def failure_of(future: Future[Any]) -> BaseException | None:
+    assert future.done()
+    return future.exception()
+
+
+FLOATS = [0.0, 0.5, -1.0, 2.0]
+INTEGERS = array("h", [0, 16384, -32767, 32767])
+
+
+@pytest.mark.parametrize(
+    "audio",
+    [
+        INTEGERS.tobytes(),
+        INTEGERS,
+        FLOATS,
+        array("f", FLOATS),
+        np.array(FLOATS),
+        np.array(FLOATS, np.float32).reshape(2, 2),
+        np.array(INTEGERS, np.int16)[::1],
+    ],
+    ids=lambda audio: type(audio).__name__,
+)
+def test_audio_may_be_bytes_or_numbers(audio: object) -> None:
+    assert to_pcm(audio, "s16le") == INTEGERS.tobytes()
+
+
+def test_floats_stay_floats_on_a_wire_of_floats() -> None:
+    assert to_pcm(FLOATS, "f32le") == array("f", FLOATS).tobytes()
+    scaled = array("f", to_pcm(INTEGERS, "f32le"))
+    assert scaled == pytest.approx([0.0, 0.5, -1.0, 1.0], abs=1e-4)
+
+
+def test_names_of_shapes_are_those_of_the_product() -> None:
+    assert {name: shapes.names for name, shapes in SHAPE_SETS.items()} == SHAPE_NAMES
+
+
+def test_repeats_a_request_until_the_time_limit() -> None:
+    scene = Scene()
+    answer = scene.core.request("flush-session", "s")
+    for _ in range(3):
+        scene.pass_time(RETRY_S)
+    requests = [fields["request"] for kind, fields in scene.commands.sent if kind.startswith("flu")]
+    assert len(requests) == 4
+    assert len(set(requests)) == 1
+    scene.pass_time(10.0)
+    assert "Start it with 'kouxing run'" in str(failure_of(answer))
+
+
+def test_a_refused_connection_names_another_remedy() -> None:
+    scene = Scene()
+    scene.commands.on_refused(True)
+    answer = scene.core.request("flush-session", "s")
+    scene.pass_time(10.1)
+    assert "refuses this client" in str(failure_of(answer))
+
+
+def test_connects_again_if_the_socket_to_control_is_dead() -> None:
+    scene = Scene()
+    dead = scene.commands
+    dead.has_room = False
+    answer = scene.core.request("flush-session", "s")
+    assert not dead.is_open
+    scene.answer("done")
+    assert answer.result()["session"] == "s"
+
+
+def test_a_request_that_control_cannot_read_is_refused() -> None:
+    scene = Scene()
+    answer = scene.core.request("flush-session", "s")
+    scene.commands.answer("error", code="bad-message", text="x")
+    assert isinstance(failure_of(answer), Refused)
+
+
+def test_status_collects_all_pages() -> None:
+    scene = Scene()
+    status = scene.core.status("")
+    scene.answer("status-report", services=[CONTROL_STATE], sessions=[], next=7)
+    assert scene.commands.sent[-1][1]["after"] == 7
+    state = {**STATE, "session": "s", "endpoints": {}}
+    scene.answer("status-report", services=[], sessions=[state], next=None)
+    assert [one.service for one in status.result().services] == ["control"]
+    assert [one.session for one in status.result().sessions] == ["s"]
+
+
+def test_a_moved_session_sends_the_new_recognizer_what_it_needs() -> None:
+    scene = Scene()
+    scene.push(5)
+    old = scene.audio()
+    scene.commands.answer("session-moved", **MOVED, next_sequence=3)
+    scene.core.tick()
+    assert not old.is_open
+    assert sequences(scene.audio(2)) == [3, 4, 5]
+    assert {fields["epoch"] for _, fields in scene.audio(2).sent} == {2}
+    scene.commands.answer("session-moved", **MOVED, next_sequence=3)  # control may repeat it
+    scene.push(1)
+    assert sequences(scene.audio(2)) == [3, 4, 5, 6]
+
+
+def test_audio_continues_when_the_recognizer_stays() -> None:
+    scene = Scene()
+    scene.push(2)
+    scene.commands.answer("session-moved", **{**MOVED, "audio": "audio 1"}, next_sequence=None)
+    scene.push(1)
+    assert sequences(scene.audio()) == [1, 2, 3]
+
+
+def test_reconnects_and_resends_if_acknowledgements_stop() -> None:
+    scene = Scene()
+    scene.push(3)
+    dead = scene.audio()
+    dead.answer("acknowledge-audio", sequence=1)
+    scene.pass_time(ANSWER_S[0] + 0.1)
+    assert not dead.is_open
+    assert sequences(scene.audio()) == [2, 3]
+    assert scene.audio().connect_ms < 300, "the round trip was shorter"
+
+
+def test_audio_waits_for_subscriptions_so_that_no_frame_is_missed() -> None:
+    scene = Scene()
+    scene.subscribe(FapFrame)
+    scene.confirm()
+    scene.push(2)
+    scene.audio().answer("acknowledge-audio", sequence=1)
+    scene.pass_time(ANSWER_S[0] + 0.1)
+    assert sequences(scene.audio()) == []
+    scene.pass_time(REJOIN_S)
+    assert sequences(scene.audio()) == [2]
+
+
+def test_a_blocked_socket_gets_the_rest_later() -> None:
+    scene = Scene()
+    scene.audio().has_room = False
+    scene.push(2)
+    assert scene.session.is_blocked
+    scene.audio().has_room = True
+    scene.core.tick()
+    assert sequences(scene.audio()) == [1, 2]
+
+
+def test_results_follow_a_move() -> None:
+    scene = Scene()
+    inbox, joined = scene.subscribe(Phone, FapFrame)
+    scene.confirm()
+    assert joined == [None]
+    scene.commands.answer("session-moved", **MOVED, next_sequence=None)
+    scene.confirm()
+    phone = Phone(epoch=2, index=0, symbol="a", duration=1, confidence=1.0, final=True)
+    scene.sockets.publish("phones 2", phone)
+    assert list(inbox.messages) == [phone]
+
+
+def test_an_unknown_session_ends_unless_it_moves() -> None:
+    scene = Scene()
+    scene.push(1)
+    scene.audio().answer("error", code="unknown-session", text="x")
+    scene.audio().answer("error", code="bad-audio", text="y")
+    assert [error.code for error in scene.session.errors] == ["bad-audio"]
+    scene.commands.answer("session-moved", **MOVED, next_sequence=1)
+    scene.pass_time(MOVE_LIMIT_S + 0.1)
+    assert not scene.session.is_over
+    scene.audio(2).answer("error", code="unknown-session", text="x")
+    scene.pass_time(MOVE_LIMIT_S + 0.1)
+    assert scene.session.is_over
+    assert "unknown-session" in str(scene.session.failure)
+
+
+def test_a_session_that_control_closes_ends_after_its_last_results() -> None:
+    scene = Scene()
+    inbox, _ = scene.subscribe(FapFrame)
+    (events,) = scene.sockets.at("events")
+    events.answer("event", name="session-closed", detail="no audio")
+    scene.pass_time(LAST_S / 2)
+    assert not inbox.is_over
+    scene.pass_time(LAST_S)
+    assert "control has closed the session: no audio" in str(inbox.failure)
+    assert [one for one in scene.sockets.connections if one.is_open] == [scene.commands, events]
+    assert events.topics == set()
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_asks_where_a_silent_session_of_another_program_is(is_there: bool) -> None:
+    scene = Scene()
+    following = scene.core.follow("other")
+    endpoints = {"audio": "a", "phones": "phones 1", "faps": "faps 1"}
+    state = {**STATE, "session": "other", "endpoints": endpoints}
+    scene.answer("status-report", services=[CONTROL_STATE], sessions=[state])
+    scene.session = following.result()
+    inbox, _ = scene.subscribe(FapFrame)
+    scene.confirm()
+    scene.pass_time(SILENT_S + 0.1)
+    assert scene.commands.sent[-1][0] == "status-request"
+    if is_there:
+        state["endpoints"] = {**endpoints, "faps": "faps 2"}
+        scene.answer("status-report", services=[], sessions=[state])
+        assert scene.sockets.at("faps 2")
+        assert not inbox.is_over
+    else:
+        scene.answer("error", code="unknown-session", text="x")
+        assert inbox.is_over
+        assert inbox.failure is None
+
+
+def test_closing_the_client_fails_what_waits() -> None:
+    scene = Scene()
+    inbox, joined = scene.subscribe(FapFrame)
+    answer = scene.core.request("flush-session", "s")
+    scene.core.close(KouxingError("the client is closed"))
+    assert "closed" in str(failure_of(answer))
+    assert "closed" in str(inbox.failure)
+    assert "closed" in str(joined[0])
