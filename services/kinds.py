@@ -1,4 +1,4 @@
-"""The kinds of service: one entry here makes a service known to every command and test."""
+"""The kinds of service, and the addresses that they bind."""
 
 from __future__ import annotations
 
@@ -7,67 +7,20 @@ import errno
 import pkgutil
 import socket
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-from kouxing.shared.config import COMMON, Bound, ServiceConfig, Settings, bound_keys, variable
+from kouxing.shared.config import COMMON, Bound, Settings, bound_keys, variable
 from kouxing.shared.endpoints import WILDCARDS
 from kouxing.shared.errors import UserError
+from kouxing.shared.service_kind import ServiceKind
 
+_PACKAGES = ("control", "recognizer", "synthesizer", "driver", "gateway")  # in order of start
 
-@dataclass(frozen=True, slots=True)
-class ServiceKind:
-    """A service by name; its classes are imported when they are needed."""
-
-    name: str
-    config: str  # its keys, as module:class
-    service: str  # its process, as module:class
-    summary: str
-
-    @property
-    def config_type(self) -> type[ServiceConfig]:
-        """The class of its configuration."""
-        found: type[ServiceConfig] = pkgutil.resolve_name(self.config)
-        return found
-
-
-KINDS = {
-    kind.name: kind
-    for kind in (  # in the order in which they start
-        ServiceKind(
-            "control",
-            "kouxing.services.control.config:ControlConfig",
-            "kouxing.services.control.service:ControlService",
-            "Run control: it opens sessions and places them on the other services.",
-        ),
-        ServiceKind(
-            "recognizer",
-            "kouxing.services.recognizer.config:RecognizerConfig",
-            "kouxing.services.recognizer.service:RecognizerService",
-            "Run a recognizer: audio in, phones with times out.",
-        ),
-        ServiceKind(
-            "synthesizer",
-            "kouxing.services.synthesizer.config:SynthesizerConfig",
-            "kouxing.services.synthesizer.service:SynthesizerService",
-            "Run a synthesizer: phones in, FAP frames out.",
-        ),
-        ServiceKind(
-            "driver",
-            "kouxing.services.driver.config:DriverConfig",
-            "kouxing.services.driver.service:DriverService",
-            "Run a driver: FAP frames in, a window and videos out.",
-        ),
-        ServiceKind(
-            "gateway",
-            "kouxing.services.gateway.config:GatewayConfig",
-            "kouxing.services.gateway.service:GatewayService",
-            "Run the gateway: the face and a microphone in a browser.",
-        ),
-    )
+KINDS: dict[str, ServiceKind] = {
+    package: pkgutil.resolve_name(f"kouxing.services.{package}.kind:KIND") for package in _PACKAGES
 }
-
-WORKERS = ("recognizer", "synthesizer")  # of which there may be several
+WORKERS = tuple(kind.name for kind in KINDS.values() if kind.role == "worker")
+PROVIDERS = {endpoint: kind.name for kind in KINDS.values() for endpoint in kind.provides}
 
 
 def read_settings(

@@ -1,15 +1,14 @@
-"""A service as a process: read the configuration, run, and say how it ended.
+"""Runs a service as a process.
 
-What takes long to import is imported once Ctrl-C gives no traceback any more.
+Slow imports are inside functions: they run after Ctrl-C is set up to exit without a traceback.
 """
 
 from __future__ import annotations
 
 import argparse
-import pkgutil
 import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,36 +17,57 @@ if TYPE_CHECKING:
 
 
 def serve(name: str, file: Path | None, assignments: Iterable[str]) -> int:
-    """Run a service to its end; return the exit status.
+    """Run a service; return the exit status.
 
     Parameters
     ----------
     name
         One of ``kouxing.services.kinds.KINDS``.
     file
-        A TOML file, if there is one.
+        TOML file; None: no file.
     assignments
-        Values from the command line, ``KEY=VALUE`` each.
+        Values from the command line, as ``KEY=VALUE``.
 
     Raises
     ------
     UserError
-        If the configuration is wrong.
+        If the configuration is invalid.
     """
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while it starts is no error
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during startup prints no traceback
     from kouxing.services.kinds import KINDS, read_settings
     from kouxing.shared.config import parse_assignments
-    from kouxing.shared.service import run_service
 
     kind = KINDS[name]
     config = read_settings(file).load(kind.config_type, parse_assignments(assignments))
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # peers come and go
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # a closed connection is not fatal
+    return run_service(lambda: kind.service_type(config), name, config.log_level)
 
-    def make() -> Service:
-        service: Service = pkgutil.resolve_name(kind.service)(config)
-        return service
 
-    return run_service(make, name, config.log_level)
+def run_service(make_service: Callable[[], Service], name: str, log_level: str) -> int:
+    """Run a service; return the exit status.
+
+    An invalid setting prints one line and returns 2. An internal error logs a traceback and
+    returns 1.
+    """
+    from kouxing.shared.connections import raise_file_limit
+    from kouxing.shared.errors import UserError
+    from kouxing.shared.logs import LOG, configure
+    from kouxing.shared.metrics import keep_one_arena
+
+    configure(name, log_level)
+    keep_one_arena()
+    raise_file_limit()
+    try:
+        service = make_service()
+    except UserError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 2
+    try:
+        service.run()
+    except Exception:  # also a UserError, which is not the user's mistake any more
+        LOG.critical("internal error", exc_info=True, extra={"session": service.current_session})
+        return 1
+    return 0
 
 
 def run_module(name: str) -> None:

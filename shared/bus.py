@@ -364,8 +364,15 @@ class Bus:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def bind_router(self, endpoint: str, key: str, limits: Limits = AUDIO) -> Socket:
-        """Bind a socket that many peers send commands or data to."""
+    def bind_router(
+        self, endpoint: str, key: str, limits: Limits = AUDIO, *, role: str = ""
+    ) -> Socket:
+        """Bind a socket that many peers send commands or data to.
+
+        If a role is given, only keys with such a role (``service``: any service) may connect.
+        """
+        if role and self.zap is not None:
+            self.zap.required_roles[key] = role
         return self._bind(zmq.ROUTER, endpoint, key, limits)
 
     def bind_publisher(

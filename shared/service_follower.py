@@ -54,7 +54,7 @@ class ServiceFollower(Follower):
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
         """Subscribe, as ``Follower.start``."""
         super().start(epoch, endpoints)
-        self._service.at_each_step.add(self.tick)
+        self._service.tick_callbacks.add(self.tick)
 
     def tick(self) -> None:
         """Do what is due, and count."""
@@ -68,7 +68,7 @@ class ServiceFollower(Follower):
     def close(self) -> None:
         """Unsubscribe, as ``Follower.close``."""
         super().close()
-        self._service.at_each_step.discard(self.tick)
+        self._service.tick_callbacks.discard(self.tick)
 
 
 class _ServiceTransport:

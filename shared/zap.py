@@ -13,13 +13,6 @@ from kouxing.shared.kernel_sockets import network_of
 from kouxing.shared.keys import Guests, guests_file, read_guests
 from kouxing.shared.logs import LOG
 
-# Who may connect to a socket, by its setting; to the others every key that is allowed at all.
-ROLES_AT = {
-    "recognizer.audio": "client",
-    "recognizer.unpaced_audio": "client",
-    "synthesizer.phone_input": "service",
-}
-
 
 class Zap:
     """The keys that may connect.
@@ -35,6 +28,8 @@ class Zap:
         Who may connect, by public key; read again whenever the list has changed.
     version
         Of the list.
+    required_roles
+        Role that a key needs, by setting of the socket; any allowed key may connect to the others.
 
     Raises
     ------
@@ -46,6 +41,7 @@ class Zap:
         self._file = guests_file()
         self.version = self._newest_version()
         self.guests: Guests = read_guests()
+        self.required_roles: dict[str, str] = {}
         self._cut = cut
         self._lock = threading.Lock()
 
@@ -85,7 +81,7 @@ class Zap:
         guest = self.guests.get(public)
         if guest is None:
             return False
-        wanted = ROLES_AT.get(domain)
+        wanted = self.required_roles.get(domain)
         return wanted is None or any(role.partition(":")[0] == wanted for role in guest.roles)
 
 

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
+from kouxing.services.kinds import KINDS
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import variable
 from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
 from kouxing.shared.keys import Peer
-from kouxing.shared.service import Handler, Service
+from kouxing.shared.message_loop import Handler
+from kouxing.shared.service import Service
 from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import StartSession
 from kouxing.shared.wire.face import FaceSettings, FapFrame, SetFace
@@ -36,9 +38,7 @@ LOOK_AHEAD_MS = 60
 class ScriptedRecognizer(Service):
     """Publishes what the test says, and keeps the audio that it gets."""
 
-    name = "recognizer"
-    role = "worker"
-    needs = ("phone_input",)
+    kind = KINDS["recognizer"]
 
     def __init__(self, control: str) -> None:
         local = "tcp://127.0.0.1:*"
@@ -72,8 +72,7 @@ class ScriptedRecognizer(Service):
 class ScriptedSynthesizer(Service):
     """Publishes the FAP frames that the test says."""
 
-    name = "synthesizer"
-    role = "worker"
+    kind = KINDS["synthesizer"]
 
     def __init__(self, control: str) -> None:
         local = "tcp://127.0.0.1:*"
@@ -137,14 +136,14 @@ class System:
             for service in self.services():
                 service.step(0.001)
             if self._ask_recognizer_to_leave and self.recognizer is not None:
-                self.recognizer.drain()
+                self.recognizer.shutdown()
                 self.recognizer = None
             now_s = time.monotonic()
             if now_s >= due_s:
                 due_s = max(due_s + FRAME / 16000, now_s - 0.1)
                 self._publish()
         for service in reversed(self.services()):
-            service.drain()
+            service.shutdown()
 
     def _publish(self) -> None:
         shown = self.shown

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pkgutil
 from pathlib import Path
 from typing import Annotated
 
@@ -31,8 +30,7 @@ app = typer.Typer(no_args_is_help=True, help="Who may connect to the services.")
 def init() -> None:
     """Make all keys of a system on this machine: of its services and of your commands."""
     for kind in KINDS.values():
-        service = pkgutil.resolve_name(kind.service)
-        own_key(kind.name, (f"service:{kind.name}", *service.client_roles))
+        own_key(kind.name, kind.key_roles)
     user_key()
     print_message(f"the keys are in {key_folder()}")
 

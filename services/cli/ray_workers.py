@@ -21,11 +21,12 @@ import ray
 
 from kouxing.services.cli.service_process import POLL_S, ServiceProcess
 from kouxing.services.cli.supervisor import ONE_THREAD
-from kouxing.services.kinds import KINDS, ServiceKind
+from kouxing.services.kinds import KINDS
 from kouxing.shared.config import Bound, Settings, bound_keys, variable
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import key_text, own_key
-from kouxing.shared.service import DRAIN_LIMIT_S
+from kouxing.shared.service import DRAIN_TIMEOUT_S
+from kouxing.shared.service_kind import ServiceKind
 
 NAMESPACE = "kouxing"  # of the actors' names
 PLACEMENT_LIMIT_S = 5.0  # an actor that is not placed by then has no free core
@@ -133,7 +134,7 @@ class RayWorkers:
         surplus = [ray.get_actor(name) for name in running - wanted]
         drained = [actor.drain.remote() for actor in surplus]
         if drained:
-            ray.wait(drained, num_returns=len(drained), timeout=DRAIN_LIMIT_S + 1.0)
+            ray.wait(drained, num_returns=len(drained), timeout=DRAIN_TIMEOUT_S + 1.0)
         for actor in surplus:
             ray.kill(actor)  # if it has no host yet, or did not finish
 

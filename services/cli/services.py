@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 
 from kouxing.services.cli.options import Assignments, ConfigFile
-from kouxing.services.kinds import ServiceKind
+from kouxing.shared.service_kind import ServiceKind
 
 
 def service_command(kind: ServiceKind) -> Callable[..., None]:

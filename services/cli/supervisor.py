@@ -21,7 +21,7 @@ from kouxing.services.cli.service_process import POLL_S, ServiceProcess
 from kouxing.services.kinds import KINDS, kind_of
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
-from kouxing.shared.service import DRAIN_LIMIT_S
+from kouxing.shared.service import DRAIN_TIMEOUT_S
 
 MIN_BACKOFF_S, MAX_BACKOFF_S = 0.2, 5.0  # before a service that crashed twice is restarted
 STEADY_S = 30.0  # a service that has run for longer restarts without delay
@@ -157,7 +157,7 @@ class Supervisor:
             self._watcher.join()
         for process in self._processes.values():
             process.send_signal(signal.SIGTERM)
-        end_s = time.monotonic() + DRAIN_LIMIT_S + 1.0
+        end_s = time.monotonic() + DRAIN_TIMEOUT_S + 1.0
         for process in self._processes.values():
             try:
                 process.wait(max(0.1, end_s - time.monotonic()))

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from operator import itemgetter
 
 from kouxing.services.control.load import RETRY_AFTER_S, SAME_LOAD, WorkerLoad
+from kouxing.services.kinds import PROVIDERS
 from kouxing.shared.endpoints import with_key
 from kouxing.shared.keys import NOBODY, Peer
 from kouxing.shared.wire.control import Heartbeat
@@ -19,14 +20,6 @@ from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
 CLIENT_NEEDS = ("audio", "phones", "faps")  # the endpoints that a client is told
 UNPACED_AUDIO = "unpaced_audio"  # instead of "audio", where a recognizer has it
-# Who alone may provide an endpoint, as another one's key is for another kind of service.
-PROVIDERS = {
-    "audio": "recognizer",
-    UNPACED_AUDIO: "recognizer",
-    "phones": "recognizer",
-    "phone_input": "synthesizer",
-    "faps": "synthesizer",
-}
 MAX_SERVICES = 2000
 MAX_SERVICES_OF_KEY = 1500
 MAX_CANDIDATES = 32  # workers of which the least loaded gets a session

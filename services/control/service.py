@@ -22,15 +22,18 @@ from dataclasses import replace
 from typing import Any
 
 from kouxing.services.control.config import ControlConfig
-from kouxing.services.control.registry import PROVIDERS, Refusal, Registry, ServiceRecord
+from kouxing.services.control.kind import KIND
+from kouxing.services.control.registry import Refusal, Registry, ServiceRecord
 from kouxing.services.control.sessions import SessionRecord, Sessions
+from kouxing.services.kinds import PROVIDERS
 from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import now_ns
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NOBODY, Peer
 from kouxing.shared.logs import LOG
-from kouxing.shared.service import Handler, Service
+from kouxing.shared.message_loop import Handler
+from kouxing.shared.service import Service
 from kouxing.shared.wire.codec import encoded_size
 from kouxing.shared.wire.control import (
     AllowedKey,
@@ -77,11 +80,10 @@ Request = OpenSession | CloseSession | FlushSession | SetFace | StatusRequest
 class ControlService(Service):
     """The control process."""
 
-    name = "control"
-    role = "control"
+    kind = KIND
 
     def __init__(self, config: ControlConfig) -> None:
-        super().__init__(config, control=False, extra_connections=config.max_sessions)
+        super().__init__(config, has_control=False, extra_connections=config.max_sessions)
         self._registry = Registry(config.lost_after_s, config.max_load)
         self._sessions = Sessions(self._registry, config.max_sessions)
         self._idle_limit_s = config.idle_limit_s
@@ -118,7 +120,7 @@ class ControlService(Service):
         )
         self.register(self._events, {})
 
-    def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
+    def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Register control itself like any other service."""
         self._registry.add(heartbeat, NOBODY, time.monotonic())
 

@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 
 from kouxing.services.driver.config import DriverConfig
+from kouxing.services.driver.kind import KIND
 from kouxing.services.driver.poses import STALL_S, Poses
 from kouxing.services.driver.recordings import Recordings
 from kouxing.services.driver.video.recording import Recording
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.logs import LOG
-from kouxing.shared.service import Handler, Service
+from kouxing.shared.message_loop import Handler
+from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
@@ -46,9 +48,7 @@ class _Session:
 class DriverService(Service):
     """The driver process."""
 
-    name = "driver"
-    role = "observer"
-    needs = ("phones", "faps")
+    kind = KIND
 
     def __init__(self, config: DriverConfig) -> None:
         super().__init__(config)
@@ -110,7 +110,7 @@ class DriverService(Service):
         self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
         return self._recordings.is_done
 
-    def on_stopped(self) -> None:
+    def on_shutdown(self) -> None:
         """Keep what was drawn of the videos that could not be finished in time."""
         for session in self._recordings.close_early():
             LOG.warning("the video ends early", extra={"session": session})

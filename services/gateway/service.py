@@ -21,6 +21,7 @@ from aiohttp import web
 from kouxing.services.gateway import http, wire
 from kouxing.services.gateway.audio_sessions import AudioSessions, error_text
 from kouxing.services.gateway.config import GatewayConfig
+from kouxing.services.gateway.kind import KIND
 from kouxing.services.gateway.learn_mouth import MouthLearner
 from kouxing.services.gateway.microphone import Microphones
 from kouxing.services.gateway.page_endpoint import make_page_endpoint
@@ -35,10 +36,11 @@ from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.idle_motion import REST_RATE_HZ, RestingFace
 from kouxing.shared.keys import Peer
+from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
 from kouxing.shared.phones.known_text import Characters, characters_of
 from kouxing.shared.phones.syllables import SyllableTrack
-from kouxing.shared.service import Handler, Service
+from kouxing.shared.service import Service
 from kouxing.shared.service_follower import ServiceFollower
 from kouxing.shared.wire.audio import Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
@@ -69,10 +71,7 @@ class GatewayService(Service):
     HTTP runs in an asyncio loop. The loop runs while the service waits for messages.
     """
 
-    name = "gateway"
-    role = "observer"
-    needs = ("phones", "faps")
-    client_roles = ("client",)
+    kind = KIND
 
     def __init__(self, config: GatewayConfig) -> None:
         listening = bind_port(config.host, config.port)
@@ -140,7 +139,7 @@ class GatewayService(Service):
 
     # --- the loop --------------------------------------------------------------------------------
 
-    def on_start(self) -> None:
+    def on_startup(self) -> None:
         """Start serving HTTP."""
         unlimited = {route.path for route in self._routes}
         self._loop.run_until_complete(self._server.start(self._application, unlimited))
@@ -177,7 +176,7 @@ class GatewayService(Service):
         is_connected = self._web_sockets or self._whip_clients
         return self._closing.done() and not is_busy and not is_connected
 
-    def on_stopped(self) -> None:
+    def on_shutdown(self) -> None:
         """Stop HTTP and the senders."""
         self._senders.close()
         self._loop.run_until_complete(self._server.stop())
@@ -242,7 +241,7 @@ class GatewayService(Service):
         is_answered = self._report_s >= self._request_s
         if now_s - self._request_s > (STATUS_INTERVAL_S if is_answered else STATUS_TIMEOUT_S):
             self._request_s = now_s
-            self.tell_control(StatusRequest(request=secrets.token_hex(8)))
+            self.send_to_control(StatusRequest(request=secrets.token_hex(8)))
         if now_s - self._report_s > CONTROL_MISSING_S:
             self._viewers.set_missing(("control",))
 
@@ -264,7 +263,7 @@ class GatewayService(Service):
             hold_s=settings.hold_s,
             expressiveness=settings.expressiveness,
         )
-        self.tell_control(SetFace(session=session, face=face))
+        self.send_to_control(SetFace(session=session, face=face))
 
     # --- from the publishers ---------------------------------------------------------------------
 

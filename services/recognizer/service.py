@@ -20,6 +20,7 @@ from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.audio_order import AudioOrder
 from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
+from kouxing.services.recognizer.kind import KIND
 from kouxing.services.recognizer.link import SynthesizerLink
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
@@ -32,10 +33,11 @@ from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_second
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NOBODY, Peer
 from kouxing.shared.logs import LOG
+from kouxing.shared.message_loop import Handler
 from kouxing.shared.metrics import give_back_memory
 from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange, Waveform
 from kouxing.shared.phones.final_time import FinalTime
-from kouxing.shared.service import Handler, Service
+from kouxing.shared.service import Service
 from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk, Sound
 from kouxing.shared.wire.control import SessionInput, StartSession
 from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
@@ -117,9 +119,7 @@ class _Session:
 class RecognizerService(Service):
     """The recognizer process."""
 
-    name = "recognizer"
-    role = "worker"
-    needs = ("phone_input",)
+    kind = KIND
 
     def __init__(self, config: RecognizerConfig, lips: LipFrameModel | None = None) -> None:
         super().__init__(config)
@@ -135,9 +135,11 @@ class RecognizerService(Service):
         self._late = {True: False, False: False}  # by paced: a synthesizer owes too much
         self._ticked_s = time.monotonic()
         self._synthesizers: dict[str, Socket] = {}  # by endpoint
-        self._audio = self.bus.bind_router(config.audio, "recognizer.audio")
+        self._audio = self.bus.bind_router(config.audio, "recognizer.audio", role="client")
         self._phones = self.bus.bind_publisher(config.phones, "recognizer.phones")
-        self._unpaced_audio = self.bus.bind_router(config.unpaced_audio, "recognizer.unpaced_audio")
+        self._unpaced_audio = self.bus.bind_router(
+            config.unpaced_audio, "recognizer.unpaced_audio", role="client"
+        )
         self.endpoints = {
             "audio": config.reachable(self._audio.endpoint),
             "phones": config.reachable(self._phones.endpoint),
@@ -295,7 +297,7 @@ class RecognizerService(Service):
         """Let others take the sessions; finish those that nobody takes, to the last message."""
         self._process_queued()
         sessions = self._sessions.values()
-        if self.hands_over and not all(session.finished for session in sessions):
+        if self.is_handing_over and not all(session.finished for session in sessions):
             return False
         while self._unpaced:
             self._process_unpaced()
@@ -419,7 +421,7 @@ class RecognizerService(Service):
             self._queued_share += len(part) / piece
             if self._queued_share >= 1.0:
                 self._process_queued()
-                self.beat_if_due()
+                self.send_heartbeat_if_due()
 
     @property
     def _max_unpaced_s(self) -> float:
@@ -475,7 +477,7 @@ class RecognizerService(Service):
                 session.stream.accept_waveform(samples, media_time)
         self._queued, self._queued_share = {}, 0.0
         self._recognizer.decode_streams([session.stream for session in sessions])
-        self._ask_what_changed()  # if this stood still meanwhile, others may serve the sessions
+        self.resync_with_control()  # after a stall, other workers may serve the sessions
         for session in sessions:
             if self._sessions.get(session.start.session) is not session:
                 continue
@@ -537,13 +539,13 @@ class RecognizerService(Service):
                 session.sequence_out += 1
                 self._phones.send(_addressed(message, session))
             if isinstance(output, SpeechChange):
-                self.tell_control(_addressed(message, session))
+                self.send_to_control(_addressed(message, session))
 
     def _connect(self, endpoint: str) -> Socket:
         if endpoint not in self._synthesizers:
             socket = self.bus.connect_dealer(endpoint)
             self._synthesizers[endpoint] = socket
-            self.register(socket, {AcknowledgePhones: self._on_acknowledge, Error: self._on_error})
+            self.register(socket, {AcknowledgePhones: self._on_acknowledge, Error: self.on_error})
         return self._synthesizers[endpoint]
 
     def _leave_synthesizers(self) -> None:

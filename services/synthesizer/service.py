@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face import REST_S, Face, Frame
+from kouxing.services.synthesizer.kind import KIND
 from kouxing.services.synthesizer.lips.load import LIP_MODELS, load_lip_model
 from kouxing.shared.bus import PHONES, Socket
 from kouxing.shared.clock import to_samples, to_seconds
@@ -32,12 +33,13 @@ from kouxing.shared.face.faps import MASK_BYTES, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.keys import Peer
 from kouxing.shared.logs import LOG
+from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones import events
 from kouxing.shared.phones.events import EndOfSound, LipFrame, Phone, SoundEvent
 from kouxing.shared.phones.final_time import FinalTime
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 from kouxing.shared.reliable import ReliableReceiver
-from kouxing.shared.service import Handler, Service
+from kouxing.shared.service import Service
 from kouxing.shared.wire.control import EventName, SessionInput, StartSession
 from kouxing.shared.wire.events import LINK_MESSAGES, LinkMessage, SpeechMessage, event_of
 from kouxing.shared.wire.face import EndOfFaps, FaceSettings, FapFrame, SetFace
@@ -110,8 +112,7 @@ class _Session:
 class SynthesizerService(Service):
     """The synthesizer process."""
 
-    name = "synthesizer"
-    role = "worker"
+    kind = KIND
 
     def __init__(self, config: SynthesizerConfig) -> None:
         super().__init__(config)
@@ -123,7 +124,9 @@ class SynthesizerService(Service):
         self._sessions: dict[str, _Session] = {}
         self._turn = 0  # of sessions with many frames to make
         self._dropped_s = 0.0  # when frames were dropped that nobody takes
-        self._input = self.bus.bind_router(config.phone_input, "synthesizer.phone_input", PHONES)
+        self._input = self.bus.bind_router(
+            config.phone_input, "synthesizer.phone_input", PHONES, role="service"
+        )
         self._faps = self.bus.bind_publisher(config.faps, "synthesizer.faps", self._on_joined)
         self.endpoints = {
             "phone_input": config.reachable(self._input.endpoint),
@@ -166,7 +169,7 @@ class SynthesizerService(Service):
     def stop_session(self, session: str) -> None:
         """Forget a session."""
         found = self._sessions.pop(session, None)
-        if found is not None and not found.finished and not self.stopping:  # then another goes on
+        if found is not None and not found.finished and not self.should_exit:
             self._end(found)
 
     def flush_session(self, session: str) -> None:
@@ -234,7 +237,7 @@ class SynthesizerService(Service):
     def on_drain(self) -> bool:
         """Let others take the sessions; lead the faces that nobody takes to rest, and end them."""
         unfinished = [session for session in self._sessions.values() if not session.finished]
-        if unfinished and self.hands_over:
+        if unfinished and self.is_handing_over:
             return False
         for session in unfinished:
             self._publish(session, session.face.relax(round(REST_S * self.frame_rate_hz)))

@@ -131,10 +131,10 @@ def recognizer_with_lips(control: str) -> Iterator[None]:
     stop = threading.Event()
 
     def serve() -> None:
-        service.announce_ready()
+        service.startup()
         while not stop.is_set():
             service.step(0.01)
-        service.drain()
+        service.shutdown()
 
     thread = threading.Thread(target=serve)
     thread.start()

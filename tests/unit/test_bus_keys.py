@@ -15,6 +15,7 @@ import zmq
 from kouxing_client import Client, KouxingError
 
 from kouxing.evaluation.system.attackers import connect
+from kouxing.services.kinds import KINDS
 from kouxing.shared import connections, kernel_sockets
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.config import ServiceConfig
@@ -45,8 +46,8 @@ class Server:
         self.key = own_key("control", ())
         self.bus = Bus(self.key)
 
-    def router(self, name: str) -> tuple[Socket, str]:
-        router = self.bus.bind_router(LOCAL, name)
+    def router(self, name: str, role: str = "") -> tuple[Socket, str]:
+        router = self.bus.bind_router(LOCAL, name, role=role)
         return router, with_key(router.endpoint, self.key.public)
 
     def publisher(self) -> tuple[Socket, str]:
@@ -86,19 +87,19 @@ def test_a_message_comes_with_the_key_of_its_sender(server: Server) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "roles", "gets_in"),
+    ("required", "roles", "gets_in"),
     [
-        ("control.commands", ("subscriber:*",), True),
-        ("recognizer.audio", ("client",), True),
-        ("recognizer.audio", ("subscriber:*", "service:driver"), False),
-        ("synthesizer.phone_input", ("service:recognizer",), True),
-        ("synthesizer.phone_input", ("client", "operator"), False),
+        ("", ("subscriber:*",), True),
+        ("client", ("client",), True),
+        ("client", ("subscriber:*", "service:driver"), False),
+        ("service", ("service:recognizer",), True),
+        ("service", ("client", "operator"), False),
     ],
 )
 def test_a_socket_takes_keys_of_its_roles_only(
-    server: Server, name: str, roles: tuple[str, ...], gets_in: bool
+    server: Server, required: str, roles: tuple[str, ...], gets_in: bool
 ) -> None:
-    router, endpoint = server.router(name)
+    router, endpoint = server.router("some.setting", role=required)
     with Bus(key_of("guest", *roles)) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
@@ -255,8 +256,7 @@ def test_a_key_that_is_revoked_while_its_subscription_is_handled_harms_nobody(
 class Recognizer(Service):
     """A service of which nothing is wanted but who may connect."""
 
-    name = "recognizer"
-    role = "worker"
+    kind = KINDS["recognizer"]
 
 
 def test_a_list_that_cannot_be_written_counts_as_long_as_the_service_runs(
@@ -278,10 +278,10 @@ def test_a_list_that_cannot_be_written_counts_as_long_as_the_service_runs(
         assert bus.is_refused(endpoint)
         key_folder().chmod(0o755)  # nothing is written there
         allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
-        service._allow(allowed)
-        assert "are not kept: others can read" in caplog.text
+        service._allow_keys(allowed)
+        assert "until this process ends: others can read" in caplog.text
         assert not bus.is_refused(endpoint)
-        service._allow({})
+        service._allow_keys({})
         assert bus.is_refused(endpoint)
 
 

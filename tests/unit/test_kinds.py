@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import pkgutil
 import socket
 
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from kouxing.services.gateway.config import GatewayConfig
 from kouxing.services.kinds import (
     KINDS,
-    ServiceKind,
     available_addresses,
     kind_of,
     more_workers,
@@ -21,15 +19,15 @@ from kouxing.services.kinds import (
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.service import Service
+from kouxing.shared.service_kind import ServiceKind
 
 pytestmark = pytest.mark.unit
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
-def test_an_entry_leads_to_its_classes_and_its_module(kind: ServiceKind) -> None:
-    service = pkgutil.resolve_name(kind.service)
-    assert issubclass(service, Service)
-    assert service.name == kind.name
+def test_a_kind_has_classes_and_a_main_module(kind: ServiceKind) -> None:
+    assert issubclass(kind.service_type, Service)
+    assert kind.service_type.kind is kind
     assert issubclass(kind.config_type, ServiceConfig)
     assert importlib.util.find_spec(f"kouxing.services.{kind.name}.__main__")
 

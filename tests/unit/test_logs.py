@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
+from kouxing.services.process import run_service
 from kouxing.shared.logs import LOG, configure
-from kouxing.shared.service import run_service
 
 pytestmark = pytest.mark.unit
 
 
 class Crashing:
-    session_at_work = "second"
+    current_session = "second"
 
     def run(self) -> None:
         LOG.warning("dropped", extra={"session": "first"})

@@ -69,9 +69,9 @@ class Watched(RecognizerService):
         self._process_queued()
         while self._unpaced:
             self._process_unpaced()
-            self.beat_if_due()
+            self.send_heartbeat_if_due()
 
-    def beat_if_due(self) -> None:
+    def send_heartbeat_if_due(self) -> None:
         self.media_times += [session.stream.media_time for session in self._sessions.values()]
 
 

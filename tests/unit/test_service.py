@@ -15,7 +15,8 @@ from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.keys import NOBODY, Peer
-from kouxing.shared.service import SESSIONS_A_BEAT, STOOD_STILL_S, Service
+from kouxing.shared.service import RESYNC_AFTER_S, SESSIONS_PER_HEARTBEAT, Service
+from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.wire.control import (
     Heartbeat,
     HeartbeatReply,
@@ -34,11 +35,10 @@ pytestmark = pytest.mark.unit
 class Slow(Service):
     """Takes 5 ms for a message; counts what its loop does."""
 
-    name = "slow"
-    role = "worker"
+    kind = ServiceKind(name="slow", role="worker")
 
     def __init__(self) -> None:
-        super().__init__(ServiceConfig(insecure=True), control=False)
+        super().__init__(ServiceConfig(insecure=True), has_control=False)
         self.num_ticks = self.num_beats = self.num_handled = 0
         self.input = self.bus.bind_router("tcp://127.0.0.1:*", "slow.input")
         self.register(self.input, {Progress: self._on_progress})
@@ -46,7 +46,7 @@ class Slow(Service):
     def on_tick(self, now_s: float) -> None:
         self.num_ticks += 1
 
-    def on_heartbeat_due(self, heartbeat: Heartbeat) -> None:
+    def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:
         self.num_beats += 1
 
     def _on_progress(self, _progress: Progress, _sender: Peer) -> None:
@@ -126,15 +126,14 @@ def test_an_open_service_that_others_reach_says_so(
     slow: Slow, caplog: pytest.LogCaptureFixture, address: str, warns: bool
 ) -> None:
     slow.endpoints = {"input": f"tcp://{address}:5570"}
-    slow.announce_ready()
+    slow.startup()
     assert ("insecure = true" in caplog.text) == warns
 
 
 class Worker(Service):
     """Serves whatever it is told; notes what happens in which order."""
 
-    name = "worker"
-    role = "worker"
+    kind = ServiceKind(name="worker", role="worker")
 
     def __init__(self, control: str, num_sessions: int = 1) -> None:
         super().__init__(ServiceConfig(insecure=True, control=control))
@@ -217,7 +216,7 @@ def test_one_that_stood_still_asks_control_before_it_goes_on(
     with Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
         sender.send(Progress(level_db=0.0))
-        time.sleep(STOOD_STILL_S + 0.1)
+        time.sleep(RESYNC_AFTER_S + 0.1)
         control.stops = ["s0"]
         answering = threading.Thread(target=control.answer)
         answering.start()
@@ -236,7 +235,7 @@ def test_one_that_stood_still_in_the_midst_of_its_work_asks_before_it_ticks(
     answering = threading.Thread(target=control.answer)
 
     def stand_still(*_: object) -> None:
-        time.sleep(STOOD_STILL_S + 0.1)
+        time.sleep(RESYNC_AFTER_S + 0.1)
         worker.happened.append("input")
         answering.start()
 
@@ -254,7 +253,7 @@ def test_one_that_stood_still_goes_on_though_control_is_away(worker: Worker) -> 
     with Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
         sender.send(Progress(level_db=0.0))
-        time.sleep(STOOD_STILL_S + 0.1)
+        time.sleep(RESYNC_AFTER_S + 0.1)
         for _ in range(100):
             worker.step(0.01)
     assert worker.happened == ["input"]
@@ -281,7 +280,7 @@ def test_a_restarted_control_learns_the_sessions(
 def test_it_registers_where_something_else_answered_before(
     monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
 ) -> None:
-    monkeypatch.setattr("kouxing.shared.service.UNANSWERED_S", 0.3)
+    monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.3)
     monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
     listener = socket.create_server(("127.0.0.1", 0))
     commands = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
@@ -302,18 +301,18 @@ def test_it_registers_where_something_else_answered_before(
 def test_where_control_hangs_what_is_meant_for_it_waits(
     monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
 ) -> None:
-    monkeypatch.setattr("kouxing.shared.service.UNANSWERED_S", 0.0)
+    monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.0)
     monkeypatch.setattr(Service, "_warn_if_refused", lambda self: None)
     connected = worker.control
     for _ in range(3):
-        worker._beat_due_s = 0.0
-        worker.beat_if_due()
+        worker._heartbeat_due_s = 0.0
+        worker.send_heartbeat_if_due()
     assert worker.control is connected
     run_until(control, worker, lambda: len(control.beats) >= 3)
 
 
 def test_one_that_stops_says_so_before_it_finishes_its_sessions(control: Control) -> None:
-    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_A_BEAT)
+    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_PER_HEARTBEAT)
     run_until(control, worker, lambda: bool(control.beats))
     seen: list[Heartbeat] = []
 
@@ -323,19 +322,19 @@ def test_one_that_stops_says_so_before_it_finishes_its_sessions(control: Control
         return True
 
     worker.on_drain = finish  # type: ignore[method-assign]
-    worker.drain()
+    worker.shutdown()
     assert seen
     assert {*seen[0].sessions} == {*worker.names}
 
 
 def test_heartbeats_name_a_great_many_sessions_in_turn(control: Control) -> None:
-    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_A_BEAT + 10)
+    worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_PER_HEARTBEAT + 10)
     try:
         run_until(control, worker, lambda: len(control.beats) >= 3)
     finally:
         worker.bus.close()
     named = [name for beat in control.beats[:3] for name in beat.sessions]
-    assert len(named) == 3 * SESSIONS_A_BEAT
+    assert len(named) == 3 * SESSIONS_PER_HEARTBEAT
     assert {*named} == {*worker.names}
 
 
@@ -346,10 +345,10 @@ def test_a_process_ends_when_it_is_asked_for_its_health_and_its_loop_hangs(
     monkeypatch.setattr("kouxing.shared.service.os._exit", ends.append)
     slow.step(0.0)
     assert slow.check_health()
-    monkeypatch.setattr("kouxing.shared.service.ALIVE_S", 0.0)
+    monkeypatch.setattr("kouxing.shared.service.MAX_TICK_GAP_S", 0.0)
     time.sleep(0.02)
     assert not slow.check_health()
     assert ends == []
-    monkeypatch.setattr("kouxing.shared.service.ENDS_S", 0.0)
+    monkeypatch.setattr("kouxing.shared.service.EXIT_AFTER_S", 0.0)
     slow.check_health()
     assert ends == [1]

@@ -1,0 +1,119 @@
+"""Handles the messages that arrive on the sockets of a service."""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable
+from typing import Any
+
+from kouxing.shared.bus import Bus, Received, Socket
+from kouxing.shared.keys import Peer
+from kouxing.shared.logs import LOG, RateLimit
+from kouxing.shared.metrics import Metrics
+from kouxing.shared.wire.codec import BadMessage
+from kouxing.shared.wire.message import VERSION, Message
+from kouxing.shared.wire.session import Error, ErrorCode
+
+MAX_TURN_S = 0.05  # for the messages of one socket, before the others get their turn
+
+Handler = Callable[[Any, Peer], None]
+
+
+class MessageLoop:
+    """Passes messages to handlers, by socket and type.
+
+    Parameters
+    ----------
+    bus
+        Opens the sockets.
+
+    Attributes
+    ----------
+    metrics
+        Counts messages and problems.
+    current_session
+        Session whose message is being handled.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self.bus = bus
+        self.metrics = Metrics()
+        self.current_session = ""
+        self._warning_limit = RateLimit()
+        self._poller = bus.poller()
+        self._handlers: dict[Socket, dict[type[Message], Handler]] = {}
+        self._paused: set[Socket] = set()
+
+    def register(self, socket: Socket, handlers: dict[type[Message], Handler]) -> None:
+        """Handle the messages of a socket, by type."""
+        self._handlers[socket] = handlers
+        self._poller.add(socket)
+
+    def unregister(self, socket: Socket) -> None:
+        """Close a socket, and handle its messages no longer."""
+        self._poller.remove(socket)
+        del self._handlers[socket]
+        self.bus.drop(socket)
+
+    def pause(self, socket: Socket, *, paused: bool) -> None:
+        """Leave a socket's messages in its queue for now, so that the senders wait."""
+        if paused and socket not in self._paused:
+            self._paused.add(socket)
+            self._poller.remove(socket)
+        elif not paused and socket in self._paused:
+            self._paused.remove(socket)
+            self._poller.add(socket)
+
+    def wait(self, timeout_s: float) -> list[Socket]:
+        """Wait up to the timeout for messages; return the sockets that have some."""
+        return self._poller.wait(timeout_s)
+
+    def warn(self, reason: str, text: str, session: str = "") -> None:
+        """Count a problem, and log it at a limited rate."""
+        self.metrics.count(f"dropped_{reason}")
+        if self._warning_limit.allows(reason):
+            LOG.warning(text, extra={"session": session})
+
+    def handle_messages(self, socket: Socket) -> None:
+        """Handle the messages that a socket has received, up to its fair share."""
+        handlers = self._handlers.get(socket)
+        if handlers is None:  # a handler has closed the socket in this step
+            return
+        end_s = time.monotonic() + MAX_TURN_S
+        for received in socket.receive():
+            self._dispatch(socket, handlers, received)
+            if socket in self._paused or time.monotonic() > end_s:
+                break
+
+    def _dispatch(
+        self, socket: Socket, handlers: dict[type[Message], Handler], received: Received
+    ) -> None:
+        message, sender = received.message, received.sender
+        if isinstance(message, BadMessage):
+            self.warn(message.reason, f"dropped a message: {message}")
+            # The answer has the sender's version, so that the sender can read it.
+            self._answer_bad_message(socket, sender, str(message), message.version)
+            return
+        handler = handlers.get(type(message))
+        if handler is None:
+            text = f"dropped a {message.kind} message: not expected here"
+            self.warn("unexpected", text, message.session)
+            self._answer_bad_message(socket, sender, f"this socket does not accept {message.kind}")
+            return
+        self.metrics.count(f"in_{message.kind.replace('-', '_')}")
+        self.current_session = message.session
+        try:
+            handler(message, sender)
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE):
+                raise
+            self.warn("files", f"{message.kind}: {error.strerror}", message.session)
+        self.current_session = ""
+
+    def _answer_bad_message(
+        self, socket: Socket, sender: Peer, text: str, version: int = VERSION
+    ) -> None:
+        if sender.address:
+            answer = Error(version=version, code=ErrorCode.BAD_MESSAGE, text=text[:2000])
+            socket.send(answer, to=sender)
