@@ -1,7 +1,7 @@
-"""A stream of messages that survives a reconnect.
+"""A stream of messages that survives a reconnection: from the recognizer to the synthesizer.
 
-Sequence numbers, cumulative acknowledgement, and a queue of messages not acknowledged yet: ZeroMQ
-drops messages in flight when a peer goes away, and a high-water mark does not prevent it.
+Messages have sequence numbers, and the receiver acknowledges them cumulatively. The sender keeps
+unacknowledged messages, because ZeroMQ drops messages in flight when a peer disconnects.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AcknowledgePhones
 
 RESEND_AFTER_S = 0.5
-ACKNOWLEDGE_EVERY = 32  # messages; each tick acknowledges the rest
+ACKNOWLEDGE_EVERY = 32  # messages; a tick acknowledges the rest
 
 
 class ReliableSender:
@@ -27,47 +27,47 @@ class ReliableSender:
         self._session = session
         self.epoch = epoch
         self._next = 1
-        self._waiting: deque[Message] = deque()  # the owner watches its length, the backlog
+        self._unacknowledged: deque[Message] = deque()
         self._progress_s = 0.0
 
     @property
-    def waiting(self) -> tuple[Message, ...]:
-        """The messages that are not acknowledged yet, oldest first."""
-        return tuple(self._waiting)
+    def unacknowledged(self) -> tuple[Message, ...]:
+        """The unacknowledged messages, oldest first."""
+        return tuple(self._unacknowledged)
 
     @property
     def backlog(self) -> int:
-        """Number of messages not acknowledged yet."""
-        return len(self._waiting)
+        """Number of unacknowledged messages; their owner limits it."""
+        return len(self._unacknowledged)
 
     def send(self, message: Message, now_s: float) -> Message:
-        """Send a message with the next number; return it as it was sent."""
+        """Send a message with the next number; return the numbered message."""
         numbered = dataclasses.replace(
             message, session=self._session, epoch=self.epoch, sequence=self._next
         )
         self._next += 1
-        if not self._waiting:
+        if not self._unacknowledged:
             self._progress_s = now_s
-        self._waiting.append(numbered)
+        self._unacknowledged.append(numbered)
         self._socket.send(numbered)
         return numbered
 
     def acknowledge(self, up_to: int, now_s: float) -> list[Message]:
-        """Forget the messages that the receiver has; return them."""
-        known = []
-        while self._waiting and self._waiting[0].sequence <= up_to:
-            known.append(self._waiting.popleft())
+        """Drop the messages up to a number, which the receiver has; return them."""
+        acknowledged = []
+        while self._unacknowledged and self._unacknowledged[0].sequence <= up_to:
+            acknowledged.append(self._unacknowledged.popleft())
             self._progress_s = now_s
-        return known
+        return acknowledged
 
     def tick(self, now_s: float) -> int:
-        """Send the waiting messages again after too long without progress; return their number."""
-        if not self._waiting or now_s - self._progress_s < RESEND_AFTER_S:
+        """Resend all messages if acknowledgements have stopped; return how many were resent."""
+        if not self._unacknowledged or now_s - self._progress_s < RESEND_AFTER_S:
             return 0
         self._progress_s = now_s
-        for message in self._waiting:
+        for message in self._unacknowledged:
             self._socket.send(message)
-        return len(self._waiting)
+        return len(self._unacknowledged)
 
 
 class ReliableReceiver:
@@ -76,31 +76,31 @@ class ReliableReceiver:
     Parameters
     ----------
     socket
-        ROUTER that the messages come through.
+        ROUTER socket at which the messages arrive.
     session
         Name of the session.
-    answer
-        Makes an acknowledgement with what it tells beside the sequence number.
+    make_acknowledgement
+        Returns an acknowledgement; the receiver sets its session, epoch and sequence number.
     """
 
     def __init__(
         self,
         socket: Socket,
         session: str,
-        answer: Callable[[], AcknowledgePhones] = AcknowledgePhones,
+        make_acknowledgement: Callable[[], AcknowledgePhones] = AcknowledgePhones,
     ) -> None:
         self._socket = socket
         self._session = session
-        self._answer = answer
+        self._make_acknowledgement = make_acknowledgement
         self._epoch = -1
         self._last = 0
         self._acknowledged = 0
         self._peer = NOBODY
 
-    def accept(self, message: Message, sender: Peer) -> bool:
-        """Return whether this message is the next one; ignore it if not.
+    def receive(self, message: Message, sender: Peer) -> bool:
+        """Return whether a message is the next one; all others must be ignored.
 
-        The first message of a greater epoch starts again at whatever number it carries.
+        The first message of a greater epoch sets the number from which the epoch is counted.
         """
         if message.epoch < self._epoch:
             return False
@@ -110,7 +110,7 @@ class ReliableReceiver:
             self._last = message.sequence - 1
             self._acknowledged = self._last
         if message.sequence != self._last + 1:
-            self.acknowledge()  # so that the sender knows which are missing
+            self.acknowledge()  # reports which messages are missing
             return False
         self._last = message.sequence
         if self._last - self._acknowledged >= ACKNOWLEDGE_EVERY:
@@ -118,16 +118,19 @@ class ReliableReceiver:
         return True
 
     def tick(self) -> None:
-        """Acknowledge messages that came since the last acknowledgement."""
+        """Acknowledge messages that have arrived since the last acknowledgement."""
         if self._last > self._acknowledged:
             self.acknowledge()
 
     def acknowledge(self) -> None:
-        """Tell the sender of the last message, if there is one, what has come."""
+        """Send an acknowledgement to the sender of the last message, if there was a message."""
         if self._peer is NOBODY:
             return
         self._acknowledged = self._last
         acknowledgement = dataclasses.replace(
-            self._answer(), session=self._session, epoch=self._epoch, sequence=self._last
+            self._make_acknowledgement(),
+            session=self._session,
+            epoch=self._epoch,
+            sequence=self._last,
         )
         self._socket.send(acknowledgement, to=self._peer)

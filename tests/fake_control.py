@@ -77,7 +77,7 @@ class FakeControl:
         self.bus.close()
 
     def do(self, job: Callable[[], object]) -> None:
-        """Run something on the thread that owns the sockets, and wait for it."""
+        """Run a job on the thread that owns the sockets, and wait until it is done."""
         done = threading.Event()
         self._jobs.put(job)
         self._jobs.put(done.set)

@@ -220,7 +220,7 @@ def silent_subscribers(control: str, source: str, seconds: float) -> None:
         for _ in range(NUM_SILENT_SUBSCRIBERS):
             raw = stack.enter_context(context.socket(zmq.SUB))
             raw.rcvhwm, raw.rcvbuf, raw.linger = 1, 4096, 0
-            connect(raw, session.endpoints["faps"], user_key(), source)
+            connect(raw, session.info["faps"], user_key(), source)
             raw.subscribe(f"fap-frame/{session.name}/")
         while time.monotonic() < end_s:
             if session.try_push(bytes(640)):

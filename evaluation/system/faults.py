@@ -41,7 +41,7 @@ from kouxing.shared.config import COMMON, variable
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import CLIENT
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
 NUM_SESSIONS = 16
 SPIN = """
@@ -343,7 +343,7 @@ def _outcome(
         if len(sound) not in undisturbed:
             undisturbed[len(sound)] = speak_undisturbed(client, sound)
         sessions, num_refused = _open_all(client, fault.num_sessions)
-        silence = load_inventory(sessions[0].endpoints["facts"]["language"]).silence
+        silence = load_inventory(sessions[0].info["facts"]["language"] or DEFAULT_LANGUAGE).silence
         publishers = [
             each.endpoints["faps"] for each in client.status().services if "faps" in each.endpoints
         ]

@@ -79,7 +79,7 @@ class Spoken:
         come count as if they had come at its end. A chunk counts as spoken when it is due, so a
         client or a service that is late is not excused.
         """
-        rate_hz = self.session.endpoints["facts"]["frame_rate_hz"]
+        rate_hz = self.session.info["facts"]["frame_rate_hz"]
         for number in range(int((until_s - self.begin_s) * rate_hz)):
             media_time = round(number / rate_hz * MEDIA_RATE_HZ)
             needed = -(-(media_time + round(delay_s * MEDIA_RATE_HZ)) // CHUNK)  # chunks

@@ -57,7 +57,7 @@ def follow(session: str, output: Path | None, shown: Shown, form: CurveForm, con
     with connect(control) as client:
         followed = _wait_for_session(session, client)
         if shown is not Shown.FAPS:
-            language = followed.endpoints["facts"]["language"] or DEFAULT_LANGUAGE
+            language = followed.info["facts"]["language"] or DEFAULT_LANGUAGE
             phones = _until_interrupted(followed.results(Phone, keep_all=True), followed.name)
             count = _print(_phone_lines(phones, shown, load_inventory(language)))
         else:
@@ -81,7 +81,7 @@ def _open_exporter(output: Path, form: CurveForm) -> CurveExporter:
 
 
 def _wait_for_session(name: str, client: Client) -> Session:
-    """Follow the open session of that name (if empty, the newest) once there is one."""
+    """Follow the open session of that name, or the newest; wait until one is open."""
     is_waiting = False
     while True:
         try:

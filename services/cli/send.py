@@ -59,7 +59,7 @@ class _Search:
     Attributes
     ----------
     newest
-        The session that control reported last; None if there was none.
+        The session that control reported last; None at first.
     """
 
     def __init__(self, session: str, client: Client) -> None:

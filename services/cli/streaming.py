@@ -22,7 +22,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from kouxing.shared.audio_file import AudioSource, clipping_remarks, num_clipped
 from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
-from kouxing.shared.phones.inventory import load_inventory
+from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
 
 PUSH_TIMEOUT_S = 30.0
 STATUS_S = 1.0  # between status requests
@@ -73,7 +73,7 @@ def stream(
             mouth_profile=mouth_profile or None,
         )
         events = opened.events()
-        silence = load_inventory(opened.endpoints["facts"]["language"]).silence
+        silence = load_inventory(opened.info["facts"]["language"] or DEFAULT_LANGUAGE).silence
         try:
             with _progress(console) as progress:
                 title = f"speaking {source.name}"
@@ -218,7 +218,7 @@ def _wait_for_video(
     drawn_before_s: float,
     duration_s: float,
 ) -> str:
-    """Wait for the driver's video of ``duration_s``; return its path, empty if there is none.
+    """Wait for the driver's video of ``duration_s``; return its path, or an empty string.
 
     Raises
     ------

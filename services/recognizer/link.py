@@ -33,7 +33,7 @@ class SynthesizerLink:
 
     def connect(self, socket: Socket, session: str, epoch: int, now_s: float) -> None:
         """Send to a synthesizer from now on; first what a new one needs."""
-        messages = [*self._kept, *(self._sender.waiting if self._sender is not None else ())]
+        messages = [*self._kept, *(self._sender.unacknowledged if self._sender is not None else ())]
         self._kept.clear()
         self._sender = ReliableSender(socket, session, epoch)
         if (frame := self._newest_frame) is not None:

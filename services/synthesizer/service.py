@@ -293,7 +293,7 @@ class SynthesizerService(Service):
             self.metrics.count("other_epoch")
         elif len(session.waiting) >= MAX_WAITING:
             self.metrics.count("too_early")
-        elif not session.receiver.accept(message, sender):
+        elif not session.receiver.receive(message, sender):
             self.metrics.count("repeated")
         else:
             return session

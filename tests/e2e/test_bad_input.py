@@ -101,7 +101,7 @@ def test_empty_chunks_and_silence_and_clipping_are_taken(client: Client, witness
 def test_an_unknown_session_is_named(
     system: System, client: Client, bus: Bus, witness: Session
 ) -> None:
-    audio = bus.connect_dealer(witness.endpoints["audio"])
+    audio = bus.connect_dealer(witness.info["audio"])
     audio.send(AudioChunk(session="nobody", token="t", sequence=1, pcm=b""))
     error = next(answers(audio))
     assert (error.code, error.session) == ("unknown-session", "nobody")
@@ -113,7 +113,7 @@ def test_an_unknown_session_is_named(
 def test_a_foreign_token_is_refused_and_a_replay_dropped(
     client: Client, bus: Bus, witness: Session
 ) -> None:
-    thief = bus.connect_dealer(witness.endpoints["audio"])
+    thief = bus.connect_dealer(witness.info["audio"])
     thief.send(AudioChunk(session=witness.name, token="guess", sequence=1, pcm=b""))
     thief.send(AudioChunk(session=witness.name, token="guess", sequence=2, last=True))
     codes = answers(thief)
@@ -121,7 +121,7 @@ def test_a_foreign_token_is_refused_and_a_replay_dropped(
     with pytest.raises(Refused) as caught:
         client.request("close-session", witness.name, token="guess")
     assert caught.value.code == "bad-token"
-    token = witness.endpoints["token"]
+    token = witness.info["token"]
     output = witness.results(Sound)
     witness.push(np.zeros(320, np.float32))
     assert list(output.available(60.0))
@@ -250,8 +250,8 @@ def test_messages_of_other_sockets_are_refused_kindly(system: System, witness: S
 def test_a_gap_in_media_time_keeps_the_new_time(client: Client, bus: Bus, witness: Session) -> None:
     session = client.open_session(encoding="f32le", paced=False)
     output = session.frames()
-    token, pcm = session.endpoints["token"], np.zeros(1600, "<f4").tobytes()
-    audio = bus.connect_dealer(session.endpoints["audio"])
+    token, pcm = session.info["token"], np.zeros(1600, "<f4").tobytes()
+    audio = bus.connect_dealer(session.info["audio"])
     for sequence, media_time in ((1, 0), (2, 1600), (5, 160_000), (6, 161_600), (7, 163_200)):
         audio.send(
             AudioChunk(
@@ -272,8 +272,8 @@ def test_a_gap_in_media_time_keeps_the_new_time(client: Client, bus: Bus, witnes
 
 def test_a_wall_clock_for_media_time_is_refused(client: Client, bus: Bus, witness: Session) -> None:
     session = client.open_session(encoding="f32le")
-    audio = bus.connect_dealer(session.endpoints["audio"])
-    token = session.endpoints["token"]
+    audio = bus.connect_dealer(session.info["audio"])
+    token = session.info["token"]
     audio.send(AudioChunk(session=session.name, token=token, sequence=1, media_time=2**53, pcm=b""))
     assert next(answers(audio)).code == "bad-audio"
     session.close()
@@ -284,14 +284,14 @@ def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
 ) -> None:
     session = client.open_session(encoding="f32le", paced=False)
     output = session.frames()
-    audio = bus.connect_dealer(session.endpoints["audio"])
+    audio = bus.connect_dealer(session.info["audio"])
     later = 2**39
     pcm = np.zeros(8000, "<f4").tobytes()
     for sequence, media_time in ((1, 0), (2, later)):
         audio.send(
             AudioChunk(
                 session=session.name,
-                token=session.endpoints["token"],
+                token=session.info["token"],
                 sequence=sequence,
                 media_time=media_time,
                 pcm=pcm,

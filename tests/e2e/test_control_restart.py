@@ -20,7 +20,7 @@ def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: P
     samples = samples_of_file(DEMO / "hello-female.wav")[:64000]
     with System(SERVICES, tmp_path) as system, Client(system.control) as client:
         session = client.open_session(encoding="f32le", shapes=["vrm"])
-        opened = session.endpoints
+        opened = session.info
         output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:16000], output, collected, paced=True)
@@ -32,7 +32,7 @@ def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: P
         system.start("control")
         session.set_face(expressions={"joy": 0.5})  # asked before control knows the session
         send(session, samples[32000:40000], output, collected, paced=True)
-        assert session.endpoints == opened, "it has not moved"
+        assert session.info == opened, "it has not moved"
         (state,) = client.status().sessions
         assert (state.session, state.state) == (session.name, "open")
         provided = {"audio", "unpaced_audio", "phones", "phone_input", "faps"}
@@ -44,7 +44,7 @@ def test_a_session_goes_on_while_control_is_killed_and_started_again(tmp_path: P
         lost.wait()
         send(session, samples[40000:], output, collected, paced=True)
         finish(session, output, collected)
-        assert session.endpoints["epoch"] == 2, "the new control tells the client that it has moved"
+        assert session.info["epoch"] == 2, "the new control tells the client that it has moved"
         session.flush()
         session.close()
         assert not client.status().sessions

@@ -91,7 +91,7 @@ def test_they_follow_a_face_that_another_synthesizer_makes(
         lost.wait()
         send(session, samples[16000:], output, collected, paced=True)
         finish(session, output, collected)
-        assert session.endpoints["epoch"] > 1
+        assert session.info["epoch"] > 1
         outputs = [each.communicate(timeout=60)[0].splitlines() for each in running]
         session.close()
     assert [each.returncode for each in running] == [0, 0, 0]

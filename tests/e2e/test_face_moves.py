@@ -75,7 +75,7 @@ def test_whoever_follows_sees_every_frame_once(tmp_path: Path, blow: signal.Sign
         session = client.open_session(encoding="f32le")
         place = next(each for each in client.status().sessions if each.session == session.name)
         lost = system.processes["other" if place.workers["faps"] == "other" else "synthesizer"]
-        stranger = Stranger(session.name, session.endpoints["faps"], session.endpoints["events"])
+        stranger = Stranger(session.name, session.info["faps"], session.info["events"])
         following = threading.Thread(target=stranger.follow_to_the_end)
         following.start()
         output = session.results(*KINDS, keep_all=True)
@@ -90,7 +90,7 @@ def test_whoever_follows_sees_every_frame_once(tmp_path: Path, blow: signal.Sign
         session.close()
 
     times = [frame.media_time for frame in undisturbed.frames]
-    assert session.endpoints["epoch"] > 1
+    assert session.info["epoch"] > 1
     spoken = [frame for frame in collected.frames if frame.media_time in set(times)]
     assert sorted({frame.media_time for frame in spoken}) == times
     assert list(stranger.frames) == times

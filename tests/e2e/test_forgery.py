@@ -73,7 +73,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
         assert answer(stranger, Error).code == "not-allowed"
     assert {each.instance for each in client.status().services} == before
     session = client.open_session(paced=False)
-    assert session.endpoints["audio"] == witness.endpoints["audio"]
+    assert session.info["audio"] == witness.info["audio"]
     session.close()
 
 

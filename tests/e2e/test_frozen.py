@@ -38,9 +38,9 @@ def test_one_that_thaws_does_not_publish_beside_the_one_in_its_place(
         output = session.results(*KINDS, keep_all=True)
         kind: type[Message]
         kind, endpoint = (
-            (Phone, session.endpoints["phones"])
+            (Phone, session.info["phones"])
             if service == "recognizer"
-            else (FapFrame, session.endpoints["faps"])
+            else (FapFrame, session.info["faps"])
         )
         witness = bus.connect_subscriber(endpoint)
         witness.subscribe(kind, session.name)
@@ -50,7 +50,7 @@ def test_one_that_thaws_does_not_publish_beside_the_one_in_its_place(
         frozen = system.processes[service].pid
         os.kill(frozen, signal.SIGSTOP)
         until_moved = 24000
-        while session.endpoints["epoch"] == 1:
+        while session.info["epoch"] == 1:
             assert until_moved < 80000, "it was not replaced"
             piece = samples[until_moved : until_moved + 1600]
             send(session, piece, output, collected, paced=True)
@@ -85,7 +85,7 @@ def test_the_only_recognizer_goes_on_with_its_sessions_after_it_stood_still(
         os.kill(frozen, signal.SIGCONT)
         send(session, samples[24000:], output, collected, paced=True)
         finish(session, output, collected)
-        assert session.endpoints["epoch"] == 1
+        assert session.info["epoch"] == 1
         session.close()
 
     numbers = [frame.sequence for frame in collected.frames]

@@ -34,7 +34,7 @@ def test_a_session_goes_on_when_its_worker_ends(
     with System(services, tmp_path, settings=SETTINGS) as system, Client(system.control) as client:
         undisturbed = final_phones(stream(system.control, samples))
         session = client.open_session(encoding="f32le")
-        before = session.endpoints
+        before = session.info
         output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:24000], output, collected, paced=True)
@@ -45,7 +45,7 @@ def test_a_session_goes_on_when_its_worker_ends(
             ended.wait()
         send(session, samples[24000:], output, collected, paced=True)
         finish(session, output, collected)
-        after = session.endpoints
+        after = session.info
         session.close()
         assert ended.wait(60) == (0 if how == signal.SIGTERM else -how)
         system.assert_all_alive()

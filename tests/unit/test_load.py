@@ -21,7 +21,7 @@ pytestmark = pytest.mark.unit
 
 
 class _Session:
-    endpoints: ClassVar = {"facts": {"frame_rate_hz": 50.0}}
+    info: ClassVar = {"facts": {"frame_rate_hz": 50.0}}
 
 
 def _spoken(arrived_s: dict[int, float]) -> Spoken:

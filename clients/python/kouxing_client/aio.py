@@ -76,19 +76,17 @@ class AsyncClient(BaseClient):
     ) -> AsyncSession:
         """Open a session, as ``Client.open_session``."""
         fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
-        opened = self._thread.submit(lambda: self._thread.core.open_session(fields))
+        opened = self._thread.submit(lambda core: core.open_session(fields))
         return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
 
     async def follow(self, name: str = "") -> AsyncSession:
         """Follow another program's session, as ``Client.follow``."""
-        followed = self._thread.submit(lambda: self._thread.core.follow(name))
+        followed = self._thread.submit(lambda core: core.follow(name))
         return AsyncSession(self._thread, await asyncio.wrap_future(followed), None)
 
     async def status(self, session: str = "") -> Status:
         """Return the state of services and sessions, as ``Client.status``."""
-        return await asyncio.wrap_future(
-            self._thread.submit(lambda: self._thread.core.status(session))
-        )
+        return await asyncio.wrap_future(self._thread.submit(lambda core: core.status(session)))
 
     async def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
         """Change the face of any session, as ``Client.set_face``."""

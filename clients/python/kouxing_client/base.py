@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from typing import Any, TypedDict
 
 from kouxing_client.audio import SAMPLE_BYTES, split, to_pcm
-from kouxing_client.core import new_future
+from kouxing_client.core import ClientCore, new_future
 from kouxing_client.errors import KouxingError, Refused
 from kouxing_client.keys import KeyPair, find_key
 from kouxing_client.messages import Fields, Result
@@ -75,7 +75,7 @@ class BaseClient:
         self._thread = ClientThread(control, key, timeout_s, type(self)._make_signal)
 
     def _request(self, kind: str, session: str, fields: Fields) -> Future[Fields]:
-        return self._thread.submit(lambda: self._thread.core.request(kind, session, **fields))
+        return self._thread.submit(lambda core: core.request(kind, session, **fields))
 
 
 class BaseSession:
@@ -98,8 +98,12 @@ class BaseSession:
         return self._core.name
 
     @property
-    def endpoints(self) -> Fields:
-        """Control's answer to ``open-session`` or ``status-request``, with current endpoints."""
+    def info(self) -> Fields:
+        """The fields of ``session-opened`` with the current epoch and endpoints.
+
+        Of a session that another program opened, only ``session``, ``epoch``, ``facts`` and the
+        endpoints are known.
+        """
         return {**self._core.endpoints, "epoch": self._core.epoch}
 
     @property
@@ -176,15 +180,15 @@ class BaseSession:
             self._thread.call(lambda: self._core.add_audio(0, {"last": True}))
 
     def _request(self, kind: str, fields: Fields) -> Future[Fields]:
-        return self._thread.submit(lambda: self._thread.core.request(kind, self.name, **fields))
+        return self._thread.submit(lambda core: core.request(kind, self.name, **fields))
 
     def _flush(self) -> Future[Fields]:
         self._num_frames(b"")
 
-        def flush() -> Future[Fields]:
+        def flush(core: ClientCore) -> Future[Fields]:
             if self._core.stream is not None:
                 self._core.stream.flush()
-            return self._thread.core.request("flush-session", self.name, token=self._core.token)
+            return core.request("flush-session", self.name, token=self._core.token)
 
         return self._thread.submit(flush)
 
@@ -275,7 +279,7 @@ class BaseResults:
         return self._inbox.is_over or bool(self._inbox.messages)
 
     def _take(self) -> Any:
-        """Return the next result; None if there is none.
+        """Return the next result; None if no result is left.
 
         Raises
         ------

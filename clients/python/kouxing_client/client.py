@@ -46,7 +46,10 @@ class ThreadSignal:
 
 
 class Client(BaseClient):
-    """A connection to a running system; ``BaseClient`` describes the parameters."""
+    """A connection to a running system; ``BaseClient`` describes the parameters.
+
+    All requests raise ``Refused`` if control refuses, and ``KouxingError`` if it does not answer.
+    """
 
     _make_signal = ThreadSignal
 
@@ -85,65 +88,26 @@ class Client(BaseClient):
         options
             Other fields of ``open-session``, such as ``paced=False`` for audio that arrives faster
             than real time.
-
-        Raises
-        ------
-        Refused
-            If control refuses.
-        KouxingError
-            If control does not answer.
         """
         fields = open_fields(name, sample_rate_hz, num_channels, encoding, shapes, options)
-        core = self._thread.submit(lambda: self._thread.core.open_session(fields)).result()
+        core = self._thread.submit(lambda core: core.open_session(fields)).result()
         return Session(self._thread, core, fields)
 
     def follow(self, name: str = "") -> Session:
-        """Follow a session that another program opened; if the name is empty, the newest.
-
-        Raises
-        ------
-        Refused
-            If there is no such session.
-        KouxingError
-            If control does not answer.
-        """
-        core = self._thread.submit(lambda: self._thread.core.follow(name)).result()
+        """Follow a session that another program opened; if the name is empty, the newest."""
+        core = self._thread.submit(lambda core: core.follow(name)).result()
         return Session(self._thread, core, None)
 
     def status(self, session: str = "") -> Status:
-        """Return the state of all services and sessions, or of one session and its services.
-
-        Raises
-        ------
-        Refused
-            If there is no session of this name.
-        KouxingError
-            If control does not answer.
-        """
-        return self._thread.submit(lambda: self._thread.core.status(session)).result()
+        """Return the state of all services and sessions, or of one session and its services."""
+        return self._thread.submit(lambda core: core.status(session)).result()
 
     def set_face(self, session: str, **settings: Unpack[FaceSettings]) -> None:
-        """Change the face of any session; the keywords are those of ``FaceSettings``.
-
-        Raises
-        ------
-        Refused
-            If control refuses.
-        KouxingError
-            If control does not answer.
-        """
+        """Change the face of any session; the keywords are those of ``FaceSettings``."""
         self.request("set-face", session, face=settings)
 
     def request(self, kind: str, session: str = "", **fields: object) -> Fields:
-        """Send any request of PROTOCOL.md; return the fields of the answer.
-
-        Raises
-        ------
-        Refused
-            If control refuses.
-        KouxingError
-            If control does not answer.
-        """
+        """Send any request of PROTOCOL.md; return the fields of the answer."""
         return self._request(kind, session, fields).result()
 
 
@@ -231,13 +195,13 @@ class Session(BaseSession):
         Parameters
         ----------
         classes
-            Such as ``FapFrame`` and ``Phone``.
+            Classes of results, such as ``FapFrame`` and ``Phone``.
         shapes
             Name of the set of blend shapes, if the classes include ``Shapes``.
         keep_all
             Whether all unread results of a live session are kept, not only the newest 100.
         on_result
-            Called with each result by the client's thread; nothing is left to read then.
+            The client's thread calls this with each result, instead of keeping it.
         """
         return self._join(classes, shapes, keep_all, on_result)
 

@@ -31,7 +31,7 @@ class Transport(Protocol):
 
     @property
     def resumed_at_s(self) -> float:
-        """When this process last resumed after it was suspended; minus infinity if never."""
+        """When this process last resumed after a suspension; minus infinity before the first."""
 
     def subscribe(
         self,

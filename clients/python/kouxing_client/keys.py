@@ -14,7 +14,7 @@ _FILE = "client.key"
 
 
 class KeyPair(Protocol):
-    """What a client needs of a key; Z85, 40 characters each."""
+    """A key pair and the public key of control; Z85, 40 characters each."""
 
     @property
     def public(self) -> str:

@@ -48,7 +48,7 @@ class Sockets:
     connect_ms
         Limit for one attempt to connect, of sockets that are opened from now on.
     resumed_at_s
-        When this process last resumed after it was suspended; minus infinity if never.
+        When this process last resumed after a suspension; minus infinity before the first.
     """
 
     def __init__(self, key: KeyPair | None) -> None:

@@ -56,7 +56,7 @@ class ClientThread:
         """Let the thread call a function soon."""
         self._sockets.call(function)
 
-    def submit(self, function: Callable[[], Future[T]]) -> Future[T]:
+    def submit(self, function: Callable[[ClientCore], Future[T]]) -> Future[T]:
         """Let the thread call a function; return the future that this function returns."""
         answer = new_future()
 
@@ -68,7 +68,7 @@ class ClientThread:
 
         if not self._thread.is_alive():
             raise KouxingError("the client is closed")
-        self._sockets.call(lambda: function().add_done_callback(pass_on))
+        self._sockets.call(lambda: function(self.core).add_done_callback(pass_on))
         return answer
 
     def forget(self, session: SessionCore) -> Future[None]:
