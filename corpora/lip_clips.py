@@ -81,7 +81,7 @@ class LipClip:
 
     name: str
     speaker: str
-    licence: str
+    license: str
     language: str  # "zh", "en", ...
     part: str  # "train", "choice" or "held"
     is_in_sync: bool  # otherwise only shapes can be compared, not times
@@ -112,11 +112,11 @@ def part_of(name: str, *, may_train: bool) -> str:
 
 
 def read_clips(
-    folder: Path, *, any_licence: bool = False, language: str | None = "zh"
+    folder: Path, *, any_license: bool = False, language: str | None = "zh"
 ) -> list[LipClip]:
     """Read the clips of a folder in one language, or in all with None.
 
-    ``any_licence`` also trains on clips whose license does not allow distribution. Raises UserError
+    ``any_license`` also trains on clips whose license does not allow distribution. Raises UserError
     if there are no clips, or one of them cannot be read.
     """
     held = folder / "held.txt"
@@ -124,7 +124,7 @@ def read_clips(
     clips = [
         clip
         for path in sorted(folder.glob("*.json"))
-        if (clip := _read_clip(path, language, any_licence=any_licence, held_out=held_out))
+        if (clip := _read_clip(path, language, any_license=any_license, held_out=held_out))
     ]
     if not clips:
         what = {"zh": "Mandarin clips", None: "clips"}.get(language, f"clips in {language!r}")
@@ -134,13 +134,13 @@ def read_clips(
 
 def read_clip(path: Path) -> LipClip:
     """Read one clip by the path of its ``.json``; UserError if it cannot be read."""
-    clip = _read_clip(path.with_suffix(".json"), None, any_licence=True)
+    clip = _read_clip(path.with_suffix(".json"), None, any_license=True)
     assert clip is not None  # noqa: S101 - in any language
     return clip
 
 
 def _read_clip(
-    path: Path, language: str | None, *, any_licence: bool, held_out: Collection[str] = ()
+    path: Path, language: str | None, *, any_license: bool, held_out: Collection[str] = ()
 ) -> LipClip | None:
     """Read a clip; None if it is in another language."""
     try:
@@ -148,7 +148,7 @@ def _read_clip(
         clip_language = str(about.get("language", "zh"))[:2]
         if language not in (None, clip_language):
             return None
-        licence, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
+        license_name, speaker = str(about.get("licence", "")), str(about.get("speaker", ""))
         with path.with_suffix(".csv").open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         if not rows or None in rows[0]:
@@ -160,11 +160,11 @@ def _read_clip(
         faps = _rig_faps(values) if is_rig else _tracked_faps(values)
         if np.isnan(faps).all():
             raise ValueError("it contains no FAP of the mouth")
-        part = part_of(path.stem, may_train=any_licence or may_ship(licence))
+        part = part_of(path.stem, may_train=any_license or may_ship(license_name))
         return LipClip(
             name=path.stem,
             speaker=speaker,
-            licence=licence,
+            license=license_name,
             language=clip_language,
             part="held" if {path.stem, speaker} & {*held_out} else part,
             is_in_sync=about.get("grade") not in _OUT_OF_SYNC_GRADES,

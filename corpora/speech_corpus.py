@@ -25,11 +25,11 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory, Syllable
 
 # Licenses that allow distributing a model trained on the data.
-_FREE_LICENCE = re.compile(
+_FREE_LICENSE = re.compile(
     r"apache|\bmit\b|cc0|cc[ -]by(?!-nc|-nd)(?!-sa-nc)|unlicense|public domain|synthetic", re.I
 )
 # Exceptions in a license, and footage by third parties, exclude it.
-_CLOSED_LICENCE = re.compile(
+_CLOSED_LICENSE = re.compile(
     r"\bnc\b|\bnd\b|non-?commercial|no-?deriv|exceptions|film clip|youtube", re.I
 )
 _MIN_PHONE_S = 0.03
@@ -45,7 +45,7 @@ class Utterance:
     path: Path
     speaker: str
     source: str
-    licence: str
+    license: str
     split: str
     seconds: float
     phones: tuple[int, ...]  # indices into the inventory's phones
@@ -81,14 +81,14 @@ class RowErrors:
         return UserError(f"no usable recordings {where}{last}; give others")
 
 
-def may_ship(licence: str) -> bool:
+def may_ship(license_name: str) -> bool:
     """Return whether a model trained on data under this license may be distributed."""
-    return bool(_FREE_LICENCE.search(licence)) and not _CLOSED_LICENCE.search(licence)
+    return bool(_FREE_LICENSE.search(license_name)) and not _CLOSED_LICENSE.search(license_name)
 
 
-def is_synthetic(licence: str) -> bool:
+def is_synthetic(license_name: str) -> bool:
     """Return whether data under this license is synthetic speech."""
-    return "synthetic" in licence.lower()
+    return "synthetic" in license_name.lower()
 
 
 def read_corpus(
@@ -179,7 +179,7 @@ def _utterance(
         path=path,
         speaker=row.get("speaker") or row["utt_id"],
         source=row.get("source", ""),
-        licence=row.get("licence", ""),
+        license=row.get("licence", ""),
         split=_split_of(row),
         seconds=seconds,
         phones=phones,

@@ -100,7 +100,7 @@ def clip_of(time_s: NDArray[np.float64], faps: NDArray[np.float64]) -> LipClip:
     return LipClip(
         name="made_up",
         speaker="nobody",
-        licence="CC0",
+        license="CC0",
         language="zh",
         part="held",
         is_in_sync=True,

@@ -30,9 +30,9 @@ PhoneLm = Annotated[
     Path | None,
     typer.Option(help="File with a phone language model: phone_lm.npz, or a recognizer's model."),
 ]
-AnyLicence = Annotated[
+AnyLicense = Annotated[
     bool,
-    typer.Option("--any-licence", help="Also use data whose license excludes distribution."),
+    typer.Option("--any-license", help="Also use data whose license excludes distribution."),
 ]
 Whisper = Annotated[
     Path, typer.Option(help="Folder of Whisper base for faster-whisper, for its encoder.")
@@ -116,7 +116,7 @@ def gmm(
     seed: Seed = 0,
     mixtures: Annotated[int, typer.Option(help="Gaussians per state, a power of two.")] = 32,
     synthetic_weight: SyntheticWeight = SYNTHETIC_WEIGHT,
-    any_licence: AnyLicence = False,
+    any_license: AnyLicense = False,
 ) -> None:
     """Train the Gaussian mixture recognizer, and write its model card."""
     from kouxing.training.gmm.recipe import train_gmm
@@ -130,7 +130,7 @@ def gmm(
         seed=seed,
         num_mixtures=mixtures,
         synthetic_weight=synthetic_weight,
-        shipping=not any_licence,
+        shipping=not any_license,
     )
 
 
@@ -159,7 +159,7 @@ def neural(
         float, typer.Option(help="Look-ahead to train for, a multiple of 10 ms.")
     ] = 10.0,
     steps: Annotated[int, typer.Option(min=1, help="Number of batches of 30 s of audio.")] = 800,
-    any_licence: AnyLicence = False,
+    any_license: AnyLicense = False,
 ) -> None:
     """Train the neural recognizer, and write its model card and training curves."""
     check_output(output)
@@ -177,7 +177,7 @@ def neural(
         look_ahead_ms=look_ahead_ms,
         seed=seed,
         num_steps=steps,
-        shipping=not any_licence,
+        shipping=not any_license,
     )
 
 
@@ -193,7 +193,7 @@ def blocks(
         int, typer.Option(min=1, help="Number of batches of 70 s of audio for the first readout.")
     ] = 450,
     steps: Annotated[int, typer.Option(min=1, help="Number of batches of 32 s of audio.")] = 450,
-    any_licence: AnyLicence = False,
+    any_license: AnyLicense = False,
 ) -> None:
     """Train the block model, and write its model card.
 
@@ -212,7 +212,7 @@ def blocks(
         seed=seed,
         num_readout_steps=readout_steps,
         num_steps=steps,
-        shipping=not any_licence,
+        shipping=not any_license,
     )
 
 
@@ -220,13 +220,13 @@ def blocks(
 def visemes(
     clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Parameter file (.json).")],
-    any_licence: AnyLicence = False,
+    any_license: AnyLicense = False,
 ) -> None:
     """Train the parameters of the dynamic visemes on tracked lips."""
     from kouxing.training.visemes.recipe import train_visemes
 
     check_output(output)
-    train_visemes(clips, output, any_licence=any_licence)
+    train_visemes(clips, output, any_license=any_license)
 
 
 @app.command()
@@ -247,7 +247,7 @@ def lips(
         typer.Option(help="Folder of Whisper base for faster-whisper: teacher."),
     ] = None,
     seed: Seed = 0,
-    any_licence: AnyLicence = False,
+    any_license: AnyLicense = False,
 ) -> None:
     """Train the lip model on tracked lips, and write its model card."""
     check_output(output)
@@ -260,7 +260,7 @@ def lips(
         speech=speech or [],
         whisper=whisper,
         seed=seed,
-        any_licence=any_licence,
+        any_license=any_license,
     )
 
 
@@ -269,10 +269,10 @@ def ferguson(
     clips: Annotated[Path, typer.Option(help="Folder of clips with tracked lips.")],
     corpus: Corpora,
     output: Annotated[Path, typer.Option("--output", "-o", help="Table to write (.tsv).")],
-    any_licence: AnyLicence = False,
+    any_license: AnyLicense = False,
 ) -> None:
     """Learn the table of the ferguson lip model: openings, durations, influence factors."""
     from kouxing.training.ferguson.recipe import train_ferguson
 
     check_output(output)
-    train_ferguson(clips, corpus, output, print_message, any_licence=any_licence)
+    train_ferguson(clips, corpus, output, print_message, any_license=any_license)

@@ -29,7 +29,7 @@ def write_card(
     """
     by_license: dict[str, list[Example]] = defaultdict(list)
     for example in examples:
-        by_license[example.licence or "none given"].append(example)
+        by_license[example.license or "none given"].append(example)
     rows = [
         f"| {name} | {len(group)} | {len({example.speaker for example in group})} | "
         f"{sum(len(example.log_mel) for example in group) / FRAMES_PER_MINUTE:.1f} |"

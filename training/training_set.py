@@ -48,14 +48,14 @@ class Example:
     phones: tuple[int, ...]  # indices into the inventory's phones
     syllables: tuple[int, ...]  # number of phones in each syllable
     weight: float  # weight of its frames in the estimates
-    licence: str = ""
+    license: str = ""
     speaker: str = ""
     samples: NDArray[np.int16] | None = None  # (n,) 16 kHz, the samples of the frames
 
     @property
     def kind(self) -> str:
         """The kind of speech: ``sentence``, ``word`` or ``synthetic``."""
-        if is_synthetic(self.licence):
+        if is_synthetic(self.license):
             return "synthetic"
         return "word" if len(self.phones) <= MAX_WORD_PHONES else "sentence"
 
@@ -104,7 +104,7 @@ def load_examples(
                 phones=utterance.phones,
                 syllables=utterance.syllables,
                 weight=weight,
-                licence=utterance.licence,
+                license=utterance.license,
                 speaker=utterance.speaker,
                 samples=None if sound is None else sound[_samples_of(span, len(trimmed))],
             )
@@ -117,12 +117,12 @@ def load_examples(
 def _shippable(rows: Sequence[Utterance], errors: RowErrors) -> list[Utterance]:
     """Drop the rows whose license does not allow distributing the model."""
     for row in rows:
-        if not may_ship(row.licence):
+        if not may_ship(row.license):
             errors.add(
                 row.utterance_id,
-                f"its license ({row.licence or 'none'}) does not allow distributing a model",
+                f"its license ({row.license or 'none'}) does not allow distributing a model",
             )
-    return [row for row in rows if may_ship(row.licence)]
+    return [row for row in rows if may_ship(row.license)]
 
 
 def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[float]:
@@ -134,7 +134,7 @@ def _weights(utterances: Sequence[Utterance], synthetic_weight: float) -> list[f
     for utterance in utterances:
         weight = np.sqrt(_NEUTRAL_MINUTES / minutes[utterance.speaker])
         weight = float(np.clip(weight, _MIN_WEIGHT, _MAX_WEIGHT))
-        weights.append(weight * (synthetic_weight if is_synthetic(utterance.licence) else 1.0))
+        weights.append(weight * (synthetic_weight if is_synthetic(utterance.license) else 1.0))
     return weights
 
 
@@ -169,7 +169,7 @@ def _file_without_text(path: Path) -> Utterance:
         path=path,
         speaker="",
         source="",
-        licence="",
+        license="",
         split="",
         seconds=0.0,
         phones=(),

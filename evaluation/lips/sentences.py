@@ -101,7 +101,7 @@ def _clip(model: AcousticModel, path: Path, name: str, speaker: str, text: str =
     return LipClip(
         name=name,
         speaker=speaker,
-        licence="",
+        license="",
         language=model.inventory.code,
         part="held",
         is_in_sync=True,

@@ -160,7 +160,7 @@ def utterance(name: str, speaker: str, seconds: float) -> Utterance:
         path=Path(name),
         speaker=speaker,
         source="",
-        licence="",
+        license="",
         split="test",
         seconds=seconds,
         phones=(0,),

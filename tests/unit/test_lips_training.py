@@ -202,10 +202,10 @@ def test_counts_found_missed_and_false_closures() -> None:
     assert counts.f1 == pytest.approx(0.5)
 
 
-def write_clip(folder: Path, name: str, speaker: str, licence: str) -> None:
+def write_clip(folder: Path, name: str, speaker: str, license_name: str) -> None:
     samples = samples_of_file(VOWELS_FILE)[: 2 * SAMPLE_RATE_HZ]
     soundfile.write(folder / f"{name}.flac", samples, SAMPLE_RATE_HZ)
-    about = {"speaker": speaker, "licence": licence, "language": "en"}
+    about = {"speaker": speaker, "licence": license_name, "language": "en"}
     (folder / f"{name}.json").write_text(json.dumps(about))
     rows = [
         f"{k * FRAME_S},{100 + 50 * np.sin(k)},0,{-200 - 100 * np.sin(k)},{5 * np.cos(k)},0"

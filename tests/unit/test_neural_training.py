@@ -420,7 +420,7 @@ def test_trains_and_writes_model_card_and_curves(
     assert sum("teacher, step" in line for line in lines) == 5
     card = output.with_suffix(".md").read_text()
     assert "CC0-1.0" in card
-    assert "Whisper's weights (Radford et al. 2023, MIT licence)" in card
+    assert "Whisper's weights (Radford et al. 2023, MIT license)" in card
     assert "with a readout of Whisper's whole encoder as the teacher." in card
     assert output.with_suffix(".png").stat().st_size > 1000
 

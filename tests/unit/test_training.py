@@ -164,7 +164,7 @@ def test_reads_an_aishell_folder(tmp_path: Path) -> None:
     transcript.write_text("BAC009S0002W0122 而 对\nBAC009S0002W0123 无声\n", encoding="utf-8")
     errors = RowErrors()
     rows = read_corpus(tmp_path, errors, MANDARIN, split="train")
-    assert [(u.speaker, u.split, u.licence) for u in rows] == [("S0002", "train", "Apache-2.0")]
+    assert [(u.speaker, u.split, u.license) for u in rows] == [("S0002", "train", "Apache-2.0")]
     assert "BAC009S0002W0123" in errors.messages[0]
 
 
@@ -203,7 +203,7 @@ def test_pinyin_takes_precedence_over_the_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("licence", "free"),
+    ("license_name", "free"),
     [
         ("Apache-2.0 (AISHELL-1/OpenSLR33)", True),
         ("MIT", True),
@@ -222,11 +222,11 @@ def test_pinyin_takes_precedence_over_the_text(tmp_path: Path) -> None:
         ("", False),
     ],
 )
-def test_licenses_that_allow_distribution(licence: str, free: bool) -> None:
-    assert may_ship(licence) is free
+def test_licenses_that_allow_distribution(license_name: str, free: bool) -> None:
+    assert may_ship(license_name) is free
 
 
-def test_weights_and_licence_filter(tmp_path: Path) -> None:
+def test_weights_and_license_filter(tmp_path: Path) -> None:
     write_corpus(
         tmp_path,
         [

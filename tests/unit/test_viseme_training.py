@@ -105,10 +105,12 @@ def test_closures_last_as_long_as_in_the_clips() -> None:
 
 
 def write_clip(
-    folder: Path, name: str, language: str, header: str, row: str, licence: str = "MIT"
+    folder: Path, name: str, language: str, header: str, row: str, license_name: str = "MIT"
 ) -> None:
     (folder / f"{name}.json").write_text(
-        json.dumps({"language": language, "speaker": "one", "licence": licence, "transcript": ""})
+        json.dumps(
+            {"language": language, "speaker": "one", "licence": license_name, "transcript": ""}
+        )
     )
     (folder / f"{name}.csv").write_text(f"{header}\n{row}\n")
     soundfile.write(folder / f"{name}.flac", np.zeros(1600), 16_000)
@@ -163,11 +165,11 @@ def test_a_rule_assigns_clips_to_parts(tmp_path: Path) -> None:
     ]
     header, row = "t,ok,F3_open_jaw", "0.5,1,10"
     for name in names[:12]:
-        write_clip(tmp_path, name, "zh", header, row, licence="academic use only")
+        write_clip(tmp_path, name, "zh", header, row, license_name="academic use only")
     assert "train" not in {clip.part for clip in read_clips(tmp_path)}
-    with pytest.raises(UserError, match="--any-licence"):
+    with pytest.raises(UserError, match="--any-license"):
         train_visemes(tmp_path, tmp_path / "out.json")
-    clips = read_clips(tmp_path, any_licence=True)
+    clips = read_clips(tmp_path, any_license=True)
     assert {clip.name: clip.part for clip in clips} == {
         name: part for name, part in zip(names, free, strict=True) if name in names[:12]
     }

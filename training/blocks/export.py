@@ -147,12 +147,12 @@ class _BlockGraph(Graph):
         ]
         masked = self.node("Add", [self.node("Concat", products, axis=-1), mask])
         weights = self.node("Softmax", [masked], axis=-1)
-        names = [f"{name}.{part}_weights" for part in ("past", "own")]
-        past, own = self.split(weights, names, self._past, self._length)
-        pairs = ((past, old_values), (own, value))
-        seen = self.node("Add", [self.node("MatMul", pair) for pair in pairs])
-        seen = self.node("Transpose", [seen], perm=[0, 2, 1, 3])
-        return self.node("Reshape", [seen, self.integers("rows", -1, width)])
+        names = [f"{name}.{part}_weights" for part in ("past", "block")]
+        past, block = self.split(weights, names, self._past, self._length)
+        pairs = ((past, old_values), (block, value))
+        attended = self.node("Add", [self.node("MatMul", pair) for pair in pairs])
+        attended = self.node("Transpose", [attended], perm=[0, 2, 1, 3])
+        return self.node("Reshape", [attended, self.integers("rows", -1, width)])
 
     def _log_posteriors(self, features: str) -> None:
         """Run the readout on (rows, features)."""

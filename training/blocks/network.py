@@ -133,18 +133,18 @@ class BlockReadout(Readout):
         """Compute log posteriors: (batch, n, features) to (batch, n, 2, states)."""
         inner = self.inner_of(features)
         of_blocks = inner[:, laid.blocks]
-        forwards = self._forwards(inner[:, : laid.num_positions], of_blocks, laid)
-        context = torch.cat([forwards, self._backwards(of_blocks, laid)], dim=-1)
+        forward_states = self._forward_states(inner[:, : laid.num_positions], of_blocks, laid)
+        context = torch.cat([forward_states, self._backward_states(of_blocks, laid)], dim=-1)
         return self.log_posteriors(context, inner).view(*features.shape[:2], 2, -1)
 
-    def _forwards(self, own: Tensor, of_blocks: Tensor, laid: Layout) -> Tensor:
+    def _forward_states(self, inner: Tensor, of_blocks: Tensor, laid: Layout) -> Tensor:
         """Run over the recording, and from each block's end over its right context."""
-        own = self._run(own, own.new_zeros(len(own), self.gru.hidden_size))
+        outputs = self._run(inner, inner.new_zeros(len(inner), self.gru.hidden_size))
         last = laid.blocks[:, : laid.block_length].amax(dim=1)
         right = of_blocks[:, :, laid.block_length :]
-        after = self._run(right.flatten(0, 1), own[:, last].flatten(0, 1))
+        after = self._run(right.flatten(0, 1), outputs[:, last].flatten(0, 1))
         of_right = after.view(*right.shape[:3], -1)[:, laid.exists[:, laid.block_length :]]
-        return torch.cat([own, of_right], dim=1)
+        return torch.cat([outputs, of_right], dim=1)
 
     def _run(self, inputs: Tensor, state: Tensor) -> Tensor:
         weights = [getattr(self.gru, f"{kind}_l0") for kind in _GRU_WEIGHTS]
@@ -153,7 +153,7 @@ class BlockReadout(Readout):
         )  # with biases, one layer, no dropout, one direction, batch first
         return outputs
 
-    def _backwards(self, of_blocks: Tensor, laid: Layout) -> Tensor:
+    def _backward_states(self, of_blocks: Tensor, laid: Layout) -> Tensor:
         """Run backward over each right context and its block: (batch, n, width)."""
         weights = [getattr(self.gru, f"{kind}_l0_reverse") for kind in _GRU_WEIGHTS]
         state = of_blocks.new_zeros(

@@ -124,7 +124,7 @@ def train_blocks(
     write_card(
         output,
         title="Block model: Whisper's encoder in blocks with a cached past, gently tuned",
-        details=f"with Whisper's weights (Radford et al. 2023, MIT licence), seed {seed}, "
+        details=f"with Whisper's weights (Radford et al. 2023, MIT license), seed {seed}, "
         f"{num_readout_steps} steps of the readout, {num_steps} of {BATCH_S} s of sound of all, "
         f"aligned by `{start.name}`, on {len(recordings)} recordings of {minutes:.0f} minutes "
         "drawn from those below",

@@ -35,7 +35,7 @@ def train_ferguson(
     output: Path,
     report: Report,
     *,
-    any_licence: bool = False,
+    any_license: bool = False,
 ) -> None:
     """Learn the table from the training clips and recordings.
 
@@ -43,18 +43,18 @@ def train_ferguson(
     """
     model = load_model()
     inventory = model.inventory
-    used = [clip for clip in read_clips(clips, any_licence=any_licence) if clip.part == "train"]
+    used = [clip for clip in read_clips(clips, any_license=any_license) if clip.part == "train"]
     if not used:
         raise UserError(
-            f"no clip in {clips} may be used; give clips with a free license, or --any-licence"
+            f"no clip in {clips} may be used; give clips with a free license, or --any-license"
         )
     openings = fit_openings(used, [label_clip(model, clip) for clip in used], inventory)
     errors = RowErrors()
-    rows = training_rows(corpora, inventory, errors, any_licence=any_licence)
+    rows = training_rows(corpora, inventory, errors, any_license=any_license)
     times = usual_times(aligned_speech(model, rows, errors), inventory)
     errors.print_to(report)
     _report_travels(travel_of(used), report)
-    licences = sorted({clip.licence for clip in used} | {row.licence for row in rows})
+    licenses = sorted({clip.license for clip in used} | {row.license for row in rows})
     table = PhoneTable(
         opening=openings,
         duration_s=times.duration_s,
@@ -66,7 +66,7 @@ def train_ferguson(
         "Made by `kouxing train ferguson`; least squares, no seed.",
         f"Openings from the clips {', '.join(clip.name for clip in used)}; "
         f"the rest from {len(rows)} recordings.",
-        f"Under: {'; '.join(licences)}",
+        f"Under: {'; '.join(licenses)}",
     ]
     try:
         output.write_text(format_table(table, inventory, about), encoding="utf-8")
@@ -85,7 +85,7 @@ def _report_travels(travels: NDArray[np.float64], report: Report) -> None:
 
 
 def training_rows(
-    corpora: Sequence[Path], inventory: PhoneInventory, errors: RowErrors, *, any_licence: bool
+    corpora: Sequence[Path], inventory: PhoneInventory, errors: RowErrors, *, any_license: bool
 ) -> list[Utterance]:
     """Read sentences of the training split, at most ``_MAX_OF_SPEAKER`` of each speaker.
 
@@ -96,7 +96,7 @@ def training_rows(
     for corpus in corpora:
         for row in read_corpus(corpus, errors, inventory, split="train"):
             number = of_speaker.get(row.speaker, 0)
-            is_free = any_licence or may_ship(row.licence)
+            is_free = any_license or may_ship(row.license)
             if is_free and len(row.syllables) >= _MIN_SYLLABLES and number < _MAX_OF_SPEAKER:
                 of_speaker[row.speaker] = number + 1
                 chosen.append(row)

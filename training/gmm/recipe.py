@@ -125,7 +125,7 @@ def _copies(example: Example, rng: np.random.Generator) -> list[Copy]:
     Low-weight recordings are sampled less often.
     """
     num_copies, weight = 1, example.weight
-    if not is_synthetic(example.licence):
+    if not is_synthetic(example.license):
         if len(example.syllables) >= _MIN_SENTENCE_SYLLABLES:
             num_copies = _SENTENCE_COPIES
         else:

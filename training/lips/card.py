@@ -114,7 +114,7 @@ def predict(model: LipPredictor, speech: Sequence[Speech]) -> list[Prediction]:
 def _data_rows(clips: Sequence[LipClip]) -> list[list[object]]:
     by_license: dict[str, list[LipClip]] = defaultdict(list)
     for clip in clips:
-        by_license[clip.licence].append(clip)
+        by_license[clip.license].append(clip)
     return [
         [
             name,

@@ -89,7 +89,7 @@ def train_lips(
     speech: Sequence[Path] = (),
     whisper: Path | None = None,
     seed: int = 0,
-    any_licence: bool = False,
+    any_license: bool = False,
 ) -> None:
     """Train the lip model, and write it with its card.
 
@@ -106,13 +106,13 @@ def train_lips(
     model = load_model()
     if not isinstance(model, NeuralModel):
         raise UserError("the lip model needs the neural acoustic model; reinstall it")
-    clips = read_clips(folder, any_licence=any_licence, language=None)
+    clips = read_clips(folder, any_license=any_license, language=None)
     used = [
-        clip for clip in clips if clip.part != "held" and (any_licence or may_ship(clip.licence))
+        clip for clip in clips if clip.part != "held" and (any_license or may_ship(clip.license))
     ]
     if not used:
         raise UserError(
-            f"no clip in {folder} may be used; give clips with a free license, or --any-licence"
+            f"no clip in {folder} may be used; give clips with a free license, or --any-license"
         )
     recordings = draw_recordings(speech, seed)
     speech_of_clips = track(speech_of(model, clips), description="clips", total=len(clips))

@@ -102,7 +102,7 @@ def _read_recording(path: Path) -> LipClip:
     return LipClip(
         name=path.name,
         speaker="",
-        licence="",
+        license="",
         language="",
         part="train",
         is_in_sync=True,

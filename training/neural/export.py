@@ -103,7 +103,7 @@ class _NetworkGraph(Graph):
         caches = []
         for kind in ("keys", "values"):
             names = [f"{kind}_{number}" for number in range(shape.layers)]
-            self.node("Concat", [f"{name}_own" for name in names], kind, axis=1)
+            self.node("Concat", [f"{name}_current" for name in names], kind, axis=1)
             caches += [halves(name, "sessions", shape.heads, WINDOW, size) for name in names]
         inputs = [
             floats("frames", "rows", SEEN_FRAMES * NUM_INPUTS),
@@ -112,9 +112,9 @@ class _NetworkGraph(Graph):
             floats("past_mask", "sessions", 1, 1, WINDOW),
             *caches,
         ]
-        own = ("rows", shape.layers, shape.heads, size)
+        of_position = ("rows", shape.layers, shape.heads, size)
         log_posteriors = floats("log_posteriors", "rows", 2, shape.num_states)
-        outputs = [log_posteriors, floats("keys", *own), floats("values", *own)]
+        outputs = [log_posteriors, floats("keys", *of_position), floats("values", *of_position)]
         return self.file("transformer acoustic model", inputs, outputs)
 
     def _layer(self, name: str, hidden: str, number: int) -> str:
@@ -125,9 +125,9 @@ class _NetworkGraph(Graph):
             joint = self.node("Reshape", [joint, self.integers("by_head", -1, 3 * heads, 1, size)])
             parts = [f"{name}.{part}" for part in ("query", "key", "value")]
             query, key, value = self.split(joint, parts, axis=1)
-            for kind, own in (("keys", key), ("values", value)):
+            for kind, current in (("keys", key), ("values", value)):
                 of_layer = self.integers("of_layer", -1, 1, heads, size)
-                self.node("Reshape", [own, of_layer], f"{kind}_{number}_own")
+                self.node("Reshape", [current, of_layer], f"{kind}_{number}_current")
             attended = self._attention(query, key, value, number)
             return self.node("Reshape", [attended, self.integers("in_a_row", -1, heads * size)])
 
@@ -140,14 +140,14 @@ class _NetworkGraph(Graph):
         keys, values = (self.floats_of(f"{kind}_{number}") for kind in ("keys", "values"))
         past = self.node("FusedMatMul", [query, keys], domain=DOMAIN, transB=1, alpha=scale)
         past = self.node("Add", [past, "past_mask"])
-        own = self.node("ReduceSum", [self.node("Mul", [query, key]), last], keepdims=1)
+        current = self.node("ReduceSum", [self.node("Mul", [query, key]), last], keepdims=1)
         place = np.where(np.arange(WINDOW) == WINDOW - 1, np.float32(scale), np.float32(0))
-        own = self.node("Mul", [own, self.constant("own_place", place)])
-        weights = self.node("Softmax", [self.node("Add", [past, own])], axis=-1)
-        seen = self.node("MatMul", [weights, values])
+        current = self.node("Mul", [current, self.constant("current_slot", place)])
+        weights = self.node("Softmax", [self.node("Add", [past, current])], axis=-1)
+        attended = self.node("MatMul", [weights, values])
         ends = [self.integers("before_last", WINDOW - 1), self.integers("after_last", WINDOW)]
-        own = self.node("Slice", [weights, *ends, last])
-        return self.node("Add", [seen, self.node("Mul", [own, value])])
+        current = self.node("Slice", [weights, *ends, last])
+        return self.node("Add", [attended, self.node("Mul", [current, value])])
 
     def _outputs(self, hidden: str, number: int) -> str:
         """Compute the selected output layer, if its number is at least ``number``."""

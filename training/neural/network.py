@@ -69,9 +69,9 @@ class Layer(nn.Module):
             .view(batch, num_positions, 3, self.heads, width // self.heads)
             .permute(2, 0, 3, 1, 4)
         )
-        seen = scaled_dot_product_attention(query, key, value, attn_mask=may_attend)
-        seen = seen.transpose(1, 2).reshape(batch, num_positions, width)
-        hidden = hidden + self.dropout(self.attended(seen))
+        attended = scaled_dot_product_attention(query, key, value, attn_mask=may_attend)
+        attended = attended.transpose(1, 2).reshape(batch, num_positions, width)
+        hidden = hidden + self.dropout(self.attended(attended))
         inner = gelu(self.inner(self.inner_norm(hidden)))
         out: Tensor = hidden + self.dropout(self.outer(inner))
         return out

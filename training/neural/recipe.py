@@ -216,7 +216,7 @@ def train_neural(
     )
     (chosen or _UNTUNED).applied_to(unscaled).save(output)
     draw_curves(monitor.losses, monitor.error_rates, output.with_suffix(".png"))
-    source = f"`{start.name}`" if start else "Whisper's weights (Radford et al. 2023, MIT licence)"
+    source = f"`{start.name}`" if start else "Whisper's weights (Radford et al. 2023, MIT license)"
     write_card(
         output,
         title=f"Neural recognizer, a causal transformer of {network.shape.layers} layers",

@@ -66,7 +66,7 @@ def train_phone_lm(
 
 
 def _is_sentence(row: Utterance) -> bool:
-    return len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.licence)
+    return len(row.phones) > MAX_WORD_PHONES and not is_synthetic(row.license)
 
 
 def phone_lm_of(examples: Sequence[Example], inventory: PhoneInventory) -> PhoneLanguageModel:

@@ -102,16 +102,16 @@ def _lead(parameters: VisemeParameters) -> VisemeParameters:
     )
 
 
-def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> None:
+def train_visemes(folder: Path, output: Path, *, any_license: bool = False) -> None:
     """Train viseme parameters on the training clips of a folder.
 
     Raises UserError if no clip may be used, or the file cannot be written.
     """
-    clips = read_clips(folder, any_licence=any_licence)
+    clips = read_clips(folder, any_license=any_license)
     used = [clip for clip in clips if clip.part == "train"]
     if not used:
         raise UserError(
-            f"no clip in {folder} may be used; give clips with a free license, or --any-licence"
+            f"no clip in {folder} may be used; give clips with a free license, or --any-license"
         )
     model = load_model()
     inventory = model.inventory
@@ -120,12 +120,12 @@ def train_visemes(folder: Path, output: Path, *, any_licence: bool = False) -> N
     parameters = replace(parameters, level_db=usual_levels(used, labels, inventory))
     reach_s = closure_reach(parameters, used, labels, inventory)
     parameters = _lead(replace(parameters, closure_reach_s=reach_s))
-    licences = "; ".join(sorted({clip.licence for clip in used}))
+    licenses = "; ".join(sorted({clip.license for clip in used}))
     try:
         save_parameters(
             parameters,
             output,
-            f"{_SOURCE}; the rest learned from clips under: {licences}",
+            f"{_SOURCE}; the rest learned from clips under: {licenses}",
             learnt_from=[clip.name for clip in used],
             chosen_with=[clip.name for clip in clips if clip.part == "choice"],
         )
