@@ -1,5 +1,5 @@
 /**
- * Return the address of one of the gateway's WebSockets.
+ * Return the URL of one of the gateway's WebSockets.
  *
  * @param gateway address of the gateway, such as "http://localhost:8080"
  * @param path "/viewer" or "/microphone"

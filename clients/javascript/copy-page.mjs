@@ -1,10 +1,10 @@
-// Copies what the package shares with the gateway's page, which is where these modules stand.
+// Copies the modules that the package shares with the gateway's page.
 
 import { cp, mkdir } from "node:fs/promises";
 
 const SHARED = [
-  ...["joints", "link", "messages", "morph", "pace", "pictures", "playout", "presence", "recent"],
-  ...["sound", "sound-worklet"],
+  ...["draw-rate", "image-queue", "joints", "messages", "morph", "playout", "sliding-window"],
+  ...["sound", "sound-worklet", "stream-activity", "viewer-socket"],
 ];
 const PAGE = new URL("../../services/gateway/page/", import.meta.url);
 const COPY = new URL("page/", import.meta.url);

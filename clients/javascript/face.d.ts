@@ -10,14 +10,14 @@ export interface KouxingFaceEventMap extends HTMLElementEventMap {
  * Events: `load`, `error`, `session`, `phone`.
  */
 export class KouxingFace extends HTMLElement {
-  /** What moves the model; null until it is loaded. */
+  /** Set of values that moves the model; null before loading. */
   readonly set: ShapeSet | "faps" | null;
-  /** What is shown: weights by name, or 68 FAPs; null until there is something. */
+  /** The shown values: weights by name, or 68 FAPs; null before the first. */
   readonly shown: Record<string, number> | number[] | null;
-  /** Let the session be heard; call it from a click. */
+  /** Turn the session's sound on. Call it from a click handler. */
   turnSoundOn(): Promise<void>;
   turnSoundOff(): void;
-  /** Play the recording to its end, or until another begins; an audio element may play its sound. */
+  /** Play the recording, with the sound of an audio element. Resolved when it ends. */
   play(audio?: HTMLAudioElement | null): Promise<void>;
   addEventListener<K extends keyof KouxingFaceEventMap>(
     type: K,

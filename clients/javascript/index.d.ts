@@ -7,7 +7,7 @@ export const NUM_FAPS: 68;
 export type MediaTime = number;
 
 export interface SessionMessage {
-  /** the one that is shown from here on; null: none */
+  /** the session that is shown from now on; null: none */
   session: string | null;
   chosen: string;
   epoch: number;
@@ -15,7 +15,7 @@ export interface SessionMessage {
   sample: boolean;
 }
 
-/** A phone, or with Pinyin's letters a syllable; the same index again revises it. */
+/** A phone, or a syllable in Pinyin. The same index again revises it. */
 export interface PhoneMessage {
   index: number;
   symbol: string;
@@ -26,40 +26,40 @@ export interface PhoneMessage {
   final: boolean;
 }
 
-/** What a viewer calls. All may be left out. */
+/** Handlers of a viewer. All are optional. */
 export interface ViewerHandlers {
   connected?(isConnected: boolean): void;
   /** 68 values in FAP units, FAP 1 first */
   frame?(mediaTime: MediaTime, values: Float32Array): void;
-  /** weights of the shapes that were asked for, 0 to 1, and their names */
+  /** weights of the requested shapes, 0 to 1, and their names */
   weights?(mediaTime: MediaTime, weights: Float32Array, names: string[]): void;
   /** 16 kHz, mono */
   sound?(mediaTime: MediaTime, samples: Int16Array): void;
-  /** FAPs of a face while nobody speaks */
+  /** FAPs of the face at rest */
   rest?(values: Float32Array): void;
-  /** weights of a face while nobody speaks, and their names */
+  /** weights of the face at rest, and their names */
   restWeights?(weights: Float32Array, names: string[]): void;
   session?(message: SessionMessage): void;
   phone?(message: PhoneMessage): void;
   syllable?(message: Omit<PhoneMessage, "confidence">): void;
   speech?(message: { active: boolean; media_time: MediaTime }): void;
-  /** no more frames of this session */
+  /** the session has no more frames */
   end?(message: { media_time: MediaTime }): void;
   error?(message: { code: string; text: string }): void;
   status?(message: { missing: string[] }): void;
   lips?(message: { lips: string }): void;
 }
 
-/** Follows a session, or always the newest; connects again by itself until it is closed. */
+/** Follows one session, or always the newest. Reconnects by itself until it is closed. */
 export class Viewer {
   constructor(
     gateway: string,
     handlers: ViewerHandlers,
     options?: { session?: string; shapes?: ShapeSet | ""; token?: string },
   );
-  /** Fulfilled when a session is shown: nothing that is said from then on is missed. */
+  /** Resolved when a session is shown. The viewer misses nothing from then on. */
   readonly ready: Promise<void>;
-  /** Look at another session; "" for the newest. */
+  /** Show another session; "" for the newest. */
   follow(session: string): void;
   /** Send a command of GATEWAY.md, such as { express: { joy: 0.5 } }. */
   send(command: object): void;
@@ -67,43 +67,43 @@ export class Viewer {
 }
 
 export interface SpeakerOptions {
-  /** 8000 to 48000; 16000 if not given */
+  /** 8000 to 48000; default 16000 */
   sampleRateHz?: number;
   numChannels?: 1 | 2;
-  /** of bytes that are pushed, and what goes over the wire */
+  /** of pushed bytes and of the messages; default "s16le" */
   encoding?: "s16le" | "f32le";
-  /** audio may come before its time, as that of a file or of text-to-speech: it goes on in real time */
+  /** audio may come faster than real time, such as text-to-speech; it is played in real time */
   ahead?: boolean;
-  /** profile of the speaker's voice, base64 */
+  /** the speaker's mouth profile, base64 */
   voice?: string;
   token?: string;
-  /** the session is over; null: as it should be */
+  /** called when the session has ended; null: without an error */
   closed?(error: Error | null): void;
 }
 
-/** A session of its own: audio goes in. */
+/** A session that this program feeds with audio. */
 export class Speaker {
   private constructor();
   static open(gateway: string, options?: SpeakerOptions): Promise<Speaker>;
   readonly session: string;
-  /** Send audio, interleaved; await it where more comes than is spoken. */
+  /** Send interleaved audio. Await it if audio comes faster than real time. */
   push(audio: Int16Array | Float32Array | Uint8Array | ArrayBuffer): Promise<void>;
-  /** Interrupt: audio not yet shown is dropped, and the face returns to rest. */
+  /** Interrupt: drop audio whose face is not shown yet. The face returns to rest. */
   flush(): void;
-  /** Say that no more audio comes; fulfilled when all is spoken and the session closed. */
+  /** End the audio. Resolved when all is spoken and the session is closed. */
   finish(): Promise<void>;
   /** Close the session at once. */
   close(): void;
 }
 
-/** Frames of a `.csv` or `.jsonl` of `kouxing listen -o` or `kouxing render -o`. */
+/** Read a `.csv` or `.jsonl` file of `kouxing listen -o` or `kouxing render -o`. */
 export function readRecording(text: string): {
-  /** of the shapes; null: the values are the 68 FAPs */
+  /** names of the shapes; null: the values are the 68 FAPs */
   names: string[] | null;
   frames: [MediaTime, Float32Array][];
 };
 
-/** Read one of the gateway's binary messages; null for what a later gateway may send. */
+/** Read one of the gateway's binary messages; null for an unknown type. */
 export function readMessage(
   data: ArrayBuffer,
 ):
@@ -114,26 +114,26 @@ export function readMessage(
   | { rest: Float32Array }
   | null;
 
-/** Frames, or weights, in order of media time, and the face between two of them. */
+/** Frames or weights in order of media time, with interpolation. */
 export class FapTrack {
   reset(): void;
   /** Add a frame; return whether it advances media time. */
   push(mediaTime: MediaTime, values: Float32Array): boolean;
-  /** Write the face at a media time; return the media time it belongs to, null without any. */
+  /** Write the face at a media time to `out`; return its media time, or null without frames. */
   sample(mediaTime: MediaTime, out: Float32Array): MediaTime | null;
 }
 
-/** Says which media time is due: sound waits for the frames that belong to it. */
+/** The playout clock: computes which media time is due. Sound waits for its frames. */
 export class Playout {
-  isHeard: boolean;
+  isAudible: boolean;
   outputLatencyMs: number;
-  pictureMs: number;
+  imageDelayMs: number;
   readonly offsetMs: number | null;
   readonly delayMs: number | null;
   reset(): void;
   mediaAt(nowMs: number): MediaTime | null;
   frameArrived(nowMs: number, mediaTime: MediaTime): void;
   soundArrived(nowMs: number, mediaTime: MediaTime, numSamples: number): void;
-  /** Move towards what was measured; to be called for every picture. */
+  /** Move towards the measured delay. Call it for every image. */
   adjust(nowMs: number): void;
 }

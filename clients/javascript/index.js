@@ -1,4 +1,4 @@
-// A client of kouxing's gateway, for browsers and for Node 22 or newer.
+// Client for kouxing's gateway, for browsers and Node 22 or newer.
 
 export { NUM_FAPS, readMessage } from "./page/messages.js";
 export { FapTrack, Playout } from "./page/playout.js";

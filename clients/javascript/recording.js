@@ -1,19 +1,19 @@
-// Files of `kouxing listen -o` and `kouxing render -o`: .csv and .jsonl, of FAPs or shapes.
+// Reads the .csv and .jsonl files of `kouxing listen -o` and `kouxing render -o`: FAPs or shapes.
 
 const RATE_HZ = 16000;
 
 /**
  * Read a recording.
  *
- * @param {string} text the file's content
+ * @param {string} text content of the file
  * @returns { names: of the shapes, or null for the 68 FAPs, frames: [[media time, Float32Array]] }
  */
 export function readRecording(text) {
   const lines = text.trim().split(/\r?\n/);
-  return lines[0].startsWith("{") ? readJson(lines) : readCsv(lines);
+  return lines[0].startsWith("{") ? readJsonLines(lines) : readCsv(lines);
 }
 
-function readJson(lines) {
+function readJsonLines(lines) {
   const objects = lines.map((line) => JSON.parse(line));
   const set = Object.keys(objects[0]).find((key) => !["time_s", "sequence"].includes(key));
   const names = Array.isArray(objects[0][set]) ? null : Object.keys(objects[0][set]);
@@ -26,8 +26,8 @@ function readJson(lines) {
   };
 }
 
-function readCsv([head, ...rows]) {
-  const names = head.split(",").slice(1);
+function readCsv([header, ...rows]) {
+  const names = header.split(",").slice(1);
   return {
     names: names[0] === "viseme" ? null : names,
     frames: rows.map((row) => {

@@ -1,20 +1,20 @@
-// Speech into a new session.
+// Sends speech into a new session.
 
 import { socketUrl } from "./address.js";
 
-const PIECE_BYTES = 32000; // of one message
-const MAX_BUFFERED_BYTES = 1 << 18; // then whoever pushes waits
-const LOOK_EVERY_MS = 10;
+const MESSAGE_BYTES = 32000;
+const MAX_BUFFERED_BYTES = 1 << 18; // above it, push() waits
+const POLL_MS = 10;
 
-/** A session of its own: audio goes in. */
+/** A session that this program feeds with audio. */
 export class Speaker {
   #socket;
   #encoding;
   #failure = null;
-  #isOver = null; // a promise
+  #closed; // a promise
 
-  /** Use Speaker.open. */
-  constructor(socket, session, encoding, closed) {
+  /** Use Speaker.open instead. */
+  constructor(socket, session, encoding, onClosed) {
     this.#socket = socket;
     this.#encoding = encoding;
     this.session = session;
@@ -22,10 +22,10 @@ export class Speaker {
       const { type, text } = JSON.parse(data);
       if (type === "error" || type === "closed") this.#failure = new Error(text);
     };
-    this.#isOver = new Promise((fulfil) => {
+    this.#closed = new Promise((resolve) => {
       socket.onclose = () => {
-        closed(this.#failure);
-        fulfil();
+        onClosed(this.#failure);
+        resolve();
       };
     });
   }
@@ -34,10 +34,10 @@ export class Speaker {
    * Open a session.
    *
    * @param gateway address of the gateway
-   * @param options { sampleRateHz, numChannels, encoding: "s16le" or "f32le", ahead: audio may come
-   *   before its time, voice: in base64, token, closed: called when the session is over, with an error
-   *   or null }
-   * @returns a promise of a speaker; it fails if the gateway refuses
+   * @param options { sampleRateHz, numChannels, encoding: "s16le" or "f32le", ahead: whether audio may
+   *   come faster than real time, voice: mouth profile in base64, token, closed: called with an
+   *   error or null when the session has ended }
+   * @returns a promise of a Speaker; it is rejected if the gateway refuses the session
    */
   static open(gateway, options = {}) {
     const { sampleRateHz = 16000, numChannels = 1, encoding = "s16le", token = "" } = options;
@@ -51,38 +51,40 @@ export class Speaker {
         if (type === "opened") resolve(new Speaker(socket, session, encoding, closed));
         else reject(new Error(text));
       };
-      socket.onclose = () => reject(new Error(`${gateway} cannot be reached`));
+      socket.onclose = () => {
+        reject(new Error(`cannot connect to ${gateway}; start it with: kouxing run`));
+      };
     });
   }
 
   /**
-   * Send audio; wait for the promise before more, where more comes than is spoken.
+   * Send audio. If it comes faster than real time, wait for the promise before the next call.
    *
-   * @param audio interleaved: Int16Array, Float32Array within ±1, or bytes of PCM in the session's
+   * @param audio interleaved: Int16Array, Float32Array from -1 to 1, or bytes of PCM in the session's
    *   encoding
    */
   async push(audio) {
     const pcm = toPcm(audio, this.#encoding);
-    for (let begin = 0; begin < pcm.byteLength; begin += PIECE_BYTES) {
-      this.#check();
-      this.#socket.send(pcm.subarray(begin, begin + PIECE_BYTES));
-      while (this.#socket.bufferedAmount > MAX_BUFFERED_BYTES && this.#socket.readyState === WebSocket.OPEN) {
-        await new Promise((done) => setTimeout(done, LOOK_EVERY_MS));
+    for (let begin = 0; begin < pcm.byteLength; begin += MESSAGE_BYTES) {
+      this.#checkOpen();
+      this.#socket.send(pcm.subarray(begin, begin + MESSAGE_BYTES));
+      while (this.#isOpen && this.#socket.bufferedAmount > MAX_BUFFERED_BYTES) {
+        await new Promise((resolve) => setTimeout(resolve, POLL_MS));
       }
     }
   }
 
-  /** Interrupt: audio not yet shown is dropped, and the face returns to rest. */
+  /** Interrupt: drop audio whose face is not shown yet. The face returns to rest. */
   flush() {
-    this.#check();
+    this.#checkOpen();
     this.#socket.send(JSON.stringify({ flush: true }));
   }
 
-  /** Say that no more audio comes; the promise is fulfilled when all is spoken and the session closed. */
+  /** End the audio. The promise is resolved when all is spoken and the session is closed. */
   async finish() {
-    this.#check();
+    this.#checkOpen();
     this.#socket.send(JSON.stringify({ eof: 1 }));
-    await this.#isOver;
+    await this.#closed;
   }
 
   /** Close the session at once. */
@@ -90,9 +92,13 @@ export class Speaker {
     this.#socket.close();
   }
 
-  #check() {
+  get #isOpen() {
+    return this.#socket.readyState === WebSocket.OPEN;
+  }
+
+  #checkOpen() {
     if (this.#failure) throw this.#failure;
-    if (this.#socket.readyState !== WebSocket.OPEN) throw new Error("the session is over");
+    if (!this.#isOpen) throw new Error("the session has ended; open another one");
   }
 }
 

@@ -1,52 +1,53 @@
-// What comes from a session; proto/GATEWAY.md has all messages.
+// Receives the frames, sound and events of a session; see proto/GATEWAY.md.
 
 import { socketUrl } from "./address.js";
-import { Link } from "./page/link.js";
+import { ViewerSocket } from "./page/viewer-socket.js";
 
-const TEXTS = ["session", "phone", "syllable", "speech", "end", "error", "status", "lips"];
+const EVENTS = ["session", "phone", "syllable", "speech", "end", "error", "status", "lips"];
 
-/** Follows a session, or always the newest; connects again by itself until it is closed. */
+/** Follows one session, or always the newest. Reconnects by itself until it is closed. */
 export class Viewer {
-  #link;
+  #socket;
 
   /**
    * @param gateway address of the gateway
-   * @param handlers functions by what they take; index.d.ts has all
-   * @param options { session: name, "" for the newest; shapes: set that comes beside FAP frames;
-   *   token: the gateway's }
+   * @param handlers functions by name, see index.d.ts
+   * @param options { session: name, "" for the newest; shapes: set of blend shapes to receive in
+   *   addition to FAP frames; token: the gateway's token }
    */
   constructor(gateway, handlers, { session = "", shapes = "", token = "" } = {}) {
     let names = [];
-    let ready = null;
-    /** Fulfilled when a session is shown: nothing that is said from then on is missed. */
-    this.ready = new Promise((fulfil) => (ready = fulfil));
-    const tell = (name, ...values) => handlers[name]?.(...values);
-    this.#link = new Link((chosen) => socketUrl(gateway, "/viewer", { session: chosen, shapes, token }), session, {
-      state: (isConnected) => tell("connected", isConnected),
-      fap: (mediaTime, values) => tell("frame", mediaTime, values),
-      sound: (mediaTime, samples) => tell("sound", mediaTime, samples),
-      rest: (values) => tell("rest", values),
-      weights: (mediaTime, weights) => tell("weights", mediaTime, weights, names),
-      restWeights: (weights) => tell("restWeights", weights, names),
+    let resolveReady = null;
+    /** Resolved when a session is shown. The viewer misses nothing from then on. */
+    this.ready = new Promise((resolve) => (resolveReady = resolve));
+    const call = (name, ...values) => handlers[name]?.(...values);
+    const url = (chosen) => socketUrl(gateway, "/viewer", { session: chosen, shapes, token });
+    this.#socket = new ViewerSocket(url, session, {
+      state: (isConnected) => call("connected", isConnected),
+      fap: (mediaTime, values) => call("frame", mediaTime, values),
+      sound: (mediaTime, samples) => call("sound", mediaTime, samples),
+      rest: (values) => call("rest", values),
+      weights: (mediaTime, weights) => call("weights", mediaTime, weights, names),
+      restWeights: (weights) => call("restWeights", weights, names),
       text(message) {
         if (message.type === "shapes") ({ names } = message);
-        else if (TEXTS.includes(message.type)) tell(message.type, message);
-        if (message.type === "session" && message.session !== null) ready();
+        else if (EVENTS.includes(message.type)) call(message.type, message);
+        if (message.type === "session" && message.session !== null) resolveReady();
       },
     });
   }
 
-  /** Look at another session; "" for the newest. */
+  /** Show another session; "" for the newest. */
   follow(session) {
-    this.#link.follow(session);
+    this.#socket.follow(session);
   }
 
   /** Send a command, such as { express: { joy: 0.5 } }. */
   send(command) {
-    this.#link.send(command);
+    this.#socket.send(command);
   }
 
   close() {
-    this.#link.close();
+    this.#socket.close();
   }
 }

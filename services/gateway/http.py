@@ -15,6 +15,7 @@ from aiohttp import WSCloseCode, web
 import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.connection_quota import ConnectionQuota
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
 from kouxing.shared.logs import LOG
 from kouxing.shared.page_heads import page_heads_folder
 
@@ -128,6 +129,7 @@ def make_application(
 
     application.add_routes(routes)
     application.router.add_get("/", serve_page)
+    application.router.add_get("/offers.json", _serve_offers)
     application.router.add_get("/{name}", serve_page)
     if modules is not None:
         face_mesh = modules / "@mediapipe" / "face_mesh"
@@ -158,6 +160,13 @@ def _modules_folder() -> Path | None:
         if (folder / "three").is_dir() and (folder / "@mediapipe" / "face_mesh").is_dir():
             return folder
     return None
+
+
+async def _serve_offers(_request: web.Request) -> web.StreamResponse:
+    """Answer with the names of the heads and lip models that the page's settings offer."""
+    heads = sorted(path.stem.removeprefix("head-") for path in PAGE.glob("head-*.webp"))
+    lips = sorted(LipModelName, key=lambda name: name != DEFAULT_LIP_MODEL)
+    return web.json_response({"heads": heads, "lips": lips})
 
 
 def _find(folder: Path, name: str, suffixes: Collection[str]) -> Path:

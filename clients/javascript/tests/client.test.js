@@ -1,4 +1,4 @@
-// The built package in Node, against the gateway at $GATEWAY.
+// Tests of the built package in Node, with the gateway at $GATEWAY.
 
 import assert from "node:assert/strict";
 import { readFile } from "node:fs/promises";
@@ -7,7 +7,7 @@ import { Speaker, Viewer, readRecording } from "kouxing-client";
 
 const { GATEWAY, SPEECH } = process.env;
 
-test("recordings are lines of JSON or a table, of FAPs or shapes", () => {
+test("reads recordings in JSON lines and CSV, with FAPs or shapes", () => {
   const named = { names: ["jawOpen", "mouthClose"], frames: [[0, Float32Array.of(0.25, 1)], [320, Float32Array.of(0.5, 0)]] };
   const json = [[0.25, 1], [0.5, 0]].map(([jawOpen, mouthClose], sequence) =>
     JSON.stringify({ time_s: sequence / 50, sequence, arkit: { jawOpen, mouthClose } }),
@@ -19,14 +19,14 @@ test("recordings are lines of JSON or a table, of FAPs or shapes", () => {
   assert.deepEqual(readRecording("time_s,viseme,expression\n0,7,8\n"), faps);
 });
 
-test("what is spoken comes back as frames, shapes, phones and sound", async () => {
+test("speech returns as frames, shapes, phones and sound", async () => {
   const wav = await readFile(SPEECH);
   const speaker = await Speaker.open(GATEWAY, { sampleRateHz: wav.readUInt32LE(24), ahead: true });
-  const [faps, opened, symbols] = [[], [], []];
+  const [faps, openings, symbols] = [[], [], []];
   let numSamples = 0;
   const handlers = {
     frame: (mediaTime, values) => faps.push([mediaTime, values[2]]),
-    weights: (mediaTime, weights, names) => opened.push([mediaTime, weights[names.indexOf("jawOpen")]]),
+    weights: (mediaTime, weights, names) => openings.push([mediaTime, weights[names.indexOf("jawOpen")]]),
     phone: ({ symbol, final }) => final && symbols.push(symbol),
     sound: (_, samples) => (numSamples += samples.length),
   };
@@ -37,14 +37,14 @@ test("what is spoken comes back as frames, shapes, phones and sound", async () =
   await speaker.finish();
   viewer.close();
   assert.ok(Math.max(...faps.map(([, jaw]) => jaw)) > 200);
-  assert.ok(Math.max(...opened.map(([, weight]) => weight)) > 0.1);
-  const [times, shapeTimes] = [faps, opened].map((frames) => frames.slice(0, 50).map(([time]) => time));
+  assert.ok(Math.max(...openings.map(([, weight]) => weight)) > 0.1);
+  const [times, shapeTimes] = [faps, openings].map((frames) => frames.slice(0, 50).map(([time]) => time));
   assert.deepEqual(shapeTimes, times);
   assert.deepEqual(symbols.slice(0, 4), ["n", "i", "h", "ao"]);
   assert.ok(numSamples > 30000);
 });
 
-test("a refusal says why", async () => {
+test("a refused session is rejected with the reason", async () => {
   await assert.rejects(Speaker.open(GATEWAY, { sampleRateHz: 1000 }), /sample_rate_hz must be/);
-  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /cannot be reached/);
+  await assert.rejects(Speaker.open("http://127.0.0.1:1"), /cannot connect/);
 });

@@ -1,4 +1,4 @@
-// The API as a TypeScript program uses it; only its types are checked.
+// The API in TypeScript. Only the types are checked.
 
 import { FapTrack, Playout, Speaker, Viewer, readMessage, readRecording } from "kouxing-client";
 import type { KouxingFace } from "kouxing-client/face";
@@ -35,9 +35,9 @@ face.addEventListener("session", ({ detail }) => console.log(detail.epoch));
 await face.turnSoundOn();
 if (face.set !== "faps" && face.shown !== null && !Array.isArray(face.shown)) console.log(face.shown.jawOpen);
 
-// @ts-expect-error: there are no such shapes
+// @ts-expect-error: unknown shapes
 new Viewer(gateway, {}, { shapes: "apple" });
-// @ts-expect-error: a speaker comes from Speaker.open
+// @ts-expect-error: use Speaker.open
 new Speaker();
-// @ts-expect-error: sound is no text
+// @ts-expect-error: audio is not text
 await speaker.push("sound");

@@ -1,9 +1,9 @@
-// The gateway's addresses. Its token, if it wants one, stands in the page's address once, behind the
-// "#", which no server sees; then it is in this page's memory alone.
+// Addresses of the gateway. The page's URL contains the token after "#", which browsers do not send
+// to servers. The page removes the token from the URL and keeps it only in memory.
 
 let token = null;
 
-function secret() {
+function takeToken() {
   if (token === null) {
     token = new URLSearchParams(location.hash.slice(1)).get("token") ?? "";
     if (token !== "") history.replaceState(null, "", location.pathname + location.search);
@@ -11,13 +11,13 @@ function secret() {
   return token;
 }
 
-/** Return a path with its query, the token included; empty fields are left out. */
+/** Return a path with its query and the token; empty fields are left out. */
 export function pathOf(path, fields = {}) {
-  const given = Object.entries({ ...fields, token: secret() }).filter(([, value]) => value !== "");
-  return given.length === 0 ? path : `${path}?${new URLSearchParams(given)}`;
+  const query = Object.entries({ ...fields, token: takeToken() }).filter(([, value]) => value !== "");
+  return query.length === 0 ? path : `${path}?${new URLSearchParams(query)}`;
 }
 
-/** Return the address of a WebSocket. */
+/** Return the URL of a WebSocket. */
 export function socketUrl(path, fields) {
   const scheme = location.protocol === "https:" ? "wss" : "ws";
   return `${scheme}://${location.host}${pathOf(path, fields)}`;

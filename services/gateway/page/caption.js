@@ -1,4 +1,4 @@
-// What is spoken, below the face: syllables, or phones on request.
+// The caption below the face: syllables, or phones if the user chose them.
 
 import { element } from "./elements.js";
 import { PhoneTrack } from "./phones.js";
@@ -6,16 +6,16 @@ import { PhoneTrack } from "./phones.js";
 export class Caption {
   #syllables = new PhoneTrack();
   #phones = new PhoneTrack();
-  #choices;
+  #preferences;
 
-  /** @param choices Choices, where "phones" is kept */
-  constructor(choices) {
-    this.#choices = choices;
+  /** @param {Preferences} preferences stores whether phones are shown */
+  constructor(preferences) {
+    this.#preferences = preferences;
     const button = element("show-phones");
-    button.setAttribute("aria-pressed", this.#arePhonesShown);
+    button.setAttribute("aria-pressed", this.#showsPhones);
     button.onclick = () => {
-      choices.set("phones", !this.#arePhonesShown);
-      button.setAttribute("aria-pressed", this.#arePhonesShown);
+      preferences.set("phones", !this.#showsPhones);
+      button.setAttribute("aria-pressed", this.#showsPhones);
     };
   }
 
@@ -28,14 +28,14 @@ export class Caption {
     this.#phones.reset();
   }
 
-  /** Take a message, "syllable" or "phone". */
-  accept(message) {
-    (message.type === "phone" ? this.#phones : this.#syllables).accept(message);
+  /** Add a "syllable" or "phone" message. */
+  add(message) {
+    (message.type === "phone" ? this.#phones : this.#syllables).add(message);
   }
 
-  /** Show what is spoken at a media time, and what was before. */
+  /** Show the caption of a media time. */
   show(mediaTime) {
-    const { current, past } = (this.#arePhonesShown ? this.#phones : this.#syllables).at(mediaTime);
+    const { current, past } = (this.#showsPhones ? this.#phones : this.#syllables).at(mediaTime);
     if (this.text !== current) element("spoken").value = current;
     const key = past.join(" ");
     if (element("past").dataset.key !== key) {
@@ -44,8 +44,8 @@ export class Caption {
     }
   }
 
-  get #arePhonesShown() {
-    return this.#choices.get("phones") === true;
+  get #showsPhones() {
+    return this.#preferences.get("phones") === true;
   }
 }
 

@@ -1,8 +1,8 @@
-// A stream's microphone in chunks, by an audio worklet.
+// Captures a stream's audio in chunks, with an audio worklet.
 
 const MAX_RATE_HZ = 48000;
 
-/** Return an audio context in which a microphone can be captured, of at most 48 kHz. */
+/** Return an audio context with a sample rate of at most 48 kHz. */
 export async function openCaptureContext() {
   let context = new AudioContext({ latencyHint: "interactive" });
   if (context.sampleRate > MAX_RATE_HZ) {
@@ -14,8 +14,10 @@ export async function openCaptureContext() {
 }
 
 /**
- * Hand over a stream's microphone: onChunk(samples, int16, of 20 ms, their level, 0 to 1, and when
- * they were recorded, ms of the page's clock, however long this page was busy since).
+ * Capture a stream's audio.
+ *
+ * @param onChunk (samples: Int16Array of 20 ms, rms: level from 0 to 1, recordedMs: when they were
+ *   recorded, on the page's clock). recordedMs is right even if the page was busy since then.
  */
 export function capture(context, stream, onChunk) {
   const node = new AudioWorkletNode(context, "capture", {

@@ -1,10 +1,18 @@
-// The page's elements, by their names.
+// Access to the page's elements.
+
+import { say } from "./language.js";
 
 export function element(id) {
   return document.getElementById(id);
 }
 
-/** Show a text, if another is shown: what reads the screen aloud hears of each change. */
+/** Set an element's text if it differs. Screen readers announce every change. */
 export function setText(target, text) {
   if (target.textContent !== text) target.textContent = text;
+}
+
+/** Give an element another text of the table; it changes with the page's language. */
+export function setTextKey(target, key) {
+  target.dataset.text = key;
+  setText(target, say(key));
 }

@@ -1,7 +1,8 @@
-// Finds the face in pictures, in a frame of its own (face-mesh.html): pictures come as messages,
-// landmarks go back. MediaPipe's face mesh, on the CPU, which every browser computes alike.
+// Finds the face in images with MediaPipe's face mesh, in a frame of its own (face-mesh.html).
+// Images arrive as messages, landmarks are sent back. It runs on the CPU, so that all browsers
+// compute the same landmarks.
 
-const { FaceMesh, FACEMESH_LIPS } = window; // of modules/face_mesh/face_mesh.js
+const { FaceMesh, FACEMESH_LIPS } = window; // from modules/face_mesh/face_mesh.js
 
 function answer(message) {
   parent.postMessage(message, location.origin);
@@ -15,14 +16,14 @@ mesh.onResults(({ image, multiFaceLandmarks: [face] }) => {
   answer({ landmarks: pixels ? Float32Array.from(pixels) : null });
 });
 
-addEventListener("message", async ({ data: picture, origin }) => {
+addEventListener("message", async ({ data: image, origin }) => {
   if (origin !== location.origin) return;
   try {
-    await mesh.send({ image: picture });
+    await mesh.send({ image });
   } catch (error) {
     answer({ problem: error.message });
   } finally {
-    picture.close();
+    image.close();
   }
 });
 

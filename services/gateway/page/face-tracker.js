@@ -1,47 +1,49 @@
-// The face in pictures, found in a frame of its own; see face-mesh.js.
+// Finds the face in images. The work is done in a frame of its own; see face-mesh.js.
 
-const LOADING_LIMIT_MS = 60000;
+import { UserError, say } from "./language.js";
+
+const LOADING_TIMEOUT_MS = 60000;
 
 export class FaceTracker {
-  lips = []; // pairs of landmarks that a line of the lips joins
+  lips = []; // pairs of landmarks that are joined by the outline of the lips
   #frame = document.createElement("iframe");
-  #waiting = null; // { resolve, reject } of the answer that is to come
+  #pending = null; // { resolve, reject } of the next answer
   #onMessage = (event) => this.#receive(event);
 
-  /** Load the tracker; an Error says what is wrong. */
+  /** Load the tracker. Throws a UserError if it cannot run. */
   async load() {
     addEventListener("message", this.#onMessage);
     this.#frame.src = "face-mesh.html";
     this.#frame.tabIndex = -1;
     document.body.append(this.#frame);
-    const timer = setTimeout(() => this.#fail("it does not answer"), LOADING_LIMIT_MS);
-    ({ lips: this.lips } = await this.#answer());
+    const timer = setTimeout(() => this.#fail("timeout"), LOADING_TIMEOUT_MS);
+    ({ lips: this.lips } = await this.#nextAnswer());
     clearTimeout(timer);
   }
 
-  /** Return the landmarks, x y z in pixels each, of the face in a picture; null if it has none. */
-  async find(picture) {
-    this.#frame.contentWindow.postMessage(picture, location.origin, [picture]);
-    return (await this.#answer()).landmarks;
+  /** Return the landmarks of the face in an image (x, y, z in pixels), or null without a face. */
+  async find(image) {
+    this.#frame.contentWindow.postMessage(image, location.origin, [image]);
+    return (await this.#nextAnswer()).landmarks;
   }
 
   close() {
     removeEventListener("message", this.#onMessage);
     this.#frame.remove();
-    this.#fail("it was closed");
+    this.#fail("closed");
   }
 
-  #answer() {
-    return new Promise((resolve, reject) => (this.#waiting = { resolve, reject }));
+  #nextAnswer() {
+    return new Promise((resolve, reject) => (this.#pending = { resolve, reject }));
   }
 
   #receive({ data, source }) {
     if (source !== this.#frame.contentWindow) return;
-    if (data.problem === undefined) this.#waiting?.resolve(data);
+    if (data.problem === undefined) this.#pending?.resolve(data);
     else this.#fail(data.problem);
   }
 
-  #fail(text) {
-    this.#waiting?.reject(new Error(`no face can be found here: ${text}`));
+  #fail(reason) {
+    this.#pending?.reject(new UserError(say("trackerFailed", { reason })));
   }
 }

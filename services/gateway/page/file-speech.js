@@ -1,36 +1,31 @@
-// A file's speech as the stream of a microphone: decoded by this browser, in its sandbox.
+// The speech of a file as an audio stream. The browser decodes the file in its sandbox.
+
+import { UserError, say } from "./language.js";
 
 const MAX_BYTES = 200 << 20;
 const MAX_S = 3600;
 
 /**
- * Return { stream, play(ended) } of a sound file, or of a video's sound.
+ * Return { stream, play(onEnded) } for a sound file or the sound of a video.
  *
- * @throws { en, zh }: why it cannot be spoken
+ * @throws {UserError} if the file is too large, too long or cannot be decoded
  */
-export async function fileSpeech(context, file) {
-  if (file.size > MAX_BYTES) {
-    throw { en: "The file is larger than 200 MB.", zh: "文件大于 200 MB。" };
-  }
+export async function openFileSpeech(context, file) {
+  if (file.size > MAX_BYTES) throw new UserError(say("fileTooLarge"));
   let buffer;
   try {
     buffer = await context.decodeAudioData(await file.arrayBuffer());
   } catch {
-    throw {
-      en: `This browser cannot read the sound of ${file.name}; kouxing speak reads more formats.`,
-      zh: `浏览器无法解码 ${file.name}；可改用 kouxing speak，它支持更多格式。`,
-    };
+    throw new UserError(say("fileUnreadable", { file: file.name }));
   }
-  if (buffer.duration > MAX_S) {
-    throw { en: "The file is longer than an hour.", zh: "文件超过一小时。" };
-  }
+  if (buffer.duration > MAX_S) throw new UserError(say("fileTooLong"));
   const source = new AudioBufferSourceNode(context, { buffer });
   const destination = new MediaStreamAudioDestinationNode(context, { channelCount: 1 });
   source.connect(destination);
   return {
     stream: destination.stream,
-    play(ended) {
-      source.onended = ended;
+    play(onEnded) {
+      source.onended = onEnded;
       source.start();
     },
   };

@@ -1,19 +1,26 @@
-// The head: a GLB whose morph targets and joints are named by FAPs (services/driver/head/glb_export.py).
+// The head: a GLB whose morph targets and joints are named after FAPs, as written by
+// services/driver/head/glb_export.py.
 
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
-import { coarsen } from "./coarse.js";
-import { findJoints, turnJoints } from "./joints.js";
-import { dim, physicalMaterial, plainMaterial, release, studio } from "./materials.js";
+import { coarsen } from "./coarse-mesh.js";
+import { DrawRate } from "./draw-rate.js";
+import { ImageQueue, drawsInSoftware } from "./image-queue.js";
+import { findJoints, rotateJoints } from "./joints.js";
+import {
+  physicalMaterial,
+  plainMaterial,
+  release,
+  setLight,
+  studioEnvironment,
+} from "./materials.js";
 import { MorphedMesh } from "./morph.js";
 import { mouthLight } from "./mouth-light.js";
-import { Pace } from "./pace.js";
-import { Pictures, drawsInSoftware } from "./pictures.js";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const IN_MOUTH = ["teeth_upper", "teeth_lower", "tongue"]; // lit through the lips
-const OVERLAY_SHARE = 0.6;
-const PORTRAIT_ASPECT = 0.66; // narrower windows step back, so that the face still fits
+const OVERLAY_SHARE = 0.6; // fraction of the overlay that the head avoids
+const PORTRAIT_ASPECT = 0.66; // in narrower windows the camera moves back, so that the face fits
 
 export class Head {
   #renderer;
@@ -22,48 +29,48 @@ export class Head {
   #camera = new THREE.PerspectiveCamera(22, 1, 0.05, 10);
   #controls;
   #model = null; // in the scene
-  #meshes = []; // that FAPs move
+  #meshes = []; // moved by FAPs
   #inMouth = []; // materials
   #joints = [];
-  #faps = null; // to be taken on
-  #front = new THREE.Vector3(); // where the camera stands at first
+  #faps = null; // for the next image
+  #front = new THREE.Vector3(); // initial position of the camera
   #fovYDegrees = 22;
-  #stale = true;
-  #software; // the processor draws
-  #pace;
-  #pictures;
+  #needsDrawing = true;
+  #isSoftware; // the processor draws
+  #drawRate;
+  #images;
   #isFilmed = false;
-  #size = [0, 0]; // on the page
+  #size = [0, 0]; // on the page, pixels
 
-  /** @param canvas to draw into; @param overlay the element that covers its lower edge */
+  /** @param canvas to draw on; @param overlay element that covers its lower edge */
   constructor(canvas, overlay) {
     this.#overlay = overlay;
-    // Smooth edges come from more pixels than the screen has: multisampling speckles a mesh whose
-    // triangles are as small as pixels.
+    // Edges are smoothed by drawing more pixels than the screen has. Multisampling would speckle a
+    // mesh whose triangles are as small as pixels.
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: false, alpha: true });
     const gl = this.#renderer.getContext();
-    this.#software = drawsInSoftware(gl);
+    this.#isSoftware = drawsInSoftware(gl);
     const full = Math.min(2, Math.max(1.5, devicePixelRatio));
-    this.#pace = this.#software ? new Pace(0.5, 1, true) : new Pace(full, full, false);
-    this.#pictures = new Pictures(gl, this.#pace);
-    if (!this.#software) this.#light();
+    this.#drawRate = this.#isSoftware ? new DrawRate(0.5, 1, true) : new DrawRate(full, full, false);
+    this.#images = new ImageQueue(gl, this.#drawRate);
+    if (!this.#isSoftware) this.#addLights();
     this.#controls = new OrbitControls(this.#camera, canvas);
     this.#controls.enablePan = false;
     this.#controls.minAzimuthAngle = -1.2;
     this.#controls.maxAzimuthAngle = 1.2;
     this.#controls.minPolarAngle = 1.1;
     this.#controls.maxPolarAngle = 1.9;
-    this.#controls.addEventListener("change", () => (this.#stale = true));
+    this.#controls.addEventListener("change", () => (this.#needsDrawing = true));
     new ResizeObserver(() => {
       this.#resize();
       this.#render();
     }).observe(canvas);
   }
 
-  /** Load a head, in place of the one before. */
+  /** Load a head and replace the current one. */
   async load(url) {
     const gltf = await new GLTFLoader().loadAsync(url);
-    if (this.#software) await coarsen(gltf);
+    if (this.#isSoftware) await coarsen(gltf);
     this.#model?.removeFromParent();
     this.#model?.traverse(({ geometry, material }) => {
       geometry?.dispose();
@@ -76,96 +83,95 @@ export class Head {
 
   #add(gltf) {
     this.#model = gltf.scene;
-    const about = gltf.scene.getObjectByName("kouxing").userData.kouxing;
-    const plain = this.#software || about.cel;
+    const info = gltf.scene.getObjectByName("kouxing").userData.kouxing;
+    const plain = this.#isSoftware || info.cel;
     gltf.scene.traverse((node) => {
       if (!node.isMesh) return;
-      node.frustumCulled = false; // bounds do not follow the face
+      node.frustumCulled = false; // its bounds do not follow the face
       node.material = plain
-        ? plainMaterial(node.name, node.material, gltf.scene.getObjectByName("head"), about.cel)
+        ? plainMaterial(node.name, node.material, gltf.scene.getObjectByName("head"), info.cel)
         : physicalMaterial(node.name, node.material);
       if (IN_MOUTH.includes(node.name)) this.#inMouth.push(node.material);
-      if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, about.faps));
+      if (node.morphTargetDictionary) this.#meshes.push(new MorphedMesh(node, info.faps));
     });
-    this.#joints = findJoints(gltf.scene, about.faps);
+    this.#joints = findJoints(gltf.scene, info.faps);
     this.#scene.add(gltf.scene);
-    this.#frame(about.camera);
+    this.#setCamera(info.camera);
   }
 
   /**
-   * Draw for a film, before a CSS colour, with as many pixels as now to its end; null: for the page
-   * again.
+   * Draw for a video: on a CSS color and with a constant number of pixels. null ends the video.
    */
   film(color) {
     this.#isFilmed = color !== null;
     this.#renderer.setClearColor(color ?? 0, color === null ? 0 : 1);
     this.#resize();
-    this.#stale = true;
+    this.#needsDrawing = true;
   }
 
-  /** Take on a face with the next picture: 68 values in FAP units. */
+  /** Set the face of the next image: 68 values in FAP units. */
   pose(faps) {
     this.#faps = faps;
-    this.#stale = true;
+    this.#needsDrawing = true;
   }
 
   #apply(faps) {
     for (const mesh of this.#meshes) mesh.pose(faps);
     const light = mouthLight(faps);
-    for (const material of this.#inMouth) dim(material, light);
-    turnJoints(this.#joints, faps);
+    for (const material of this.#inMouth) setLight(material, light);
+    rotateJoints(this.#joints, faps);
   }
 
   /**
-   * Draw, if anything has changed and it is time for a picture.
+   * Draw if the face has changed and it is time for an image.
    *
-   * @param seen called with when this picture is seen first, ms, if it is drawn
+   * @param onVisible called with the time at which the image becomes visible, ms
    */
-  draw(nowMs, seen) {
-    if (!this.#stale || !this.#pictures.isDue(nowMs)) return;
-    if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#resize(); // which blanks the canvas
-    this.#stale = false;
+  draw(nowMs, onVisible) {
+    if (!this.#needsDrawing || !this.#images.isDue(nowMs)) return;
+    if (this.#renderer.getPixelRatio() !== this.#drawRate.ratio) this.#resize(); // this clears the canvas
+    this.#needsDrawing = false;
     if (this.#faps !== null) this.#apply(this.#faps);
     this.#faps = null;
-    this.#pictures.draw(nowMs, () => this.#render(), seen);
+    this.#images.draw(nowMs, () => this.#render(), onVisible);
   }
 
   /**
-   * Turn the head in the picture, to the left and up, degrees; without any: to the front. Return how
-   * far it is turned.
+   * Turn the head to the left and up by degrees, or to the front without arguments. Return
+   * { left, up }: its angles, degrees.
    */
   turn(left = null, up = null) {
     const { target, minAzimuthAngle, maxAzimuthAngle, minPolarAngle, maxPolarAngle } = this.#controls;
-    const [front, place] = [this.#front, this.#camera.position].map((position) =>
+    const [front, view] = [this.#front, this.#camera.position].map((position) =>
       new THREE.Spherical().setFromVector3(position.clone().sub(target)),
     );
     const { clamp, degToRad, radToDeg } = THREE.MathUtils;
-    place.theta = left === null ? front.theta : place.theta + degToRad(left);
-    place.phi = up === null ? front.phi : place.phi + degToRad(up);
-    place.theta = clamp(place.theta, minAzimuthAngle, maxAzimuthAngle);
-    place.phi = clamp(place.phi, minPolarAngle, maxPolarAngle);
-    this.#camera.position.setFromSpherical(place).add(target);
+    view.theta = left === null ? front.theta : view.theta + degToRad(left);
+    view.phi = up === null ? front.phi : view.phi + degToRad(up);
+    view.theta = clamp(view.theta, minAzimuthAngle, maxAzimuthAngle);
+    view.phi = clamp(view.phi, minPolarAngle, maxPolarAngle);
+    this.#camera.position.setFromSpherical(view).add(target);
     this.#controls.update();
-    return { left: radToDeg(place.theta - front.theta), up: radToDeg(place.phi - front.phi) };
+    return { left: radToDeg(view.theta - front.theta), up: radToDeg(view.phi - front.phi) };
   }
 
-  /** How long after it is drawn a picture is seen, ms, to the middle of the time for which it is. */
-  get untilSeenMs() {
-    return this.#pace.untilSeenMs;
+  /** How long after drawing starts an image is visible, ms, to the middle of its time. */
+  get visibleDelayMs() {
+    return this.#drawRate.visibleDelayMs;
   }
 
   /**
-   * How it is drawn: { isCoarse: as the processor draws it, width, height: in pixels, numPictures:
-   * until now, pictureMs: that one takes }.
+   * How it is drawn: { isCoarse: by the processor, width, height: pixels, numPictures: drawn since
+   * the start, pictureMs: duration of drawing }.
    */
   get drawing() {
     const { width, height } = this.#renderer.domElement;
     return {
-      isCoarse: this.#software,
+      isCoarse: this.#isSoftware,
       width,
       height,
-      numPictures: this.#pictures.numDrawn,
-      pictureMs: this.#pace.pictureMs,
+      numPictures: this.#images.numDrawn,
+      pictureMs: this.#drawRate.imageMs,
     };
   }
 
@@ -173,7 +179,7 @@ export class Head {
     this.#renderer.render(this.#scene, this.#camera);
   }
 
-  #frame({ target, position, fovYDegrees }) {
+  #setCamera({ target, position, fovYDegrees }) {
     this.#fovYDegrees = fovYDegrees;
     this.#front.set(...position);
     this.#camera.position.copy(this.#front);
@@ -185,9 +191,9 @@ export class Head {
     this.#resize();
   }
 
-  /** A key from the front upper left, a rim, and the light of a studio. */
-  #light() {
-    this.#scene.environment = studio(this.#renderer);
+  /** Add a key light from the front upper left, fill and rim lights, and a studio environment. */
+  #addLights() {
+    this.#scene.environment = studioEnvironment(this.#renderer);
     this.#scene.environmentIntensity = 0.8;
     for (const [color, intensity, x, y, z] of [
       [0xfff2e4, 2.7, -0.42, 0.5, 0.8],
@@ -205,17 +211,17 @@ export class Head {
     if (!this.#isFilmed) this.#size = [clientWidth, clientHeight];
     const [width, height] = this.#size;
     if (width === 0 || height === 0) return;
-    // The head is fitted into what the controls leave free, a little behind them at most.
-    const hidden = this.#overlay.offsetHeight * OVERLAY_SHARE;
-    const free = Math.max(0.5 * height, height - hidden);
+    // The head fits into the area above the controls, with a small overlap.
+    const covered = this.#overlay.offsetHeight * OVERLAY_SHARE;
+    const free = Math.max(0.5 * height, height - covered);
     const half = Math.tan(THREE.MathUtils.degToRad(this.#fovYDegrees / 2));
     const widened = half * Math.max(height / free, PORTRAIT_ASPECT * (height / width));
     this.#camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(widened));
     this.#camera.aspect = width / height;
     this.#camera.setViewOffset(width, height, 0, (height - free) / 2, width, height);
-    this.#stale = true;
+    this.#needsDrawing = true;
     if (this.#isFilmed) return;
-    this.#renderer.setPixelRatio(this.#pace.ratio);
+    this.#renderer.setPixelRatio(this.#drawRate.ratio);
     this.#renderer.setSize(width, height, false);
   }
 }

@@ -1,31 +1,41 @@
-// The page's language, English or Chinese: that of the browser, unless another is chosen.
+// The page's language, English or Chinese: the chosen one, else the browser's.
 
-const ATTRIBUTES = ["title", "aria-label"]; // data-zh-title beside title, and so on
+import { TEXTS } from "./texts.js";
 
-let isChinese = false;
+const ATTRIBUTES = { title: "title", label: "aria-label" }; // by their data- attributes
 
-/** Return "zh" or "en", for a browser's languages in the order in which its user likes them. */
+let language = "en";
+
+/** An error whose message is a text for the user. */
+export class UserError extends Error {}
+
+/** Return "zh" or "en", for the languages that a browser's user prefers, in this order. */
 export function languageFor(preferred) {
   const known = preferred.map((tag) => tag.slice(0, 2).toLowerCase());
   return known.find((name) => name === "zh" || name === "en") ?? "en";
 }
 
-/** Return that of two texts that is in the page's language. */
-export function say({ en, zh }) {
-  return isChinese ? zh : en;
+/**
+ * Return a text of the table in the page's language.
+ *
+ * @param {string} key of TEXTS; without an entry, the text is the part after the last dot
+ * @param {object} values by the names of their placeholders
+ */
+export function say(key, values = {}) {
+  const text = TEXTS[key]?.[language] ?? key.split(".").at(-1);
+  return text.replace(/\{(\w+)\}/g, (_, name) => values[name]);
 }
 
-/** Speak a language from here on; the style sheet shows its share of the document. */
+/** Set the page's language and translate all elements that name a text (data-text etc.). */
 export function setLanguage(name, page = document) {
-  isChinese = name === "zh";
+  language = name;
   page.documentElement.lang = name;
-  for (const attribute of ATTRIBUTES) {
-    for (const element of page.querySelectorAll(`[data-zh-${attribute}]`)) {
-      const english = `data-en-${attribute}`;
-      if (!element.hasAttribute(english)) {
-        element.setAttribute(english, element.getAttribute(attribute));
-      }
-      element.setAttribute(attribute, element.getAttribute(`data-${name}-${attribute}`));
+  for (const element of page.querySelectorAll("[data-text]")) {
+    element.textContent = say(element.dataset.text);
+  }
+  for (const [key, attribute] of Object.entries(ATTRIBUTES)) {
+    for (const element of page.querySelectorAll(`[data-${key}]`)) {
+      element.setAttribute(attribute, say(element.dataset[key]));
     }
   }
 }

@@ -1,37 +1,23 @@
-// "Learn my mouth": records the own lips and speech, has the gateway learn from them, shows what it
-// brought, and keeps it or not.
+// The dialog "Learn my mouth": it records lips and voice, sends the recording to the gateway, shows
+// the learned result, and stores it if the user keeps it.
 
 import { pathOf } from "./address.js";
 import { capture, openCaptureContext } from "./capture.js";
 import { element } from "./elements.js";
+import { FaceRecording } from "./face-recording.js";
 import { FaceTracker } from "./face-tracker.js";
-import { say } from "./language.js";
+import { UserError, say } from "./language.js";
 import { curvePath, extent, figures, verdict } from "./lip-curves.js";
-import { TEXTS } from "./reading.js";
-import { FaceRecording } from "./recording.js";
+import { READING_TEXTS } from "./reading-texts.js";
 
-const CLOSED_LIPS_MS = 3000; // before the reading, to see the face at rest
-const MIN_READING = 0.5; // share of the time after which one may have finished
+const CLOSED_LIPS_MS = 3000; // before reading, to record the face at rest
+const MIN_READING = 0.5; // fraction of the time after which the user may finish
 const CURVES = ["tracked", "before", "after"];
 const BOX = { width: 600, height: 150 };
-const NEEDS = {
-  NotAllowedError:
-    { en: "Camera and microphone were not allowed: allow them for this page and try again.", zh: "未允许使用摄像头和麦克风：请允许后重试。" },
-  NotFoundError: { en: "There is no camera or no microphone: plug one in and try again.", zh: "没有摄像头或麦克风：请接上后重试。" },
-  NotReadableError:
-    { en: "Another program holds the camera or the microphone: close it and try again.", zh: "摄像头或麦克风被其他程序占用：请关闭后重试。" },
-};
-const UNPLUGGED = { en: "Camera or microphone were unplugged: try again.", zh: "摄像头或麦克风断开了，请重试。" };
-const NEEDS_SECURE =
-  { en: "A camera needs https, or this page at http://localhost or http://127.0.0.1.", zh: "使用摄像头需要 https 或 localhost。" };
-
-const STARTING = { en: "Camera and microphone start …", zh: "正在启动摄像头和麦克风…" };
-const SHOW_FACE = { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" };
-const LIPS_CLOSED = { en: "Keep your lips closed …", zh: "请先闭上嘴…" };
-const READ = { en: "Read aloud, again if time is left.", zh: "请朗读，读完可重复。" };
-const NO_ANSWER = {
-  en: "The gateway does not answer; is 'kouxing run' running?",
-  zh: "网关没有应答：kouxing run 在运行吗？",
+const CAMERA_ERRORS = {
+  NotAllowedError: "cameraForbidden",
+  NotFoundError: "cameraMissing",
+  NotReadableError: "cameraBusy",
 };
 
 const dialog = element("learn-mouth");
@@ -40,10 +26,10 @@ export class MouthLesson {
   readingS = 40;
   #profiles;
   #handlers;
-  #stop = new AbortController(); // of what is going on
+  #abort = new AbortController(); // for the current step
   #finish = () => {}; // ends the reading
-  #recording = null; // landmark file that nothing was learnt from yet
-  #learnt = null; // profile that the user has neither kept nor discarded
+  #recording = null; // landmark file that was not used yet
+  #learned = null; // profile that the user has neither kept nor discarded
 
   /**
    * @param profiles MouthProfileStore
@@ -65,33 +51,30 @@ export class MouthLesson {
     }
     for (const button of dialog.querySelectorAll(".close")) button.onclick = () => dialog.close();
     dialog.onclose = () => {
-      this.#stop.abort();
+      this.#abort.abort();
       handlers.closed();
     };
   }
 
-  /** "closed", or what the lesson is at: "intro", "reading", "learning", "result" or "problem". */
+  /** "closed", or the current step: "intro", "reading", "learning", "result" or "problem". */
   get step() {
     return dialog.open ? dialog.dataset.step : "closed";
   }
 
   open() {
-    this.#recording = this.#learnt = null;
+    this.#recording = this.#learned = null;
     const { current } = this.#profiles;
     element("lesson-profile").hidden = current === null;
     if (current !== null) {
       const [, before, after] = figures(current)[0];
       const day = new Date(current.learntOn).toLocaleDateString();
       element("lesson-profile").firstElementChild.textContent =
-        say({
-          en: `Your mouth was learnt on ${day}: opening ${before} → ${after}.`,
-          zh: `${day} 学会了你的口型：张口 ${before} → ${after}。`,
-        });
+        say("lessonLearned", { day, before, after });
     }
     const isSecure = navigator.mediaDevices !== undefined;
     element("lesson-start").disabled = !isSecure;
     element("lesson-insecure").hidden = isSecure;
-    element("lesson-insecure").textContent = say(NEEDS_SECURE);
+    element("lesson-insecure").textContent = say("cameraInsecure");
     this.#show("intro");
     dialog.showModal();
     this.#handlers.opened();
@@ -110,9 +93,9 @@ export class MouthLesson {
   // --- recording ---------------------------------------------------------------------------------
 
   async #record() {
-    this.#stop = new AbortController();
+    this.#abort = new AbortController();
     this.#prepare();
-    const recording = await this.#film(this.#stop.signal);
+    const recording = await this.#recordFace(this.#abort.signal);
     if (recording === null) return;
     const problem = recording.problem();
     if (problem === null) {
@@ -123,8 +106,8 @@ export class MouthLesson {
     }
   }
 
-  /** Return what was recorded; null if that was stopped, or if it failed, which is shown. */
-  async #film(signal) {
+  /** Return the recording; null if it was aborted or failed. A failure is shown. */
+  async #recordFace(signal) {
     const tracker = new FaceTracker();
     let stream = null;
     let context = null;
@@ -141,7 +124,7 @@ export class MouthLesson {
       await this.#read(recording, { video, tracker, context, stream, signal });
       return signal.aborted ? null : recording;
     } catch (error) {
-      if (!signal.aborted) this.#fail(NEEDS[error.name] ? say(NEEDS[error.name]) : error.message);
+      if (!signal.aborted) this.#fail(errorText(error));
       return null;
     } finally {
       for (const track of stream?.getTracks() ?? []) track.stop();
@@ -154,18 +137,18 @@ export class MouthLesson {
     this.#recording = null;
     const language = element("lesson-text").value;
     element("lesson-reading").lang = language;
-    element("lesson-reading").textContent = TEXTS[language];
+    element("lesson-reading").textContent = READING_TEXTS[language];
     element("lesson-reading").classList.remove("due");
     element("lesson-finish").disabled = true;
     element("lesson-time").value = 0;
     element("lesson-count").textContent = "";
-    element("lesson-advice").textContent = say(STARTING);
+    element("lesson-advice").textContent = say("lessonStarting");
     this.#show("reading");
   }
 
-  /** Record until the time is over, beginning when a face is seen. */
+  /** Record from the first face until the time is over. */
   async #read(recording, { video, tracker, context, stream, signal }) {
-    let beganMs = null;
+    let startMs = null;
     let isOver = false;
     const over = new Promise((resolve, reject) => {
       this.#finish = () => {
@@ -173,39 +156,39 @@ export class MouthLesson {
         resolve({});
       };
       signal.addEventListener("abort", this.#finish);
-      for (const track of stream.getTracks()) track.onended = () => reject(new Error(say(UNPLUGGED)));
+      for (const track of stream.getTracks()) track.onended = () => reject(new UserError(say("cameraUnplugged")));
     });
-    let next = nextPicture(video);
+    let next = nextImage(video);
     while (!isOver) {
-      const { takenMs, picture } = await Promise.race([next, over]);
+      const { takenMs, image } = await Promise.race([next, over]);
       if (isOver) break;
-      next = nextPicture(video); // while the face is sought in this one
-      const landmarks = await tracker.find(picture);
+      next = nextImage(video); // taken while the face in this one is being found
+      const landmarks = await tracker.find(image);
       drawLips(video, tracker.lips, landmarks);
-      if (beganMs === null && landmarks !== null) {
-        beganMs = performance.now();
+      if (startMs === null && landmarks !== null) {
+        startMs = performance.now();
         capture(context, stream, (chunk, rms, recordedMs) =>
           recording.addSound(recordedMs, chunk, rms),
         );
       }
-      if (beganMs !== null) recording.addFace(takenMs, landmarks);
-      this.#tellTime(beganMs, recording);
+      if (startMs !== null) recording.addFace(takenMs, landmarks);
+      this.#showTime(startMs, recording);
     }
   }
 
-  #tellTime(beganMs, recording) {
+  #showTime(startMs, recording) {
     const nowMs = performance.now();
-    if (beganMs === null) {
-      element("lesson-advice").textContent = say(SHOW_FACE);
+    if (startMs === null) {
+      element("lesson-advice").textContent = say("lessonShowFace");
       return;
     }
-    const readingMs = nowMs - beganMs - CLOSED_LIPS_MS;
+    const readingMs = nowMs - startMs - CLOSED_LIPS_MS;
     const leftS = Math.ceil((readingMs < 0 ? -readingMs : 1000 * this.readingS - readingMs) / 1000);
     element("lesson-count").textContent = leftS;
     element("lesson-time").value = Math.max(0, readingMs / (1000 * this.readingS));
     element("lesson-reading").classList.toggle("due", readingMs >= 0);
     element("lesson-finish").disabled = readingMs < 1000 * MIN_READING * this.readingS;
-    const advice = recording.advice(nowMs) ?? (readingMs < 0 ? LIPS_CLOSED : READ);
+    const advice = recording.advice(nowMs) ?? (readingMs < 0 ? "lessonLipsClosed" : "lessonRead");
     element("lesson-advice").textContent = say(advice);
     if (leftS <= 0) this.#finish();
   }
@@ -213,8 +196,8 @@ export class MouthLesson {
   // --- learning ----------------------------------------------------------------------------------
 
   async #learn() {
-    this.#stop = new AbortController();
-    const { signal } = this.#stop;
+    this.#abort = new AbortController();
+    const { signal } = this.#abort;
     this.#show("learning");
     let answer;
     try {
@@ -222,7 +205,7 @@ export class MouthLesson {
       const isJson = response.headers.get("Content-Type")?.startsWith("application/json");
       answer = isJson ? await response.json() : { error: await response.text() };
     } catch {
-      answer = { error: say(NO_ANSWER) };
+      answer = { error: say("gatewaySilent") };
     }
     if (signal.aborted) return;
     if (answer.error !== undefined) {
@@ -230,7 +213,7 @@ export class MouthLesson {
       return;
     }
     const { voice: profile, before, after } = answer;
-    this.#learnt = { profile, learntOn: Date.now(), before, after };
+    this.#learned = { profile, learntOn: Date.now(), before, after };
     this.#recording = null;
     this.#showResult(answer);
   }
@@ -239,7 +222,7 @@ export class MouthLesson {
     element("lesson-verdict").textContent = say(verdict({ before, after }));
     const rows = figures({ before, after }).map((cells) => {
       const row = document.createElement("tr");
-      row.append(...cells.map((text, index) => cell(index === 0 ? say(text) : text, index === 0 ? "th" : "td")));
+      row.append(...cells.map((text, index) => (index === 0 ? cell("th", say(text)) : cell("td", text))));
       return row;
     });
     element("lesson-figures").replaceChildren(...rows);
@@ -252,7 +235,7 @@ export class MouthLesson {
   }
 
   #keep() {
-    this.#profiles.keep(this.#learnt);
+    this.#profiles.keep(this.#learned);
     this.#handlers.profileChanged();
     dialog.close();
   }
@@ -264,31 +247,33 @@ export class MouthLesson {
   }
 }
 
-/** Wait for the video's next picture; return it and when it was taken, by the page's clock. */
-async function nextPicture(video) {
+/** Wait for the video's next image; return it and when it was taken, on the page's clock. */
+async function nextImage(video) {
   const takenMs = await new Promise((resolve) => {
     video.requestVideoFrameCallback((nowMs, { captureTime }) => resolve(captureTime ?? nowMs));
   });
-  return { takenMs, picture: await createImageBitmap(video) };
+  return { takenMs, image: await createImageBitmap(video) };
+}
+
+function errorText(error) {
+  return CAMERA_ERRORS[error.name] ? say(CAMERA_ERRORS[error.name]) : error.message;
 }
 
 function drawLips(video, lips, landmarks) {
   const canvas = element("lesson-lips");
-  canvas.width = video.videoWidth; // which also clears it
+  canvas.width = video.videoWidth; // this also clears it
   canvas.height = video.videoHeight;
   if (landmarks === null) return;
-  const pen = canvas.getContext("2d");
-  pen.strokeStyle = getComputedStyle(canvas).color;
-  pen.lineWidth = (1.5 * canvas.width) / canvas.clientWidth;
+  const context = canvas.getContext("2d");
+  context.strokeStyle = getComputedStyle(canvas).color;
+  context.lineWidth = (1.5 * canvas.width) / canvas.clientWidth;
   for (const [from, to] of lips) {
-    pen.moveTo(landmarks[3 * from], landmarks[3 * from + 1]);
-    pen.lineTo(landmarks[3 * to], landmarks[3 * to + 1]);
+    context.moveTo(landmarks[3 * from], landmarks[3 * from + 1]);
+    context.lineTo(landmarks[3 * to], landmarks[3 * to + 1]);
   }
-  pen.stroke();
+  context.stroke();
 }
 
-function cell(text, kind) {
-  const made = document.createElement(kind);
-  made.textContent = text;
-  return made;
+function cell(tag, text) {
+  return Object.assign(document.createElement(tag), { textContent: text });
 }

@@ -1,30 +1,30 @@
-// How loud it is, for the meter. Pure code: nothing is drawn.
+// The sound level for the meter.
 
 const MAX_QUEUED = 500; // chunks
-const DECAY = 0.9; // share of the level that is left at the next picture
+const DECAY = 0.9; // factor of the level per image
 export const SILENT_DB = -60;
 
-/** The level of the sound that is heard now; it falls slowly, so that peaks are seen. */
+/** Level of the sound that is audible now. It falls slowly, so that peaks are visible. */
 export class LevelMeter {
-  #queue = []; // { mediaTime, level } of the sound that is still to be heard
+  #queue = []; // { mediaTime, level } of sound that is not audible yet
   #level = 0; // 0 to 1
 
   reset() {
     this.#queue = [];
   }
 
-  /** Take sound, int16, that will be heard when media time gets there. */
+  /** Add sound (int16) that becomes audible at a media time. */
   push(mediaTime, samples) {
     this.#queue.push({ mediaTime, level: rms(samples) });
     if (this.#queue.length > MAX_QUEUED) this.#queue.shift();
   }
 
-  /** Show at least this level (0 to 1) now. */
+  /** Raise the level to at least this value, 0 to 1. */
   raise(level) {
     this.#level = Math.max(this.#level, level);
   }
 
-  /** Show the sound up to a media time, or leave it out if it is not to be shown. */
+  /** Remove queued sound up to a media time; show its level if isShown. */
   advance(mediaTime, isShown) {
     while (this.#queue[0]?.mediaTime <= mediaTime) {
       const { level } = this.#queue.shift();
@@ -32,8 +32,8 @@ export class LevelMeter {
     }
   }
 
-  /** Return the level in dB of full scale for one picture. */
-  decibels() {
+  /** Return the level for the next image, dB of full scale. */
+  nextDecibels() {
     const db = Math.max(SILENT_DB, 20 * Math.log10(this.#level + 1e-6));
     this.#level *= DECAY;
     return db;

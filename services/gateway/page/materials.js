@@ -1,13 +1,12 @@
-// What the head is drawn with: physical materials where a graphics card is there; the driver's own
-// shading (shared/face/light.glsl), worked out at the vertices, where the processor draws, and for
-// heads drawn as cartoons.
+// The head's materials. With a graphics card they are physical. Without one, and for cartoon heads,
+// the driver's shading (shared/face/light.glsl) is computed at the vertices.
 
 import * as THREE from "three";
 
 const EYES = ["eye_left", "eye_right"];
 const HAIR = ["hair", "hair_tips"];
-const UNKNOWN = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // of files that do not say
-const LIGHT = await (await fetch("light.glsl")).text(); // GLSL, the driver's, too
+const UNKNOWN = { wrap: [0.3, 0.3, 0.3], gloss: 14, shine: 0.08 }; // for files without these values
+const LIGHT = await (await fetch("light.glsl")).text(); // shared with the driver
 
 const PLAIN_VERTEX = `
 ${LIGHT}
@@ -22,7 +21,7 @@ varying vec3 vFacing;
 void main() {
   vec3 turned = position;
   vec3 n = normal;
-  #ifdef USE_SKINNING // the neck follows the head by a share, and the shoulders do not
+  #ifdef USE_SKINNING // the neck follows the head partly, the shoulders do not
     turned = mix(position, (turn * vec4(position, 1.0)).xyz, skinWeight.y);
     n = mix(normal, mat3(turn) * normal, skinWeight.y);
   #endif
@@ -66,8 +65,12 @@ function lightUniforms(name, gltf, cel) {
 }
 
 /**
- * The driver's shading for a part; `gltf` is its material in the file, `head` the node that the skin
- * turns with. Textures are read as cheaply as the processor can.
+ * Return the driver's shading for a part of the head.
+ *
+ * @param name of the part
+ * @param gltf the part's material in the file; its texture is set to the cheapest filter
+ * @param head node whose rotation the skin follows
+ * @param cel whether the head is a cartoon
  */
 export function plainMaterial(name, gltf, head, cel) {
   gltf.map.colorSpace = THREE.NoColorSpace;
@@ -87,7 +90,7 @@ export function plainMaterial(name, gltf, head, cel) {
   });
 }
 
-// what physical parts mirror as the plain ones do
+// Reflections that the plain materials also have.
 const WINDOW = `totalEmissiveRadiance += mirrored(
   inverseTransformDirection(normal, viewMatrix), normalize(cameraPosition));`;
 const SHEEN = `vec3 light;
@@ -97,7 +100,7 @@ const SHEEN = `vec3 light;
   totalEmissiveRadiance += high;`;
 const ADDED = { eye_left: WINDOW, eye_right: WINDOW, hair: SHEEN, hair_tips: SHEEN };
 
-/** A physical material for a part: light that scatters under the skin, wet eyes, silky hair. */
+/** Return a physical material for a part: subsurface scattering, wet eyes, glossy hair. */
 export function physicalMaterial(name, gltf) {
   const material = new THREE.MeshPhysicalMaterial({
     map: gltf.map,
@@ -121,7 +124,7 @@ export function physicalMaterial(name, gltf) {
       shader.fragmentShader
         .replace(
           "#include <lights_physical_pars_fragment>",
-          // light goes round the terminator, red farthest
+          // subsurface scattering: light reaches beyond the terminator, red farthest
           THREE.ShaderChunk.lights_physical_pars_fragment.replace(
             "reflectedLight.directDiffuse += irradiance",
             "vec3 round = (dot(geometryNormal, directLight.direction) + wrap) / (1.0 + wrap);\n" +
@@ -131,7 +134,7 @@ export function physicalMaterial(name, gltf) {
         )
         .replace(
           "#include <aomap_fragment>",
-          // what lies in shadow, by its baked vertex colours, shines less, too
+          // shadows are baked into the vertex colors; parts in shadow also reflect less
           `float open = min(1.0, 1.6 * vColor.g * diffuse.g);
           reflectedLight.directSpecular *= open;
           reflectedLight.indirectSpecular *= open;
@@ -141,20 +144,20 @@ export function physicalMaterial(name, gltf) {
   return material;
 }
 
-/** Let a part in the mouth have so much of the light, 0 to 1. */
-export function dim(material, share) {
+/** Set the light on a part inside the mouth, 0 to 1. */
+export function setLight(material, share) {
   if (material.uniforms) material.uniforms.share.value = share;
   else material.color.setScalar(share);
 }
 
-/** Give back the memory of a material and its texture. */
+/** Free the memory of a material and its texture. */
 export function release(material) {
   (material.map ?? material.uniforms?.map.value)?.dispose();
   material.dispose();
 }
 
-/** A studio about the head, as an environment map: soft boxes before dim walls. */
-export function studio(renderer) {
+/** Return the environment map of a studio: soft boxes in front of dim walls. */
+export function studioEnvironment(renderer) {
   const room = new THREE.Scene();
   const box = (color, width, height, x, y, z) => {
     const light = new THREE.Mesh(

@@ -1,4 +1,4 @@
-// The binary messages that the gateway sends; proto/GATEWAY.md describes them.
+// Binary messages of the gateway; see proto/GATEWAY.md.
 
 export const NUM_FAPS = 68;
 const FAP_TYPE = 1;
@@ -13,8 +13,8 @@ const HEADER_BYTES = 16;
  *
  * @param {ArrayBuffer} data
  * @returns { mediaTime, faps: Float32Array } for a FAP frame, { mediaTime, samples: Int16Array } for
- *   sound, { rest: Float32Array } for the face at rest, { mediaTime, weights: Float32Array } for shapes
- *   of a frame, { restWeights: Float32Array } for those at rest, null for what a later gateway may send
+ *   sound, { rest: Float32Array } for the face at rest, { mediaTime, weights: Float32Array } for a
+ *   frame's shapes, { restWeights: Float32Array } for shapes at rest, null for an unknown type
  */
 export function readMessage(data) {
   const header = new DataView(data);

@@ -1,20 +1,20 @@
-// Collects the microphone in chunks of 20 ms of int16, inside the audio thread.
+// Collects the microphone's sound in int16 chunks of 20 ms. Runs in the audio thread.
 
 class Capture extends AudioWorkletProcessor {
   #chunk = new Int16Array(Math.round(sampleRate / 50));
-  #filled = 0;
+  #numFilled = 0;
   #squares = 0;
 
   process([[input]]) {
     if (input === undefined) return true;
     for (const value of input) {
       this.#squares += value * value;
-      this.#chunk[this.#filled++] = Math.max(-32768, Math.min(32767, Math.round(value * 32767)));
-      if (this.#filled === this.#chunk.length) {
+      this.#chunk[this.#numFilled++] = Math.max(-32768, Math.min(32767, Math.round(value * 32767)));
+      if (this.#numFilled === this.#chunk.length) {
         const chunk = this.#chunk.slice();
         const rms = Math.sqrt(this.#squares / chunk.length);
         this.port.postMessage({ chunk, rms, recordedMs: Date.now() }, [chunk.buffer]);
-        this.#filled = 0;
+        this.#numFilled = 0;
         this.#squares = 0;
       }
     }

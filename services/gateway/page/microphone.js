@@ -1,103 +1,97 @@
-// The browser's microphone, or a file in its place, as a session's audio.
+// Streams the microphone, or a file in its place, into a session of its own.
 
 import { socketUrl } from "./address.js";
+import { AudioUplink } from "./audio-uplink.js";
 import { capture, openCaptureContext } from "./capture.js";
-import { fileSpeech } from "./file-speech.js";
-import { say } from "./language.js";
-import { Uplink } from "./uplink.js";
+import { openFileSpeech } from "./file-speech.js";
+import { UserError, say } from "./language.js";
 
 const RETRY_MS = 500;
-const TAIL_MS = 1000; // of silence behind a file, for its last frames
-const GIVE_UP_MS = 30000; // a crashed service is started again within this
+const TAIL_MS = 1000; // of silence after a file, for its last frames
+const GIVE_UP_MS = 30000; // a crashed service is restarted within this time
 
 export class Microphone {
   #handlers;
-  #turn = null; // from one start to its stop
+  #run = null; // identifies the time from one start to its stop
   #socket = null;
   #stream = null;
-  #speech = null; // of a file
+  #fileSpeech = null;
   #context = null;
   #uplink = null; // while it streams
-  #retry = null; // timer
-  #giveUpMs = null; // until when to try again, once it has streamed
+  #retryTimer = null;
+  #giveUpMs = null; // when to stop reconnecting; null before it has streamed
 
   /**
-   * @param handlers { mouthProfile(): the speaker's in base64, or "", lips(): the lip model to begin with,
-   *   or null, state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
+   * @param handlers { mouthProfile(): base64 or "", lips(): lip model to start with or null,
+   *   state("off" | "starting" | "on" | "interrupted"), level(rms), session(name),
    *   error({ code, text }) }
    */
   constructor(handlers) {
     this.#handlers = handlers;
   }
 
-  /** Whether it streams, or is to. */
-  get active() {
-    return this.#turn !== null;
+  /** Whether it streams or is starting. */
+  get isActive() {
+    return this.#run !== null;
   }
 
-  /** Whether a file is spoken instead. */
+  /** Whether it streams a file. */
   get isFile() {
-    return this.#speech !== null;
+    return this.#fileSpeech !== null;
   }
 
-  /** How long ago media time m was spoken, ms; null if this is not our session. */
+  /** Return how long ago a media time of its session was spoken, ms; null if it does not stream. */
   ageMs(nowMs, mediaTime) {
     return this.#uplink?.ageMs(nowMs, mediaTime) ?? null;
   }
 
-  /** Let another lip model move the mouth while the microphone streams. */
+  /** Change the lip model of its session. */
   chooseLips(name) {
     if (this.#uplink) this.#socket.send(JSON.stringify({ lips: name }));
   }
 
   start() {
-    return this.#take(async (source) => {
-      if (!navigator.mediaDevices) {
-        throw {
-          en: "A microphone needs https, or this page at http://localhost.",
-          zh: "使用麦克风需要 https 或 localhost。",
-        };
-      }
+    return this.#startFrom(async (source) => {
+      if (!navigator.mediaDevices) throw new UserError(say("microphoneInsecure"));
       source.stream = await navigator.mediaDevices.getUserMedia({
         audio: { echoCancellation: true, autoGainControl: true, channelCount: 1 },
       });
       for (const track of source.stream.getTracks()) {
-        track.onended = () =>
-          this.#fail({ en: "The microphone was unplugged.", zh: "麦克风断开了。" });
+        track.onended = () => this.#fail(say("microphoneUnplugged"));
       }
       source.context = await openCaptureContext();
     });
   }
 
-  /** Speak a file, as if it were the microphone. */
-  speak(file) {
-    return this.#take(async (source) => {
+  /** Stream a file. */
+  startFile(file) {
+    return this.#startFrom(async (source) => {
       source.context = await openCaptureContext();
-      source.speech = await fileSpeech(source.context, file);
-      source.stream = source.speech.stream;
+      source.fileSpeech = await openFileSpeech(source.context, file);
+      source.stream = source.fileSpeech.stream;
     });
   }
 
-  /** Stream from what open(source) puts into a source, unless it is stopped meanwhile. */
-  async #take(open) {
-    this.#release();
-    const turn = {};
-    this.#turn = turn;
+  /** Open a source with open(source) and stream it, unless it is stopped in the meantime. */
+  async #startFrom(open) {
+    this.stop();
+    const run = {};
+    this.#run = run;
     this.#handlers.state("starting");
-    const source = { stream: null, context: null, speech: null };
+    const source = { stream: null, context: null, fileSpeech: null };
     let problem = null;
     try {
       await open(source);
     } catch (error) {
-      problem = reason(error);
+      problem = problemText(error);
     }
-    if (this.#turn !== turn || problem !== null) letGo(source);
-    if (this.#turn !== turn) return;
+    if (this.#run !== run || problem !== null) release(source);
+    if (this.#run !== run) return;
     if (problem !== null) {
       this.#fail(problem);
       return;
     }
-    ({ stream: this.#stream, context: this.#context, speech: this.#speech } = source);
+    ({ stream: this.#stream, context: this.#context, fileSpeech: this.#fileSpeech } = source);
     capture(this.#context, this.#stream, (chunk, rms, recordedMs) => {
       this.#handlers.level(rms);
       this.#uplink?.send(performance.now(), recordedMs, chunk);
@@ -106,7 +100,14 @@ export class Microphone {
   }
 
   stop() {
-    this.#release();
+    const socket = this.#socket;
+    clearTimeout(this.#retryTimer);
+    release({ stream: this.#stream, context: this.#context });
+    this.#socket = this.#stream = this.#fileSpeech = this.#context = this.#uplink = null;
+    this.#giveUpMs = this.#run = null;
+    socket?.close();
+    this.#handlers.level(0);
+    this.#handlers.state("off");
   }
 
   #connect() {
@@ -115,78 +116,61 @@ export class Microphone {
     this.#socket = socket;
     socket.onopen = () => {
       const { sampleRate } = this.#context;
-      const hello = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
-      socket.send(JSON.stringify({ ...hello, voice: this.#handlers.mouthProfile() }));
+      const format = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
+      socket.send(JSON.stringify({ ...format, voice: this.#handlers.mouthProfile() }));
     };
     socket.onmessage = (event) => {
       if (this.#socket !== socket) return;
       const message = JSON.parse(event.data);
-      if (message.type === "opened") this.#begin(message.session);
+      if (message.type === "opened") this.#onOpened(message.session);
       else if (this.#uplink !== null && message.type === "error") this.#handlers.error(message);
       else refusal = message;
     };
     socket.onclose = () => {
-      if (this.#socket === socket) this.#onClose(refusal);
+      if (this.#socket === socket) this.#onClosed(refusal);
     };
   }
 
-  #begin(session) {
-    this.#uplink = new Uplink(this.#socket, this.#context.sampleRate);
+  #onOpened(session) {
+    this.#uplink = new AudioUplink(this.#socket, this.#context.sampleRate);
     this.#giveUpMs = null;
     this.#handlers.session(session);
     this.#handlers.state("on");
-    this.#speech?.play(() => setTimeout(() => this.#release(), TAIL_MS));
+    this.#fileSpeech?.play(() => setTimeout(() => this.stop(), TAIL_MS));
     const lips = this.#handlers.lips();
     if (lips !== null) this.chooseLips(lips);
   }
 
-  /** Once it has streamed, it goes on by itself: a service, or the gateway, is started again. */
-  #onClose(refusal) {
+  /** Reconnect if it has streamed: a service or the gateway is being restarted. */
+  #onClosed(refusal) {
     if (this.#uplink !== null) {
       this.#uplink = null;
       this.#giveUpMs = performance.now() + GIVE_UP_MS;
       this.#handlers.state("interrupted");
     }
     if (this.#giveUpMs !== null && performance.now() < this.#giveUpMs) {
-      this.#retry = setTimeout(() => this.#connect(), RETRY_MS);
+      this.#retryTimer = setTimeout(() => this.#connect(), RETRY_MS);
     } else if (refusal?.code) {
       this.#handlers.error(refusal);
-      this.#release();
+      this.stop();
     } else {
-      this.#fail({
-        en: "The microphone stopped: the gateway takes none now. Press Microphone to try again.",
-        zh: "麦克风已停止：网关暂不接受。请再按“麦克风”重试。",
-      });
+      this.#fail(say("microphoneStopped"));
     }
   }
 
-  #fail(texts) {
-    this.#handlers.error({ code: "microphone", text: say(texts) });
-    this.#release();
-  }
-
-  #release() {
-    const socket = this.#socket;
-    clearTimeout(this.#retry);
-    letGo({ stream: this.#stream, context: this.#context });
-    this.#socket = this.#stream = this.#speech = this.#context = this.#uplink = this.#giveUpMs = null;
-    this.#turn = null;
-    socket?.close();
-    this.#handlers.level(0);
-    this.#handlers.state("off");
+  #fail(text) {
+    this.#handlers.error({ code: "microphone", text });
+    this.stop();
   }
 }
 
-/** Return why there is no sound, { en, zh }, of what was thrown. */
-function reason(error) {
-  if (error.zh) return error;
-  if (error.name === "NotAllowedError") {
-    return { en: "The microphone was not allowed.", zh: "未允许使用麦克风。" };
-  }
-  return { en: `No microphone: ${error.message}`, zh: `没有麦克风：${error.message}` };
+function problemText(error) {
+  if (error instanceof UserError) return error.message;
+  if (error.name === "NotAllowedError") return say("microphoneForbidden");
+  return say("microphoneFailed", { reason: error.message });
 }
 
-function letGo({ stream, context }) {
+function release({ stream, context }) {
   for (const track of stream?.getTracks() ?? []) track.stop();
   context?.close();
 }

@@ -1,10 +1,10 @@
-// Morph targets moved on the CPU.
+// Morph targets on the CPU.
 //
-// A FAP moves a few hundred to a few thousand of a mesh's vertices, but WebGL's morph targets visit
-// every vertex for every target: fifty times the work, which phones and software rendering feel.
-// Here each target keeps only the vertices that it moves, and the normals follow the moved surface.
+// A FAP moves a few hundred to a few thousand vertices of a mesh. WebGL's morph targets process every
+// vertex for every target. This is fifty times the work and slows down phones and software rendering.
+// Here a target contains only the vertices that it moves, and the normals follow the moved surface.
 
-const NEARLY_ZERO = 1e-7; // metres
+const MIN_DELTA = 1e-7; // meters; smaller displacements are ignored
 
 /** Moves the vertices and normals of one mesh. */
 export class MorphedMesh {
@@ -13,9 +13,9 @@ export class MorphedMesh {
   #normal;
   #restPosition;
   #restNormal;
-  #corners; // three offsets into the positions for each triangle that can turn
-  #turning; // offsets of the normals that can turn
-  #sums; // the triangles' normals summed up at every vertex
+  #corners; // three offsets into the positions for each triangle that can rotate
+  #rotating; // offsets of the normals that can rotate
+  #sums; // sums of the triangles' normals at every vertex
   #restSums;
 
   /** @param mesh a three.js mesh; @param faps entries { name, number, unitsPerWeight } */
@@ -33,13 +33,13 @@ export class MorphedMesh {
     }
     geometry.morphAttributes = {};
     mesh.morphTargetInfluences = mesh.morphTargetDictionary = undefined;
-    this.#findTurning(geometry.index.array);
+    this.#findRotating(geometry.index.array);
     this.#sums = new Float32Array(this.#restPosition.length);
     this.#sumNormals();
     this.#restSums = this.#sums.slice();
   }
 
-  /** Take on a face: 68 values in FAP units. */
+  /** Move the mesh for 68 values in FAP units. */
   pose(faps) {
     const position = this.#position.array;
     position.set(this.#restPosition);
@@ -53,20 +53,20 @@ export class MorphedMesh {
         position[v + 2] += weight * deltas[3 * k + 2];
       }
     }
-    this.#turnNormals();
+    this.#rotateNormals();
     this.#position.needsUpdate = true;
     this.#normal.needsUpdate = true;
   }
 
-  /** Add the turn of the triangles to the normals of the file, which are smoother than they. */
-  #turnNormals() {
+  /** Add the rotation of the triangles to the normals of the file, which are smoother. */
+  #rotateNormals() {
     this.#sumNormals();
-    const [normal, now, then] = [this.#normal.array, this.#sums, this.#restSums];
-    for (const v of this.#turning) {
-      const nowLength = Math.hypot(now[v], now[v + 1], now[v + 2]) || 1;
-      const thenLength = Math.hypot(then[v], then[v + 1], then[v + 2]) || 1;
+    const [normal, sums, rest] = [this.#normal.array, this.#sums, this.#restSums];
+    for (const v of this.#rotating) {
+      const length = Math.hypot(sums[v], sums[v + 1], sums[v + 2]) || 1;
+      const restLength = Math.hypot(rest[v], rest[v + 1], rest[v + 2]) || 1;
       for (let i = v; i < v + 3; i++) {
-        normal[i] = this.#restNormal[i] + now[i] / nowLength - then[i] / thenLength;
+        normal[i] = this.#restNormal[i] + sums[i] / length - rest[i] / restLength;
       }
     }
   }
@@ -90,35 +90,35 @@ export class MorphedMesh {
     }
   }
 
-  /** Find the vertices of triangles that move, and all triangles that meet there. */
-  #findTurning(index) {
+  /** Find the vertices of triangles that move, and all triangles at these vertices. */
+  #findRotating(index) {
     const numVertices = this.#restPosition.length / 3;
     const moves = new Uint8Array(numVertices);
-    const turns = new Uint8Array(numVertices);
+    const rotates = new Uint8Array(numVertices);
     for (const { vertices } of this.#targets) for (const vertex of vertices) moves[vertex] = 1;
     const trianglesWith = (mark) => {
-      const found = [];
+      const corners = [];
       for (let t = 0; t < index.length; t += 3) {
         if (mark[index[t]] || mark[index[t + 1]] || mark[index[t + 2]]) {
-          found.push(index[t], index[t + 1], index[t + 2]);
+          corners.push(index[t], index[t + 1], index[t + 2]);
         }
       }
-      return found;
+      return corners;
     };
-    for (const vertex of trianglesWith(moves)) turns[vertex] = 1;
-    this.#corners = Uint32Array.from(trianglesWith(turns), (vertex) => 3 * vertex);
-    const turning = [...turns.keys()].filter((vertex) => turns[vertex]);
-    this.#turning = Uint32Array.from(turning, (vertex) => 3 * vertex);
+    for (const vertex of trianglesWith(moves)) rotates[vertex] = 1;
+    this.#corners = Uint32Array.from(trianglesWith(rotates), (vertex) => 3 * vertex);
+    const rotating = [...rotates.keys()].filter((vertex) => rotates[vertex]);
+    this.#rotating = Uint32Array.from(rotating, (vertex) => 3 * vertex);
   }
 }
 
-/** Return the vertices that a morph target moves, and by how much. */
+/** Return the vertices that a morph target moves, and their displacements. */
 function sparse(attribute) {
   const vertices = [];
   const deltas = [];
   for (let vertex = 0; vertex < attribute.count; vertex++) {
     const delta = [attribute.getX(vertex), attribute.getY(vertex), attribute.getZ(vertex)];
-    if (delta.some((value) => Math.abs(value) > NEARLY_ZERO)) {
+    if (delta.some((value) => Math.abs(value) > MIN_DELTA)) {
       vertices.push(vertex);
       deltas.push(...delta);
     }

@@ -1,12 +1,12 @@
-// How much light falls on teeth and tongue: as services/driver/head/mouth_light.py.
+// Light on teeth and tongue, computed as in services/driver/head/mouth_light.py.
 
 const DEPTH = 500; // of the teeth behind the lips at rest, FAP units (MNS / 1024)
 const SPREAD = 0.25;
-const FLOOR = 0.08;
+const MIN_LIGHT = 0.08;
 
-/** Share of the light, 0 to 1, for 68 FAPs. */
+/** Return the light for 68 FAPs, as a fraction from 0 to 1. */
 export function mouthLight(faps) {
   const height = Math.max(-(faps[3] + faps[4]), 0);
   const depth = Math.max(DEPTH + (faps[15] + faps[16]) / 2, 0);
-  return Math.min(1, FLOOR + height / (height + (SPREAD * depth ** 2) / DEPTH + 1e-6));
+  return Math.min(1, MIN_LIGHT + height / (height + (SPREAD * depth ** 2) / DEPTH + 1e-6));
 }

@@ -1,6 +1,6 @@
 // The mouth profile of this browser's user, which the gateway learned. The storage is injected.
 
-const KEY = "kouxing.voice"; // the first name of mouth profiles; browsers have stored them under it
+const KEY = "kouxing.voice"; // the name under which browsers have stored profiles from the start
 
 /** Keeps the mouth profile in the storage, or until the page closes if nothing can be stored. */
 export class MouthProfileStore {
@@ -18,10 +18,10 @@ export class MouthProfileStore {
     }
   }
 
-  keep(learned) {
-    this.current = learned;
+  keep(profile) {
+    this.current = profile;
     try {
-      this.#storage?.setItem(KEY, JSON.stringify(learned));
+      this.#storage?.setItem(KEY, JSON.stringify(profile));
     } catch {
       // the storage is full
     }

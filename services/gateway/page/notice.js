@@ -1,24 +1,24 @@
-// The notice: what went wrong or happened, for a while, and otherwise what does not work.
+// The notice at the top: recent news and errors, else a hint about a lasting problem.
 
 import { element, setText } from "./elements.js";
 
-const NEWS_MS = 8000; // for which an error, or what happened, stays to be read
+const NEWS_MS = 8000; // for which news is shown
 
 const box = element("notice");
 
 export class Notice {
-  #timer = null;
+  #newsTimer = null;
 
-  /** Say what went wrong ("error") or happened ("hint"). */
-  tell(text, kind) {
-    clearTimeout(this.#timer);
-    this.#timer = setTimeout(() => (this.#timer = null), NEWS_MS);
+  /** Show an "error", or news as a "hint", for some seconds. */
+  showNews(text, kind) {
+    clearTimeout(this.#newsTimer);
+    this.#newsTimer = setTimeout(() => (this.#newsTimer = null), NEWS_MS);
     show(text, kind);
   }
 
-  /** Show a hint, unless there is news; "" for none. */
-  hint(text) {
-    if (this.#timer === null) show(text, "hint");
+  /** Show a hint unless news is shown; "" shows no hint. */
+  showHint(text) {
+    if (this.#newsTimer === null) show(text, "hint");
   }
 }
 

@@ -1,26 +1,29 @@
-// The panel of what can be chosen: head, lips, expressiveness, expressions, language.
+// The settings panel: head, lips, expressiveness, expressions and language.
 
 import { element } from "./elements.js";
 import { languageFor, say, setLanguage } from "./language.js";
-import { EXPRESSIONS, HEADS, LIPS } from "./offers.js";
 
 const STRENGTH = 0.8; // of an expression
+const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
 
 export class Settings {
-  #choices;
+  #preferences;
+  #offers;
 
   /**
-   * @param choices Choices
-   * @param handlers { heads(name), lips(name), expressiveness(amount), express(strengths, by name) },
-   *   called when something else is chosen
+   * @param preferences Preferences
+   * @param offers { heads, lips }: names that the gateway offers
+   * @param handlers { heads(name), lips(name), expressiveness(amount), express(strengths by name) },
+   *   called when the user changes a setting
    */
-  constructor(choices, handlers) {
-    this.#choices = choices;
-    this.#speak();
-    const speak = () => this.#speak();
-    for (const [id, chosen] of Object.entries({ ...handlers, language: speak })) {
-      if (id !== "express") this.#offer(id, chosen);
-    }
+  constructor(preferences, offers, handlers) {
+    this.#preferences = preferences;
+    this.#offers = offers;
+    this.#applyLanguage();
+    this.#bind("heads", handlers.heads);
+    this.#bind("lips", handlers.lips);
+    this.#bind("expressiveness", handlers.expressiveness);
+    this.#bind("language", () => this.#applyLanguage());
     element("expressions").onclick = ({ target }) => {
       if (target.value) handlers.express({ [target.value]: STRENGTH });
     };
@@ -28,64 +31,65 @@ export class Settings {
     showAmount();
   }
 
-  /** Show the lip model that moves the mouth at the moment. */
+  /** Select the lip model that is in use. */
   showLips(name) {
     element("lips").value = name;
   }
 
-  /** Let an input choose, beginning with what was chosen before, if that is still offered. */
-  #offer(id, chosen) {
+  /** Connect an input with its preference. A stored value that is no longer offered is ignored. */
+  #bind(id, onChange) {
     const input = element(id);
-    const [usual, before] = [input.value, this.#choices.get(id)];
-    if (before !== null) input.value = before;
-    if (input.selectedIndex === -1) input.value = usual;
+    const [initial, stored] = [input.value, this.#preferences.get(id)];
+    if (stored !== null) input.value = stored;
+    if (input.selectedIndex === -1) input.value = initial;
     input.addEventListener("input", () => {
       const value = input.type === "range" ? input.valueAsNumber : input.value;
-      this.#choices.set(id, value);
-      chosen(value);
+      this.#preferences.set(id, value);
+      onChange(value);
     });
   }
 
-  #speak() {
-    const name = this.#choices.get("language") ?? languageFor(navigator.languages);
+  #applyLanguage() {
+    const name = this.#preferences.get("language") ?? languageFor(navigator.languages);
     setLanguage(name);
     element("language").value = name;
-    fill("heads", HEADS, "option");
-    showPictures();
-    fill("lips", LIPS, "option");
-    fill("expressions", EXPRESSIONS, "button");
+    fill("heads", "option", "head", ["", ...this.#offers.heads]);
+    showPictures(this.#offers.heads);
+    fill("lips", "option", "lips", this.#offers.lips);
+    fill("expressions", "button", "expression", EXPRESSIONS);
   }
 }
 
-/** Offer values, [value, texts], as elements of a kind; what is chosen stays so. */
-function fill(id, values, kind) {
-  const { value: chosen } = element(id);
-  const offers = values.map(([value, texts]) => {
-    const offer = document.createElement(kind);
-    if (kind === "button") offer.type = "button";
-    offer.value = value;
-    offer.textContent = say(texts);
-    return offer;
+/** Fill a list with options or buttons and keep the selection. */
+function fill(id, tag, textPrefix, values) {
+  const { value: selected } = element(id);
+  const items = values.map((value) => {
+    const item = document.createElement(tag);
+    if (tag === "button") item.type = "button";
+    item.value = value;
+    item.textContent = say(`${textPrefix}.${value}`);
+    return item;
   });
-  element(id).replaceChildren(...offers);
-  if (chosen) element(id).value = chosen;
+  element(id).replaceChildren(...items);
+  if (selected) element(id).value = selected;
 }
 
-/** Let a picture choose each head that has one, as its name in the list does. */
-function showPictures() {
+/** Show a picture of each head. A click on it selects the head in the list. */
+function showPictures(names) {
   const heads = element("heads");
-  const pictures = HEADS.filter(([name]) => name !== "").map(([name, texts]) => {
+  const buttons = names.map((name) => {
     const button = document.createElement("button");
     button.type = "button";
-    button.title = say(texts);
-    button.append(Object.assign(new Image(48, 48), { src: `head-${name}.webp`, alt: say(texts) }));
+    const title = say(`head.${name}`);
+    button.title = title;
+    button.append(Object.assign(new Image(48, 48), { src: `head-${name}.webp`, alt: title }));
     button.onclick = () => {
       heads.value = name;
       heads.dispatchEvent(new Event("input"));
     };
     return button;
   });
-  element("head-pictures").replaceChildren(...pictures);
+  element("head-pictures").replaceChildren(...buttons);
 }
 
 function showAmount() {

@@ -1,19 +1,19 @@
-// Plays sound by its media time, inside the audio thread. The context runs at 16 kHz: media time =
-// context frame + anchor. The anchor that is wanted moves all the time, for no two clocks run alike:
-// what is near is glided to by resampling, which is not heard, and what is far by a leap.
+// Plays sound at its media time. Runs in the audio thread. The context runs at 16 kHz: media time =
+// context frame + anchor. The target of the anchor moves all the time, because clocks drift. A small
+// distance is corrected by resampling, which is inaudible, a large one by a leap.
 
 const CAPACITY = 1 << 17; // samples, 8 s
-const MASK = CAPACITY - 1; // of a media time: its place
-const FADE = 1 / 64; // a step of the gain per sample: 4 ms against clicks
-const LEAP = 160; // samples, 10 ms: from here on it is far
-const NEAR = 1600; // samples in which a small distance shrinks to a third
-const MAX_GLIDE = 0.01; // of the pace: a sixth of a semitone
-const TAPS = 16; // of the filter between samples
-const PHASES = 512; // places between two samples
-const FILTER = filter();
+const MASK = CAPACITY - 1; // maps a media time to its index
+const FADE = 1 / 64; // change of the gain per sample; a fade takes 4 ms and avoids clicks
+const MIN_LEAP = 160; // samples, 10 ms; smaller distances are corrected by resampling
+const GLIDE_LENGTH = 1600; // samples in which a small distance shrinks to a third
+const MAX_GLIDE = 0.01; // change of speed; a sixth of a semitone
+const TAPS = 16; // of the interpolation filter
+const PHASES = 512; // positions between two samples
+const FILTER = makeFilter();
 
-/** Return the filter for each place between two samples: a windowed sinc. */
-function filter() {
+/** Return a windowed sinc for each position between two samples. */
+function makeFilter() {
   const taps = new Float32Array((PHASES + 1) * TAPS);
   for (let i = 0; i < taps.length; i++) {
     const x = (i % TAPS) + 1 - TAPS / 2 - Math.floor(i / TAPS) / PHASES;
@@ -25,9 +25,9 @@ function filter() {
 
 class SoundPlayer extends AudioWorkletProcessor {
   #samples = new Float32Array(CAPACITY);
-  #owner = new Float64Array(CAPACITY).fill(-1); // media time of the sample in each place
+  #mediaTimes = new Float64Array(CAPACITY).fill(-1); // of the samples
   #anchor = null;
-  #wanted = null; // the anchor to get to
+  #target = null; // of the anchor
   #gain = 0;
   #numPlayed = 0;
   #reportedAt = 0;
@@ -35,48 +35,48 @@ class SoundPlayer extends AudioWorkletProcessor {
   constructor() {
     super();
     this.port.onmessage = ({ data }) => {
-      if (data.anchor !== undefined) this.#wanted = data.anchor;
+      if (data.anchor !== undefined) this.#target = data.anchor;
       else this.#write(data.mediaTime, data.samples);
     };
   }
 
   #write(mediaTime, samples) {
     for (let i = 0; i < samples.length; i++) {
-      const place = (mediaTime + i) & MASK;
-      this.#samples[place] = samples[i] / 32768;
-      this.#owner[place] = mediaTime + i;
+      const index = (mediaTime + i) & MASK;
+      this.#samples[index] = samples[i] / 32768;
+      this.#mediaTimes[index] = mediaTime + i;
     }
   }
 
-  /** Return the sound at a media time that lies between samples; null if it is not there. */
+  /** Return the sound at a media time between samples; null if the sound is missing. */
   #at(media) {
-    const [owner, samples] = [this.#owner, this.#samples];
+    const [mediaTimes, samples] = [this.#mediaTimes, this.#samples];
     const first = Math.floor(media);
-    if (owner[first & MASK] !== first) return null;
+    if (mediaTimes[first & MASK] !== first) return null;
     const phase = Math.round((media - first) * PHASES) * TAPS;
     let value = 0;
     for (let i = 0; i < TAPS; i++) {
       const time = first + i + 1 - TAPS / 2;
-      const place = time & MASK;
-      if (owner[place] === time) value += FILTER[phase + i] * samples[place];
+      const index = time & MASK;
+      if (mediaTimes[index] === time) value += FILTER[phase + i] * samples[index];
     }
     return value;
   }
 
   process(_inputs, [[output]]) {
-    if (this.#wanted === null) return true;
-    const far = this.#anchor === null ? Infinity : this.#wanted - this.#anchor;
-    let leaps = Math.abs(far) > LEAP;
-    const glide = leaps ? 0 : Math.max(-MAX_GLIDE, Math.min(MAX_GLIDE, far / NEAR));
+    if (this.#target === null) return true;
+    const distance = this.#anchor === null ? Infinity : this.#target - this.#anchor;
+    let isLeaping = Math.abs(distance) > MIN_LEAP;
+    const glide = isLeaping ? 0 : Math.max(-MAX_GLIDE, Math.min(MAX_GLIDE, distance / GLIDE_LENGTH));
     for (let i = 0; i < output.length; i++) {
-      if (leaps && this.#gain === 0) {
-        this.#anchor = this.#wanted;
-        leaps = false;
+      if (isLeaping && this.#gain === 0) {
+        this.#anchor = this.#target;
+        isLeaping = false;
       }
       this.#anchor += glide;
       const value = this.#at(currentFrame + i + this.#anchor);
-      const open = value !== null && !leaps;
-      this.#gain = open ? Math.min(1, this.#gain + FADE) : Math.max(0, this.#gain - FADE);
+      const isAudible = value !== null && !isLeaping;
+      this.#gain = isAudible ? Math.min(1, this.#gain + FADE) : Math.max(0, this.#gain - FADE);
       output[i] = value * this.#gain;
       if (value !== null) this.#numPlayed++;
     }

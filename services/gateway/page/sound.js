@@ -1,45 +1,45 @@
-// The session's sound, played when its picture is due.
+// Plays the session's sound in sync with its image.
 
 import { SAMPLES_PER_MS } from "./playout.js";
-import { Recent } from "./recent.js";
+import { SlidingWindow } from "./sliding-window.js";
 
 const RATE_HZ = 16000;
 const ALIGN_EVERY_MS = 50;
 const MAX_LATENCY_S = 2; // of a loudspeaker
-const RECORDER_MS = 30; // by which a recorder itself has sound later than its picture (Chromium)
-const CLOCK_MS = 1000; // over which the sound card's clock is read: one reading is off by some ms
+const RECORDER_MS = 30; // delay of the sound that a recorder itself adds (Chromium)
+const CLOCK_MS = 1000; // window for the sound card's clock; one reading is off by some ms
 
 export class Sound {
   numPlayed = 0; // samples
-  wanted = false;
+  isWanted = false;
   #context = null;
   #node = null;
-  #anchor = null; // of what is played: media time - context frame
+  #anchor = null; // media time - context frame, as played
   #alignedMs = 0;
-  #begins = new Recent(CLOCK_MS); // when context frame 0 was heard, ms, by each reading
-  #changed;
-  #tap = null; // a node that takes the sound for a recording
+  #starts = new SlidingWindow(CLOCK_MS); // when context frame 0 was audible, ms, one value per reading
+  #onChange;
+  #tap = null; // node that provides the sound for a recording
   #speaker = null;
 
-  /** @param changed called when the state may have changed */
-  constructor(changed) {
-    this.#changed = changed;
+  /** @param onChange called when the state may have changed */
+  constructor(onChange) {
+    this.#onChange = onChange;
   }
 
-  /** "off", "blocked" (the browser wants a gesture first) or "on". */
+  /** "off", "blocked" (until the user clicks) or "on". */
   get state() {
-    if (!this.wanted) return "off";
+    if (!this.isWanted) return "off";
     return this.isPlaying ? "on" : "blocked";
   }
 
-  /** Whether sound is played, to be heard or to be recorded. */
+  /** Whether sound is played, for the loudspeaker or for a recording. */
   get isPlaying() {
     return this.#node !== null && this.#context.state === "running";
   }
 
-  /** Turn sound on; without a gesture the browser may leave it blocked. */
+  /** Turn sound on. Without a click the browser may leave it blocked. */
   async turnOn() {
-    this.wanted = true;
+    this.isWanted = true;
     await this.#run();
   }
 
@@ -59,34 +59,34 @@ export class Sound {
       node.connect(this.#speaker).connect(this.#context.destination);
       this.#node = node;
       this.#context.onstatechange = () => {
-        this.#begins.reset();
-        this.#changed();
+        this.#starts.reset();
+        this.#onChange();
       };
     }
-    // Without a gesture resume() neither succeeds nor fails until there is one: do not wait for it.
-    if (this.wanted || this.#tap) this.#context.resume().catch(() => {});
-    if (this.#speaker) this.#speaker.gain.value = this.wanted ? 1 : 0;
-    this.#changed();
+    // Do not wait: without a click, resume() neither succeeds nor fails.
+    if (this.isWanted || this.#tap) this.#context.resume().catch(() => {});
+    if (this.#speaker) this.#speaker.gain.value = this.isWanted ? 1 : 0;
+    this.#onChange();
   }
 
   turnOff() {
-    this.wanted = false;
+    this.isWanted = false;
     if (this.#speaker) this.#speaker.gain.value = 0;
-    if (this.#tap === null) this.#rest();
-    this.#changed();
+    if (this.#tap === null) this.#suspend();
+    this.#onChange();
   }
 
-  #rest() {
+  #suspend() {
     this.#context?.suspend();
     this.#anchor = null;
-    this.#begins.reset();
+    this.#starts.reset();
   }
 
-  /** Return the sound as a stream, as it is heard, also while it is off; until untap. */
+  /** Return the sound as a stream, also while it is off. Call untap() to end it. */
   async tap() {
     await this.#run();
     const stream = new MediaStreamAudioDestinationNode(this.#context);
-    // The stream has no loudspeaker's delay, and a recorder takes the picture that is seen now.
+    // The stream lacks the loudspeaker's delay, but the recorder records the current image.
     const delayTime = Math.max(0, this.outputLatencyMs - RECORDER_MS) / 1000;
     this.#tap = new DelayNode(this.#context, { delayTime, maxDelayTime: MAX_LATENCY_S });
     this.#node.connect(this.#tap).connect(stream);
@@ -97,10 +97,10 @@ export class Sound {
   untap() {
     this.#node.disconnect(this.#tap);
     this.#tap = null;
-    if (!this.wanted) this.#rest();
+    if (!this.isWanted) this.#suspend();
   }
 
-  /** Queue sound, int16, to be played when media time gets there. */
+  /** Queue sound (int16) to be played at a media time. */
   push(mediaTime, samples) {
     if (this.isPlaying) this.#node.port.postMessage({ mediaTime, samples });
   }
@@ -111,25 +111,25 @@ export class Sound {
   }
 
   /**
-   * Play such that media time m is heard at m + offset on the page's clock. To be called again and
-   * again: the sound card's clock is never quite the page's, and another device has another delay.
+   * Play so that media time m is audible at m + offset on the page's clock. Call it for every image:
+   * the sound card's clock drifts, and another device has another delay.
    */
   align(nowMs, offsetMs) {
     if (!this.isPlaying || nowMs - this.#alignedMs < ALIGN_EVERY_MS) return;
     this.#alignedMs = nowMs;
-    this.#begins.add(nowMs, this.#beginMs());
-    const anchor = (this.#begins.percentile(0.5) - offsetMs) * SAMPLES_PER_MS;
+    this.#starts.add(nowMs, this.#startMs());
+    const anchor = (this.#starts.percentile(0.5) - offsetMs) * SAMPLES_PER_MS;
     this.#node.port.postMessage({ anchor });
   }
 
-  /** The offset at which sound is really heard; null while none is. */
+  /** The actual offset of the sound; null while no sound is played. */
   get offsetMs() {
-    if (!this.isPlaying || this.#anchor === null || this.#begins.count === 0) return null;
-    return this.#begins.percentile(0.5) - this.#anchor / SAMPLES_PER_MS;
+    if (!this.isPlaying || this.#anchor === null || this.#starts.count === 0) return null;
+    return this.#starts.percentile(0.5) - this.#anchor / SAMPLES_PER_MS;
   }
 
-  /** Read when context frame 0 was heard, or would have been, ms of the page's clock. */
-  #beginMs() {
+  /** Return when context frame 0 was or would have been audible, ms on the page's clock. */
+  #startMs() {
     const { contextTime, performanceTime } = this.#context.getOutputTimestamp();
     if (performanceTime) return performanceTime - 1000 * contextTime;
     const { currentTime, outputLatency } = this.#context;

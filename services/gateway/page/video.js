@@ -1,9 +1,9 @@
-// A video of what is seen and heard, by the browser's own recorder. It shows the chosen head from the
-// side that was turned to, needs no driver, and goes to the user's downloads.
+// Records the canvas and the sound as a video, with the browser's recorder. The video is saved as a
+// download.
 
-export const BACKGROUND = "#e9e8ea"; // the page's own is no part of the canvas
+export const BACKGROUND = "#e9e8ea"; // the page's own background is not on the canvas
 const RATE_HZ = 30;
-// The first that this browser can write.
+// The first type that the browser supports is used.
 const TYPES = ["video/mp4;codecs=avc1.42E01F,mp4a.40.2", "video/mp4", "video/webm"];
 
 export class VideoRecorder {
@@ -13,18 +13,18 @@ export class VideoRecorder {
     return this.#recorder !== null;
   }
 
-  /** Begin to record a canvas and a stream of sound. */
+  /** Start recording a canvas and an audio stream. */
   start(canvas, sound) {
-    const type = TYPES.find((each) => MediaRecorder.isTypeSupported(each));
+    const mimeType = TYPES.find((type) => MediaRecorder.isTypeSupported(type));
     const tracks = [...canvas.captureStream(RATE_HZ).getTracks(), ...sound.getTracks()];
-    this.#recorder = new MediaRecorder(new MediaStream(tracks), { mimeType: type });
-    const parts = [];
-    this.#recorder.ondataavailable = ({ data }) => parts.push(data);
-    this.#recorder.onstop = () => save(new Blob(parts, { type }));
+    this.#recorder = new MediaRecorder(new MediaStream(tracks), { mimeType });
+    const chunks = [];
+    this.#recorder.ondataavailable = ({ data }) => chunks.push(data);
+    this.#recorder.onstop = () => save(new Blob(chunks, { type: mimeType }));
     this.#recorder.start(1000);
   }
 
-  /** End, and hand the video to the user. */
+  /** Stop recording and save the video. */
   stop() {
     this.#recorder.stop();
     this.#recorder = null;

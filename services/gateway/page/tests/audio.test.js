@@ -1,8 +1,8 @@
-// The audio worklets, run outside a browser, and the way of a microphone's chunks.
+// The audio worklets, run in Node, and the uplink of a microphone's chunks.
 
 import assert from "node:assert/strict";
 import test from "node:test";
-import { Uplink } from "../uplink.js";
+import { AudioUplink } from "../audio-uplink.js";
 
 const BLOCK = 128; // samples, as the Web Audio API processes them
 const processors = {};
@@ -16,7 +16,7 @@ globalThis.currentFrame = 0;
 await import("../microphone-worklet.js");
 await import("../sound-worklet.js");
 
-test("a microphone is cut into chunks of 20 ms, gapless and clipped", () => {
+test("the microphone is cut into chunks of 20 ms without gaps, and clipped", () => {
   const capture = new processors.capture();
   const input = Float32Array.from({ length: 15 * BLOCK }, (_, i) => (i % 3 === 0 ? 1.5 : i / 4096));
   for (let begin = 0; begin < input.length; begin += BLOCK) {
@@ -24,12 +24,12 @@ test("a microphone is cut into chunks of 20 ms, gapless and clipped", () => {
   }
   const { posted } = capture.port;
   assert.deepEqual(posted.map(({ chunk }) => chunk.length), [960, 960]);
-  const heard = posted.flatMap(({ chunk }) => [...chunk]);
+  const captured = posted.flatMap(({ chunk }) => [...chunk]);
   const expected = input.slice(0, 1920).map((value) => Math.round(Math.min(1, value) * 32767));
-  assert.deepEqual(heard, [...expected]);
+  assert.deepEqual(captured, [...expected]);
 });
 
-test("a chunk comes with its level and its time", () => {
+test("a chunk has its level and its time", () => {
   const capture = new processors.capture();
   const before = Date.now();
   for (let i = 0; i < 8; i++) capture.process([[new Float32Array(BLOCK).fill(0.5)]]);
@@ -38,20 +38,20 @@ test("a chunk comes with its level and its time", () => {
   assert.ok(before <= recordedMs && recordedMs <= Date.now());
 });
 
-test("a microphone that is not there yet is no error", () => {
+test("missing input is not an error", () => {
   assert.equal(new processors.capture().process([[]]), true);
 });
 
-/** Play blocks from where the context is; return what sounds. */
+/** Play blocks; return the output. */
 function play(player, numBlocks) {
-  const heard = [];
+  const output = [];
   for (let i = 0; i < numBlocks; i++) {
-    const output = new Float32Array(BLOCK);
-    player.process([], [[output]]);
+    const block = new Float32Array(BLOCK);
+    player.process([], [[block]]);
     globalThis.currentFrame += BLOCK;
-    heard.push(...output);
+    output.push(...block);
   }
-  return heard;
+  return output;
 }
 
 function playerWith(anchor) {
@@ -64,43 +64,43 @@ function playerWith(anchor) {
 test("sound is played at its media time, faded in against clicks", () => {
   const player = playerWith(1000);
   player.port.onmessage({ data: { mediaTime: 1256, samples: new Int16Array(512).fill(16384) } });
-  const heard = play(player, 8);
-  assert.ok(heard.slice(0, 256).every((value) => value === 0));
-  assert.equal(heard[256], 0.5 / 64);
-  assert.ok(heard.slice(320, 768).every((value) => value === 0.5));
-  assert.ok(heard.slice(768).every((value) => value === 0));
+  const output = play(player, 8);
+  assert.ok(output.slice(0, 256).every((value) => value === 0));
+  assert.equal(output[256], 0.5 / 64);
+  assert.ok(output.slice(320, 768).every((value) => value === 0.5));
+  assert.ok(output.slice(768).every((value) => value === 0));
 });
 
-test("a new anchor waits until the sound has faded out", () => {
+test("a leap waits until the sound has faded out", () => {
   const player = playerWith(0);
   player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(8000).fill(16384) } });
   play(player, 4);
   player.port.onmessage({ data: { anchor: 2000 } });
-  const heard = play(player, 2);
-  for (let i = 1; i < heard.length; i++) {
-    assert.ok(Math.abs(heard[i] - heard[i - 1]) <= 0.5 / 64 + 1e-6, `a click at ${i}`);
+  const output = play(player, 2);
+  for (let i = 1; i < output.length; i++) {
+    assert.ok(Math.abs(output[i] - output[i - 1]) <= 0.5 / 64 + 1e-6, `a click at ${i}`);
   }
-  assert.ok(heard.includes(0));
-  assert.equal(heard.at(-1), 0.5, "and it goes on at the new place");
+  assert.ok(output.includes(0));
+  assert.equal(output.at(-1), 0.5, "it continues at the new position");
 });
 
-test("what is near is glided to, and no sample leaps", () => {
+test("a small distance is corrected without a leap", () => {
   const player = playerWith(0);
   const tone = Int16Array.from({ length: 16000 }, (_, i) => 16384 * Math.sin(0.3 * i));
   player.port.onmessage({ data: { mediaTime: 0, samples: tone } });
   play(player, 10);
   player.port.onmessage({ data: { anchor: 40.25 } });
-  const heard = play(player, 100);
-  for (let i = 1; i < heard.length; i++) {
-    assert.ok(Math.abs(heard[i] - heard[i - 1]) < 0.16, `a click at ${i}`);
+  const output = play(player, 100);
+  for (let i = 1; i < output.length; i++) {
+    assert.ok(Math.abs(output[i] - output[i - 1]) < 0.16, `a click at ${i}`);
   }
-  for (let i = heard.length - 100; i < heard.length; i++) {
+  for (let i = output.length - 100; i < output.length; i++) {
     const expected = 0.5 * Math.sin(0.3 * (10 * BLOCK + i + 40.25));
-    assert.ok(Math.abs(heard[i] - expected) < 0.005, `${heard[i]} for ${expected}`);
+    assert.ok(Math.abs(output[i] - expected) < 0.005, `${output[i]} for ${expected}`);
   }
 });
 
-test("how much was played, and where it is, are told four times a second", () => {
+test("the number of played samples and the anchor are reported four times a second", () => {
   const player = playerWith(0);
   player.port.onmessage({ data: { mediaTime: 0, samples: new Int16Array(16000).fill(1) } });
   play(player, 100);
@@ -117,9 +117,9 @@ class FakeSocket {
   }
 }
 
-test("what a slow network does not take is left out, and the gateway is told", () => {
+test("chunks are dropped and reported while the network is too slow", () => {
   const socket = new FakeSocket();
-  const uplink = new Uplink(socket, 16000);
+  const uplink = new AudioUplink(socket, 16000);
   const chunk = () => new Int16Array(320);
   uplink.send(20, 20, chunk());
   socket.bufferedAmount = 1 << 20;
@@ -129,26 +129,26 @@ test("what a slow network does not take is left out, and the gateway is told", (
   uplink.send(80, 80, chunk());
   uplink.send(100, 100, chunk());
   assert.deepEqual(socket.sent, [640, { skip: 640 }, 640, 640]);
-  assert.equal(uplink.ageMs(100, 100 * 16), 0, "media time went on");
+  assert.equal(uplink.ageMs(100, 100 * 16), 0, "media time continues");
 });
 
-test("what a busy page hands over too late is left out", () => {
+test("chunks that a busy page sends too late are dropped", () => {
   const socket = new FakeSocket();
-  const uplink = new Uplink(socket, 16000);
+  const uplink = new AudioUplink(socket, 16000);
   for (const recordedMs of [20, 40, 1000]) uplink.send(1020, recordedMs, new Int16Array(320));
   assert.deepEqual(socket.sent, [{ skip: 640 }, 640]);
 });
 
-test("the age of sound counts from its recording, whatever was late on the way", () => {
-  const uplink = new Uplink(new FakeSocket(), 48000);
+test("the age of sound counts from its recording, even if chunks are late", () => {
+  const uplink = new AudioUplink(new FakeSocket(), 48000);
   assert.equal(uplink.ageMs(0, 0), null);
   uplink.send(1070, 1070, new Int16Array(960)); // 50 ms late
   uplink.send(1041, 1041, new Int16Array(960)); // 1 ms late
   assert.equal(uplink.ageMs(1101, 1600), 0);
 });
 
-test("sound that the sound card loses does not count as age for ever", () => {
-  const uplink = new Uplink(new FakeSocket(), 16000);
+test("sound that the sound card loses affects the age only for a while", () => {
+  const uplink = new AudioUplink(new FakeSocket(), 16000);
   for (let ms = 20; ms <= 40000; ms += 20) {
     const lostMs = ms > 20000 ? 700 : 0;
     uplink.send(ms + lostMs, ms + lostMs, new Int16Array(320));
@@ -156,10 +156,10 @@ test("sound that the sound card loses does not count as age for ever", () => {
   assert.equal(uplink.ageMs(40700, 40000 * 16), 0);
 });
 
-test("a socket that is not open gets nothing", () => {
+test("nothing is sent to a socket that is not open", () => {
   const socket = new FakeSocket();
   socket.readyState = 2;
-  const uplink = new Uplink(socket, 16000);
+  const uplink = new AudioUplink(socket, 16000);
   uplink.send(20, 20, new Int16Array(320));
   assert.deepEqual(socket.sent, []);
 });

@@ -1,28 +1,28 @@
-// Contrast of the style sheet's colours, in both themes: WCAG 2.2, AA. Panels lie over the picture,
-// which may have any colour.
+// Contrast of the style sheet's colors in both themes, by WCAG 2.2 AA. Panels are translucent and cover
+// an image of any color.
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import test from "node:test";
 
-const [TEXT, GRAPHICS] = [4.5, 3]; // least contrast (1.4.3, 1.4.11)
+const [TEXT, GRAPHICS] = [4.5, 3]; // minimum contrast (1.4.3, 1.4.11)
 const STYLE = readFileSync(new URL("../style.css", import.meta.url), "utf8");
-const COLOUR = String.raw`#[0-9a-f]{3,6}|rgb\([^)]*\)`;
+const COLOR = String.raw`#[0-9a-f]{3,6}|rgb\([^)]*\)`;
 
-/** Return a theme's colours by their names: { rgb, share: 1 if nothing shines through }. */
+/** Return a theme's colors by name: { rgb, share: opacity }. */
 function theme(which) {
   const [light, dark] = STYLE.split("prefers-color-scheme: dark");
-  const pattern = new RegExp(`--([a-z-]+): (${COLOUR});`, "g");
-  const found = [...(which === "light" ? light : light + dark).matchAll(pattern)]; // the last counts
-  return Object.fromEntries(found.map(([, name, colour]) => [name, read(colour)]));
+  const pattern = new RegExp(`--([a-z-]+): (${COLOR});`, "g");
+  const matches = [...(which === "light" ? light : light + dark).matchAll(pattern)]; // later values win
+  return Object.fromEntries(matches.map(([, name, color]) => [name, read(color)]));
 }
 
-function read(colour) {
-  if (colour.startsWith("rgb")) {
-    const [red, green, blue, percent] = colour.match(/\d+/g).map(Number);
+function read(color) {
+  if (color.startsWith("rgb")) {
+    const [red, green, blue, percent] = color.match(/\d+/g).map(Number);
     return { rgb: [red, green, blue], share: percent / 100 };
   }
-  const digits = colour.length === 4 ? colour.replace(/[0-9a-f]/g, "$&$&") : colour;
+  const digits = color.length === 4 ? color.replace(/[0-9a-f]/g, "$&$&") : color;
   return { rgb: [1, 3, 5].map((at) => parseInt(digits.slice(at, at + 2), 16)), share: 1 };
 }
 
@@ -45,30 +45,30 @@ function contrast(one, other) {
 
 const [BLACK, WHITE] = [read("#000"), read("#fff")];
 
-test("colours are plain, so that older browsers have them, too", () => {
+test("colors are plain, which older browsers support", () => {
   assert.equal(STYLE.includes("light-dark("), false);
   assert.notDeepEqual(theme("light").ink, theme("dark").ink);
 });
 
-test("contrast is computed as by WCAG", () => {
+test("contrast is computed as in WCAG", () => {
   assert.equal(contrast(BLACK, WHITE), 21);
   assert.ok(Math.abs(contrast(read("#767676"), WHITE) - 4.54) < 0.01);
 });
 
 for (const which of ["light", "dark"]) {
-  test(`every colour can be read in the ${which} theme`, () => {
-    const colours = theme(which);
-    const { panel, sheet, line, accent, good, busy, bad } = colours;
+  test(`colors have contrast in the ${which} theme`, () => {
+    const colors = theme(which);
+    const { panel, sheet, line, accent, good, busy, bad } = colors;
     const panels = [BLACK, WHITE].map((picture) => over(panel, picture));
-    const grounds = [colours["back-center"], colours["back-edge"], sheet, over(line, sheet), ...panels];
+    const grounds = [colors["back-center"], colors["back-edge"], sheet, over(line, sheet), ...panels];
     for (const ground of grounds) {
       for (const name of ["ink", "faint"]) {
-        const found = contrast(colours[name], ground);
-        assert.ok(found >= TEXT, `${name} on ${ground.rgb}: ${found.toFixed(2)}`);
+        const ratio = contrast(colors[name], ground);
+        assert.ok(ratio >= TEXT, `${name} on ${ground.rgb}: ${ratio.toFixed(2)}`);
       }
     }
     assert.ok(contrast(WHITE, accent) >= TEXT);
-    const below = over(panel, colours["back-edge"]); // the state's light is at the edge
+    const below = over(panel, colors["back-edge"]); // the status light is near the edge
     for (const light of [good, busy, bad]) {
       assert.ok(contrast(light, below) >= GRAPHICS, `${light.rgb} on ${below.rgb}`);
     }

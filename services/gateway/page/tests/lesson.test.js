@@ -1,14 +1,14 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { curvePath, extent, figures, verdict } from "../lip-curves.js";
-import { FaceRecording, LANDMARKS, NO_FACE, TOO_QUIET, TOO_SLOW } from "../recording.js";
+import { FaceRecording, LANDMARKS } from "../face-recording.js";
 import { MouthProfileStore } from "../mouth-profile.js";
 
 const RATE_HZ = 48000;
 const CHUNK = Int16Array.from({ length: 960 }, (_, i) => i);
 const LOUD = 0.1;
 
-/** Landmarks of a face: that of index i is at (i, i + 0.25, -i). */
+/** Return the landmarks of a face; landmark i is at (i, i + 0.25, -i). */
 function face() {
   return Float32Array.from({ length: 478 * 3 }, (_, k) => {
     const index = Math.floor(k / 3);
@@ -16,12 +16,12 @@ function face() {
   });
 }
 
-/** Record sound in real time from 1000 ms on, and pictures. */
-function record({ seconds, rms = LOUD, seen = () => true, everyMs = 40 }) {
+/** Record sound and images from 1000 ms on. */
+function record({ seconds, rms = LOUD, hasFace = () => true, everyMs = 40 }) {
   const recording = new FaceRecording(RATE_HZ);
   for (let ms = 0; ms < 1000 * seconds; ms += 20) {
     recording.addSound(1020 + ms, CHUNK, rms);
-    if (ms % everyMs === 0) recording.addFace(1010 + ms, seen(ms) ? face() : null);
+    if (ms % everyMs === 0) recording.addFace(1010 + ms, hasFace(ms) ? face() : null);
   }
   return recording;
 }
@@ -39,7 +39,7 @@ async function parse(recording) {
   return { header, times, frame, sound: new Int16Array(bytes.slice(at)) };
 }
 
-test("a recording becomes a landmark file", async () => {
+test("a recording is encoded as a landmark file", async () => {
   const { header, times, frame, sound } = await parse(record({ seconds: 1 }));
   assert.deepEqual(header, { times: 25, points: 43, sample_rate_hz: RATE_HZ });
   times.forEach((time, i) => assert.ok(Math.abs(time - 0.01 - 0.04 * i) < 1e-9, `${time}`));
@@ -49,45 +49,45 @@ test("a recording becomes a landmark file", async () => {
   assert.deepEqual(sound.subarray(960, 1920), CHUNK);
 });
 
-test("times rise from the first sample on, whatever the clocks do", async () => {
+test("times increase from the first sample on, even if clocks disagree", async () => {
   const recording = new FaceRecording(RATE_HZ);
   recording.addFace(900, face()); // before the sound begins
-  recording.addSound(1050, CHUNK, LOUD); // handed over 30 ms late
+  recording.addSound(1050, CHUNK, LOUD); // delivered 30 ms late
   recording.addSound(1040, CHUNK, LOUD);
   for (const ms of [1010, 1010, 1005, 1030]) recording.addFace(ms, face());
   assert.deepEqual((await parse(recording)).times, [0.01, 0.03]);
 });
 
-test("frames without a face are left out", async () => {
-  const { header } = await parse(record({ seconds: 2, seen: (ms) => ms % 400 !== 0 }));
+test("images without a face are dropped", async () => {
+  const { header } = await parse(record({ seconds: 2, hasFace: (ms) => ms % 400 !== 0 }));
   assert.equal(header.times, 45);
 });
 
-test("forty seconds fit into what the gateway takes", () => {
+test("a recording of 40 seconds fits the gateway's limit", () => {
   assert.ok(record({ seconds: 43 }).encode().size < 8 * 1024 * 1024);
 });
 
-test("while one reads, it is said when the face is gone or nothing is heard", () => {
+test("the reader is advised when the face is missing or the sound is too quiet", () => {
   const good = record({ seconds: 6 });
   assert.equal(good.advice(7000), null);
-  assert.equal(good.advice(8100), NO_FACE);
-  assert.equal(record({ seconds: 6, rms: 0 }).advice(7000), TOO_QUIET);
-  assert.equal(record({ seconds: 3, rms: 0 }).advice(4000), null, "one may pause");
+  assert.equal(good.advice(8100), "noFace");
+  assert.equal(record({ seconds: 6, rms: 0 }).advice(7000), "tooQuiet");
+  assert.equal(record({ seconds: 3, rms: 0 }).advice(4000), null, "a pause is allowed");
 });
 
-test("nothing is learnt without a face or without a voice", () => {
+test("a recording without a face or a voice has a problem", () => {
   assert.equal(record({ seconds: 6 }).problem(), null);
-  assert.equal(record({ seconds: 6, seen: (ms) => ms < 3000 }).problem(), NO_FACE);
-  assert.equal(record({ seconds: 6, rms: 0.001 }).problem(), TOO_QUIET);
-  assert.equal(new FaceRecording(RATE_HZ).problem(), NO_FACE);
-  assert.equal(record({ seconds: 6, everyMs: 120 }).problem(), TOO_SLOW);
+  assert.equal(record({ seconds: 6, hasFace: (ms) => ms < 3000 }).problem(), "noFace");
+  assert.equal(record({ seconds: 6, rms: 0.001 }).problem(), "tooQuiet");
+  assert.equal(new FaceRecording(RATE_HZ).problem(), "noFace");
+  assert.equal(record({ seconds: 6, everyMs: 120 }).problem(), "tooSlow");
 });
 
-test("a landmark is kept once, in rising order", () => {
+test("landmarks are unique and sorted", () => {
   assert.deepEqual(LANDMARKS, [...new Set(LANDMARKS)].sort((a, b) => a - b));
 });
 
-test("a curve is drawn into its box, with gaps where nothing is known", () => {
+test("a curve is scaled to its box and has gaps at missing values", () => {
   const box = { width: 100, height: 10, low: 0, high: 20 };
   const times = [5, 5.02, 5.04, 5.06, 5.08, 5.5, 6];
   const path = curvePath(times, [0, 20, null, 10, 10, 10, 0], box);
@@ -95,19 +95,19 @@ test("a curve is drawn into its box, with gaps where nothing is known", () => {
   assert.deepEqual(extent([3, null], [null, -1, 2]), { low: -1, high: 3 });
 });
 
-test("the figures are put into words", () => {
+test("figures are summed up by a verdict", () => {
   const before = { opening: 0.5, width: 0.412, jaw: null };
-  const with_ = (opening) => ({ before, after: { ...before, opening } });
-  assert.deepEqual(figures(with_(0.6)), [
-    [{ en: "Opening", zh: "张口" }, "0.50", "0.60"],
-    [{ en: "Width", zh: "宽度" }, "0.41", "0.41"],
-    [{ en: "Jaw", zh: "下颌" }, "–", "–"],
+  const withOpening = (opening) => ({ before, after: { ...before, opening } });
+  assert.deepEqual(figures(withOpening(0.6)), [
+    ["measure.opening", "0.50", "0.60"],
+    ["measure.width", "0.41", "0.41"],
+    ["measure.jaw", "–", "–"],
   ]);
-  assert.match(verdict(with_(0.6)).en, /more closely/);
-  assert.match(verdict(with_(0.51)).en, /about as well/);
-  assert.match(verdict(with_(0.4)).en, /discard/);
-  const nothing = { opening: 0.1, width: 0.1, jaw: 0 };
-  assert.match(verdict({ before: nothing, after: { ...nothing, opening: 0.3 } }).en, /discard/);
+  assert.equal(verdict(withOpening(0.6)), "lessonBetter");
+  assert.equal(verdict(withOpening(0.51)), "lessonSame");
+  assert.equal(verdict(withOpening(0.4)), "lessonWorse");
+  const poor = { opening: 0.1, width: 0.1, jaw: 0 };
+  assert.equal(verdict({ before: poor, after: { ...poor, opening: 0.3 } }), "lessonWorse");
 });
 
 class FakeStorage {
@@ -117,7 +117,7 @@ class FakeStorage {
   removeItem(key) { this.items.delete(key); }
 }
 
-test("a mouth profile is kept until it is forgotten", () => {
+test("a mouth profile is stored until it is deleted", () => {
   const storage = new FakeStorage();
   const learned = { profile: "YWJj", learntOn: 1, before: {}, after: {} };
   new MouthProfileStore(storage).keep(learned);
@@ -128,7 +128,7 @@ test("a mouth profile is kept until it is forgotten", () => {
   assert.equal(new MouthProfileStore(storage).current, null);
 });
 
-test("without a storage a mouth profile is kept for now, and invalid content is ignored", () => {
+test("a mouth profile needs no storage, and invalid content is ignored", () => {
   const now = new MouthProfileStore(null);
   now.keep({ profile: "YWJj" });
   assert.equal(now.current.profile, "YWJj");

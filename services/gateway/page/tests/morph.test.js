@@ -38,7 +38,7 @@ function faceWith(value) {
   return faps;
 }
 
-test("a FAP moves its target's vertices in proportion, and no other", () => {
+test("a FAP moves only its target's vertices, in proportion", () => {
   const mesh = twoTriangles();
   const morphed = new MorphedMesh(mesh, [JAW]);
   morphed.pose(faceWith(500));
@@ -48,7 +48,7 @@ test("a FAP moves its target's vertices in proportion, and no other", () => {
   assert.ok(mesh.geometry.attributes.position.needsUpdate);
 });
 
-test("at rest the mesh is as in the file", () => {
+test("at rest the mesh equals the file", () => {
   const mesh = twoTriangles();
   const morphed = new MorphedMesh(mesh, [JAW]);
   const normals = [...mesh.geometry.attributes.normal.array];
@@ -58,7 +58,7 @@ test("at rest the mesh is as in the file", () => {
   assert.deepEqual([...mesh.geometry.attributes.normal.array], normals);
 });
 
-test("normals turn with their triangle, and only there", () => {
+test("only the normals of moved triangles rotate", () => {
   const mesh = twoTriangles();
   new MorphedMesh(mesh, [JAW]).pose(faceWith(1000));
   const normal = mesh.geometry.attributes.normal.array;
@@ -67,7 +67,7 @@ test("normals turn with their triangle, and only there", () => {
   assert.deepEqual([...normal.slice(9)], [0, 0, 1, 0, 0, 1, 0, 0, 1]);
 });
 
-test("three.js is left no targets to move itself", () => {
+test("three.js gets no morph targets", () => {
   const mesh = twoTriangles();
   new MorphedMesh(mesh, [JAW, { name: "absent", number: 4, unitsPerWeight: 1 }]);
   assert.deepEqual(mesh.geometry.morphAttributes, {});

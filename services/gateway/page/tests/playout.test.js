@@ -4,48 +4,48 @@ import { FapTrack, Playout, SAMPLES_PER_MS } from "../playout.js";
 
 const FRAME_MS = 20;
 
-/** Let sound and its frames arrive in real time: each frame frameMs after its sound. */
+/** Let sound and frames arrive in real time, each frame frameMs after its sound. */
 function stream(playout, { fromMs = 0, forMs, clockMs = 0, frameMs = 80 }) {
   for (let ms = fromMs; ms < fromMs + forMs; ms += FRAME_MS) {
     const nowMs = ms + FRAME_MS + clockMs;
     playout.soundArrived(nowMs, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
-    const frame = ms + FRAME_MS - frameMs;
-    if (frame >= 0) playout.frameArrived(nowMs, frame * SAMPLES_PER_MS);
+    const frameTimeMs = ms + FRAME_MS - frameMs;
+    if (frameTimeMs >= 0) playout.frameArrived(nowMs, frameTimeMs * SAMPLES_PER_MS);
     playout.adjust(nowMs);
   }
 }
 
-test("nothing is due before anything arrived", () => {
+test("nothing is due before the first arrival", () => {
   const playout = new Playout();
   assert.equal(playout.mediaAt(1000), null);
   assert.equal(playout.delayMs, null);
 });
 
-test("sound waits for its picture and one FAP frame", () => {
+test("sound waits for its image and one more FAP frame", () => {
   const playout = new Playout();
   stream(playout, { forMs: 20000, frameMs: 180 });
   assert.ok(Math.abs(playout.delayMs - 200) <= 30, `${playout.delayMs}`);
 });
 
-test("the difference between the clocks drops out", () => {
+test("a constant difference between the clocks has no effect", () => {
   const [here, there] = [new Playout(), new Playout()];
   stream(here, { forMs: 5000 });
   stream(there, { forMs: 5000, clockMs: 1e6 });
   assert.equal(there.mediaAt(1e6 + 6000), here.mediaAt(6000));
 });
 
-test("a small error is glided away, which nobody hears", () => {
+test("a small error is corrected by gliding", () => {
   const playout = new Playout();
   stream(playout, { forMs: 10000 });
   const before = playout.offsetMs;
   stream(playout, { fromMs: 10000, forMs: 3000, frameMs: 100 });
   const glidedMs = playout.offsetMs - before;
-  assert.ok(glidedMs > 9 && glidedMs <= 15, `${glidedMs}: 5 ms a second, once it is known`);
+  assert.ok(glidedMs > 9 && glidedMs <= 15, `${glidedMs}: 5 ms per second after it was measured`);
   stream(playout, { fromMs: 13000, forMs: 5000, frameMs: 100 });
   assert.ok(Math.abs(playout.offsetMs - before - 20) <= 0.1, `${playout.offsetMs - before}`);
 });
 
-test("one late frame moves nothing", () => {
+test("one late frame has no effect", () => {
   const playout = new Playout();
   stream(playout, { forMs: 10000 });
   const before = playout.offsetMs;
@@ -54,7 +54,7 @@ test("one late frame moves nothing", () => {
   assert.equal(playout.offsetMs, before);
 });
 
-test("after a pause of the sender the stream is on time again", () => {
+test("the delay is as before after the sender paused", () => {
   const playout = new Playout();
   stream(playout, { forMs: 3000 });
   const delayMs = playout.delayMs;
@@ -62,14 +62,14 @@ test("after a pause of the sender the stream is on time again", () => {
   assert.ok(Math.abs(playout.delayMs - delayMs) <= 30, `${playout.delayMs}`);
 });
 
-test("a leap ahead of media time starts again at once", () => {
+test("a leap of media time restarts playout at once", () => {
   const playout = new Playout();
   stream(playout, { forMs: 1000 });
   playout.soundArrived(1020, 60000 * SAMPLES_PER_MS, 320);
   assert.ok(playout.mediaAt(1020) > 59000 * SAMPLES_PER_MS);
 });
 
-test("the face between two frames is mixed of both", () => {
+test("faces between two frames are interpolated", () => {
   const track = new FapTrack();
   const out = new Float32Array(2);
   assert.equal(track.sample(0, out), null);
@@ -78,12 +78,12 @@ test("the face between two frames is mixed of both", () => {
   assert.equal(track.sample(400, out), 400);
   assert.deepEqual([...out], [12.5, 25]);
   assert.equal(track.sample(0, out), 320);
-  assert.deepEqual([...out], [10, 0], "before the first frame: the first");
+  assert.deepEqual([...out], [10, 0], "before the first frame");
   assert.equal(track.sample(9999, out), 640);
-  assert.deepEqual([...out], [20, 100], "after the last: the last");
+  assert.deepEqual([...out], [20, 100], "after the last frame");
 });
 
-test("a frame of the same media time replaces the last, an older one is left out", () => {
+test("a frame with the same media time replaces the last one, older frames are ignored", () => {
   const track = new FapTrack();
   const out = new Float32Array(1);
   assert.equal(track.push(320, Float32Array.of(1)), true);
@@ -93,16 +93,16 @@ test("a frame of the same media time replaces the last, an older one is left out
   assert.equal(out[0], 2);
 });
 
-test("a face without sound waits for most frames and no more", () => {
+test("without sound, the face waits only for most frames", () => {
   const playout = new Playout();
-  playout.isHeard = false;
+  playout.isAudible = false;
   stream(playout, { forMs: 20000, frameMs: 180 });
   assert.ok(Math.abs(playout.delayMs - 180) <= 5, `${playout.delayMs}`);
 });
 
-test("what takes long to draw is drawn earlier", () => {
+test("images that take long to draw are drawn earlier", () => {
   const playout = new Playout();
-  playout.pictureMs = 60;
+  playout.imageDelayMs = 60;
   stream(playout, { forMs: 20000, frameMs: 180 });
   assert.ok(Math.abs(playout.delayMs - 260) <= 30, `${playout.delayMs}`);
 });

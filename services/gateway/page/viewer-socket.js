@@ -1,23 +1,23 @@
-// The WebSocket to the gateway that brings everything to be seen and heard; proto/GATEWAY.md.
+// The WebSocket that brings a session's frames, sound and events; see proto/GATEWAY.md.
 
 import { readMessage } from "./messages.js";
 
-const RETRY_MS = [300, 5000];
+const RETRY_MS = { min: 300, max: 5000 };
 
-/** Connects, and connects again by itself until it is closed. */
-export class Link {
+/** Connects, and reconnects by itself until it is closed. */
+export class ViewerSocket {
   #address;
   #handlers;
   #chosen;
   #socket = null;
-  #retry = null;
-  #retryMs = RETRY_MS[0];
+  #retryTimer = null;
+  #retryMs = RETRY_MS.min;
 
   /**
-   * @param address gives the WebSocket's address for a session
-   * @param {string} chosen session to look at; "" for the newest
+   * @param address function that returns the WebSocket's URL for a session
+   * @param {string} chosen session to show; "" for the newest
    * @param handlers { state(connected), fap(mediaTime, values), sound(mediaTime, samples),
-   *   rest(values), text(object) }; where the address asks for shapes, also weights(mediaTime, values)
+   *   rest(values), text(object) }; if the URL asks for shapes, also weights(mediaTime, values)
    *   and restWeights(values)
    */
   constructor(address, chosen, handlers) {
@@ -27,20 +27,20 @@ export class Link {
     this.#connect();
   }
 
-  /** Look at another session; "" for the newest. */
+  /** Show another session; "" for the newest. */
   follow(session) {
     this.#chosen = session;
     this.send({ follow: session });
   }
 
-  /** Send a command, unless there is no connection. */
+  /** Send a command if the socket is open. */
   send(command) {
     if (this.#socket?.readyState === WebSocket.OPEN) this.#socket.send(JSON.stringify(command));
   }
 
-  /** Disconnect for good. */
+  /** Disconnect and stop reconnecting. */
   close() {
-    clearTimeout(this.#retry);
+    clearTimeout(this.#retryTimer);
     this.#socket.onclose = null;
     this.#socket.close();
     this.#handlers.state(false);
@@ -50,14 +50,14 @@ export class Link {
     const socket = new WebSocket(this.#address(this.#chosen));
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
-      this.#retryMs = RETRY_MS[0];
+      this.#retryMs = RETRY_MS.min;
       this.#handlers.state(true);
     };
     socket.onmessage = (event) => this.#receive(event.data);
     socket.onclose = () => {
       this.#handlers.state(false);
-      this.#retry = setTimeout(() => this.#connect(), this.#retryMs);
-      this.#retryMs = Math.min(RETRY_MS[1], this.#retryMs * 2);
+      this.#retryTimer = setTimeout(() => this.#connect(), this.#retryMs);
+      this.#retryMs = Math.min(RETRY_MS.max, this.#retryMs * 2);
     };
     this.#socket = socket;
   }

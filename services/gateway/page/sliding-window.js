@@ -1,10 +1,10 @@
-// What was measured over the last seconds. Pure code: time is handed in.
+// Statistics of the values of the last seconds. Time is injected.
 
-export class Recent {
+export class SlidingWindow {
   #windowMs;
   #entries = []; // [when, value]
 
-  /** @param windowMs for which a value counts */
+  /** @param windowMs age at which values are dropped */
   constructor(windowMs) {
     this.#windowMs = windowMs;
   }
@@ -15,11 +15,10 @@ export class Recent {
 
   add(nowMs, value) {
     this.#entries.push([nowMs, value]);
-    this.forget(nowMs);
+    this.dropOld(nowMs);
   }
 
-  /** Drop the values that are too old. */
-  forget(nowMs) {
+  dropOld(nowMs) {
     while (this.#entries[0]?.[0] < nowMs - this.#windowMs) this.#entries.shift();
   }
 
@@ -27,17 +26,17 @@ export class Recent {
     return this.#entries.length;
   }
 
-  get least() {
+  get min() {
     return Math.min(...this.#entries.map((entry) => entry[1]));
   }
 
-  /** Return the greatest value since a time; Infinity if there is none. */
-  greatestSince(sinceMs) {
-    const recent = this.#entries.filter((entry) => entry[0] > sinceMs);
-    return recent.length ? Math.max(...recent.map((entry) => entry[1])) : Infinity;
+  /** Return the greatest value since a time; Infinity without values. */
+  maxSince(sinceMs) {
+    const values = this.#entries.filter((entry) => entry[0] > sinceMs).map((entry) => entry[1]);
+    return values.length ? Math.max(...values) : Infinity;
   }
 
-  /** Return a percentile, the fraction given from 0 to 1; null if there are no values. */
+  /** Return a percentile, given as a fraction from 0 to 1; null without values. */
   percentile(fraction) {
     if (this.#entries.length === 0) return null;
     const sorted = this.#entries.map((entry) => entry[1]).sort((a, b) => a - b);

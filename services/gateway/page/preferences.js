@@ -1,23 +1,23 @@
-// What this browser's user has chosen, kept for the next visit. Pure code: the storage is handed in.
+// The user's preferences, stored for the next visit. The storage is injected.
 
 const KEY = "kouxing.choices";
 
-/** Choices by name; what was not chosen is null. */
-export class Choices {
+export class Preferences {
   #storage;
   #values = {};
 
-  /** @param storage the browser's, or null if there is none */
+  /** @param storage the browser's localStorage, or null */
   constructor(storage) {
     this.#storage = storage;
     try {
       const values = JSON.parse(storage?.getItem(KEY) ?? "{}");
       if (typeof values === "object" && values !== null) this.#values = values;
     } catch {
-      // what was not written here is no choice
+      // not written by this page
     }
   }
 
+  /** Return a preference, or null. */
   get(name) {
     return this.#values[name] ?? null;
   }
@@ -27,7 +27,7 @@ export class Choices {
     try {
       this.#storage?.setItem(KEY, JSON.stringify(this.#values));
     } catch {
-      // a full storage
+      // the storage is full
     }
   }
 }

@@ -1,6 +1,6 @@
-// A text to read aloud: Aesop's "The North Wind and the Sun", which phoneticians use in all languages.
+// The text to read aloud: "The North Wind and the Sun" by Aesop, which is common in phonetics.
 
-export const TEXTS = {
+export const READING_TEXTS = {
   zh:
     "有一回，北风跟太阳正在那儿争论谁的本事大。说着说着，来了一个过路的，身上穿着一件厚袍子。它们俩就商量好了，" +
     "说谁能先叫这个过路的把他的袍子脱下来，就算谁的本事大。北风就使劲儿地吹起来了，可是它越是吹得厉害，那个人就把袍子裹得越紧。" +

@@ -1,17 +1,17 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { socketUrl } from "../address.js";
-import { Link } from "../link.js";
+import { ViewerSocket } from "../viewer-socket.js";
 import { NUM_FAPS, readMessage } from "../messages.js";
 
 class FakeWebSocket {
   static OPEN = 1;
-  static made = [];
+  static instances = [];
   readyState = 0;
   sent = [];
   constructor(url) {
     this.url = url;
-    FakeWebSocket.made.push(this);
+    FakeWebSocket.instances.push(this);
   }
   send(text) { this.sent.push(JSON.parse(text)); }
   close() {}
@@ -21,7 +21,7 @@ class FakeWebSocket {
   }
 }
 
-/** A binary message as services/gateway/wire.py makes it: <B3xId and the payload. */
+/** Return a binary message as services/gateway/wire.py packs it: <B3xId and the payload. */
 function binary(kind, mediaTime, payload) {
   const data = new ArrayBuffer(16 + payload.byteLength);
   const header = new DataView(data);
@@ -33,7 +33,7 @@ function binary(kind, mediaTime, payload) {
 }
 
 test.beforeEach(() => {
-  FakeWebSocket.made = [];
+  FakeWebSocket.instances = [];
   globalThis.WebSocket = FakeWebSocket;
   globalThis.location = { protocol: "http:", host: "localhost:8080", hash: "" };
 });
@@ -47,13 +47,13 @@ function record() {
   return { calls, handlers };
 }
 
-test("a page that came by https connects by wss", () => {
+test("an https page connects with wss", () => {
   assert.equal(socketUrl("/viewer"), "ws://localhost:8080/viewer");
   globalThis.location.protocol = "https:";
   assert.equal(socketUrl("/viewer"), "wss://localhost:8080/viewer");
 });
 
-test("binary messages are frames or sound; others of a later gateway are left out", () => {
+test("binary messages are read by their type; unknown types are ignored", () => {
   const faps = Float32Array.from({ length: NUM_FAPS }, (_, i) => i);
   const frame = readMessage(binary(1, 2 ** 40 + 1, faps));
   assert.equal(frame.mediaTime, 2 ** 40 + 1);
@@ -67,10 +67,10 @@ test("binary messages are frames or sound; others of a later gateway are left ou
   assert.equal(readMessage(binary(6, 0, new Uint8Array(4))), null);
 });
 
-test("messages go to their handlers", () => {
+test("messages are passed to their handlers", () => {
   const { calls, handlers } = record();
-  new Link(toViewer, "", handlers);
-  const [socket] = FakeWebSocket.made;
+  new ViewerSocket(toViewer, "", handlers);
+  const [socket] = FakeWebSocket.instances;
   socket.open();
   socket.onmessage({ data: binary(2, 320, Int16Array.of(5)) });
   socket.onmessage({ data: binary(9, 320, Int16Array.of(5)) });
@@ -88,44 +88,44 @@ test("messages go to their handlers", () => {
   ]);
 });
 
-test("it connects again by itself, ever more slowly, to the session chosen last", (t) => {
+test("it reconnects with increasing delays, to the session chosen last", (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const { calls, handlers } = record();
-  const link = new Link(toViewer, "", handlers);
-  FakeWebSocket.made[0].open();
-  link.follow("a b");
-  assert.deepEqual(FakeWebSocket.made[0].sent, [{ follow: "a b" }]);
-  FakeWebSocket.made[0].onclose();
+  const viewer = new ViewerSocket(toViewer, "", handlers);
+  FakeWebSocket.instances[0].open();
+  viewer.follow("a b");
+  assert.deepEqual(FakeWebSocket.instances[0].sent, [{ follow: "a b" }]);
+  FakeWebSocket.instances[0].onclose();
   t.mock.timers.tick(299);
-  assert.equal(FakeWebSocket.made.length, 1);
+  assert.equal(FakeWebSocket.instances.length, 1);
   t.mock.timers.tick(1);
-  assert.equal(FakeWebSocket.made[1].url, "ws://localhost:8080/viewer?session=a+b");
-  FakeWebSocket.made[1].onclose();
+  assert.equal(FakeWebSocket.instances[1].url, "ws://localhost:8080/viewer?session=a+b");
+  FakeWebSocket.instances[1].onclose();
   t.mock.timers.tick(599);
-  assert.equal(FakeWebSocket.made.length, 2);
+  assert.equal(FakeWebSocket.instances.length, 2);
   t.mock.timers.tick(1);
-  FakeWebSocket.made[2].open();
-  FakeWebSocket.made[2].onclose();
+  FakeWebSocket.instances[2].open();
+  FakeWebSocket.instances[2].onclose();
   t.mock.timers.tick(300);
-  assert.equal(FakeWebSocket.made.length, 4, "a success makes it quick again");
+  assert.equal(FakeWebSocket.instances.length, 4, "a connection resets the delay");
   assert.deepEqual(calls.map(([, connected]) => connected), [true, false, false, true, false]);
 });
 
-test("commands are left out while it is not connected", () => {
-  const link = new Link(toViewer, "", record().handlers);
-  link.send({ play: "sample" });
-  assert.deepEqual(FakeWebSocket.made[0].sent, []);
+test("commands are dropped while it is not connected", () => {
+  const viewer = new ViewerSocket(toViewer, "", record().handlers);
+  viewer.send({ play: "sample" });
+  assert.deepEqual(FakeWebSocket.instances[0].sent, []);
 });
 
-test("closed, it stays so", (t) => {
+test("it does not reconnect after close", (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const { calls, handlers } = record();
-  const link = new Link(toViewer, "", handlers);
-  const [socket] = FakeWebSocket.made;
+  const viewer = new ViewerSocket(toViewer, "", handlers);
+  const [socket] = FakeWebSocket.instances;
   socket.open();
-  link.close();
+  viewer.close();
   assert.equal(socket.onclose, null);
   t.mock.timers.tick(5000);
-  assert.equal(FakeWebSocket.made.length, 1);
+  assert.equal(FakeWebSocket.instances.length, 1);
   assert.deepEqual(calls.at(-1), ["state", false]);
 });

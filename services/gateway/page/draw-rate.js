@@ -1,0 +1,72 @@
+// How often and with how many pixels the head is drawn, so that a slow machine keeps up. Time is
+// injected.
+
+import { SlidingWindow } from "./sliding-window.js";
+
+const STEP = 0.85; // factor of the pixel ratio; the number of pixels changes by its square
+const MIN_RATIO = 0.35;
+const MIN_IMAGES = 10; // before their mean time is used
+const SMOOTHING = 0.2;
+const MAX_SHOWN_MS = 200; // an image that is shown for longer belongs to a face that does not move
+const MAX_DELAY_MS = 1000; // after a longer delay the page was hidden
+const WINDOW_MS = 2000; // over which delays are measured
+const TOLERANCE_MS = 8; // half a tick of the display; an image starts later than its tick
+const PERIOD_MS = 50; // 20 images per second
+const MIN_REST_MS = 10;
+const SLOW_MS = 36; // images that take longer get fewer pixels
+const FAST_MS = 16; // images that take less time get more pixels
+
+export class DrawRate {
+  imageMs = 0; // duration of drawing, mean since the ratio changed
+  visibleDelayMs = 0; // from a face to the middle of the time for which it is visible, median
+  #rests;
+  #maxRatio;
+  #startMs = -Infinity; // of the last image
+  #tookMs = 0;
+  #numImages = 0;
+  #visibleMs = -Infinity; // when the last image became visible
+  #shownMs = 0; // for how long an image is visible
+  #delays = new SlidingWindow(WINDOW_MS); // until images were visible, ms
+
+  /**
+   * @param ratio pixels drawn per pixel of the page, at first
+   * @param maxRatio maximum ratio
+   * @param rests whether to pause after an image for as long as it took, but at most until the next
+   *   of 20 per second. Use it when the processor draws: it also has to play sound.
+   */
+  constructor(ratio, maxRatio, rests) {
+    this.#rests = rests;
+    this.#maxRatio = maxRatio;
+    this.ratio = ratio;
+  }
+
+  /** Whether it is time for the next image, if the last one is done. */
+  isDue(nowMs) {
+    if (!this.#rests) return true;
+    const restMs = Math.min(this.#tookMs, Math.max(PERIOD_MS - this.#tookMs, MIN_REST_MS));
+    return nowMs - this.#startMs >= this.#tookMs + restMs - TOLERANCE_MS;
+  }
+
+  /** Record an image that was drawn. The ratio may change. */
+  recordDrawn(startMs, doneMs) {
+    this.#startMs = startMs;
+    this.#tookMs = doneMs - startMs;
+    this.#numImages++;
+    this.imageMs += Math.max(SMOOTHING, 1 / this.#numImages) * (this.#tookMs - this.imageMs);
+    if (this.#numImages < MIN_IMAGES) return;
+    const ratio = this.ratio;
+    if (this.imageMs > SLOW_MS) this.ratio = Math.max(MIN_RATIO, STEP * ratio);
+    if (this.imageMs < FAST_MS) this.ratio = Math.min(this.#maxRatio, ratio / STEP);
+    if (this.ratio !== ratio) this.#numImages = 0;
+  }
+
+  /** Record that an image became visible. faceMs: when its face was computed. */
+  recordVisible(faceMs, visibleMs) {
+    const sinceMs = visibleMs - this.#visibleMs;
+    if (sinceMs < MAX_SHOWN_MS) this.#shownMs = sinceMs;
+    this.#visibleMs = visibleMs;
+    if (visibleMs - faceMs > MAX_DELAY_MS) return;
+    this.#delays.add(visibleMs, visibleMs - faceMs + this.#shownMs / 2);
+    this.visibleDelayMs = this.#delays.percentile(0.5);
+  }
+}

@@ -1,0 +1,128 @@
+// Plays the session that is shown: it keeps sound and image in sync and computes the face that is due.
+
+import { NUM_FAPS } from "./messages.js";
+import { FapTrack, Playout } from "./playout.js";
+import { SlidingWindow } from "./sliding-window.js";
+import { StreamActivity } from "./stream-activity.js";
+
+const DELAY_WINDOW_MS = 2000;
+
+export class Player {
+  playout = new Playout();
+  faps = new Float32Array(NUM_FAPS); // the face that is shown
+  numFrames = 0; // received
+  #track = new FapTrack();
+  #activity = new StreamActivity();
+  #streamFaps = new Float32Array(NUM_FAPS);
+  #restFaps = new Float32Array(NUM_FAPS);
+  #imageDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to the image
+  #frameDelays = new SlidingWindow(DELAY_WINDOW_MS); // ms from the user's voice to its frame
+  #sound;
+  #voiceAgeMs;
+
+  /**
+   * @param {Sound} sound plays the session's sound
+   * @param voiceAgeMs (nowMs, mediaTime): how long ago this browser's user spoke, ms; null if the
+   *   session is not the user's
+   */
+  constructor(sound, voiceAgeMs) {
+    this.#sound = sound;
+    this.#voiceAgeMs = voiceAgeMs;
+  }
+
+  /** Start again with another session or epoch. */
+  reset() {
+    this.playout.reset();
+    this.#track.reset();
+    this.#imageDelays.reset();
+    this.#frameDelays.reset();
+  }
+
+  addFrame(mediaTime, faps) {
+    const nowMs = performance.now();
+    if (this.#track.push(mediaTime, faps)) this.playout.frameArrived(nowMs, mediaTime);
+    this.#activity.frameArrived(nowMs);
+    this.#addVoiceAge(this.#frameDelays, nowMs, mediaTime);
+    this.numFrames++;
+  }
+
+  addSound(mediaTime, samples) {
+    const nowMs = performance.now();
+    this.playout.soundArrived(nowMs, mediaTime, samples.length);
+    this.#sync(nowMs); // nothing else calls it while the page is hidden
+    this.#activity.soundArrived(nowMs);
+    this.#sound.push(mediaTime, samples);
+  }
+
+  /** Set the face that is shown while no session moves it. */
+  setRest(faps) {
+    this.#restFaps = faps;
+  }
+
+  isLive(nowMs) {
+    return this.#activity.isLive(nowMs);
+  }
+
+  /**
+   * Compute the face of the next image.
+   *
+   * @param imageDelayMs how long after now the image will be visible
+   * @returns { mediaTime: when the image is visible, frameTime: media time of the face, null at
+   *   rest, hasChanged: whether the face differs from the last one }
+   */
+  update(nowMs, imageDelayMs) {
+    this.playout.imageDelayMs = imageDelayMs;
+    this.#sync(nowMs);
+    const mediaTime = this.playout.mediaAt(nowMs + imageDelayMs);
+    const frameTime = mediaTime === null ? null : this.#track.sample(mediaTime, this.#streamFaps);
+    const share = this.#activity.update(nowMs, frameTime !== null);
+    return { mediaTime, frameTime, hasChanged: this.#mix(share) };
+  }
+
+  /** Record that the image of a frame became visible. */
+  imageVisible(visibleMs, frameTime) {
+    if (frameTime !== null) this.#addVoiceAge(this.#imageDelays, visibleMs, frameTime);
+  }
+
+  /** Median delay from the user's voice to the image, ms; null while unknown. */
+  get voiceToImageMs() {
+    this.#imageDelays.dropOld(performance.now());
+    return this.#imageDelays.percentile(0.5);
+  }
+
+  /** Median delay from the user's voice to the arrival of its frame, ms; null while unknown. */
+  get voiceToFrameMs() {
+    this.#frameDelays.dropOld(performance.now());
+    return this.#frameDelays.percentile(0.5);
+  }
+
+  /** How much later than its image sound is audible, ms; null without sound. */
+  get soundMinusImageMs() {
+    const offsetMs = this.#sound.offsetMs;
+    return offsetMs === null ? null : offsetMs - this.playout.offsetMs;
+  }
+
+  #sync(nowMs) {
+    this.playout.isAudible = this.#sound.isPlaying;
+    this.playout.outputLatencyMs = this.#sound.outputLatencyMs;
+    this.playout.adjust(nowMs);
+    if (this.playout.offsetMs !== null) this.#sound.align(nowMs, this.playout.offsetMs);
+  }
+
+  #addVoiceAge(delays, nowMs, mediaTime) {
+    const ageMs = this.isLive(nowMs) ? this.#voiceAgeMs(nowMs, mediaTime) : null;
+    if (ageMs !== null) delays.add(nowMs, ageMs);
+  }
+
+  /** Mix the stream's face with the face at rest; return whether the result has changed. */
+  #mix(share) {
+    const [faps, stream, rest] = [this.faps, this.#streamFaps, this.#restFaps];
+    let hasChanged = false;
+    for (let i = 0; i < NUM_FAPS; i++) {
+      const value = Math.fround(rest[i] + share * (stream[i] - rest[i]));
+      hasChanged ||= value !== faps[i];
+      faps[i] = value;
+    }
+    return hasChanged;
+  }
+}

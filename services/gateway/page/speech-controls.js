@@ -1,0 +1,124 @@
+// The buttons that make the face speak or silence it: microphone, file and sound.
+
+import { element, setTextKey } from "./elements.js";
+import { say } from "./language.js";
+import { Microphone } from "./microphone.js";
+
+export class SpeechControls {
+  state = "off"; // of the microphone
+  session = null; // of the microphone
+  #sound;
+  #handlers;
+  #microphone;
+  #wasSoundWanted = false; // before the microphone or a lesson muted the sound
+
+  /**
+   * @param {Sound} sound the session's sound
+   * @param handlers { mouthProfile(), lips(), level(rms), error({ code, text }): as of Microphone,
+   *   news(text), session(name): the microphone's session, null when it ends }
+   */
+  constructor(sound, handlers) {
+    this.#sound = sound;
+    this.#handlers = handlers;
+    this.#microphone = new Microphone({
+      mouthProfile: handlers.mouthProfile,
+      lips: handlers.lips,
+      level: handlers.level,
+      error: handlers.error,
+      state: (state) => this.#onState(state),
+      session: (name) => this.#onSession(name),
+    });
+    element("microphone").onclick = () => {
+      const isOn = this.#microphone.isActive && !this.#microphone.isFile;
+      this.#microphone.stop();
+      if (!isOn) this.#microphone.start();
+    };
+    element("open-file").onclick = () => {
+      if (this.#microphone.isFile) this.#microphone.stop();
+      else element("file").click();
+    };
+    element("file").onchange = ({ target }) => {
+      if (target.files.length > 0) this.#speakFile(target.files[0]);
+      target.value = ""; // so that the same file can be chosen again
+    };
+    document.ondragover = (event) => event.preventDefault();
+    document.ondrop = (event) => {
+      event.preventDefault();
+      if (event.dataTransfer.files.length > 0) this.#speakFile(event.dataTransfer.files[0]);
+    };
+    element("sound").onclick = () => {
+      if (sound.state === "on") sound.turnOff();
+      else sound.turnOn();
+    };
+  }
+
+  /** Return how long ago a media time of the microphone's session was spoken, ms, or null. */
+  ageMs(nowMs, mediaTime) {
+    return this.#microphone.ageMs(nowMs, mediaTime);
+  }
+
+  /** Change the lip model of the microphone's session. */
+  chooseLips(name) {
+    this.#microphone.chooseLips(name);
+  }
+
+  /** Stop the microphone and mute the sound, for a lesson. */
+  pause() {
+    this.#microphone.stop();
+    this.#mute();
+  }
+
+  /** Undo the muting of pause(). */
+  resume() {
+    if (this.#wasSoundWanted) this.#sound.turnOn();
+  }
+
+  /** Turn sound on if the browser blocked it before the user's first click. */
+  unblockSound() {
+    if (this.#sound.state === "blocked") this.#sound.turnOn();
+  }
+
+  /** Show the state of the sound on its button. */
+  showSound() {
+    const button = element("sound");
+    const isBlocked = this.#sound.state === "blocked";
+    button.setAttribute("aria-pressed", this.#sound.state === "on");
+    button.classList.toggle("asks", isBlocked);
+    setTextKey(button.querySelector("span"), isBlocked ? "turnOnSound" : "sound");
+  }
+
+  #speakFile(file) {
+    this.unblockSound();
+    this.#microphone.startFile(file);
+  }
+
+  #mute() {
+    this.#wasSoundWanted = this.#sound.isWanted;
+    this.#sound.turnOff();
+  }
+
+  #onState(state) {
+    if (this.state === "interrupted" && state === "on") {
+      this.#handlers.news(say("microphoneResumed"));
+    }
+    this.state = state;
+    const isOn = state === "on" || state === "interrupted";
+    const isBusy = state === "starting" || state === "interrupted";
+    element("microphone").setAttribute("aria-pressed", isOn && !this.#microphone.isFile);
+    element("open-file").setAttribute("aria-pressed", isOn && this.#microphone.isFile);
+    element("microphone").setAttribute("aria-busy", isBusy);
+    if (state === "off" && this.session !== null) {
+      this.session = null;
+      this.#handlers.session(null);
+      this.resume();
+    }
+  }
+
+  #onSession(name) {
+    // Users do not want to hear their own voice late. A file stays audible.
+    if (this.session === null && !this.#microphone.isFile) this.#mute();
+    else if (this.session === null) this.#wasSoundWanted = this.#sound.isWanted;
+    this.session = name;
+    this.#handlers.session(name);
+  }
+}

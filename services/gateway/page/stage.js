@@ -1,0 +1,114 @@
+// The canvas: it loads and draws heads, turns them with the arrow keys, and records videos.
+
+import { element, setText } from "./elements.js";
+import { Head } from "./head.js";
+import { UserError, say } from "./language.js";
+import { drawingText, turnText } from "./status.js";
+import { BACKGROUND, VideoRecorder } from "./video.js";
+
+const TURN_DEGREES = {
+  ArrowLeft: [10, 0],
+  ArrowRight: [-10, 0],
+  ArrowUp: [0, 10],
+  ArrowDown: [0, -10],
+  Home: [], // to the front
+};
+
+export class Stage {
+  #head = null; // until it is loaded
+  #loading = Promise.resolve(); // done when the head that was chosen last is loaded
+  #faps;
+  #handlers;
+  #recorder = new VideoRecorder();
+  #sound;
+
+  /**
+   * @param faps 68 values that are updated before each call of draw
+   * @param {Sound} sound for videos
+   * @param handlers { loaded(), failed(text) }
+   */
+  constructor(faps, sound, handlers) {
+    this.#faps = faps;
+    this.#sound = sound;
+    this.#handlers = handlers;
+    element("record").onclick = () => this.#toggleRecording();
+    element("head").onkeydown = (event) => {
+      if (this.#head === null || TURN_DEGREES[event.key] === undefined) return;
+      event.preventDefault();
+      setText(element("turned"), turnText(this.#head.turn(...TURN_DEGREES[event.key])));
+    };
+  }
+
+  get isRecording() {
+    return this.#recorder.isRecording;
+  }
+
+  /** How the head is drawn (Head.drawing); null before it is loaded. */
+  get drawing() {
+    return this.#head?.drawing ?? null;
+  }
+
+  get visibleDelayMs() {
+    return this.#head?.visibleDelayMs ?? 0;
+  }
+
+  /** Load a head by its name; "" for the gateway's default. */
+  load(name) {
+    this.#loading = this.#loading.then(() => this.#load(name)); // in order: the last one stays
+    return this.#loading;
+  }
+
+  /** Draw the face if it has changed. */
+  draw(nowMs, hasChanged, onVisible) {
+    if (hasChanged) this.#head?.pose(this.#faps);
+    this.#head?.draw(nowMs, onVisible);
+  }
+
+  /** Show how the head is drawn, if that is not at full quality. */
+  showDrawing() {
+    if (this.#head === null) return;
+    const text = drawingText(this.#head.drawing);
+    element("head").title = text;
+    setText(element("drawing"), text);
+  }
+
+  async #load(name) {
+    element("loading").hidden = false;
+    setText(element("no-head"), "");
+    const file = name === "" ? "head.glb" : `head-${name}.glb`;
+    try {
+      const head = this.#head ?? makeHead();
+      await head.load(file);
+      this.#head = head;
+      head.pose(this.#faps);
+      head.draw(performance.now(), () => {}); // the first image takes long and is not measured
+      this.#handlers.loaded();
+    } catch (error) {
+      const isText = error instanceof UserError;
+      const text = isText ? error.message : say("headMissing", { file, reason: error.message });
+      this.#handlers.failed(text);
+      setText(element("no-head"), text); // stays after the notice has vanished
+    }
+    element("loading").hidden = true;
+  }
+
+  async #toggleRecording() {
+    if (this.#recorder.isRecording) {
+      this.#recorder.stop();
+      this.#sound.untap();
+      this.#head.film(null);
+    } else if (this.#head !== null) {
+      this.#head.film(BACKGROUND);
+      this.#recorder.start(element("head"), await this.#sound.tap());
+    }
+    element("record").setAttribute("aria-pressed", this.#recorder.isRecording);
+  }
+}
+
+function makeHead() {
+  try {
+    return new Head(element("head"), document.querySelector("footer"));
+  } catch {
+    throw new UserError(say("webGlMissing"));
+  }
+}

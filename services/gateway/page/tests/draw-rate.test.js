@@ -1,0 +1,65 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { DrawRate } from "../draw-rate.js";
+
+const TICK_MS = 1000 / 60;
+
+/** Draw images that take minMs + fullMs * ratio ** 2; return their number per second. */
+function draw(drawRate, { fullMs, minMs = 0, fromMs = 0 }) {
+  const forMs = 10000;
+  let [count, freeMs] = [0, 0];
+  for (let nowMs = fromMs; nowMs < fromMs + forMs; nowMs += TICK_MS) {
+    if (nowMs < freeMs || !drawRate.isDue(nowMs)) continue;
+    freeMs = nowMs + minMs + fullMs * drawRate.ratio ** 2;
+    drawRate.recordDrawn(nowMs, freeMs);
+    count++;
+  }
+  return (1000 * count) / forMs;
+}
+
+test("a fast graphics card draws at every tick with all pixels", () => {
+  const drawRate = new DrawRate(2, 2, false);
+  assert.ok(draw(drawRate, { fullMs: 3 }) > 59);
+  assert.equal(drawRate.ratio, 2);
+});
+
+test("a slow processor draws fewer pixels until it draws 20 images a second", () => {
+  const drawRate = new DrawRate(0.5, 1, true);
+  draw(drawRate, { fullMs: 100, minMs: 12 });
+  assert.ok(draw(drawRate, { fullMs: 100, minMs: 12, fromMs: 10000 }) > 19.5);
+  assert.ok(drawRate.ratio < 0.5 && drawRate.ratio > 0.3, `${drawRate.ratio}`);
+});
+
+test("a processor draws more pixels again when it has the time", () => {
+  const drawRate = new DrawRate(0.5, 1, true);
+  draw(drawRate, { fullMs: 300 });
+  draw(drawRate, { fullMs: 12, fromMs: 10000 });
+  assert.equal(drawRate.ratio, 1);
+});
+
+test("a processor pauses as long as it drew, or less to draw 20 images a second", () => {
+  const drawRate = new DrawRate(0.35, 1, true);
+  for (const [tookMs, restMs] of [[10, 10], [24, 24], [35, 15], [100, 10]]) {
+    drawRate.recordDrawn(1000, 1000 + tookMs);
+    const dueMs = 1000 + tookMs + restMs;
+    assert.ok(!drawRate.isDue(dueMs - 10), `${tookMs} ms`);
+    assert.ok(drawRate.isDue(dueMs), `${tookMs} ms`);
+  }
+});
+
+test("the delay of an image includes half of the time for which it is visible", () => {
+  const drawRate = new DrawRate(2, 2, false);
+  for (let nowMs = 0; nowMs < 5000; nowMs += 40) drawRate.recordVisible(nowMs, nowMs + 30);
+  assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, `${drawRate.visibleDelayMs}`);
+  drawRate.recordVisible(5000, 5400);
+  assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, "one slow image changes nothing");
+  drawRate.recordVisible(5500, 60000);
+  assert.ok(Math.abs(drawRate.visibleDelayMs - 50) < 0.1, "time while the page is hidden does not count");
+});
+
+test("one slow image does not change the ratio", () => {
+  const drawRate = new DrawRate(0.5, 1, true);
+  draw(drawRate, { fullMs: 80 });
+  drawRate.recordDrawn(20000, 20060);
+  assert.equal(drawRate.ratio, 0.5);
+});

@@ -1,0 +1,164 @@
+import assert from "node:assert/strict";
+import test from "node:test";
+import { LevelMeter, rms, SILENT_DB } from "../level.js";
+import { PhoneTrack } from "../phones.js";
+import { StreamActivity } from "../stream-activity.js";
+import {
+  delayText,
+  drawingText,
+  errorText,
+  hintText,
+  playoutDelaysText,
+  stateKind,
+  stateText,
+  turnText,
+} from "../status.js";
+
+function track(...symbols) {
+  const phones = new PhoneTrack();
+  symbols.forEach((symbol, index) => {
+    phones.add({ index, symbol, media_time: 1600 * index, duration: 1600 });
+  });
+  return phones;
+}
+
+test("the phone at a media time is shown with the phones before it", () => {
+  const phones = track("sil", "n", "i", "h", "ao");
+  assert.deepEqual(phones.at(-1), { current: "", past: [] });
+  assert.deepEqual(phones.at(0), { current: "", past: ["·"] });
+  assert.deepEqual(phones.at(3300), { current: "i", past: ["·", "n"] });
+});
+
+test("a phone can be revised", () => {
+  const phones = track("n", "i");
+  phones.add({ index: 1, symbol: "v", media_time: 1600, duration: 800 });
+  assert.deepEqual(phones.at(1700), { current: "v", past: ["n"] });
+});
+
+test("a phone can be removed", () => {
+  const phones = track("n", "i", "u");
+  phones.add({ index: 1, symbol: "sil", media_time: 1600, duration: 0, final: true });
+  phones.add({ index: 9, symbol: "sil", media_time: 1600, duration: 0, final: true });
+  assert.deepEqual(phones.at(3300), { current: "u", past: ["n"] });
+});
+
+test("the last phone is shown for some seconds", () => {
+  const phones = track("n", "i");
+  assert.equal(phones.at(3200 + 8 * 16000).current, "i");
+  assert.deepEqual(phones.at(3201 + 8 * 16000), { current: "", past: ["n", "i"] });
+});
+
+test("only the newest phones are kept and shown", () => {
+  const phones = track(...Array.from({ length: 200 }, (_, i) => `p${i}`));
+  const { current, past } = phones.at(199 * 1600);
+  assert.equal(current, "p199");
+  assert.deepEqual(past, ["p191", "p192", "p193", "p194", "p195", "p196", "p197", "p198"]);
+  assert.deepEqual(phones.at(99 * 1600).past, []);
+});
+
+test("the level is that of the sound that is audible", () => {
+  const meter = new LevelMeter();
+  meter.push(320, Int16Array.of(16384, -16384));
+  meter.advance(319, true);
+  assert.equal(meter.nextDecibels(), SILENT_DB);
+  meter.advance(320, true);
+  assert.ok(Math.abs(meter.nextDecibels() + 6.02) < 0.01);
+  assert.ok(meter.nextDecibels() < -6.9, "it falls");
+});
+
+test("sound that is not shown does not change the level", () => {
+  const meter = new LevelMeter();
+  meter.push(0, Int16Array.of(16384));
+  meter.advance(0, false);
+  assert.equal(meter.nextDecibels(), SILENT_DB);
+  meter.raise(1);
+  assert.ok(Math.abs(meter.nextDecibels()) < 0.01);
+});
+
+test("the root mean square of full scale is 1", () => {
+  assert.equal(rms(Int16Array.of(-32768, -32768)), 1);
+});
+
+test("the face fades in with frames and fades to rest when they stall", () => {
+  const activity = new StreamActivity();
+  activity.update(0, false);
+  let share = 0;
+  for (let ms = 16; ms <= 1000; ms += 16) {
+    activity.frameArrived(ms);
+    share = activity.update(ms, true);
+  }
+  assert.equal(share, 1);
+  for (let ms = 1016; ms <= 1480; ms += 16) share = activity.update(ms, true);
+  assert.equal(share, 1, "too short for a stall");
+  for (let ms = 1496; ms <= 2600; ms += 16) share = activity.update(ms, true);
+  assert.equal(share, 0);
+});
+
+test("a busy page does not count as a stall", () => {
+  const activity = new StreamActivity();
+  activity.update(0, true);
+  activity.frameArrived(0);
+  activity.soundArrived(0);
+  activity.update(5000, true);
+  assert.ok(activity.isLive(5000));
+});
+
+test("an idle face without sound is not live", () => {
+  const activity = new StreamActivity();
+  for (let ms = 0; ms <= 1000; ms += 20) {
+    activity.frameArrived(ms);
+    activity.soundArrived(ms);
+    activity.update(ms, true);
+  }
+  assert.ok(activity.isLive(1900));
+  for (let ms = 1000; ms <= 3000; ms += 20) {
+    activity.frameArrived(ms);
+    activity.update(ms, true);
+  }
+  assert.ok(!activity.isLive(3000));
+});
+
+test("the state is shown with the delay", () => {
+  const state = { isConnected: true, isLive: true, isInterrupted: true };
+  assert.equal(stateText(state), "live");
+  assert.equal(stateText({ ...state, isLive: false }), "interrupted");
+  assert.equal(stateText({ ...state, isLive: false, isInterrupted: false }), "waiting for speech");
+  assert.equal(stateText({ ...state, isConnected: false }), "connecting …");
+  assert.equal(stateKind(state), "live");
+  assert.equal(stateKind({ ...state, isLive: false }), "waiting");
+  assert.equal(stateKind({ ...state, isConnected: false }), "lost");
+  assert.deepEqual([delayText(null, null), delayText(123.4, 200)], ["", "120 ms"]);
+  assert.equal(delayText(null, 161), "sound delay 160 ms");
+  assert.equal(playoutDelaysText(161, null), "");
+  assert.match(playoutDelaysText(161, 94), /by 160 ms .* delay=90 /);
+});
+
+test("hints say what does not work and what to do", () => {
+  const well = { isConnected: true, wasConnected: true, isMicrophoneInterrupted: false, missing: [] };
+  assert.equal(hintText(well), "");
+  assert.match(hintText({ ...well, isConnected: false }), /gateway has stopped.*kouxing run/);
+  const starting = { ...well, isConnected: false, wasConnected: false };
+  assert.equal(hintText(starting), "");
+  assert.match(hintText({ ...starting, isRefused: true }), /#token/);
+  assert.match(hintText({ ...well, missing: ["control"] }), /Control is not running.*kouxing run/);
+  assert.match(
+    hintText({ ...well, missing: ["recognizer", "synthesizer"] }),
+    /recognizer, synthesizer.*kouxing recognizer; kouxing synthesizer/,
+  );
+  assert.match(hintText({ ...well, isMicrophoneInterrupted: true }), /microphone was interrupted/);
+});
+
+test("errors are translated by their code, others are shown as they are", () => {
+  assert.equal(errorText({ code: "refused", text: "no" }), "no");
+  assert.equal(errorText({ code: "timeout", text: "no answer" }), "no answer");
+  assert.match(errorText({ code: "bad-voice", text: "old" }), /mouth profile does not fit/);
+});
+
+test("reduced quality and the head's rotation are described", () => {
+  const drawing = { isCoarse: true, width: 550, height: 400 };
+  assert.match(drawingText(drawing), /no graphics card.*550 × 400/);
+  assert.equal(drawingText({ ...drawing, isCoarse: false }), "");
+  assert.equal(turnText({ left: 0.2, up: -0.3 }), "from the front");
+  assert.equal(turnText({ left: -20, up: 10 }), "turned 20° to the right, 10° up");
+  assert.equal(turnText({ left: 69, up: -9.8 }), "turned 69° to the left, 10° down");
+});

@@ -1,0 +1,272 @@
+// All texts of the page, in English and Chinese. {name} is replaced by a value.
+
+export const TEXTS = {
+  // Main view
+  canvas: {
+    en: "talking head; the arrow keys turn it, Home returns it to the front",
+    zh: "说话的头像：方向键转动，Home 键回到正面",
+  },
+  loading: { en: "Loading the head …", zh: "正在加载头像…" },
+  phonesLabel: { en: "recognized speech", zh: "识别结果" },
+  phones: { en: "Phones", zh: "声韵母" },
+  phonesHelp: { en: "Show initials and finals instead of syllables", zh: "显示声母和韵母，而不是音节" },
+  level: { en: "level", zh: "音量" },
+  microphone: { en: "Microphone", zh: "麦克风" },
+  sample: { en: "Sample", zh: "播放示例" },
+  file: { en: "File", zh: "文件" },
+  fileHelp: {
+    en: "Speak a sound file; you can also drop it on the page",
+    zh: "播放音频文件，也可直接拖到页面上",
+  },
+  record: { en: "Record", zh: "录制" },
+  recordHelp: { en: "Record face and sound as a video", zh: "把人脸和声音录成视频" },
+  learn: { en: "Learn my mouth", zh: "学我的口型" },
+  learnHelp: { en: "Teach the head how you move your lips", zh: "让头像学会你的口型" },
+  sound: { en: "Sound", zh: "声音" },
+  turnOnSound: { en: "Turn on sound", zh: "打开声音" },
+
+  // Status
+  connecting: { en: "connecting …", zh: "连接中…" },
+  live: { en: "live", zh: "直播" },
+  interrupted: { en: "interrupted", zh: "中断" },
+  waiting: { en: "waiting for speech", zh: "等待语音" },
+  soundDelay: { en: "sound delay {ms} ms", zh: "声音延迟 {ms} ms" },
+  turnedFront: { en: "from the front", zh: "正面" },
+  turned: { en: "turned {directions}", zh: "{directions}" },
+  turnedLeft: { en: "{degrees}° to the left", zh: "向左 {degrees}°" },
+  turnedRight: { en: "{degrees}° to the right", zh: "向右 {degrees}°" },
+  turnedUp: { en: "{degrees}° up", zh: "向上 {degrees}°" },
+  turnedDown: { en: "{degrees}° down", zh: "向下 {degrees}°" },
+
+  // Hints: what is wrong, and what to do
+  gatewayStopped: {
+    en: "The gateway has stopped. Start it with “kouxing run”; this page reconnects by itself.",
+    zh: "网关已停止。请运行 kouxing run，本页会自动重新连接。",
+  },
+  connectionRefused: {
+    en:
+      "The gateway refused the connection. Open the whole address that “kouxing run” printed, " +
+      "including #token=… if it has one.",
+    zh: "网关拒绝了连接。请打开 kouxing run 显示的完整地址（包括其中的 #token=…）。",
+  },
+  controlMissing: {
+    en: "Control is not running. Start it with “kouxing run”; this page reconnects by itself.",
+    zh: "控制服务（control）没有运行。请运行 kouxing run，本页会自动重新连接。",
+  },
+  servicesMissing: {
+    en:
+      "Not running: {services}. “kouxing run” restarts services by itself; without it, start " +
+      "them with: {commands}",
+    zh: "没有运行：{services}。kouxing run 会自动重启服务；否则请运行：{commands}",
+  },
+  microphoneInterrupted: {
+    en: "The microphone was interrupted. It resumes by itself.",
+    zh: "麦克风中断，会自动恢复。",
+  },
+  microphoneResumed: { en: "The microphone is on again.", zh: "麦克风已恢复。" },
+  serviceRestarted: {
+    en: "A service crashed and was restarted. The session continues.",
+    zh: "一个服务崩溃后已重启，会话继续。",
+  },
+
+  // Errors
+  headMissing: {
+    en: "Cannot load {file}: {reason}. Create the file with “kouxing head export”.",
+    zh: "无法加载 {file}：{reason}。请用 kouxing head export 生成该文件。",
+  },
+  webGlMissing: {
+    en:
+      "This browser cannot draw 3-D images (WebGL). Turn on hardware acceleration in its " +
+      "settings, or use another browser.",
+    zh: "浏览器无法绘制 3-D 图像（WebGL）。请在浏览器设置中打开硬件加速，或换一个浏览器。",
+  },
+  microphoneInsecure: {
+    en: "The microphone needs https. Open this page at an https address or at http://localhost.",
+    zh: "使用麦克风需要 https。请用 https 地址或 http://localhost 打开本页。",
+  },
+  microphoneForbidden: {
+    en: "The microphone is blocked. Allow it for this page in the browser and try again.",
+    zh: "未允许使用麦克风。请在浏览器中允许本页使用，然后重试。",
+  },
+  microphoneUnplugged: {
+    en: "The microphone was unplugged. Plug it in and press Microphone again.",
+    zh: "麦克风断开了。请接上后再按“麦克风”。",
+  },
+  microphoneFailed: { en: "Cannot use the microphone: {reason}", zh: "无法使用麦克风：{reason}" },
+  microphoneStopped: {
+    en: "The gateway closed the connection. Press Microphone to try again.",
+    zh: "网关关闭了连接。请再按“麦克风”重试。",
+  },
+  fileTooLarge: { en: "The file is larger than 200 MB. Use a smaller file.", zh: "文件大于 200 MB，请用较小的文件。" },
+  fileTooLong: { en: "The file is longer than an hour. Use a shorter file.", zh: "文件超过一小时，请用较短的文件。" },
+  fileUnreadable: {
+    en: "This browser cannot read the sound of {file}. “kouxing speak” reads more formats.",
+    zh: "浏览器无法解码 {file}。kouxing speak 支持更多格式。",
+  },
+  "error.bad-audio": { en: "{text}", zh: "音频有误（{text}）" },
+  "error.busy": { en: "{text}", zh: "人太多了：请稍后再试（{text}）" },
+  "error.bad-voice": {
+    en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
+    zh: "学到的口型不适用于当前版本：请重新“学我的口型”。",
+  },
+  "error.no-service": { en: "{text}", zh: "缺少服务：请运行 kouxing run（{text}）" },
+  "error.session-exists": { en: "{text}", zh: "同名会话已存在（{text}）" },
+  "error.too-many-sessions": { en: "{text}", zh: "会话太多：请先关闭一些（{text}）" },
+  "error.unknown-session": { en: "{text}", zh: "会话已不存在（{text}）" },
+  "error.timeout": { en: "{text}", zh: "服务没有及时应答：请重试（{text}）" },
+
+  // Settings
+  settings: { en: "Settings", zh: "设置" },
+  head: { en: "Head", zh: "头像" },
+  drawnInSoftware: {
+    en: "There is no graphics card, so the head has fewer triangles and pixels: {size}",
+    zh: "没有显卡，画面已简化：{size} 像素",
+  },
+  lips: { en: "Lips", zh: "口型" },
+  expressiveness: { en: "Movement of the mouth", zh: "口型幅度" },
+  expression: { en: "Expression", zh: "表情" },
+  senders: { en: "Other programs", zh: "其他程序" },
+  senderAddress: {
+    en: "Address of a program that shows the face",
+    zh: "显示这张脸的程序的地址",
+  },
+  send: { en: "Send", zh: "发送" },
+  stop: { en: "Stop", zh: "停止" },
+  start: { en: "Start", zh: "开始" },
+  senderState: { en: "{contents}, {rate} frames/s", zh: "{contents}，每秒 {rate} 帧" },
+  senderStateDelayed: {
+    en: "{contents}, {rate} frames/s, delayed {delay} ms",
+    zh: "{contents}，每秒 {rate} 帧，延迟 {delay} ms",
+  },
+  delaySenders: {
+    en: "Delay them by {ms} ms to match this sound",
+    zh: "延迟 {ms} ms 以配合此声音",
+  },
+  playoutDelays: {
+    en:
+      "Sound is delayed by {soundMs} ms to match the picture. To match another program's face to " +
+      "this sound, add delay={frameMs} to the address.",
+    zh: "声音延迟 {soundMs} ms 以配合画面。要让其他程序的脸与此声音同步，请在地址中加 delay={frameMs}。",
+  },
+  language: { en: "Language", zh: "语言" },
+  "head.": { en: "default", zh: "默认" },
+  "head.woman": { en: "woman", zh: "女士" },
+  "head.man": { en: "man", zh: "男士" },
+  "head.elder": { en: "elder", zh: "老人" },
+  "head.child": { en: "child", zh: "孩子" },
+  "head.ada": { en: "Ada", zh: "艾达" },
+  "head.leo": { en: "Leo", zh: "利奥" },
+  "head.rosa": { en: "Rosa", zh: "罗莎" },
+  "head.mika": { en: "Mika (cartoon)", zh: "米卡（卡通）" },
+  "lips.learnt": { en: "from the sound (learned)", zh: "由声音（学得）" },
+  "lips.dynamic-visemes": { en: "from the phones (dynamic visemes)", zh: "由音素（动态视位）" },
+  "lips.ferguson": { en: "from one opening (Ferguson)", zh: "由单一开口（Ferguson）" },
+  "expression.smile": { en: "smile", zh: "微笑" },
+  "expression.joy": { en: "joy", zh: "高兴" },
+  "expression.surprise": { en: "surprise", zh: "惊讶" },
+  "expression.sadness": { en: "sadness", zh: "悲伤" },
+  "expression.anger": { en: "anger", zh: "生气" },
+  "expression.fear": { en: "fear", zh: "害怕" },
+  "expression.disgust": { en: "disgust", zh: "厌恶" },
+
+  // Learn my mouth
+  lessonIntro: {
+    en:
+      "Read a text aloud in front of your camera for 40 seconds. When you use the microphone, the " +
+      "head then moves its lips as you do.",
+    zh: "对着摄像头朗读 40 秒，之后用麦克风时，头像就会学着你的口型说话。",
+  },
+  lessonPrivacy: {
+    en:
+      "No picture leaves this browser. The gateway receives your voice and the positions of 43 " +
+      "points of your face. It deletes both when it has learned.",
+    zh: "图像不会离开浏览器。网关只收到你的声音和脸上 43 个点的位置，学完即删除。",
+  },
+  lessonLearned: {
+    en: "Your mouth was learned on {day}: opening {before} → {after}.",
+    zh: "{day} 学会了你的口型：张口 {before} → {after}。",
+  },
+  lessonForget: { en: "Forget it", zh: "删除" },
+  lessonText: { en: "Text", zh: "文本" },
+  close: { en: "Close", zh: "关闭" },
+  cancel: { en: "Cancel", zh: "取消" },
+  secondsLeft: { en: "seconds left", zh: "剩余秒数" },
+  time: { en: "time", zh: "时间" },
+  lessonFinish: { en: "I have read it", zh: "读完了" },
+  lessonLearning: { en: "Learning your mouth. This takes some seconds …", zh: "正在学习，请稍候…" },
+  learning: { en: "learning", zh: "学习中" },
+  lessonCurves: { en: "opening of the lips over time", zh: "张口随时间的变化" },
+  yourLips: { en: "your lips", zh: "你的" },
+  before: { en: "before", zh: "之前" },
+  after: { en: "after", zh: "之后" },
+  lessonSimilarity: {
+    en: "How closely the head's lips follow yours (1: exactly)",
+    zh: "与你的相似度（1 为完全一致）",
+  },
+  lessonHeldOut: {
+    en: "Measured on the last quarter of your reading, which was not used for learning.",
+    zh: "用未参与学习的最后四分之一测得。",
+  },
+  discard: { en: "Discard", zh: "放弃" },
+  keep: { en: "Keep", zh: "保留" },
+  recordAgain: { en: "Record again", zh: "重录" },
+  sendAgain: { en: "Send again", zh: "重发" },
+  lessonStarting: { en: "Starting camera and microphone …", zh: "正在启动摄像头和麦克风…" },
+  lessonShowFace: { en: "Show your face to the camera.", zh: "请把脸对准摄像头。" },
+  lessonLipsClosed: { en: "Keep your lips closed …", zh: "请先闭上嘴…" },
+  lessonRead: { en: "Read aloud. Repeat the text if there is time left.", zh: "请朗读，读完可重复。" },
+  "measure.opening": { en: "Opening", zh: "张口" },
+  "measure.width": { en: "Width", zh: "宽度" },
+  "measure.jaw": { en: "Jaw", zh: "下颌" },
+  lessonBetter: {
+    en: "The head's lips now follow yours more closely.",
+    zh: "现在头像的口型更像你了。",
+  },
+  lessonSame: {
+    en: "The head's lips follow yours about as well as before.",
+    zh: "效果和以前差不多。",
+  },
+  lessonWorse: {
+    en:
+      "The head's lips do not follow yours. Discard this and try again, with light on your face " +
+      "and without other voices.",
+    zh: "效果不好。建议放弃，换个光线好、安静的地方再试。",
+  },
+  noFace: {
+    en: "No face is visible. Sit in front of the camera, with light on your face.",
+    zh: "看不到脸。请正对摄像头，脸部要有光。",
+  },
+  tooQuiet: {
+    en: "The sound is too quiet. Speak louder, or turn the microphone up.",
+    zh: "声音太小。请大声一点，或调高麦克风音量。",
+  },
+  tooSlow: {
+    en: "This computer analyzes too few pictures per second. Close other programs and try again.",
+    zh: "这台电脑处理画面太慢。请关闭其他程序再试。",
+  },
+  cameraInsecure: {
+    en: "The camera needs https. Open this page at an https address or at http://localhost.",
+    zh: "使用摄像头需要 https。请用 https 地址或 http://localhost 打开本页。",
+  },
+  cameraForbidden: {
+    en: "Camera or microphone are blocked. Allow them for this page and try again.",
+    zh: "未允许使用摄像头和麦克风。请允许后重试。",
+  },
+  cameraMissing: {
+    en: "No camera or no microphone was found. Plug one in and try again.",
+    zh: "没有摄像头或麦克风。请接上后重试。",
+  },
+  cameraBusy: {
+    en: "Another program uses the camera or the microphone. Close it and try again.",
+    zh: "摄像头或麦克风被其他程序占用。请关闭后重试。",
+  },
+  cameraUnplugged: {
+    en: "Camera or microphone was unplugged. Plug it in and try again.",
+    zh: "摄像头或麦克风断开了。请接上后重试。",
+  },
+  trackerFailed: { en: "Cannot find faces in this browser: {reason}", zh: "浏览器无法识别人脸：{reason}" },
+  gatewaySilent: {
+    en: "The gateway does not answer. Start it with “kouxing run” and send again.",
+    zh: "网关没有应答。请运行 kouxing run 后重发。",
+  },
+};
