@@ -1,9 +1,9 @@
-"""Blender add-on: a face of shape keys speaks, live or from a recording. Blender 4.2 to 5.0.
+"""Blender add-on: a face with shape keys speaks, live or from a recording. Blender 4.2 to 5.0.
 
-Every shape key of the scene that has one of ARKit's 52 names follows. Live, the weights come by
-UDP as the app Live Link Face sends them (`kouxing send livelink://127.0.0.1:11111`); a recording is
-a table of `kouxing render my.wav my.csv --as arkit`, or its .jsonl. "Edit > Preferences > Add-ons >
-Install from Disk" takes this file; its panel is in the sidebar (N) of the 3-D view.
+It moves all shape keys of the scene that have one of ARKit's 52 names. Live weights arrive by UDP
+in the format of the app Live Link Face (`kouxing send livelink://127.0.0.1:11111`). A recording is
+a file of `kouxing render my.wav my.csv --as arkit`, or a .jsonl file. Install this file with "Edit
+> Preferences > Add-ons > Install from Disk". The panel is in the sidebar (N) of the 3-D view.
 """
 
 import csv
@@ -22,13 +22,13 @@ bl_info = {
     "version": (1, 0, 0),
     "blender": (4, 2, 0),
     "location": "3D View > Sidebar > kouxing",
-    "description": "Speech moves a face of ARKit shape keys",
+    "description": "Speech moves a face with ARKit shape keys",
     "category": "Animation",
 }
 
 PORT = 11111
 POLL_S = 1 / 60
-NUM_VALUES = 61  # of which the first 52 are shapes
+NUM_VALUES = 61  # in a packet; the first 52 are shapes
 # fmt: off
 LIVE_LINK_ORDER = (
     "eyeBlinkLeft", "eyeLookDownLeft", "eyeLookInLeft", "eyeLookOutLeft", "eyeLookUpLeft",
@@ -47,16 +47,16 @@ LIVE_LINK_ORDER = (
 
 
 def shape_keys():
-    """Find the scene's shape keys: a list of those of each name."""
-    found = defaultdict(list)
+    """Return the scene's shape keys: lists by name."""
+    keys = defaultdict(list)
     for shapes in bpy.data.shape_keys:
         for key in shapes.key_blocks[1:]:  # the first is the face at rest
-            found[key.name].append(key)
-    return found
+            keys[key.name].append(key)
+    return keys
 
 
 def read_live_link(packet):
-    """Return the weights of a packet by name, or nothing if it is none."""
+    """Return the weights of a packet by name, or {} if it has another format."""
     size = 4 * NUM_VALUES
     if len(packet) <= size or packet[0] != 6 or packet[-size - 1] != NUM_VALUES:
         return {}
@@ -65,7 +65,7 @@ def read_live_link(packet):
 
 
 def read_recording(path):
-    """Return the times in seconds, and the weights at these by name, of a .csv or .jsonl file."""
+    """Return the times in seconds and the weights by name of a .csv or .jsonl file."""
     with Path(path).open(encoding="utf-8") as file:
         if path.endswith(".csv"):
             rows = [
@@ -80,7 +80,7 @@ def read_recording(path):
 
 
 class Receiver:
-    """Takes packets from a port and shows the newest."""
+    """Receives packets on a port and shows the newest."""
 
     def __init__(self):
         self.socket = None
@@ -94,13 +94,13 @@ class Receiver:
         self.num_packets = 0
 
     def close(self):
-        """Stop; the face stays as it is."""
+        """Stop receiving; the face keeps its pose."""
         if self.socket is not None:
             self.socket.close()
         self.socket = None
 
     def poll(self):
-        """Show what has come, and say when to look again; Blender's timer calls this."""
+        """Show the newest packet; return when Blender's timer must call this again, seconds."""
         if self.socket is None:
             return None
         packet = b""
@@ -121,7 +121,7 @@ RECEIVER = Receiver()
 
 
 class KOUXING_OT_follow(bpy.types.Operator):
-    """Let the face follow the stream, or stop it."""
+    """Start or stop following the stream."""
 
     bl_idname = "kouxing.follow"
     bl_label = "Follow the stream"
@@ -135,14 +135,15 @@ class KOUXING_OT_follow(bpy.types.Operator):
             RECEIVER.open(context.scene.kouxing_port)
         except OSError as error:
             RECEIVER.close()
-            self.report({"ERROR"}, f"port {context.scene.kouxing_port}: {error.strerror}")
+            port = context.scene.kouxing_port
+            self.report({"ERROR"}, f"cannot use port {port}: {error.strerror}; choose another")
             return {"CANCELLED"}
         bpy.app.timers.register(RECEIVER.poll)
         return {"FINISHED"}
 
 
 class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
-    """Insert a recording as key frames, from the current frame on."""
+    """Insert a recording as key frames, starting at the current frame."""
 
     bl_idname = "kouxing.insert"
     bl_label = "Insert a recording"
@@ -154,27 +155,27 @@ class KOUXING_OT_insert(bpy.types.Operator, ImportHelper):
         try:
             times_s, weights = read_recording(self.filepath)
         except (OSError, KeyError, ValueError, IndexError) as error:
-            self.report({"ERROR"}, f"{self.filepath} is no table of ARKit weights: {error}")
+            self.report({"ERROR"}, f"{self.filepath} is not a file of ARKit weights: {error}")
             return {"CANCELLED"}
         keys = shape_keys()
-        known = [name for name in weights if name in keys]
-        if not known:
-            self.report({"ERROR"}, "no shape key in the scene has a name of the table's (jawOpen)")
+        names = [name for name in weights if name in keys]
+        if not names:
+            self.report({"ERROR"}, "no shape key in the scene has an ARKit name (such as jawOpen)")
             return {"CANCELLED"}
         scene = context.scene
         rate_hz = scene.render.fps / scene.render.fps_base
         frames = [scene.frame_current + time_s * rate_hz for time_s in times_s]
-        for name in known:
+        for name in names:
             for key in keys[name]:
                 for frame, key.value in zip(frames, weights[name], strict=True):
                     key.keyframe_insert("value", frame=frame)
         scene.frame_end = max(scene.frame_end, int(frames[-1]) + 1)
-        self.report({"INFO"}, f"{len(frames)} frames of {len(known)} shapes")
+        self.report({"INFO"}, f"{len(frames)} frames of {len(names)} shapes")
         return {"FINISHED"}
 
 
 class KOUXING_PT_panel(bpy.types.Panel):
-    """What the sidebar shows."""
+    """The panel in the sidebar."""
 
     bl_label = "kouxing"
     bl_space_type = "VIEW_3D"
@@ -182,13 +183,13 @@ class KOUXING_PT_panel(bpy.types.Panel):
     bl_category = "kouxing"
 
     def draw(self, context):
-        """Draw the port, the two commands and the number of packets."""
-        follows = RECEIVER.socket is not None
+        """Draw the port, both commands and the number of packets."""
+        is_following = RECEIVER.socket is not None
         self.layout.prop(context.scene, "kouxing_port")
         self.layout.operator(
-            KOUXING_OT_follow.bl_idname, text="Stop" if follows else "", depress=follows
+            KOUXING_OT_follow.bl_idname, text="Stop" if is_following else "", depress=is_following
         )
-        if follows:
+        if is_following:
             self.layout.label(text=f"{RECEIVER.num_packets} packets")
         self.layout.operator(KOUXING_OT_insert.bl_idname)
 
@@ -198,16 +199,16 @@ CLASSES = (KOUXING_OT_follow, KOUXING_OT_insert, KOUXING_PT_panel)
 
 def register():
     """Add commands and panel to Blender."""
-    for each in CLASSES:
-        bpy.utils.register_class(each)
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
     bpy.types.Scene.kouxing_port = bpy.props.IntProperty(
-        name="Port", default=PORT, min=1, max=65535, description="Of Live Link Face packets"
+        name="Port", default=PORT, min=1, max=65535, description="Port for Live Link Face packets"
     )
 
 
 def unregister():
-    """Take them away."""
+    """Remove commands and panel from Blender."""
     RECEIVER.close()
     del bpy.types.Scene.kouxing_port
-    for each in reversed(CLASSES):
-        bpy.utils.unregister_class(each)
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,4 +1,4 @@
-// A VRM avatar in the browser speaks as a live session does: three-vrm, and the gateway's WebSocket.
+// A VRM avatar in the browser follows a live session, with three-vrm and the gateway's WebSocket.
 //
 // index.html?avatar=my.vrm&gateway=ws://127.0.0.1:8080&session=NAME (default: the newest session)
 
@@ -6,11 +6,11 @@ import { VRMLoaderPlugin, VRMUtils } from "@pixiv/three-vrm";
 import * as THREE from "three";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 
-const FAP_FRAME = 1; // kinds of binary messages, proto/GATEWAY.md
+const FAP_FRAME = 1; // types of binary messages, proto/GATEWAY.md
 const FACE_AT_REST = 3;
-const WEIGHTS = [4, 5]; // of a frame, of a face at rest
+const WEIGHTS = [4, 5]; // of a frame, of the face at rest
 const HEADER_BYTES = 16;
-const HEAD_TURN = [47, 48, 49]; // places of FAPs 48 to 50: pitch, yaw, roll
+const HEAD_ROTATION = [47, 48, 49]; // indices of FAPs 48 to 50: pitch, yaw, roll
 const RADIANS_PER_UNIT = 1e-5;
 const RETRY_MS = 1000;
 
@@ -27,7 +27,7 @@ const camera = new THREE.PerspectiveCamera(22, 1, 0.05, 20);
 const loader = new GLTFLoader();
 loader.register((parser) => new VRMLoaderPlugin(parser));
 const { vrm } = (await loader.loadAsync(query.get("avatar") ?? "avatar.vrm")).userData;
-VRMUtils.rotateVRM0(vrm); // those of version 0 look the other way
+VRMUtils.rotateVRM0(vrm); // models of version 0 face the other way
 const expressions = vrm.expressionManager;
 const head = vrm.humanoid.getNormalizedBoneNode("head");
 scene.add(vrm.scene, new THREE.HemisphereLight(0xffffff, 0xa0a4b0, 2.2));
@@ -39,11 +39,11 @@ const face = head.getWorldPosition(new THREE.Vector3()).add(new THREE.Vector3(0,
 camera.position.copy(face).add(new THREE.Vector3(0.1, 0.03, 1.1));
 camera.lookAt(face);
 
-/** Follow the session, and connect again for as long as the page is open. */
+/** Follow the session; reconnect while the page is open. */
 function connect() {
   const url = new URL("/viewer", query.get("gateway") ?? "ws://127.0.0.1:8080");
   url.searchParams.set("session", query.get("session") ?? "");
-  // An avatar with "perfect sync" has ARKit's 52 shapes, every other VRM's own.
+  // Avatars with "Perfect Sync" have ARKit's 52 shapes, others have only VRM's shapes.
   url.searchParams.set("shapes", expressions.getExpression("jawOpen") ? "arkit" : "vrm");
   const socket = new WebSocket(url);
   socket.binaryType = "arraybuffer";
@@ -52,26 +52,26 @@ function connect() {
     if (typeof data === "string") {
       const message = JSON.parse(data);
       if (message.type === "shapes") names = message.names;
-      if (message.type === "session") note.textContent = message.session ?? "nobody speaks";
+      if (message.type === "session") note.textContent = message.session ?? "no session; start one in the gateway's page";
       if (message.type === "error") note.textContent = message.text;
       return;
     }
-    const kind = new DataView(data).getUint8(0);
-    if (kind === FAP_FRAME || kind === FACE_AT_REST) turn(new Float32Array(data, HEADER_BYTES));
-    if (WEIGHTS.includes(kind)) show(names, new Float32Array(data, HEADER_BYTES));
+    const type = new DataView(data).getUint8(0);
+    if (type === FAP_FRAME || type === FACE_AT_REST) rotateHead(new Float32Array(data, HEADER_BYTES));
+    if (WEIGHTS.includes(type)) show(names, new Float32Array(data, HEADER_BYTES));
   };
   socket.onclose = () => {
-    note.textContent = "no gateway: start kouxing run --set gateway.allowed_origins=" + location.origin;
+    note.textContent = "cannot connect to the gateway; run: kouxing run --set gateway.allowed_origins=" + location.origin;
     setTimeout(connect, RETRY_MS);
   };
 }
 
 function show(names, weights) {
-  for (const [place, name] of names.entries()) expressions.setValue(name, weights[place]);
+  names.forEach((name, index) => expressions.setValue(name, weights[index]));
 }
 
-function turn(faps) {
-  const [pitch, yaw, roll] = HEAD_TURN.map((place) => faps[place] * RADIANS_PER_UNIT);
+function rotateHead(faps) {
+  const [pitch, yaw, roll] = HEAD_ROTATION.map((index) => faps[index] * RADIANS_PER_UNIT);
   head.rotation.set(pitch, yaw, roll, "YXZ");
 }
 
@@ -85,4 +85,4 @@ renderer.setAnimationLoop(() => {
   renderer.render(scene, camera);
 });
 connect();
-window.avatar = { vrm, show }; // for the console
+window.avatar = { vrm, show }; // for the console and the tests

@@ -1,11 +1,11 @@
-## Moves a face by a live session. Godot 4: add this script to a node, and choose the face in the
-## inspector; every mesh below it that has blend shapes with ARKit's names takes part.
+## Moves a face with a live session. Godot 4: add this script to a node and choose the face in the
+## inspector. It moves every mesh below the face that has blend shapes with ARKit's names.
 extends Node
 
 const RETRY_MS := 1000
 
 @export var gateway := "ws://127.0.0.1:8080"
-## The session to follow; empty: the newest.
+## Session to follow; if empty, the newest.
 @export var session := ""
 @export var face: Node3D
 
@@ -33,7 +33,7 @@ func _process(_delta: float) -> void:
 				_socket.connect_to_url(gateway + "/viewer" + query)
 
 
-## Take on a face, of the session or at rest; messages of other types say what is not needed here.
+## Show a face of the session or at rest; ignore other messages.
 func _receive(message: Dictionary) -> void:
 	if message["type"] == "error":
 		push_warning("kouxing: " + message["text"])

@@ -1,10 +1,10 @@
-// Follows the face of a session from C#, with examples/unity/KouxingStream.cs beside it:
+// Follows the face of a session from C#. It also needs examples/unity/KouxingStream.cs:
 //
-// dotnet new console -o follow; copy both files there in place of Program.cs; dotnet run [SESSION [GATEWAY]]
+// dotnet new console -o follow; replace Program.cs by both files; dotnet run [SESSION [GATEWAY]]
 // (default: the newest session, ws://127.0.0.1:8080)
 //
-// Prints 20 times a second how far the jaw opens, 0 to 1. It speaks with the gateway: NetMQ knows
-// CURVE as well, but ZeroMQ gains nothing on one machine.
+// Prints the opening of the jaw, 0 to 1, 20 times per second. It uses the gateway's WebSocket. NetMQ
+// also supports CURVE, but ZeroMQ has no advantage on one machine.
 
 using System;
 using System.Linq;

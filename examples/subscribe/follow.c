@@ -1,11 +1,11 @@
-/* Follows the face of a session from C: needs libzmq 4.3 alone (Debian: libzmq3-dev).
+/* Follows the face of a session from C. Needs only libzmq 4.3 (Debian: libzmq3-dev).
 
    cc -std=c11 -Wall -o follow follow.c -lzmq
    ./follow [SESSION [CONTROL-ADDRESS]]      (default: the newest session, tcp://127.0.0.1:5550)
 
-   Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
-   52 weights. It waits until there is a session, follows it to whatever host, and ends with it.
-   proto/PROTOCOL.md says what else there is, and has the names of the others. */
+   Prints a line per frame, 50 per second: the time of its sound and the opening of the jaw, one of
+   ARKit's 52 weights. It waits for a session, follows it to other hosts, and ends with the session.
+   proto/PROTOCOL.md describes all messages and lists the names of the weights. */
 
 #define _POSIX_C_SOURCE 200809L
 #include <stdbool.h>
@@ -17,14 +17,14 @@
 #include <zmq.h>
 
 enum { KEY_LENGTH = 40, MAX_NAME = 64, MAX_ENDPOINT = 256 };
-enum { NUM_WEIGHTS = 52, JAW_OPEN = 24 }; /* its place among ARKit's names */
+enum { NUM_WEIGHTS = 52, JAW_OPEN = 24 }; /* index in ARKit's names */
 
 static void fail(const char *what) {
   fprintf(stderr, "follow: %s\n", what);
   exit(1);
 }
 
-/* --- msgpack: as much of it as a reader of maps needs ------------------------------------------ */
+/* --- msgpack: the parts that reading maps requires ---------------------------------------------- */
 
 typedef struct {
   const uint8_t *at, *end;
@@ -39,12 +39,12 @@ typedef struct {
 
 static uint64_t big_endian(Bytes *in, int num_bytes) {
   uint64_t number = 0;
-  if (in->end - in->at < num_bytes) fail("a message breaks off");
+  if (in->end - in->at < num_bytes) fail("a message is truncated");
   while (num_bytes-- > 0) number = number << 8 | *in->at++;
   return number;
 }
 
-/* Read a value, of an array or a map only its size. */
+/* Read a value; for an array or a map, only its size. */
 static Value read_value(Bytes *in) {
   Value value = {NUMBER, 0, 0, NULL};
   uint8_t tag = (uint8_t)big_endian(in, 1);
@@ -74,7 +74,7 @@ static Value read_value(Bytes *in) {
     default: fail("a message has a type that the protocol does not use");
   }
   if (value.kind == STRING) {
-    if (in->end - in->at < (ptrdiff_t)value.size) fail("a message breaks off");
+    if (in->end - in->at < (ptrdiff_t)value.size) fail("a message is truncated");
     value.text = in->at;
     in->at += value.size;
   }
@@ -88,13 +88,13 @@ static void skip(Bytes *in) {
     skip(in);
 }
 
-/* Move to the value of a key of a map; false if there is none. */
-static bool find(Bytes map, const char *key, Bytes *found) {
+/* Find the value of a key in a map; return false if the key is missing. */
+static bool find(Bytes map, const char *key, Bytes *value) {
   Value pairs = read_value(&map);
   if (pairs.kind != MAP) return false;
   while (pairs.size-- > 0) {
     Value name = read_value(&map);
-    *found = map;
+    *value = map;
     if (name.kind == STRING && name.size == strlen(key) && !memcmp(name.text, key, name.size))
       return true;
     skip(&map);
@@ -102,7 +102,7 @@ static bool find(Bytes map, const char *key, Bytes *found) {
   return false;
 }
 
-/* Copy the text at a key of a map; false if there is none, or it is longer than the place for it. */
+/* Copy the text of a key in a map; return false if it is missing or does not fit. */
 static bool find_text(Bytes map, const char *key, char *text, size_t capacity) {
   Bytes at;
   if (!find(map, key, &at)) return false;
@@ -124,25 +124,25 @@ typedef struct {
   char public[KEY_LENGTH + 1], secret[KEY_LENGTH + 1], control[KEY_LENGTH + 1];
 } Key;
 
-/* Take a key out of a JSON object of three strings. */
+/* Read a key from a JSON object of three strings. */
 static void read_key(const char *json, const char *name, char *key) {
   char quoted[16];
   snprintf(quoted, sizeof quoted, "\"%s\"", name);
   const char *at = strstr(json, quoted);
   at = at ? strchr(at + strlen(quoted), '"') : NULL;
-  if (!at || strlen(at) <= KEY_LENGTH) fail("client.key is no key file");
+  if (!at || strlen(at) <= KEY_LENGTH) fail("client.key is not a key file");
   memcpy(key, at + 1, KEY_LENGTH);
   key[KEY_LENGTH] = '\0';
 }
 
-static Key own_key(void) {
+static Key user_key(void) {
   char path[4096], json[1024] = "";
   const char *state = getenv("XDG_STATE_HOME"), *home = getenv("HOME");
   if (state && *state) snprintf(path, sizeof path, "%s/kouxing/client.key", state);
   else snprintf(path, sizeof path, "%s/.local/state/kouxing/client.key", home ? home : "");
   FILE *file = fopen(path, "r");
   if (!file || fread(json, 1, sizeof json - 1, file) == 0)
-    fail("no client.key: start kouxing, or copy one from its machine");
+    fail("no client.key: start kouxing, or copy the file from its machine");
   fclose(file);
   Key key;
   read_key(json, "public", key.public);
@@ -151,7 +151,7 @@ static Key own_key(void) {
   return key;
 }
 
-/* Connect to an address and the public key of who is there: "tcp://HOST:PORT KEY". */
+/* Connect to an endpoint: an address and the server's public key, "tcp://HOST:PORT KEY". */
 static void connect_to(void *socket, const char *endpoint, const Key *key) {
   char address[MAX_ENDPOINT + 1], server[MAX_ENDPOINT + 1];
   if (sscanf(endpoint, "%256s %256s", address, server) != 2) fail("an endpoint has no key");
@@ -162,7 +162,7 @@ static void connect_to(void *socket, const char *endpoint, const Key *key) {
     fail(zmq_strerror(zmq_errno()));
 }
 
-/* Receive the two parts of a message; the body lies in `body` until the next. */
+/* Receive the two parts of a message; `body` is valid until the next call. */
 static Bytes receive(void *socket, char *topic, size_t capacity, zmq_msg_t *body) {
   int size = zmq_recv(socket, topic, capacity - 1, 0);
   if (size < 0 || zmq_msg_recv(body, socket, 0) < 0) fail(zmq_strerror(zmq_errno()));
@@ -173,14 +173,14 @@ static Bytes receive(void *socket, char *topic, size_t capacity, zmq_msg_t *body
 
 /* --- the program -------------------------------------------------------------------------------- */
 
-/* Send control a request about a session, and receive the answer; `rest` is a further field. */
+/* Send control a request about a session and receive the answer; `rest` is one more field. */
 static Bytes ask(void *control, const char *kind, const char *session, const char *rest,
                  zmq_msg_t *answer) {
   static int number = 0;
   char topic[MAX_NAME + 32], request[16], body[192];
   snprintf(topic, sizeof topic, "%s/%s/", kind, session);
   snprintf(request, sizeof request, "%d", ++number);
-  /* a map: an integer, two strings with their lengths before them, and the rest */
+  /* a map: an integer, two strings preceded by their lengths, and the rest */
   int size = snprintf(body, sizeof body, "%c\xa7version\x03\xa7session\xd9%c%s\xa7request%c%s%s",
                       *rest ? 0x84 : 0x83, (int)strlen(session), session,
                       0xa0 + (int)strlen(request), request, rest);
@@ -189,41 +189,41 @@ static Bytes ask(void *control, const char *kind, const char *session, const cha
   return receive(control, topic, sizeof topic, answer);
 }
 
-/* Ask control once for the wanted session, or the newest; false if there is none yet. */
+/* Ask control for the wanted session, or the newest; return false if there is no session yet. */
 static bool find_session(void *control, const char *wanted, char *name, char *faps) {
   zmq_msg_t answer;
   zmq_msg_init(&answer);
   Bytes report = ask(control, "status-request", wanted, "", &answer), sessions, endpoints;
-  double least_age_s = 1e300;
-  if (find(report, "sessions", &sessions)) { /* an error has none */
+  double min_age_s = 1e300;
+  if (find(report, "sessions", &sessions)) { /* an error has no sessions */
     for (uint32_t left = read_value(&sessions).size; left > 0; left--, skip(&sessions)) {
       double age_s = find_number(sessions, "age_s");
-      if (age_s < least_age_s && find(sessions, "endpoints", &endpoints) &&
+      if (age_s < min_age_s && find(sessions, "endpoints", &endpoints) &&
           find_text(endpoints, "faps", faps, MAX_ENDPOINT + 1) &&
           find_text(sessions, "session", name, MAX_NAME + 1))
-        least_age_s = age_s;
+        min_age_s = age_s;
     }
   }
   zmq_msg_close(&answer);
-  return least_age_s < 1e300;
+  return min_age_s < 1e300;
 }
 
-/* Ask control where it tells of sessions that move. */
+/* Ask control where it publishes that sessions move. */
 static void find_events(void *control, char *events) {
   zmq_msg_t answer;
   zmq_msg_init(&answer);
   Bytes services, endpoints;
-  bool found = false;
+  bool is_found = false;
   if (find(ask(control, "status-request", "", "", &answer), "services", &services))
-    for (uint32_t left = read_value(&services).size; left > 0 && !found; left--, skip(&services))
-      found = find(services, "endpoints", &endpoints) &&
-              find_text(endpoints, "events", events, MAX_ENDPOINT + 1); /* control's alone */
+    for (uint32_t left = read_value(&services).size; left > 0 && !is_found; left--, skip(&services))
+      is_found = find(services, "endpoints", &endpoints) &&
+              find_text(endpoints, "events", events, MAX_ENDPOINT + 1); /* only control has them */
   zmq_msg_close(&answer);
-  if (!found) fail("control tells nobody when sessions move");
+  if (!is_found) fail("control does not publish events");
 }
 
-/* Subscribe to a kind of message of a session, or no longer. */
-static void choose(void *socket, int option, const char *kind, const char *session) {
+/* Subscribe to a kind of message of a session, or unsubscribe. */
+static void set_subscription(void *socket, int option, const char *kind, const char *session) {
   char topic[MAX_NAME + 32];
   int size = snprintf(topic, sizeof topic, "%s/%s/", kind, session);
   zmq_setsockopt(socket, option, topic, (size_t)size);
@@ -232,8 +232,8 @@ static void choose(void *socket, int option, const char *kind, const char *sessi
 int main(int num_arguments, char **arguments) {
   const char *wanted = num_arguments > 1 ? arguments[1] : "";
   const char *address = num_arguments > 2 ? arguments[2] : "tcp://127.0.0.1:5550";
-  if (strlen(wanted) > MAX_NAME) fail("no session has such a long name");
-  Key key = own_key();
+  if (strlen(wanted) > MAX_NAME) fail("a session's name has at most 64 characters");
+  Key key = user_key();
   void *context = zmq_ctx_new();
 
   char endpoint[MAX_ENDPOINT + 1], name[MAX_NAME + 1], events[MAX_ENDPOINT + 1];
@@ -246,10 +246,10 @@ int main(int num_arguments, char **arguments) {
 
   void *face = zmq_socket(context, ZMQ_SUB);
   connect_to(face, endpoint, &key);
-  choose(face, ZMQ_SUBSCRIBE, "session-moved", name);
-  choose(face, ZMQ_SUBSCRIBE, "fap-frame", name);
-  choose(face, ZMQ_SUBSCRIBE, "end-of-faps", name);
-  choose(face, ZMQ_SUBSCRIBE, "joined", name); /* last: no frame is missed from then on */
+  set_subscription(face, ZMQ_SUBSCRIBE, "session-moved", name);
+  set_subscription(face, ZMQ_SUBSCRIBE, "fap-frame", name);
+  set_subscription(face, ZMQ_SUBSCRIBE, "end-of-faps", name);
+  set_subscription(face, ZMQ_SUBSCRIBE, "joined", name); /* last, so no frame is missed */
 
   double epoch = 0, newest = -1, newest_number = 0; /* of the frames shown */
   bool following = false;
@@ -260,27 +260,27 @@ int main(int num_arguments, char **arguments) {
     Bytes message = receive(face, topic, sizeof topic, &body), shapes, at;
     double time = find_number(message, "media_time"), number = find_number(message, "sequence");
     if (!strncmp(topic, "end-of-faps/", 12) && find_number(message, "epoch") >= epoch) break;
-    if (!strncmp(topic, "joined/", 7) && !following) { /* it comes again whenever anybody joins */
+    if (!strncmp(topic, "joined/", 7) && !following) { /* arrives for every new subscriber */
       following = true;
       zmq_msg_t answer;
       zmq_msg_init(&answer);
       /* face: a map of one, shapes: a list of one */
       ask(control, "set-face", name, "\xa4" "face\x81\xa6shapes\x91\xa5" "arkit", &answer);
       zmq_msg_close(&answer);
-      connect_to(face, events, &key); /* control tells there when the face is made elsewhere */
+      connect_to(face, events, &key); /* control publishes there when the session moves */
       printf("following %s\n", name);
     } else if (!strncmp(topic, "session-moved/", 14) &&
                find_text(message, "faps", endpoint, sizeof endpoint)) {
       epoch = find_number(message, "epoch");
       connect_to(face, endpoint, &key);
-      choose(face, ZMQ_UNSUBSCRIBE, "joined", name);
-      choose(face, ZMQ_SUBSCRIBE, "joined", name); /* a moved face's newest frames come again */
+      set_subscription(face, ZMQ_UNSUBSCRIBE, "joined", name);
+      set_subscription(face, ZMQ_SUBSCRIBE, "joined", name); /* after joining, the newest frames arrive again */
     } else if (find(message, "shapes", &shapes) && find(shapes, "arkit", &at) &&
                (time > newest || (time == newest && number > newest_number))) {
       newest = time, newest_number = number;
       Value values = read_value(&at);
-      float weights[NUM_WEIGHTS]; /* little-endian on the wire, as on every usual machine */
-      if (values.kind != STRING || values.size != sizeof weights) fail("a face has other weights");
+      float weights[NUM_WEIGHTS]; /* little-endian, as on common machines */
+      if (values.kind != STRING || values.size != sizeof weights) fail("a frame has an unknown number of weights");
       memcpy(weights, values.text, sizeof weights);
       printf("%.3f %.2f\n", time / 16000, weights[JAW_OPEN]);
     }

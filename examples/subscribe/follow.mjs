@@ -3,9 +3,9 @@
 // usage: node follow.mjs [SESSION [CONTROL-ADDRESS]]
 // (default: the newest session, tcp://127.0.0.1:5550)
 //
-// Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
-// 52 weights. It waits until there is a session, follows it to whatever host, and ends with it.
-// proto/PROTOCOL.md says what else there is, and has the names of the others.
+// Prints a line per frame, 50 per second: the time of its sound and the opening of the jaw, one of
+// ARKit's 52 weights. It waits for a session, follows it to other hosts, and ends with the session.
+// proto/PROTOCOL.md describes all messages and lists the names of the weights.
 
 import { readFile } from "node:fs/promises";
 import { homedir } from "node:os";
@@ -14,14 +14,14 @@ import { setTimeout as sleep } from "node:timers/promises";
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer, Subscriber } from "zeromq";
 
-const JAW_OPEN = 24; // its place among ARKit's names
+const JAW_OPEN = 24; // index in ARKit's names
 const [wanted = "", controlAddress = "tcp://127.0.0.1:5550"] = process.argv.slice(2);
 const state = process.env.XDG_STATE_HOME || join(homedir(), ".local", "state");
 const key = JSON.parse(await readFile(join(state, "kouxing", "client.key"), "utf8"));
 
 let numRequests = 0;
 
-/** Connect to an address and the public key of who is there. */
+/** Connect to an endpoint: an address and the server's public key. */
 function connect(Kind, endpoint) {
   const [address, curveServerKey] = endpoint.split(" ");
   const socket = new Kind({ curveServerKey, curvePublicKey: key.public, curveSecretKey: key.secret });
@@ -29,38 +29,38 @@ function connect(Kind, endpoint) {
   return socket;
 }
 
-/** Return the kind of a message and its fields. */
+/** Return the kind and the fields of a message. */
 function read([topic, body]) {
   return [topic.toString().split("/")[0], decode(body)];
 }
 
-/** Send a request, and return the answer. */
+/** Send a request; return the fields of the answer. */
 async function ask(control, kind, session, fields = {}) {
   const body = { version: 3, session, request: String(++numRequests), ...fields };
   await control.send([`${kind}/${session}/`, encode(body)]);
   return read(await control.receive())[1];
 }
 
-/** Return whether a frame is newer than another; after a move some come twice. */
+/** Return whether a frame is newer than another. After a move some frames arrive twice. */
 function isAfter(one, other) {
   return one.media_time > other.media_time
     || (one.media_time === other.media_time && one.sequence > other.sequence);
 }
 
-/** Return the wanted session, or the newest, once control knows one. */
+/** Wait for the wanted session, or for any session; return it or the newest. */
 async function find(control) {
   for (;;) {
-    const { sessions = [] } = await ask(control, "status-request", wanted); // an error has none
+    const { sessions = [] } = await ask(control, "status-request", wanted); // an error has no sessions
     const open = sessions.filter(({ endpoints }) => "faps" in endpoints);
     if (open.length > 0) return open.reduce((a, b) => (a.age_s < b.age_s ? a : b));
     await sleep(500);
   }
 }
 
-/** Print a session's frames from one publisher, to the end. */
+/** Print a session's frames from one publisher until they end. */
 async function follow(endpoint) {
   const face = connect(Subscriber, endpoint);
-  for (const kind of ["fap-frame", "end-of-faps", "joined"]) { // joined last: none is missed from then on
+  for (const kind of ["fap-frame", "end-of-faps", "joined"]) { // joined last: no frame is missed
     face.subscribe(`${kind}/${session}/`);
   }
   for await (const message of face) {
@@ -69,7 +69,7 @@ async function follow(endpoint) {
     if (kind === "joined" && newest.media_time < 0) {
       await ask(control, "set-face", session, { face: { shapes: ["arkit"] } });
       console.log("following", session);
-      face.unsubscribe(`joined/${session}/`); // it comes whenever anybody joins
+      face.unsubscribe(`joined/${session}/`); // it arrives for every subscriber that joins
     } else if (body.shapes?.arkit && isAfter(body, newest)) {
       newest = body;
       const weights = new Float32Array(new Uint8Array(body.shapes.arkit).buffer); // 52
@@ -82,7 +82,7 @@ const control = connect(Dealer, `${controlAddress} ${key.control}`);
 const { session, endpoints } = await find(control);
 const { services } = await ask(control, "status-request", "");
 const { events } = services.find(({ service }) => service === "control").endpoints;
-const moves = connect(Subscriber, events); // control tells there when the face is made elsewhere
+const moves = connect(Subscriber, events); // control publishes there when the session moves
 moves.subscribe(`session-moved/${session}/`);
 
 let epoch = 0;

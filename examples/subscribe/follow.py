@@ -2,9 +2,9 @@
 
 usage: follow.py [SESSION [CONTROL-ADDRESS]]    (default: the newest session, tcp://127.0.0.1:5550)
 
-Prints a line a frame, 50 a second: the time of its sound and how far the jaw opens, one of ARKit's
-52 weights. It waits until there is a session, follows it to whatever host, and ends with it.
-proto/PROTOCOL.md says what else there is, and has the names of the others.
+Prints a line per frame, 50 per second: the time of its sound and the opening of the jaw, one of
+ARKit's 52 weights. It waits for a session, follows it to other hosts, and ends with the session.
+proto/PROTOCOL.md describes all messages and lists the names of the weights.
 """
 
 import itertools
@@ -23,72 +23,75 @@ state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
 key = json.loads(Path(state, "kouxing", "client.key").read_text(encoding="utf-8"))
 context = zmq.Context()
 numbers = itertools.count(1)  # of requests
-JAW_OPEN = 24  # its place among ARKit's names
+JAW_OPEN = 24  # index in ARKit's names
 
 
 def connect(socket, endpoint):
-    """Connect to an address and the public key of who is there."""
+    """Connect to an endpoint: an address and the server's public key."""
     address, socket.curve_serverkey = endpoint.encode().split()
     socket.curve_publickey, socket.curve_secretkey = key["public"].encode(), key["secret"].encode()
     socket.connect(address.decode())
 
 
 def receive(socket):
-    """Return the kind of the next message and its fields."""
+    """Return the kind and the fields of the next message."""
     topic, body = socket.recv_multipart()
     return topic.decode().split("/")[0], msgpack.unpackb(body)
 
 
 def ask(control, kind, session, **fields):
-    """Send a request, and return the kind of the answer and its fields."""
+    """Send a request; return the kind and the fields of the answer."""
     body = {"version": 3, "session": session, "request": str(next(numbers)), **fields}
     control.send_multipart([f"{kind}/{session}/".encode(), msgpack.packb(body)])
     return receive(control)
 
 
 def sessions(control):
-    """Yield what control knows of the wanted session, or of all, twice a second."""
+    """Yield the status of the wanted session, or of all sessions, twice per second."""
     while True:
         kind, answer = ask(control, "status-request", wanted)
-        yield answer["sessions"] if kind == "status-report" else []  # an error: there is none yet
+        yield answer["sessions"] if kind == "status-report" else []  # an error: no session yet
         time.sleep(0.5)
 
 
 control = context.socket(zmq.DEALER)
 connect(control, f"{control_address} {key['control']}")
-found = (
+candidates = (
     [session for session in known if "faps" in session["endpoints"]] for known in sessions(control)
 )
-session = min(next(filter(None, found)), key=lambda each: each["age_s"])
+session = min(next(filter(None, candidates)), key=lambda candidate: candidate["age_s"])
 name = session["session"]
 _, report = ask(control, "status-request", "")
 events = next(
-    each["endpoints"]["events"] for each in report["services"] if each["service"] == "control"
+    service["endpoints"]["events"]
+    for service in report["services"]
+    if service["service"] == "control"
 )
 
 face = context.socket(zmq.SUB)
 connect(face, session["endpoints"]["faps"])
-for kind in ("session-moved", "fap-frame", "end-of-faps", "joined"):  # joined last: none is missed
+# joined is last, so that no frame is missed
+for kind in ("session-moved", "fap-frame", "end-of-faps", "joined"):
     face.subscribe(f"{kind}/{name}/")
 
 epoch, newest, following = 0, (-1, 0), False
 while True:
     kind, body = receive(face)
-    if kind == "joined" and not following:  # it comes again whenever anybody joins
+    if kind == "joined" and not following:  # it arrives for every subscriber that joins
         following = True
         ask(control, "set-face", name, face={"shapes": ["arkit"]})
-        connect(face, events)  # control tells there when the face is made elsewhere
+        connect(face, events)  # control publishes there when the session moves
         print("following", name, flush=True)
     elif kind == "session-moved":
         epoch = body["epoch"]
         connect(face, body["faps"])
         face.unsubscribe(f"joined/{name}/")
-        face.subscribe(f"joined/{name}/")  # who joins a moved face gets its newest frames again
+        face.subscribe(f"joined/{name}/")  # after joining, the newest frames arrive again
     elif kind == "end-of-faps" and body["epoch"] >= epoch:
         break
     elif kind == "fap-frame" and "arkit" in body["shapes"]:
-        place = body["media_time"], body["sequence"]
-        if place > newest:
-            newest = place
+        position = body["media_time"], body["sequence"]
+        if position > newest:
+            newest = position
             weights = struct.unpack("<52f", body["shapes"]["arkit"])
             print(f"{body['media_time'] / 16000:.3f} {weights[JAW_OPEN]:.2f}", flush=True)

@@ -1,5 +1,5 @@
-// Follows a live session by the gateway's WebSocket: the weights of ARKit's 52 shapes, in plain C#
-// (.NET Standard 2.1: Unity 2021 or newer, .NET 5 or newer); nothing has to be installed.
+// Follows a live session over the gateway's WebSocket: the weights of ARKit's 52 shapes, in plain C#
+// (.NET Standard 2.1: Unity 2021 or newer, .NET 5 or newer) without dependencies.
 
 using System;
 using System.Collections.Generic;
@@ -10,10 +10,10 @@ using System.Text.RegularExpressions;
 using System.Threading;
 using System.Threading.Tasks;
 
-/// <summary>A face as it is shown now: the names of the shapes and their weights, 0 to 1.</summary>
+/// <summary>The current face: the names of the shapes and their weights, 0 to 1.</summary>
 public sealed class KouxingStream : IDisposable
 {
-    const int WeightsOfFrame = 4, WeightsAtRest = 5; // kinds of binary messages, proto/GATEWAY.md
+    const int WeightsOfFrame = 4, WeightsAtRest = 5; // types of binary messages, proto/GATEWAY.md
     const int HeaderBytes = 16;
     const int RetryMs = 1000;
     static readonly Regex Quoted = new Regex("\"([^\"]*)\"");
@@ -21,13 +21,13 @@ public sealed class KouxingStream : IDisposable
     readonly Uri _url;
     readonly CancellationTokenSource _stop = new CancellationTokenSource();
 
-    /// <summary>In the order of the weights; empty until connected.</summary>
+    /// <summary>Names in the order of the weights; empty until connected.</summary>
     public IReadOnlyList<string> Names { get; private set; } = Array.Empty<string>();
 
-    /// <summary>The newest face. It is replaced, never changed: any thread may read it.</summary>
+    /// <summary>Weights of the newest face. The array is replaced, never changed, so any thread may read it.</summary>
     public float[] Weights { get; private set; } = Array.Empty<float>();
 
-    /// <summary>Follow a session until disposed; an empty name is the newest.</summary>
+    /// <summary>Follow a session until disposed; an empty name means the newest.</summary>
     public KouxingStream(string gateway = "ws://127.0.0.1:8080", string session = "")
     {
         _url = new Uri(gateway + "/viewer?shapes=arkit&session=" + Uri.EscapeDataString(session));
@@ -48,7 +48,7 @@ public sealed class KouxingStream : IDisposable
                     await ReceiveAsync(socket);
                 }
             }
-            catch (WebSocketException) { } // no gateway, or no longer
+            catch (WebSocketException) { } // the gateway is not running
             catch (OperationCanceledException) { return; }
             await Task.Delay(RetryMs);
         }
@@ -56,15 +56,15 @@ public sealed class KouxingStream : IDisposable
 
     async Task ReceiveAsync(ClientWebSocket socket)
     {
-        var part = new ArraySegment<byte>(new byte[4096]);
+        var buffer = new ArraySegment<byte>(new byte[4096]);
         while (socket.State == WebSocketState.Open)
         {
             var message = new MemoryStream();
             WebSocketReceiveResult result;
             do
             {
-                result = await socket.ReceiveAsync(part, _stop.Token);
-                message.Write(part.Array, 0, result.Count);
+                result = await socket.ReceiveAsync(buffer, _stop.Token);
+                message.Write(buffer.Array, 0, result.Count);
             } while (!result.EndOfMessage);
             if (result.MessageType == WebSocketMessageType.Text) ReadText(Encoding.UTF8.GetString(message.ToArray()));
             if (result.MessageType == WebSocketMessageType.Binary) ReadBinary(message.ToArray());
@@ -76,9 +76,9 @@ public sealed class KouxingStream : IDisposable
     {
         int names = text.IndexOf("\"names\"", StringComparison.Ordinal);
         if (!text.Contains("\"shapes\"") || names < 0) return;
-        var found = new List<string>();
-        foreach (Match match in Quoted.Matches(text, text.IndexOf('[', names))) found.Add(match.Groups[1].Value);
-        Names = found;
+        var list = new List<string>();
+        foreach (Match match in Quoted.Matches(text, text.IndexOf('[', names))) list.Add(match.Groups[1].Value);
+        Names = list;
     }
 
     void ReadBinary(byte[] message)

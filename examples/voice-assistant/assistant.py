@@ -2,10 +2,10 @@
 
 usage: assistant.py [GATEWAY]    (default: ws://127.0.0.1:8080; with a token: wss://HOST:8080?token=...)
 
-Each line typed is something that the user said. The assistant answers it, and the face of its
-session speaks the answer, on the page and wherever else it is sent. A line typed while it speaks
-interrupts it: the face falls silent at once and goes on with the new answer. Put your language
-model in place of `answer` and your text-to-speech in place of `synthesize`.
+Type what the user says, one line at a time. The face of the assistant's session speaks the answer,
+on the page and in other programs. A line that is typed during an answer interrupts the answer: the
+face stops at once and continues with the new one. Replace `answer` by your language model and
+`synthesize` by your text-to-speech.
 """
 
 import array
@@ -24,12 +24,12 @@ SYLLABLE_S = 0.2
 
 
 def answer(text):
-    """Say something about what the user said."""
+    """Return an answer to the user."""
     return f"you said {text}"
 
 
 async def synthesize(text):
-    """Yield 16-bit PCM as it is made, in pieces of any length: here a hum with a vowel a letter."""
+    """Yield 16-bit PCM in pieces of any length; here a hum with one vowel per letter."""
     for letter in text:
         states = [[0.0, 0.0], [0.0, 0.0]]
         samples = array.array("h")
@@ -42,21 +42,21 @@ async def synthesize(text):
                 state[:] = value, state[0]
             samples.append(max(-32767, min(32767, int(1500 * value))))
         yield samples.tobytes()
-        await asyncio.sleep(0)  # others may have work
+        await asyncio.sleep(0)  # let other tasks run
 
 
 async def speak(face, text):
-    """Send an answer to the face, and wait until it is spoken."""
-    begun_s = asyncio.get_running_loop().time()
+    """Send an answer to the face and wait until it is spoken."""
+    start_s = asyncio.get_running_loop().time()
     sent_s = 0.0
     async for pcm in synthesize(text):
         await face.send_bytes(pcm)
         sent_s += len(pcm) / 2 / RATE_HZ
-    await asyncio.sleep(begun_s + sent_s - asyncio.get_running_loop().time())
+    await asyncio.sleep(start_s + sent_s - asyncio.get_running_loop().time())
 
 
 async def converse(face):
-    """Answer the user until there is no more."""
+    """Answer the user until the input ends."""
     speaking = None
     for number in itertools.count(1):
         line = (await asyncio.to_thread(sys.stdin.readline)).strip()
@@ -84,7 +84,7 @@ async def main(gateway):
             raise SystemExit(opened["text"])
         print("the face is session", opened["session"], flush=True)
         conversation = asyncio.create_task(converse(face))
-        async for message in face:  # until the gateway closes, as it does when all is spoken
+        async for message in face:  # until all is spoken and the gateway closes
             if message.type is aiohttp.WSMsgType.TEXT:
                 raise SystemExit(message.json()["text"])
         await conversation

@@ -17,6 +17,7 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, replace
 
 from aiohttp import web
+from kouxing_client import KouxingError
 
 from kouxing.services.gateway import http, wire
 from kouxing.services.gateway.audio_sessions import AudioSessions, error_text
@@ -256,13 +257,7 @@ class GatewayService(Service):
         if not missing or self._report_s > since_s + MISSING_S:
             self._viewers.set_missing(missing)
 
-    def _set_face(self, session: str, settings: wire.FaceSettings) -> None:
-        expressions = None if settings.expressions is None else dict(settings.expressions)
-        face = FaceSettings(
-            expressions=expressions,
-            hold_s=settings.hold_s,
-            expressiveness=settings.expressiveness,
-        )
+    def _set_face(self, session: str, face: FaceSettings) -> None:
         self.send_to_control(SetFace(session=session, face=face))
 
     # --- from the publishers ---------------------------------------------------------------------
@@ -362,7 +357,7 @@ class GatewayService(Service):
                     characters_of, SAMPLE_TEXT, load_inventory()
                 )
             await sample.speak()
-        except UserError as refusal:
+        except (UserError, KouxingError) as refusal:
             error = error_text(refusal)
         finally:
             self._sample = None

@@ -17,9 +17,9 @@ from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.rate_limit import COMMAND_S, RateLimit
 from kouxing.services.gateway.shape_messages import ShapeEncoder, parse_shape_query
 from kouxing.services.gateway.viewer_queue import MessageKind, ViewerQueue
-from kouxing.services.gateway.wire import FaceSettings
 from kouxing.shared.errors import UserError
 from kouxing.shared.metrics import Metrics
+from kouxing.shared.wire.face import FaceSettings
 
 MAX_VIEWERS = 64
 SEND_BUFFER_BYTES = 64 * 1024  # in the kernel, for a slow viewer; about a second
@@ -202,13 +202,14 @@ class Viewers:
             command = wire.parse_object(message)
             session = command.get("follow")
             settings = wire.parse_face_settings(command)
+            lips = settings.lips if settings is not None else None
             if command.get("play") == "sample":
-                self._sample = viewer.chosen = self._play_sample(settings.lips)
-            elif settings.lips:
+                self._sample = viewer.chosen = self._play_sample(lips or "")
+            elif lips:
                 if not self._sample or viewer.chosen != self._sample:
                     raise UserError("a viewer can choose the lips of the sample sentence only")
-                self._choose_sample_lips(settings.lips)
-            elif settings:
+                self._choose_sample_lips(lips)
+            elif settings is not None:
                 if viewer.shown is None:
                     raise UserError("no session is shown; start a microphone or the sample first")
                 self._set_face(viewer.shown[0], settings)

@@ -11,6 +11,7 @@ import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from kouxing.services.gateway.pcm_format import RATES_HZ, PcmFormat, check_text
 from kouxing.shared.errors import UserError
@@ -20,6 +21,7 @@ from kouxing.shared.face.expressions import (
     check_expressiveness,
 )
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES, LipModelName
+from kouxing.shared.wire.face import FaceSettings
 
 _HEADER = struct.Struct("<B3xId")
 FAP_TYPE = 1  # payload: 68 float32, FAP units
@@ -125,21 +127,8 @@ def _parse_lips(fields: Mapping[str, object]) -> str:
     return lips
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FaceSettings:
-    """Changes to a session's face. Fields with default values change nothing."""
-
-    lips: str = ""  # name of the lip model
-    expressions: Mapping[str, float] | None = None  # strengths from 0 to 1; {}: fade out
-    hold_s: float = DEFAULT_HOLD_S  # until the expressions fade
-    expressiveness: float | None = None  # factor for the mouth's movement
-
-    def __bool__(self) -> bool:
-        return bool(self.lips) or self.expressions is not None or self.expressiveness is not None
-
-
-def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings:
-    """Return the face settings of a viewer's command.
+def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings | None:
+    """Return the face settings of a viewer's command; None if it contains none.
 
     Raises
     ------
@@ -147,17 +136,17 @@ def parse_face_settings(fields: Mapping[str, object]) -> FaceSettings:
         If a name is unknown or a number is out of range.
     """
     expressions, hold_s = fields.get("express"), fields.get("hold_s", DEFAULT_HOLD_S)
+    settings: dict[str, Any] = {}
+    if lips := _parse_lips(fields):
+        settings["lips"] = lips
     if expressions is not None:
         if not isinstance(expressions, dict):
             raise UserError("express must be an object of strengths by name")
         check_expressions(expressions, hold_s)
-    amount = fields.get("expressiveness")
-    return FaceSettings(
-        lips=_parse_lips(fields),
-        expressions=expressions,
-        hold_s=float(hold_s) if expressions is not None else DEFAULT_HOLD_S,  # type: ignore[arg-type]
-        expressiveness=None if amount is None else check_expressiveness(amount),
-    )
+        settings.update(expressions=expressions, hold_s=hold_s)
+    if (amount := fields.get("expressiveness")) is not None:
+        settings["expressiveness"] = check_expressiveness(amount)
+    return FaceSettings(**settings) if settings else None
 
 
 def parse_object(message: str) -> dict[str, object]:

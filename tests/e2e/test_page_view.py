@@ -78,9 +78,9 @@ def test_other_programs_are_sent_the_face_from_the_settings(
         browser.evaluate(f"document.getElementById('send-to').value = {url!r}")
         browser.evaluate("document.getElementById('send').requestSubmit()")
         assert program.recv(2000)[0] == 6  # of Live Link Face's version
-        browser.wait_for("/head, \\d+ frames/.test(document.getElementById('programs').innerText)")
-        browser.evaluate("document.querySelector('#programs button').click()")
-        browser.wait_for("document.getElementById('programs').children.length === 0")
+        browser.wait_for("/head, \\d+ frames/.test(document.getElementById('senders').innerText)")
+        browser.evaluate("document.querySelector('#senders button').click()")
+        browser.wait_for("document.getElementById('senders').children.length === 0")
     browser.evaluate("document.getElementById('send-to').value = 'vmc://192.0.2.1'")
     browser.evaluate("document.getElementById('send').requestSubmit()")
     browser.wait_for(

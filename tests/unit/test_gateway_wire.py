@@ -11,6 +11,7 @@ from kouxing.services.gateway import wire
 from kouxing.services.gateway.pcm_format import PcmFormat
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES
+from kouxing.shared.wire.face import FaceSettings
 
 pytestmark = pytest.mark.unit
 
@@ -78,11 +79,11 @@ def test_rejects_bad_microphone_commands(fields: object, error: str) -> None:
 
 
 def test_parses_face_settings() -> None:
-    assert not wire.parse_face_settings({"follow": "one"})
+    assert wire.parse_face_settings({"follow": "one"}) is None
     settings = wire.parse_face_settings({"express": {"joy": 1}, "hold_s": 7, "expressiveness": 2})
-    assert settings.expressions == {"joy": 1}
-    assert (settings.hold_s, settings.expressiveness, settings.lips) == (7.0, 2.0, "")
-    assert wire.parse_face_settings({"express": {}})
+    assert settings == FaceSettings(expressions={"joy": 1}, hold_s=7, expressiveness=2)
+    assert wire.parse_face_settings({"express": {}}) == FaceSettings(expressions={})
+    assert wire.parse_face_settings({"lips": "learnt"}) == FaceSettings(lips="learnt")
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,28 @@ test("a small error is corrected by gliding", () => {
   assert.ok(Math.abs(playout.offsetMs - before - 20) <= 0.1, `${playout.offsetMs - before}`);
 });
 
+test("half of a large error is corrected at once, every half second", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 10000 });
+  const beforeMs = playout.delayMs;
+  stream(playout, { fromMs: 10000, forMs: 500, frameMs: 200 });
+  assert.ok(playout.delayMs - beforeMs <= 70, `${playout.delayMs}: at most half of the error`);
+  stream(playout, { fromMs: 10500, forMs: 20000, frameMs: 200 });
+  assert.ok(Math.abs(playout.delayMs - beforeMs - 120) <= 5, `${playout.delayMs}`);
+});
+
+test("a burst after a network stall does not leave a lasting delay", () => {
+  const playout = new Playout();
+  stream(playout, { forMs: 4000 });
+  const beforeMs = playout.delayMs;
+  for (let ms = 4000; ms < 5000; ms += FRAME_MS) {
+    playout.soundArrived(5000, ms * SAMPLES_PER_MS, FRAME_MS * SAMPLES_PER_MS);
+    playout.frameArrived(5000, (ms - 60) * SAMPLES_PER_MS);
+  }
+  stream(playout, { fromMs: 5000, forMs: 2000 });
+  assert.ok(Math.abs(playout.delayMs - beforeMs) <= 30, `${playout.delayMs}`);
+});
+
 test("one late frame has no effect", () => {
   const playout = new Playout();
   stream(playout, { forMs: 10000 });
