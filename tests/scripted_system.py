@@ -19,7 +19,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.shared.config import variable
 from kouxing.shared.face.faps import FAP_NUMBER, MASK_BYTES
-from kouxing.shared.keys import Peer
+from kouxing.shared.keys import Peer, user_key
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
 from kouxing.shared.wire.audio import AudioChunk, Sound
@@ -101,6 +101,7 @@ class System:
             ControlConfig(control=local, events=local, lost_after_s=10.0, max_load=1000.0)
         )
         self.address = self.control.endpoints["commands"]
+        user_key()  # creates the key file that clients read
         control = self.address.partition(" ")[0]
         self.synthesizer = ScriptedSynthesizer(control)
         self.recognizer: ScriptedRecognizer | None = ScriptedRecognizer(control)

@@ -266,7 +266,7 @@ def test_clicks_are_heard_when_the_mouth_is_seen_to_open(
         seen_ms, _, jaw = images.T
         is_open = jaw > A_VALUES[0] / 2
         opens_ms = seen_ms[1:][is_open[1:] & ~is_open[:-1]]
-        counted_ms = sync.with_images(clicks_ms, seen_ms)[:NUM_CLICKS]
+        counted_ms = sync.with_pictures(clicks_ms, seen_ms)[:NUM_CLICKS]
         offsets[:] = [min(click - opens_ms, key=abs) for click in counted_ms]
         return len(offsets) == NUM_CLICKS
 
