@@ -26,13 +26,7 @@ PROVIDERS = {endpoint: kind.name for kind in KINDS.values() for endpoint in kind
 def read_settings(
     file: Path | None = None, assignments: Mapping[str, str] | None = None
 ) -> Settings:
-    """Return what a file, the environment and a command line say about all services.
-
-    Raises
-    ------
-    UserError
-        As ``kouxing.shared.config.Settings``.
-    """
+    """Return the settings of all services; raises as ``kouxing.shared.config.Settings``."""
     types = {kind.name: kind.config_type for kind in KINDS.values()}
     return Settings(types, file=file, assignments=assignments)
 
@@ -40,17 +34,17 @@ def read_settings(
 def free_addresses(
     names: Collection[str] = tuple(KINDS), hosts: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """Return an environment in which services bind free ports, beside a system that runs already.
+    """Return an environment in which services bind free ports.
 
     Parameters
     ----------
     names
         Services that bind.
     hosts
-        Addresses of this machine, by service; 127.0.0.1 where none is given.
+        Host to bind for each service; by default 127.0.0.1.
     """
     environment = {}
-    with contextlib.ExitStack() as probes:  # all stay open, so that no port is found twice
+    with contextlib.ExitStack() as probes:  # all stay open, so that all ports differ
         for name in names:
             host = (hosts or {}).get(name, "127.0.0.1")
             for key, bound in bound_keys(KINDS[name].config_type).items():
@@ -67,17 +61,17 @@ def free_addresses(
 
 
 def available_addresses(settings: Settings) -> dict[str, str]:
-    """Return an environment in which services bind free ports where default ones are taken.
+    """Return an environment in which services bind free ports instead of default ports in use.
 
     Raises
     ------
     UserError
-        If a port that was chosen is taken.
+        If a port in use was set by the user.
     """
     free = free_addresses()
     environment = {}
     for kind in KINDS.values():
-        values = {each.key: each for each in settings.describe(kind.config_type)}
+        values = {setting.key: setting for setting in settings.describe(kind.config_type)}
         bound = bound_keys(kind.config_type)
         host = next((str(values[key].value) for key in bound if bound[key] is Bound.HOST), "")
         for key in (key for key in bound if bound[key] is not Bound.HOST):
@@ -88,34 +82,34 @@ def available_addresses(settings: Settings) -> dict[str, str]:
                     continue
                 if not setting.is_default:
                     raise UserError(
-                        f"{kind.name}.{key}: another program has port {port}; choose another, or"
-                        " none to get a free one"
+                        f"{kind.name}.{key}: another program uses port {port}; set another port, or"
+                        " none to use a free one"
                     )
             environment[variable(kind.name, key)] = free[variable(kind.name, key)]
     return environment
 
 
 def more_workers(settings: Settings, number: int) -> dict[str, dict[str, str]]:
-    """Return environments of that many workers of a kind in all, but for the first of each.
+    """Return the environments of additional workers, so that each kind has ``number`` of them.
 
-    Their names are ``recognizer-2`` and so on. They bind free ports, on the addresses of the first.
+    Their names are ``recognizer-2`` and so on. They bind free ports on the first worker's host.
     """
     environments: dict[str, dict[str, str]] = {}
     for name in WORKERS:
         config = settings.load(KINDS[name].config_type)
-        own = {variable(name, "instance"): ""}
+        environment = {variable(name, "instance"): ""}
         for key, bound in bound_keys(type(config)).items():
             if bound is Bound.ENDPOINT:
                 host = str(getattr(config, key)).rpartition(":")[0]
-                own[variable(name, key)] = f"{host}:*"
+                environment[variable(name, key)] = f"{host}:*"
             elif bound is Bound.PORT:
-                own[variable(name, key)] = "0"
-        environments |= {f"{name}-{count}": own for count in range(2, number + 1)}
+                environment[variable(name, key)] = "0"
+        environments |= {f"{name}-{count}": environment for count in range(2, number + 1)}
     return environments
 
 
 def kind_of(name: str) -> str:
-    """Return the kind of service that has some name, such as ``recognizer-2``."""
+    """Return the kind of a service from its name, such as ``recognizer-2``."""
     return name.partition("-")[0]
 
 

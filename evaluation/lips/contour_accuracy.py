@@ -35,7 +35,6 @@ from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import faster
-from kouxing.services.cli.mouth_drawing import syllables_of
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
@@ -53,6 +52,7 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import Syllable
+from kouxing.shared.phones.syllables import group_syllables
 
 Array = NDArray[np.float64]
 Samples = NDArray[np.float32]
@@ -186,7 +186,7 @@ def _text(
         phones = align_phones(model, samples, SAMPLE_RATE_HZ, syllables)
         return syllables, spoken(phones, model.inventory)
     phones = spoken(recognize(model, samples, SAMPLE_RATE_HZ), model.inventory)
-    groups = syllables_of(phones, model.inventory)
+    groups = group_syllables(phones, model.inventory)
     return [tuple(phone.symbol for phone in group) for group in groups], phones
 
 

@@ -23,11 +23,13 @@ from kouxing.shared.face.expressions import DEFAULT_HOLD_S, ExpressionName, chec
 from kouxing.shared.keys import control_endpoint
 from kouxing.shared.terminal import CONSOLE, JsonFile, print_message, write_json
 
-SHOWN_FIGURES = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
+SHOWN_METRICS = {"in_audio_chunk_per_s", "out_fap_frame_per_s", "frames_missed", "cpu_s"}
 
 Control = Annotated[
     str,
-    typer.Option(help="Address of control; else $KOUXING_CONTROL, else the system you run here."),
+    typer.Option(
+        help="Address of control; by default $KOUXING_CONTROL, or the system that you run here."
+    ),
 ]
 
 
@@ -36,27 +38,28 @@ def speak(
         str,
         typer.Argument(
             metavar="FILE|-|mic|monitor",
-            help="'-': raw int16, or WAV, from standard input; 'monitor': what this machine plays.",
+            help="'-' is standard input, raw int16 or WAV; 'monitor' is the sound output of this"
+            " machine.",
         ),
     ],
     session: Annotated[str, typer.Option(help="Name of the session.")] = "",
     record: Annotated[
         bool,
-        typer.Option("--record", help="The driver writes <session>.mp4, or <session>-2.mp4."),
+        typer.Option("--record", help="Let the driver write <session>.mp4."),
     ] = False,
     fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as possible, not in real time.")
+        bool, typer.Option("--fast", help="Send as fast as possible instead of in real time.")
     ] = False,
     device: Annotated[
         str,
-        typer.Option(help="Part of the name of the 'mic' or 'monitor'; 'kouxing devices' lists."),
+        typer.Option(help="Part of the name of the 'mic' or 'monitor'; see 'kouxing devices'."),
     ] = "",
-    rate: Annotated[int, typer.Option(help="Sample rate of '-', Hz.")] = 16000,
-    channels: Annotated[int, typer.Option(help="Channels of '-'.")] = 1,
+    rate: Annotated[int, typer.Option(help="Sample rate of '-' in Hz.")] = 16000,
+    channels: Annotated[int, typer.Option(help="Number of channels of '-'.")] = 1,
     mouth: MouthFile = None,
     control: Control = "",
 ) -> None:
-    """Stream a file, standard input, a microphone or what is played to a running system."""
+    """Stream a file, standard input, a microphone or this machine's sound to a running system."""
     from kouxing.services.cli.streaming import stream
     from kouxing.services.recognizer.mouth_profile import read_mouth_profile
     from kouxing.shared.audio_file import open_audio, raw_audio
@@ -64,7 +67,7 @@ def speak(
 
     profile = b"" if mouth is None else read_mouth_profile(mouth)
     if device and source not in ("mic", "monitor"):
-        raise UserError("--device names a microphone or a monitor: kouxing speak mic --device NAME")
+        raise UserError("--device is for mic and monitor: kouxing speak mic --device NAME")
     if source == "mic":
         audio = microphone(device)
     elif source == "monitor":
@@ -90,10 +93,10 @@ def speak(
 
 
 def devices() -> None:
-    """List what 'kouxing speak mic' and 'kouxing speak monitor' can name with --device."""
+    """List the devices for 'kouxing speak mic' and 'kouxing speak monitor'."""
     from kouxing.shared.sound_devices import sound_devices
 
-    table = Table("kind", "name", "speak it", box=box.SIMPLE)
+    table = Table("kind", "name", "command", box=box.SIMPLE)
     for device in sound_devices():
         source = "mic" if device.kind == "mic" else "monitor"
         command = f'kouxing speak {source} --device "{device.name}"'
@@ -104,22 +107,23 @@ def devices() -> None:
 def listen(
     session: Annotated[
         str,
-        typer.Argument(help="Name of the session, which may open later; without it, the newest."),
+        typer.Argument(help="Name of the session, which may open later; by default the newest."),
     ] = "",
     show: Annotated[
-        Shown, typer.Option(help="What to print; syllables and phones once they are final.")
+        Shown,
+        typer.Option(help="What to print; syllables and phones when they are final."),
     ] = Shown.FAPS,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Record the frames to a .fap, .csv or .jsonl file."),
+        typer.Option("--output", "-o", help="Record the frames: .fap, .csv, .jsonl or .glb."),
     ] = None,
     form: Annotated[
         CurveForm,
-        typer.Option("--as", help="Values of the frames; printed, shapes are lines of JSON."),
+        typer.Option("--as", help="Values of the frames. Shapes are printed as lines of JSON."),
     ] = CurveForm.FAPS,
     control: Control = "",
 ) -> None:
-    """Print or record what a session shows, until it ends."""
+    """Print or record the output of a session until it ends."""
     from kouxing.services.cli.follow import follow
 
     follow(_session_name(session), output, show, form, control_address(control))
@@ -128,14 +132,17 @@ def listen(
 def send(
     targets: Annotated[
         list[str],
-        typer.Argument(metavar="URL...", help="Programs that show the face, as vmc://HOST:PORT."),
+        typer.Argument(
+            metavar="URL...",
+            help="Addresses of programs that show the face, such as vmc://HOST:PORT.",
+        ),
     ],
     session: Annotated[
-        str, typer.Option(help="Name of the session; without it, always the newest.")
+        str, typer.Option(help="Name of the session; by default always the newest.")
     ] = "",
     control: Control = "",
 ) -> None:
-    """Send the face to avatars in other programs: VMC, Live Link Face, OSC, VTube Studio."""
+    """Send the face to avatars in other programs by VMC, Live Link Face, OSC or VTube Studio."""
     from kouxing.services.cli.send import send_to
     from kouxing.services.senders.target import parse_target
     from kouxing.services.synthesizer.config import SynthesizerConfig
@@ -155,15 +162,15 @@ def express(
         list[str] | None,
         typer.Argument(
             metavar="NAME=STRENGTH",
-            help=f"Strengths from 0 to 1 of {', '.join(ExpressionName)}.",
+            help=f"Strengths from 0 to 1. The names are {', '.join(ExpressionName)}.",
         ),
     ] = None,
     hold: Annotated[
-        float, typer.Option(help="Seconds that they stay before they fade.")
+        float, typer.Option(help="Seconds until the expressions fade.")
     ] = DEFAULT_HOLD_S,
     control: Control = "",
 ) -> None:
-    """Let the face of a session show expressions for a while; none ends those before."""
+    """Show expressions on the face of a session for a while. Without names, end them."""
     from kouxing.shared.control_client import connect
 
     strengths = dict(map(_strength, expressions or ()))
@@ -187,44 +194,38 @@ def status(control: Control = "", json_file: JsonFile = None) -> None:
     with connect(control_address(control), timeout_s=3.0) as client:
         report = client.status()
     out = Console()
-    services = Table("service", "state", "answered", "figures", box=box.SIMPLE)
+    services = Table("service", "state", "last seen", "metrics", box=box.SIMPLE)
     for service in report.services:
-        figures = ", ".join(
+        metrics = ", ".join(
             f"{name} {value:.4g}"
             for name, value in sorted(service.metrics.items())
-            if name.endswith(("_p50", "_p95")) or name in SHOWN_FIGURES or _is_drop(name)
+            if name.endswith(("_p50", "_p95")) or name in SHOWN_METRICS or _is_drop(name)
         )
         services.add_row(
-            escape(service.instance), service.state, f"{service.age_s:.1f} s ago", escape(figures)
+            escape(service.instance), service.state, f"{service.age_s:.1f} s ago", escape(metrics)
         )
     out.print(services)
     if not report.sessions:
         out.print("no session is open")
     else:
         sessions = Table("session", "state", "open for", "speaking", "workers", box=box.SIMPLE)
-        for each in report.sessions:
+        for session in report.sessions:
             sessions.add_row(
-                each.session,
-                each.state,
-                f"{each.age_s:.0f} s",
-                "yes" if each.speaking else "no",
-                escape(", ".join(sorted({*each.workers.values()}))),
+                session.session,
+                session.state,
+                f"{session.age_s:.0f} s",
+                "yes" if session.speaking else "no",
+                escape(", ".join(sorted({*session.workers.values()}))),
             )
         out.print(sessions)
     write_json(json_file, asdict(report))
 
 
 def _session_name(name: str) -> str:
-    """Return a name that a session can have, or an empty one.
-
-    Raises
-    ------
-    UserError
-        If no session can have it.
-    """
+    """Return a session name after checking it. An empty name is allowed."""
     if not re.fullmatch("[A-Za-z0-9_-]{0,64}", name):
         raise UserError(
-            f"no session can be called {name!r}; use up to 64 letters, digits, '-' and '_'"
+            f"{name!r} is not a session name; use up to 64 letters, digits, '-' and '_'"
         )
     return name
 
@@ -234,14 +235,12 @@ def _is_drop(name: str) -> bool:
 
 
 def control_address(given: str) -> str:
-    """Return where control is: as told, else the user's newest system, else the default.
+    """Return the address of control, followed by its public key unless connections are insecure.
 
-    Its public key follows the address, unless all is plain.
+    Without ``given`` and without a setting, it is that of the user's newest system.
     """
     settings, overrides = read_settings(), {"control": given} if given else {}
-    (setting,) = (
-        each for each in settings.describe(ServiceConfig, overrides) if each.key == "control"
-    )
+    keys = {setting.key: setting for setting in settings.describe(ServiceConfig, overrides)}
+    running = find_control() if keys["control"].is_default else ""
     config = settings.load(ServiceConfig, overrides)
-    found = find_control() if setting.is_default else ""
-    return found or control_endpoint(config.control, insecure=config.insecure)
+    return running or control_endpoint(config.control, insecure=config.insecure)

@@ -10,36 +10,31 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kouxing.services.cli.options import ConfigFile
+from kouxing.services.cli.options import ConfigFile, ServiceAssignments
 from kouxing.services.kinds import KINDS, read_settings
 from kouxing.shared.config import parse_assignments
 from kouxing.shared.errors import UserError, install_command
 
-Number = Annotated[int | None, typer.Option(min=0, max=1000, help="How many are to run.")]
+Number = Annotated[int | None, typer.Option(min=0, max=1000, help="Number of workers to run.")]
 
 
 def cluster(
     recognizers: Number = None,
     synthesizers: Number = None,
     address: Annotated[
-        str, typer.Option(help="Address of the Ray cluster; auto: the one that this host is in.")
+        str, typer.Option(help="Address of the Ray cluster; 'auto' is the cluster of this host.")
     ] = "auto",
     config: ConfigFile = None,
-    assignments: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="SERVICE.KEY=VALUE", help="Set one key of new workers; repeatable."
-        ),
-    ] = None,
+    assignments: ServiceAssignments = None,
 ) -> None:
-    """Run so many recognizers and synthesizers on a Ray cluster; without numbers, list them."""
+    """Start or stop workers on a Ray cluster until their numbers are right, then list them."""
     settings = read_settings(config, parse_assignments(assignments or []))
     try:
         from kouxing.services.cli.ray_workers import RayWorkers
     except ModuleNotFoundError:
         command = install_command("kouxing[cluster]")
         raise UserError(
-            f"Ray is missing: {command}; the same on every host of the cluster"
+            f"Ray is not installed; on every host of the cluster, run: {command}"
         ) from None
     with RayWorkers(address) as workers:
         for name, number in (("recognizer", recognizers), ("synthesizer", synthesizers)):

@@ -23,12 +23,12 @@ from kouxing.shared.keys import (
 )
 from kouxing.shared.terminal import print_message
 
-app = typer.Typer(no_args_is_help=True, help="Who may connect to the services.")
+app = typer.Typer(no_args_is_help=True, help="Keys that may connect to the services.")
 
 
 @app.command()
 def init() -> None:
-    """Make all keys of a system on this machine: of its services and of your commands."""
+    """Create all keys of a system on this machine: those of its services and of your commands."""
     for kind in KINDS.values():
         own_key(kind.name, kind.key_roles)
     user_key()
@@ -37,20 +37,20 @@ def init() -> None:
 
 @app.command()
 def add(
-    name: Annotated[str, typer.Argument(help="Whose key it is: a machine, a program, a person.")],
+    name: Annotated[str, typer.Argument(help="Name of a machine, program or person.")],
     roles: Annotated[
         list[str] | None,
         typer.Option(
             "--role",
-            help="client (if none is given), operator, service:KIND, subscriber:SESSION or"
+            help="client (the default), operator, service:KIND, subscriber:SESSION or"
             " 'subscriber:*'; repeatable.",
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="File to write; else NAME.key.")
+        Path | None, typer.Option("--output", "-o", help="File to write; by default NAME.key.")
     ] = None,
 ) -> None:
-    """Make a key for another machine and allow it at once."""
+    """Create a key for another machine, and allow it at once."""
     roles = roles or [CLIENT]
     path = output or Path(f"{name}.key")
     add_guest(name, roles, path)
@@ -63,7 +63,7 @@ def add(
 
 @app.command("list")
 def list_keys() -> None:
-    """Show the keys that are allowed, with their roles."""
+    """List the allowed keys with their roles."""
     table = Table("name", "roles", "public key", box=box.SIMPLE)
     for public, guest in sorted(read_guests().items(), key=lambda item: item[1].name):
         table.add_row(guest.name, escape(", ".join(guest.roles)), escape(public))
@@ -71,7 +71,7 @@ def list_keys() -> None:
 
 
 @app.command()
-def revoke(name: Annotated[str, typer.Argument(help="As 'kouxing keys list' shows it.")]) -> None:
-    """Allow a key no longer; its connections end at once."""
+def revoke(name: Annotated[str, typer.Argument(help="Name in 'kouxing keys list'.")]) -> None:
+    """Revoke a key. Its connections end at once."""
     revoke_guest(name)
-    print_message(f"{name} is allowed no longer")
+    print_message(f"revoked the key of {name}")

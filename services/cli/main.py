@@ -19,14 +19,14 @@ from kouxing.services.kinds import KINDS
 from kouxing.shared.errors import UserError
 from kouxing.shared.terminal import CONSOLE
 
-SERVICES = "One service alone (run starts them all)"
-ENTRY_POINTS = "kouxing.commands"  # each a typer.Typer, such as those of training and evaluation
+SERVICES = "A single service (run starts all of them)"
+ENTRY_POINTS = "kouxing.commands"  # such as those of training and evaluation
 
 
 class CommandGroup(TyperGroup):
-    """The commands of this package, and those that others add as entry points.
+    """The commands of this package, and those that other packages add as entry points.
 
-    Entry points are imported only if the command is none of this package, or help lists all.
+    Entry points are imported only for their own commands and for the list of all commands.
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -88,10 +88,10 @@ for kind in KINDS.values():
 
 
 def main() -> None:
-    """Run the command line; a user's mistake is one line on standard error and status 2."""
+    """Run the command line. A user error gives one line on standard error and exit status 2."""
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as in `kouxing phones my.wav | head`
     if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)  # progress shows in a log file, too
+        sys.stdout.reconfigure(line_buffering=True)  # also when it is a log file
     try:
         app(prog_name="kouxing")
     except UserError as error:

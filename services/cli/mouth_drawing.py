@@ -1,12 +1,14 @@
-"""The 2-D mouth of a sound: videos, pictures of the key frames, and tables of the contour.
+"""``kouxing lips``: the 2-D mouth of a sound, as a video, a picture of key frames, or a table.
 
-What Zhang et al. 2021 do: text and its timing give key frames of the opening R, these R(t), and
-that the contour.
+The method is that of Zhang et al. 2021. A text and its timing give key frames of the opening R.
+Interpolation gives R(t), and R(t) gives the contour.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,18 +34,37 @@ from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
+from kouxing.shared.phones.syllables import group_syllables
 from kouxing.shared.phones.transcript import TimedSyllable, Transcript
-from kouxing.shared.terminal import CONSOLE, check_output, print_message, write_text
+from kouxing.shared.terminal import CONSOLE, cannot_write, check_output, print_message, write_text
 
-Span = tuple[float, float, str]  # from, to (seconds): what is said
+Span = tuple[float, float, str]  # start and end in seconds, and the label
 
 FRAME_RATE_HZ = 25.0
-SUFFIXES = (".svg", ".png", ".mp4", ".csv")
 CSV_COLUMNS = ("time_s", "opening", "line", "point", "x", "y")
 _VIDEO_SIZE_PX = (640, 480)
-_MOUTHS_A_ROW, _MOUTH_PX = 8, 150.0
-_MAX_MOUTHS = 400  # of one picture
-_BLOCK = 250  # frames whose contours are computed at once
+_MOUTHS_PER_ROW, _MOUTH_PX = 8, 150.0
+_MAX_MOUTHS = 400  # in one picture
+_BLOCK_FRAMES = 250  # number of contours to compute at once
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Mouth:
+    """The motion of a mouth, and what the drawing says about it."""
+
+    samples: NDArray[np.float32]  # 16 kHz mono, shape (n,)
+    phones: Sequence[Phone]
+    syllables: Sequence[TimedSyllable]
+    key_frames: KeyFrames
+    silence: str
+    smooth: bool  # whether the velocity of the opening is continuous
+    num_points: int  # of each line of the contour, in a table
+
+    def sample(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the times of the video's frames, and the opening at each of them."""
+        num_frames = int(len(self.samples) / MEDIA_RATE_HZ * FRAME_RATE_HZ) + 1
+        times_s = np.arange(num_frames) / FRAME_RATE_HZ
+        return times_s, self.key_frames.openings_at(times_s, smooth=self.smooth)
 
 
 def draw_mouth(
@@ -56,89 +77,65 @@ def draw_mouth(
     num_points: int = 21,
     speech_to_text: Path | None = None,
 ) -> None:
-    """Write the mouth of a sound; the suffix of ``output`` tells how.
+    """Draw the mouth of a sound, in the format of the output's suffix.
 
     Parameters
     ----------
     source
         A sound file.
     text
-        What is said; None: the phones are recognised.
+        The spoken text. If None, phones are recognized.
     output
-        ``.svg`` or ``.png``: the mouths at the key frames; ``.mp4``: a video with sound; ``.csv``:
-        the contour of every frame.
+        ``.svg`` or ``.png`` for the mouths at the key frames, ``.mp4`` for a video with sound, or
+        ``.csv`` for the contour of every frame.
     timing
-        For a text; None: by endpoints.
+        How to time a text. If None, by endpoints.
     smooth
-        Whether the opening has a continuous velocity between key frames.
+        Whether the velocity of the opening is continuous at key frames.
     num_points
-        Of each line, in a ``.csv``.
+        Number of points of each line, in a ``.csv``.
     speech_to_text
-        Folder of a model that tells what is said, instead of ``text``.
+        Folder of a model that recognizes the text.
 
     Raises
     ------
     UserError
         If a file cannot be read or written, or the options do not fit each other.
     """
-    kind = output.suffix.lower()
-    if kind not in SUFFIXES:
-        raise UserError(f"{output}: give a name that ends in {', '.join(SUFFIXES)}")
+    write = _WRITERS.get(output.suffix.lower())
+    if write is None:
+        raise UserError(f"{output}: give a name that ends in {', '.join(_WRITERS)}")
     if text is not None and speech_to_text is not None:
-        raise UserError("give a text or --speech-to-text, not both")
+        raise UserError("give either a text or --speech-to-text")
     if text is None and speech_to_text is None and timing is not None:
-        raise UserError("--timing is for a text; give what is said, before the output's name")
+        raise UserError("--timing is for a text; give the spoken text before the output file")
     check_output(output)
     samples = read_mono_16k(source)
     inventory = load_inventory()
     if speech_to_text is not None:
-        text = _recognised_text(source, samples, speech_to_text)
+        text = SherpaTranscriber(speech_to_text).transcribe(samples) or None
+        print_message(f"{source}: {text or 'no words were recognized'}")
     transcript = None if text is None else read_text(text, inventory)
     with CONSOLE.status(f"timing {len(samples) / MEDIA_RATE_HZ:.0f} s"):
-        phones = spoken(
-            _timed_phones(source, samples, transcript, timing or Timing.ENDPOINTS), inventory
-        )
+        timed = _time_phones(source, samples, transcript, timing or Timing.ENDPOINTS)
+    phones = spoken(timed, inventory)
     if not phones:
         print_message(f"{source}: no speech was found; the mouth stays closed")
-    motion = key_frames_of(phones, load_table(inventory), inventory.silence)
-    if kind == ".csv":
-        num_frames = _write_csv(output, motion, len(samples), num_points, smooth=smooth)
-        print_message(f"wrote {output}: {num_frames} frames")
-        return
-    syllables = (
-        timed_syllables(phones, transcript, inventory)
-        if transcript is not None
-        else _recognised_syllables(phones, inventory)
+    mouth = _Mouth(
+        samples=samples,
+        phones=phones,
+        syllables=_label_syllables(phones, transcript, inventory),
+        key_frames=key_frames_of(phones, load_table(inventory), inventory.silence),
+        silence=inventory.silence,
+        smooth=smooth,
+        num_points=num_points,
     )
-    labels = _labels(syllables, are_pixels=kind != ".svg")
-    if kind == ".mp4":
-        num_frames = _write_video(output, motion, phones, labels, samples, smooth=smooth)
-        print_message(f"wrote {output}: {num_frames} images, {len(phones)} phones")
-    else:
-        moments = key_moments(motion, phones, labels, inventory.silence)
-        if len(moments) > _MAX_MOUTHS:
-            raise UserError(
-                f"{source} needs {len(moments)} mouths, one picture holds {_MAX_MOUTHS}; cut it,"
-                " or write .mp4 or .csv"
-            )
-        picture = drawing.strip(moments, _MOUTHS_A_ROW, _MOUTH_PX)
-        if kind == ".svg":
-            write_text(output, drawing.svg(picture))
-        else:
-            write_picture(output, drawing.rasterize(picture))
-        print_message(f"wrote {output}: {len(moments)} key frames, {len(phones)} phones")
+    print_message(f"wrote {output}: {write(output, mouth)}")
 
 
-def _recognised_text(source: Path, samples: NDArray[np.float32], model: Path) -> str | None:
-    text = SherpaTranscriber(model).transcribe(samples)
-    print_message(f"{source}: {text or 'no words were recognised'}")
-    return text or None
-
-
-def _timed_phones(
+def _time_phones(
     source: Path, samples: NDArray[np.float32], transcript: Transcript | None, timing: Timing
 ) -> list[Phone]:
-    """Return the phones of a sound, 16 kHz mono, shape (n,); recognise them without a text."""
     if transcript is not None and timing is Timing.ENDPOINTS:
         return time_text(progress_of(samples), transcript.phones, load_table(load_inventory()))
     model = load_live_model()
@@ -150,130 +147,123 @@ def _timed_phones(
     return alignment.phones
 
 
-def key_moments(
-    motion: KeyFrames, phones: Sequence[Phone], labels: Sequence[Span], silence: str
-) -> list[drawing.Moment]:
-    """Return the key frames of phones; closed mouths before and after speech have no phone."""
+def _label_syllables(
+    phones: Sequence[Phone], transcript: Transcript | None, inventory: PhoneInventory
+) -> list[TimedSyllable]:
+    """Return the syllables of the text, or those of recognized phones, which have no tones."""
+    if transcript is not None:
+        return timed_syllables(phones, transcript, inventory)
+    syllables = []
+    for group in group_syllables(phones, inventory):
+        spelling = inventory.spell(tuple(phone.symbol for phone in group))
+        onset_s = group[0].onset_s
+        duration_s = group[-1].onset_s + group[-1].duration_s - onset_s
+        syllables.append(TimedSyllable(spelling, spelling, onset_s, duration_s))
+    return syllables
+
+
+def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
+    """Return the label of each syllable: its characters, if they can be drawn, and its spelling."""
+    texts = [item.text for item in mouth.syllables if item.text != item.spelling]
+    shows_text = not are_pixels or drawing.can_draw("".join(texts))
+    if not shows_text:
+        print_message(
+            "labels are only pinyin: no font with Chinese characters was found (Debian: install"
+            " fonts-noto-cjk)"
+        )
+    return [
+        (
+            item.onset_s,
+            item.onset_s + item.duration_s,
+            f"{item.text} {item.spelling}"
+            if shows_text and item.text != item.spelling
+            else item.spelling,
+        )
+        for item in mouth.syllables
+    ]
+
+
+def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.Moment]:
+    """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
-    anchors = anchors_of(phones, silence) or [(0.0, silence)]
+    anchors = anchors_of(mouth.phones, mouth.silence) or [(0.0, mouth.silence)]
     return [
         drawing.Moment(
             time_s,
             float(opening),
-            "" if phone == silence else phone,
+            "" if phone == mouth.silence else phone,
             syllables.get(time_s, ""),
         )
-        for (time_s, phone), opening in zip(anchors, motion.openings, strict=True)
+        for (time_s, phone), opening in zip(anchors, mouth.key_frames.openings, strict=True)
         if time_s >= 0.0
     ]
 
 
-def syllables_of(phones: Sequence[Phone], inventory: PhoneInventory) -> list[list[Phone]]:
-    """Group phones, in order and without pauses, by their syllables."""
-    syllables: list[list[Phone]] = []
-    for phone in phones:
-        follows_initial = syllables and syllables[-1][-1].symbol in inventory.initials
-        if follows_initial and phone.symbol in inventory.vowels:
-            syllables[-1].append(phone)
-        else:
-            syllables.append([phone])
-    return syllables
-
-
-def _recognised_syllables(
-    phones: Sequence[Phone], inventory: PhoneInventory
-) -> list[TimedSyllable]:
-    """Return the syllables of recognised phones, which have no tones."""
-    timed = []
-    for syllable in syllables_of(phones, inventory):
-        spelling = inventory.spell(tuple(phone.symbol for phone in syllable))
-        end_s = syllable[-1].onset_s + syllable[-1].duration_s
-        onset_s = syllable[0].onset_s
-        timed.append(TimedSyllable(spelling, spelling, onset_s, end_s - onset_s))
-    return timed
-
-
-def _labels(syllables: Sequence[TimedSyllable], *, are_pixels: bool) -> list[Span]:
-    """Return onset, end and label of each syllable: what is written, and its spelling.
-
-    A picture of pixels needs a font for characters; without one, the spelling stands alone.
-    """
-    texts = [one.text for one in syllables if one.text != one.spelling]
-    shows_text = not are_pixels or drawing.can_draw("".join(texts))
-    if not shows_text:
-        print_message(
-            "labels are pinyin alone: no font with Chinese characters was found (Debian: "
-            "fonts-noto-cjk)"
+def _write_picture(output: Path, mouth: _Mouth) -> str:
+    is_svg = output.suffix.lower() == ".svg"
+    moments = _key_moments(mouth, _labels(mouth, are_pixels=not is_svg))
+    if len(moments) > _MAX_MOUTHS:
+        raise UserError(
+            f"{output}: a picture holds {_MAX_MOUTHS} mouths, but this sound has {len(moments)};"
+            " cut the sound, or write .mp4 or .csv"
         )
-    return [
-        (
-            one.onset_s,
-            one.onset_s + one.duration_s,
-            f"{one.text} {one.spelling}"
-            if shows_text and one.text != one.spelling
-            else one.spelling,
-        )
-        for one in syllables
+    picture = drawing.strip(moments, _MOUTHS_PER_ROW, _MOUTH_PX)
+    if is_svg:
+        write_text(output, drawing.svg(picture))
+    else:
+        write_picture(output, drawing.rasterize(picture))
+    return f"{len(moments)} key frames, {len(mouth.phones)} phones"
+
+
+def _write_video(output: Path, mouth: _Mouth) -> str:
+    labels = _labels(mouth, are_pixels=True)
+    symbols = [
+        (phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in mouth.phones
     ]
-
-
-def _write_video(
-    output: Path,
-    motion: KeyFrames,
-    phones: Sequence[Phone],
-    labels: Sequence[Span],
-    samples: NDArray[np.float32],
-    *,
-    smooth: bool,
-) -> int:
-    symbols = [(phone.onset_s, phone.onset_s + phone.duration_s, phone.symbol) for phone in phones]
-    times_s = _frame_times(len(samples))
-    openings = motion.openings_at(times_s, smooth=smooth)
+    times_s, openings = mouth.sample()
+    frames = list(zip(times_s.tolist(), openings.tolist(), strict=True))
     with (
         VideoWriter(output, *_VIDEO_SIZE_PX, FRAME_RATE_HZ, MEDIA_RATE_HZ) as writer,
         Progress(console=CONSOLE, transient=True, disable=not CONSOLE.is_interactive) as progress,
     ):
-        writer.write_sound(samples)
-        for time_s, opening in progress.track(
-            list(zip(times_s.tolist(), openings.tolist(), strict=True)), description="drawing"
-        ):
+        writer.write_sound(mouth.samples)
+        for time_s, opening in progress.track(frames, description="drawing"):
             moment = drawing.Moment(
-                time_s, opening, _spoken_at(time_s, symbols), _spoken_at(time_s, labels)
+                time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels)
             )
             writer.write_image(drawing.rasterize(drawing.image(moment, *_VIDEO_SIZE_PX)))
-    return len(times_s)
+    return f"{len(frames)} images, {len(mouth.phones)} phones"
 
 
-def _spoken_at(time_s: float, spans: Sequence[Span]) -> str:
-    return next((text for start_s, end_s, text in spans if start_s <= time_s < end_s), "")
+def _label_at(time_s: float, spans: Sequence[Span]) -> str:
+    return next((label for start_s, end_s, label in spans if start_s <= time_s < end_s), "")
 
 
-def _write_csv(
-    output: Path, motion: KeyFrames, num_samples: int, num_points: int, *, smooth: bool
-) -> int:
-    times_s = _frame_times(num_samples)
+def _write_csv(output: Path, mouth: _Mouth) -> str:
+    times_s, openings = mouth.sample()
     try:
-        with output.open("w", encoding="utf-8") as file:
-            file.write(",".join(CSV_COLUMNS) + "\n")
-            for first in range(0, len(times_s), _BLOCK):
-                block_s = times_s[first : first + _BLOCK]
-                openings = motion.openings_at(block_s, smooth=smooth)
-                file.writelines(_csv_rows(block_s, openings, num_points))
+        with output.open("w", encoding="utf-8", newline="") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(CSV_COLUMNS)
+            for first in range(0, len(times_s), _BLOCK_FRAMES):
+                block = slice(first, first + _BLOCK_FRAMES)
+                contours = contour(openings[block], mouth.num_points)
+                for time_s, opening, lines in zip(
+                    times_s[block], openings[block], contours, strict=True
+                ):
+                    table.writerows(
+                        (f"{time_s:.3f}", f"{opening:.4f}", name, number, f"{x:.5f}", f"{y:.5f}")
+                        for name, line in zip(LINES, lines, strict=True)
+                        for number, (x, y) in enumerate(line)
+                    )
     except OSError as error:
-        raise UserError(f"{output}: cannot be written: {error.strerror}") from None
-    return len(times_s)
+        raise cannot_write(output, error) from None
+    return f"{len(times_s)} frames"
 
 
-def _csv_rows(
-    times_s: NDArray[np.float64], openings: NDArray[np.float64], num_points: int
-) -> Iterator[str]:
-    for time_s, opening, lines in zip(
-        times_s, openings, contour(openings, num_points), strict=True
-    ):
-        for name, line in zip(LINES, lines, strict=True):
-            for number, (x, y) in enumerate(line):
-                yield f"{time_s:.3f},{opening:.4f},{name},{number},{x:.5f},{y:.5f}\n"
-
-
-def _frame_times(num_samples: int) -> NDArray[np.float64]:
-    return np.arange(int(num_samples / MEDIA_RATE_HZ * FRAME_RATE_HZ) + 1) / FRAME_RATE_HZ
+_WRITERS: dict[str, Callable[[Path, _Mouth], str]] = {
+    ".svg": _write_picture,
+    ".png": _write_picture,
+    ".mp4": _write_video,
+    ".csv": _write_csv,
+}

@@ -139,7 +139,7 @@ class RayWorkers:
             ray.kill(actor)  # if it has no host yet, or did not finish
 
     def hosts(self) -> dict[str, str]:
-        """Return the host of each worker by name; empty while no core is free for it."""
+        """Return the host of each worker by name. While no core is free, the host is empty."""
         names = [name for kind in KINDS for name in _names(kind)]
         answers = {ray.get_actor(name).host.remote(): name for name in names}
         if not answers:

@@ -1,7 +1,7 @@
-"""Where a user's systems run, for commands that are told no address.
+"""The running systems of a user, for commands without an address.
 
-``kouxing run`` writes control's address to a file in a folder of the user's own, and holds a lock
-on the file for as long as it runs. The lock goes with the process, however that ends.
+``kouxing run`` writes control's address to a file in the user's own folder, and locks the file. The
+lock ends with the process, even if the process is killed.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def announce(control: str) -> Iterator[None]:
-    """Let commands of this user find a system while it runs.
+    """Let this user's commands find a system while it runs.
 
-    A machine on which that is impossible runs it all the same.
+    If the folder cannot be used, nothing is announced.
     """
     folder = _folder()
     if folder is None:
@@ -36,7 +36,7 @@ def announce(control: str) -> Iterator[None]:
 
 
 def find_control() -> str:
-    """Return where control of the user's newest running system takes commands; "": none runs."""
+    """Return the address of control in the user's newest running system, or an empty string."""
     folder = _folder()
     paths = [] if folder is None else folder.iterdir()
     for path in sorted(paths, key=lambda path: path.stat().st_mtime, reverse=True):
@@ -45,12 +45,12 @@ def find_control() -> str:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 return file.read()
-            path.unlink()  # its system is gone
+            path.unlink()  # its system has ended
     return ""
 
 
 def _folder() -> Path | None:
-    """Return a folder that only this user can write to, or None."""
+    """Return a folder that only this user can write to, or None if that is impossible."""
     root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     folder = Path(root) / f"kouxing-{os.getuid()}"
     try:

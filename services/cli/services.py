@@ -1,4 +1,4 @@
-"""One command per kind of service, and the options that services take."""
+"""One command per kind of service."""
 
 from __future__ import annotations
 

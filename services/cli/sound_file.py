@@ -1,4 +1,4 @@
-"""Sound files as the commands read them."""
+"""Reads sound files for commands."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from kouxing.shared.terminal import print_message
 
 
 def read_mono_16k(path: Path) -> NDArray[np.float32]:
-    """Return a file's samples as the recognizer processes them: 16 kHz mono, shape ``(n,)``.
+    """Return a file's samples as the recognizer uses them: 16 kHz mono, shape ``(n,)``.
 
-    Tells the user if the file is cut off or clipped.
+    Prints a message if the file is truncated or clipped.
 
     Raises
     ------

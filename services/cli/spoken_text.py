@@ -1,4 +1,4 @@
-"""The text of a recording as the commands read it."""
+"""Reads the text of a recording for commands."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ _MAX_BYTES = 1024 * 1024
 
 
 def read_text(text: str, inventory: PhoneInventory) -> Transcript:
-    """Read a text, or the file of that name; tell the user what was dropped.
+    """Return the syllables of a text or of a text file. Prints a message about ignored words.
 
     Raises
     ------
     UserError
-        If the file or the text cannot be read, or nothing is left of it.
+        If the file or the text cannot be read, or the text has no syllables.
     """
     transcript = inventory.read(text_of(text))
     if transcript.dropped:
         words = ", ".join(repr(word) for word in transcript.dropped)
-        print_message(f"left out of the text: {words}; write in characters how they are spoken")
+        print_message(f"ignored in the text: {words}; write them as they are spoken, in characters")
     if not transcript.syllables:
         raise UserError("the text is empty; give the words that are spoken")
     return transcript
 
 
 def does_not_fit(audio: Path, alignment: Alignment) -> str:
-    """Tell the user that a text does not fit a recording."""
+    """Return the message that a text does not fit a recording."""
     return (
-        f"{audio}: the text does not fit the sound (fit {alignment.fit:.2f}, {MIN_FIT} or more is"
-        " usual); is it what was said, all of it?"
+        f"{audio}: the text does not fit the sound (fit {alignment.fit:.2f}, normally at least"
+        f" {MIN_FIT}); check that the text is complete and is what was said"
     )
 
 
 def text_of(text: str) -> str:
-    """Return a text, or what the file of that name holds.
+    """Return a text, or the content of the text file of that name.
 
     Raises
     ------
@@ -52,11 +52,11 @@ def text_of(text: str) -> str:
             if path.suffix.lower() == ".txt":
                 raise UserError(f"{path}: there is no such file")
             return text
-    except (OSError, ValueError):  # too long for a name
+    except (OSError, ValueError):  # too long for a file name
         return text
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise UserError(f"{path}: this is no text of a recording; it is larger than 1 MiB")
+            raise UserError(f"{path}: a text file must not be larger than 1 MiB")
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as a text in UTF-8: {error}") from None
+        raise UserError(f"{path}: cannot be read as UTF-8 text: {error}") from None

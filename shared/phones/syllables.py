@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -112,3 +113,15 @@ class SyllableTrack:
             duration_s=max(0.0, last.onset_s + last.duration_s - first.onset_s),
             final=is_complete and all(phone.final for phone in phones),
         )
+
+
+def group_syllables(phones: Sequence[Phone], inventory: PhoneInventory) -> list[list[Phone]]:
+    """Group phones, in order and without pauses, by syllable."""
+    syllables: list[list[Phone]] = []
+    for phone in phones:
+        follows_initial = syllables and syllables[-1][-1].symbol in inventory.initials
+        if follows_initial and phone.symbol in inventory.vowels:
+            syllables[-1].append(phone)
+        else:
+            syllables.append([phone])
+    return syllables

@@ -133,7 +133,7 @@ def test_a_text_that_does_not_fit_is_told_and_fails(
         align(DEMO / "hello-female.wav", str(tmp_path / "wrong.txt"), output=output)
     assert ended.value.exit_code == 1
     told = capsys.readouterr().err
-    assert "left out of the text: 'Mike'" in told
+    assert "ignored in the text: 'Mike'" in told
     assert "does not fit" in told
     assert output.is_file()
 

@@ -37,7 +37,7 @@ def test_only_default_addresses_give_way_to_other_programs(host: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         chosen = read_settings(assignments={"gateway.port": str(port)})
-        with pytest.raises(UserError, match=f"gateway.port: another program has port {port}"):
+        with pytest.raises(UserError, match=f"gateway.port: another program uses port {port}"):
             available_addresses(chosen)
         chosen = read_settings(
             assignments={
