@@ -1,11 +1,13 @@
-"""How a recognizer goes on with a session of a lost one: from a time on, as if it had done it all.
+"""How a recognizer continues the session of a lost one.
 
-It works through some sound before that time, to know what the other knew: the networks look back
-2.5 s. Of that sound it says nothing. What the other said of later sound is void.
+It processes some audio again from before the time at which it continues, because the networks look
+back 2.5 s. It does not emit the results of that audio. Everything that the lost recognizer emitted
+for later audio is void.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TypeAlias
@@ -15,23 +17,67 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.live_decoder import StreamOutput
 from kouxing.shared.clock import MEDIA_RATE_HZ, to_samples
-from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange, Waveform
+from kouxing.shared.phones.events import (
+    EndOfSound,
+    LipFrame,
+    Phone,
+    Progress,
+    SoundEvent,
+    SpeechChange,
+    Waveform,
+)
+from kouxing.shared.phones.final_time import FinalTime
 
-WARM_UP_S = 2.8  # of sound before that time; docs/recognition.md tells how it was chosen
-# Sound begins at a multiple of this: of the voice detector's blocks, the networks' positions and
-# the feature frames, which then lie as in a session without a loss.
+WARM_UP_S = 2.8  # of audio before that time; docs/recognition.md says how this was chosen
+# Audio starts at a multiple of this time, which VAD blocks, network positions and feature frames
+# divide. So they are aligned as in a session without a loss.
 GRID_S = 0.16
+MAX_REPLAYED = 5000  # audio messages that a client keeps
 
 Chunk: TypeAlias = tuple[int, NDArray[np.float32]]  # media time; samples, (n, channels)
 
 
+class ReplayWindow:
+    """The audio messages that another recognizer would need to continue the session.
+
+    Attributes
+    ----------
+    last_droppable_sequence : int
+        Number of the newest message that no other recognizer would need.
+    """
+
+    def __init__(self) -> None:
+        self.last_droppable_sequence = 0
+        self._final = FinalTime()  # of the events that the synthesizer has
+        self._messages: deque[tuple[int, int]] = deque(maxlen=MAX_REPLAYED)  # sequence, end
+
+    @property
+    def final_time_s(self) -> float:
+        """Media time up to which the synthesizer has final phones."""
+        return self._final.time_s
+
+    def add(self, sequence: int, end: int) -> None:
+        """Add an audio message that ends at a media time in samples."""
+        self._messages.append((sequence, end))
+
+    def update(self, event: SoundEvent, newest_sequence: int) -> None:
+        """Drop the messages that are no longer needed once the synthesizer has an event."""
+        if isinstance(event, EndOfSound):
+            self.last_droppable_sequence = newest_sequence
+            return
+        self._final.update(event)
+        needed_from = to_samples(max(0.0, self._final.time_s - WARM_UP_S))
+        while self._messages and self._messages[0][1] <= needed_from:
+            self.last_droppable_sequence, _ = self._messages.popleft()
+
+
 class Resumption:
-    """Keeps back what was said already.
+    """Suppresses results that are already known.
 
     Parameters
     ----------
     time_s
-        Media time up to which phones are known: a phone whose middle lies before it is one of them.
+        Media time up to which phones are known, by the middle of the phone.
     silence
         The symbol of silence.
     """
@@ -39,64 +85,68 @@ class Resumption:
     def __init__(self, time_s: float, silence: str) -> None:
         self._time_s = time_s
         self._silence = silence
-        self._told: set[int] = set()  # indices of phones emitted, not yet final
-        self._is_speaking = False  # at the time, as far as known
-        self._has_begun = False
+        self._emitted: set[int] = set()  # indices of phones that were emitted, not yet final
+        self._is_speaking = False  # at ``time_s``, as far as known
+        self._is_aligned = False
+        self._has_emitted = False
 
-    def on_grid(self, chunk: Chunk, sample_rate_hz: int) -> Chunk:
-        """Leave out what is before the next multiple of ``GRID_S``; for chunks before the first."""
+    def align(self, chunk: Chunk, sample_rate_hz: int) -> Chunk:
+        """Drop the audio before the first multiple of ``GRID_S``; the result may be empty."""
         media_time, samples = chunk
+        if self._is_aligned:
+            return chunk
         num_skipped = -media_time % round(GRID_S * MEDIA_RATE_HZ)
         begin = min(len(samples), -(-num_skipped * sample_rate_hz // MEDIA_RATE_HZ))
+        self._is_aligned = begin < len(samples)
         return media_time + begin * MEDIA_RATE_HZ // sample_rate_hz, samples[begin:]
 
-    def pass_on(self, outputs: Iterable[StreamOutput]) -> list[StreamOutput]:
-        """Return what is new of a stream's outputs, first of all whether somebody speaks."""
-        passed: list[StreamOutput] = []
-        for output in outputs:
-            new = self._new_part_of(output)
+    def new_results(self, results: Iterable[StreamOutput]) -> list[StreamOutput]:
+        """Return a stream's results that are new, preceded by whether someone speaks."""
+        emitted: list[StreamOutput] = []
+        for result in results:
+            new = self._new_part(result)
             if new is None:
                 continue
-            if not self._has_begun:
-                self._has_begun = True
-                passed.append(SpeechChange(active=self._is_speaking, time_s=self._time_s))
-            passed.append(new)
-        return passed
+            if not self._has_emitted:
+                self._has_emitted = True
+                emitted.append(SpeechChange(active=self._is_speaking, time_s=self._time_s))
+            emitted.append(new)
+        return emitted
 
-    def _new_part_of(self, output: StreamOutput) -> StreamOutput | None:
-        match output:
+    def _new_part(self, result: StreamOutput) -> StreamOutput | None:
+        match result:
             case Phone():
-                return self._new_phone(output)
+                return self._new_phone(result)
             case SpeechChange():
-                return self._new_change(output)
+                return self._new_change(result)
             case Waveform():
-                return self._new_sound(output)
-        is_known = (isinstance(output, Progress) and output.time_s <= self._time_s) or (
-            isinstance(output, LipFrame) and output.time_s < self._time_s
+                return self._new_waveform(result)
+        is_known = (isinstance(result, Progress) and result.time_s <= self._time_s) or (
+            isinstance(result, LipFrame) and result.time_s < self._time_s
         )
-        return None if is_known else output
+        return None if is_known else result
 
     def _new_change(self, change: SpeechChange) -> SpeechChange | None:
-        if not self._has_begun and change.time_s <= self._time_s:
+        if not self._has_emitted and change.time_s <= self._time_s:
             self._is_speaking = change.active
             return None
         return replace(change, time_s=max(change.time_s, self._time_s))
 
-    def _new_sound(self, sound: Waveform) -> Waveform | None:
-        num_known = max(0, to_samples(self._time_s) - to_samples(sound.time_s))
+    def _new_waveform(self, waveform: Waveform) -> Waveform | None:
+        num_known = max(0, to_samples(self._time_s) - to_samples(waveform.time_s))
         if num_known == 0:
-            return sound
-        samples = sound.samples[num_known:]
+            return waveform
+        samples = waveform.samples[num_known:]
         return Waveform(time_s=self._time_s, samples=samples) if len(samples) else None
 
     def _new_phone(self, phone: Phone) -> Phone | None:
-        """Return a phone to emit; one that proves to be known already is withdrawn when final."""
+        """Return a new phone; one that turns out to be known is withdrawn when it is final."""
         is_new = phone.onset_s + phone.duration_s / 2 >= self._time_s
-        was_told = phone.index in self._told
+        was_emitted = phone.index in self._emitted
         if phone.final:
-            self._told.discard(phone.index)
+            self._emitted.discard(phone.index)
         elif is_new:
-            self._told.add(phone.index)
-        if is_new or (was_told and not phone.final):
+            self._emitted.add(phone.index)
+        if is_new or (was_emitted and not phone.final):
             return phone
-        return replace(phone, symbol=self._silence, duration_s=0.0) if was_told else None
+        return replace(phone, symbol=self._silence, duration_s=0.0) if was_emitted else None

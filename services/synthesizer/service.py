@@ -306,7 +306,7 @@ class SynthesizerService(Service):
             text = f"{event.symbol!r} is no phone of {language}"
             self.warn("unknown-phone", text, message.session)
             return
-        session.final.accept(event)
+        session.final.update(event)
         session.waiting.append(event)
         if len(session.waiting) == 1:
             self._make_frames(session)

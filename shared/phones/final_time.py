@@ -1,28 +1,28 @@
-"""Up to where a session's phones are final, so that another recognizer may go on from there."""
+"""The time up to which a session's phones are final, from which another recognizer may continue."""
 
 from __future__ import annotations
 
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 
-QUIET_S = 0.5  # speech that begins is told sooner after its first phone's onset
+QUIET_S = 0.5  # the start of speech is reported sooner after its first phone's onset than this
 
 
 class FinalTime:
-    """Follows a session's sound events; no phone that is still to come begins before ``time_s``.
+    """Follows a session's events; no later phone starts before ``time_s``.
 
     Attributes
     ----------
     time_s : float
-        End of the last final phone or time of the last change of speech, seconds of media time;
-        while nobody speaks, it follows the sound.
+        End of the last final phone or time of the last speech change, seconds of media time.
+        During silence, it follows the audio.
     """
 
     def __init__(self) -> None:
         self.time_s = 0.0
         self._is_speaking = False
 
-    def accept(self, event: SoundEvent) -> None:
-        """Take the next event."""
+    def update(self, event: SoundEvent) -> None:
+        """Process the next event."""
         time_s = 0.0
         if isinstance(event, SpeechChange):
             self._is_speaking, time_s = event.active, event.time_s

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.acoustic.load import load_model, model_path
 from kouxing.services.recognizer.acoustic.model_file import write_archive
 from kouxing.services.recognizer.lip_predictor import (
     CLOSURE,
@@ -17,6 +17,7 @@ from kouxing.services.recognizer.lip_predictor import (
     NUM_OUTPUTS,
     LipPredictor,
     features_at,
+    lip_predictor_for,
     load_lip_predictor,
     mouth_faps,
 )
@@ -144,6 +145,17 @@ def test_a_missing_array_or_delay_is_named(tmp_path: Path) -> None:
         load_lip_predictor(tmp_path / "bad.npz")
     with pytest.raises(UserError, match="no delay of 70 ms; choose -5, 55, 155"):
         MODEL.create_stream([0.07])
+
+
+def test_uses_the_predictor_only_with_its_network(tmp_path: Path) -> None:
+    path = tmp_path / "lips.npz"
+    MODEL.save(path)
+    assert lip_predictor_for(load_model(), path) is not None
+    assert lip_predictor_for(load_model(model_path("gmm")), path) is None
+    wider = np.pad(MODEL.projection, ((0, 2), (0, 0)))
+    mean = np.pad(MODEL.feature_mean, (0, 2))
+    write_archive(path, {**arrays_of(MODEL), "projection": wider, "feature_mean": mean})
+    assert lip_predictor_for(load_model(), path) is None
 
 
 def test_the_shipped_lips_open_round_and_close() -> None:

@@ -1,7 +1,7 @@
-"""A session's messages to its synthesizer, and what a new synthesizer needs to go on.
+"""A session's messages to its synthesizer.
 
-A face shows what it was told lately. A synthesizer that takes the place of a lost one is told the
-newest frame that was shown, then the last seconds of messages once more.
+A new synthesizer in place of a lost one must continue the face. It gets the newest frame that was
+published, and the messages of the last seconds again.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from kouxing.shared.reliable import ReliableSender
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AcknowledgePhones, NewestFrame, ResumeFace, Speech
 
-KEPT = to_samples(3.0)  # samples of media time whose messages a new synthesizer is told
+KEPT = to_samples(3.0)  # media time of the messages that a new synthesizer gets, samples
 
 
 class SynthesizerLink:
-    """Sends to one synthesizer after the other, and keeps what the next one needs."""
+    """Sends to the session's current synthesizer, and keeps what a new one needs."""
 
     def __init__(self) -> None:
         self._sender: ReliableSender | None = None
-        self._kept: deque[Message] = deque()  # acknowledged ones of the last KEPT samples
-        self._speech: Speech | None = None  # the newest one before them
+        self._kept: deque[Message] = deque()  # acknowledged messages of the last KEPT samples
+        self._speech: Speech | None = None  # the newest one before those
         self._newest_frame: NewestFrame | None = None  # that the synthesizer has published
 
     @property
     def backlog(self) -> int:
-        """Number of messages not acknowledged yet."""
+        """Number of messages that are not acknowledged yet."""
         return self._sender.backlog if self._sender is not None else 0
 
     def connect(self, socket: Socket, session: str, epoch: int, now_s: float) -> None:
-        """Send to a synthesizer from now on; first what a new one needs."""
+        """Send to this synthesizer from now on, first what a new one needs."""
         messages = [*self._kept, *(self._sender.unacknowledged if self._sender is not None else ())]
         self._kept.clear()
         self._sender = ReliableSender(socket, session, epoch)
@@ -45,7 +45,7 @@ class SynthesizerLink:
                 self._sender.send(message, now_s)
 
     def disconnect(self) -> None:
-        """Send nothing any more."""
+        """Stop sending."""
         self._sender = None
         self.forget()
 
@@ -55,23 +55,23 @@ class SynthesizerLink:
             self._sender.send(message, now_s)
 
     def acknowledge(self, ack: AcknowledgePhones, now_s: float) -> list[Message]:
-        """Return the messages that the synthesizer has now."""
+        """Return the messages that the synthesizer has newly acknowledged."""
         if self._sender is None or ack.epoch != self._sender.epoch:
             return []
         self._newest_frame = ack.newest_frame or self._newest_frame
-        known = self._sender.acknowledge(ack.sequence, now_s)
-        self._kept.extend(each for each in known if not isinstance(each, ResumeFace))
+        messages = self._sender.acknowledge(ack.sequence, now_s)
+        self._kept.extend(message for message in messages if not isinstance(message, ResumeFace))
         while self._kept and self._kept[0].media_time < self._kept[-1].media_time - KEPT:
             oldest = self._kept.popleft()
             if isinstance(oldest, Speech):
                 self._speech = oldest
-        return known
+        return messages
 
     def forget(self) -> None:
-        """Keep nothing of what came before an interruption."""
+        """Forget all messages before an interruption."""
         self._kept.clear()
         self._speech = None
 
     def tick(self, now_s: float) -> int:
-        """Repeat what is not acknowledged after too long; return the number of messages."""
+        """Resend messages that were not acknowledged in time; return their number."""
         return self._sender.tick(now_s) if self._sender is not None else 0

@@ -1,0 +1,239 @@
+"""One session of the recognizer service: its audio, its stream and its synthesizer."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import replace
+
+from kouxing.services.recognizer.audio_order import AudioOrder
+from kouxing.services.recognizer.front_end.pcm import BadAudio, pcm16_of, samples_of
+from kouxing.services.recognizer.lip_frames import LipFrameModel
+from kouxing.services.recognizer.live_decoder import StreamOutput
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.resumption import Chunk, ReplayWindow, Resumption
+from kouxing.services.recognizer.stream import SpeechStream
+from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
+from kouxing.shared.bus import Socket
+from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
+from kouxing.shared.errors import UserError
+from kouxing.shared.keys import NOBODY
+from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange, Waveform
+from kouxing.shared.wire.audio import AudioChunk, Sound
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.events import SpeechMessage, event_of, message_of
+from kouxing.shared.wire.face import CurrentFace
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import ErrorCode
+from kouxing.shared.wire.speech import AcknowledgePhones, AudioState, Progress
+
+MAX_MEDIA_TIME = 2**40  # samples: two years
+MAX_LEAD_S = 15.0  # of a paced client ahead of the clock; a delayed one may catch up as much
+ACKNOWLEDGE_EVERY_S = 0.1  # to a client that sends audio
+STALLED_AFTER_S = 0.2  # without audio of a live client
+_CLIENT_CLOCK_RATE = 1.01  # a client's clock may be faster than this one
+
+
+class AudioRejected(Exception):
+    """A client's audio message is rejected; the client gets the code and the text."""
+
+    def __init__(self, code: ErrorCode, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class RecognizerSession:
+    """A session's state.
+
+    Parameters
+    ----------
+    start
+        Control's message.
+    stream
+        The session's stream.
+    socket
+        Where its audio arrives.
+    resumption
+        What to suppress, if another recognizer has lost the session.
+    now_s
+        Time of the monotonic clock.
+    """
+
+    def __init__(
+        self,
+        start: StartSession,
+        stream: SpeechStream,
+        socket: Socket,
+        resumption: Resumption | None,
+        now_s: float,
+    ) -> None:
+        self.start = start
+        self.first_epoch = start.epoch
+        self.face = CurrentFace(start.face, now_s)
+        self.stream = stream
+        self.socket = socket
+        self.resumption = resumption
+        self.link = SynthesizerLink()
+        self.replay_window = ReplayWindow()
+        self.order = AudioOrder()
+        self.client = NOBODY  # sender of the newest audio
+        self.mouth_profile_error = ""  # why the profile is not used; empty once reported
+        self.end: AudioChunk | None = None  # the last chunk, if it has arrived
+        self.is_finished = False  # all audio up to the end is decoded
+        self.last_audio_s = now_s
+        self.without_audio_s = 0.0  # time in which this process could receive audio and did not
+        self.acknowledge_due_s: float | None = None
+        self.acknowledged_s = 0.0
+        self.sequence_out = 0
+        self.num_gaps_counted = 0
+        self.overdue_since_s: float | None = None  # the synthesizer's acknowledgements
+        # After a loss, the client sends the audio that it kept in the meantime.
+        self._lead = _LeadLimit(now_s, may_catch_up=start.epoch > 1)
+
+    @property
+    def name(self) -> str:
+        """The session's name."""
+        return self.start.session
+
+    @property
+    def received_sequence(self) -> int:
+        """Number of the newest audio message that the client need not resend."""
+        if self.end is None or self.is_finished:
+            return self.order.last
+        return min(self.order.last, self.end.sequence - 1)
+
+    def check_sender(self, message: AudioChunk, socket: Socket) -> None:
+        """Raise ``AudioRejected`` if the sender may not send this message here."""
+        if not secrets.compare_digest(self.start.token.encode(), message.token.encode()):
+            text = f"the token is not that of session {self.name!r}"
+            raise AudioRejected(ErrorCode.BAD_TOKEN, text)
+        if socket is not self.socket:
+            text = f"send the audio of session {self.name!r} to the endpoint in session-opened"
+            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+        if message.sequence == 0:
+            text = "the message has no sequence; number audio messages from 1"
+            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+
+    def check_open(self, message: AudioChunk) -> None:
+        """Raise ``AudioRejected`` if the session has ended or the media time is impossible."""
+        if message.media_time > MAX_MEDIA_TIME:
+            text = f"media_time {message.media_time} is too large; count samples at 16 kHz from 0"
+            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+        if self.end is not None:
+            text = f"session {self.name!r} has ended; open another"
+            raise AudioRejected(ErrorCode.FINISHED, text)
+
+    def read_chunk(self, chunk: AudioChunk, now_s: float) -> Chunk | None:
+        """Return the audio of a message in order; None if all of it is to be skipped.
+
+        Raises
+        ------
+        AudioRejected
+            If the audio is not valid, or too early.
+        """
+        rate_hz, media_time = self.start.sample_rate_hz, chunk.media_time
+        try:
+            samples = samples_of(chunk.pcm, self.start.encoding, self.start.num_channels)
+        except BadAudio as error:
+            raise AudioRejected(ErrorCode.BAD_AUDIO, str(error)) from None
+        duration_s = len(samples) / rate_hz
+        if self.start.paced and not self._lead.allows(to_seconds(media_time), duration_s, now_s):
+            text = (
+                f"the audio is more than {MAX_LEAD_S:g} s ahead of the clock; to send faster than "
+                "real time, open the session with paced = false"
+            )
+            raise AudioRejected(ErrorCode.BAD_AUDIO, text)
+        end = media_time + len(samples) * MEDIA_RATE_HZ // rate_hz
+        self.replay_window.add(chunk.sequence, end)
+        if self.resumption is None:
+            return media_time, samples
+        aligned = self.resumption.align((media_time, samples), rate_hz)
+        return aligned if len(aligned[1]) else None
+
+    def becomes_stalled(self, tick_s: float) -> bool:
+        """Count time in which no audio arrived; return whether a live client has now stalled."""
+        before_s, self.without_audio_s = self.without_audio_s, self.without_audio_s + tick_s
+        is_live = self.start.paced and not self.is_finished
+        return is_live and before_s <= STALLED_AFTER_S < self.without_audio_s
+
+    def request_acknowledgement(self, now_s: float, *, at_once: bool) -> None:
+        """Schedule an acknowledgement to the client."""
+        due_s = now_s if at_once else self.acknowledged_s + ACKNOWLEDGE_EVERY_S
+        self.acknowledge_due_s = min(self.acknowledge_due_s or due_s, due_s)
+
+    def new_results(self, recognizer: Recognizer) -> list[StreamOutput]:
+        """Return the stream's new results, without those that a lost recognizer has emitted."""
+        results = recognizer.get_result(self.stream)
+        return results if self.resumption is None else self.resumption.new_results(results)
+
+    def published_message(self, result: StreamOutput) -> Message | None:
+        """Return the message of a result for subscribers; None if they do not get it."""
+        message: Message
+        if isinstance(result, Waveform):
+            message = Sound(media_time=to_samples(result.time_s), pcm=pcm16_of(result.samples))
+        elif isinstance(result, Phone | LipFrame | SpeechChange):
+            message = message_of(result)
+        else:
+            return None
+        self.sequence_out += 1
+        return replace(
+            message, session=self.name, epoch=self.start.epoch, sequence=self.sequence_out
+        )
+
+    def on_acknowledge(self, ack: AcknowledgePhones, now_s: float) -> None:
+        """Process the synthesizer's acknowledgement."""
+        for message in self.link.acknowledge(ack, now_s):
+            is_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED
+            if isinstance(message, SpeechMessage) and not is_stalled:
+                self.replay_window.update(event_of(message), self.order.last)
+
+
+def create_session(
+    start: StartSession,
+    recognizer: Recognizer,
+    lips: LipFrameModel | None,
+    socket: Socket,
+    now_s: float,
+) -> RecognizerSession:
+    """Create a session, with its own mouth profile if that fits."""
+    mouth_profile_error = ""
+    if start.mouth_profile is not None:
+        try:
+            if lips is None:
+                raise UserError("this recognizer has no lip predictor")
+            lips = lips.with_mouth_profile(start.mouth_profile)
+        except UserError as error:
+            mouth_profile_error = f"the mouth profile is not used: {error}"
+    stream = recognizer.create_stream(
+        sample_rate_hz=start.sample_rate_hz,
+        num_channels=start.num_channels,
+        lips=lips,
+        face_delay_s=(start.facts.delay_ms or 0.0) / 1e3,
+        speech_time=start.speech_time or 0,
+    )
+    resumption = None
+    if start.media_time:
+        silence = recognizer.model.inventory.silence
+        resumption = Resumption(to_seconds(start.media_time), silence)
+    session = RecognizerSession(start, stream, socket, resumption, now_s)
+    session.mouth_profile_error = mouth_profile_error
+    return session
+
+
+class _LeadLimit:
+    """Limits how far a paced client's audio is ahead of the clock."""
+
+    def __init__(self, now_s: float, *, may_catch_up: bool) -> None:
+        self._lead_s, self._updated_s = -MAX_LEAD_S if may_catch_up else 0.0, now_s
+        self._end_s: float | None = None  # media time of the end of the newest audio
+
+    def allows(self, begin_s: float, duration_s: float, now_s: float) -> bool:
+        """Return whether audio, with the gap before it that frames fill, is not too early."""
+        gap_s = 0.0 if self._end_s is None else max(0.0, begin_s - self._end_s)
+        passed_s = (now_s - self._updated_s) * _CLIENT_CLOCK_RATE
+        lead_s = max(self._lead_s - passed_s, -MAX_LEAD_S) + duration_s
+        lead_s += gap_s if gap_s <= MAX_GAP_S else 0.0
+        if lead_s > MAX_LEAD_S:
+            return False
+        self._lead_s, self._updated_s = lead_s, now_s
+        self._end_s = begin_s + duration_s
+        return True

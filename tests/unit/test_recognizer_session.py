@@ -1,0 +1,214 @@
+"""A session of the recognizer service: which audio it accepts, and what it sends."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.lip_predictor import load_lip_predictor
+from kouxing.services.recognizer.mouth_profile import MouthProfile
+from kouxing.services.recognizer.recognizer import Recognizer
+from kouxing.services.recognizer.session import (
+    MAX_LEAD_S,
+    MAX_MEDIA_TIME,
+    STALLED_AFTER_S,
+    AudioRejected,
+    RecognizerSession,
+    create_session,
+)
+from kouxing.services.recognizer.unpaced_audio import UnpacedAudio
+from kouxing.shared.bus import Socket
+from kouxing.shared.phones.events import LipFrame
+from kouxing.shared.wire.audio import AudioChunk
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.session import ErrorCode, SessionFacts
+from tests.e2e.following import samples_of_file
+from tests.system import VOWELS_FILE
+
+pytestmark = pytest.mark.unit
+RATE_HZ = 8000
+SOCKET, OTHER_SOCKET = (cast(Socket, object()) for _ in range(2))
+RECOGNIZER = Recognizer(load_model())
+LIPS = load_lip_predictor()
+START = StartSession(
+    session="s",
+    epoch=1,
+    request="r",
+    token="t",
+    encoding="s16le",
+    sample_rate_hz=RATE_HZ,
+    num_channels=1,
+    record=False,
+    paced=True,
+    facts=SessionFacts(language="mandarin", delay_ms=0.0),
+    endpoints={},
+)
+
+
+def make_session(**changes: Any) -> RecognizerSession:
+    return create_session(replace(START, **changes), RECOGNIZER, LIPS, SOCKET, 0.0)
+
+
+def chunk(
+    sequence: int = 1, duration_s: float = 0.02, time_s: float = 0.0, **values: Any
+) -> AudioChunk:
+    values = {"pcm": bytes(2 * round(duration_s * RATE_HZ)), **values}
+    media_time = round(16_000 * time_s)
+    return AudioChunk(
+        session="s", sequence=sequence, **{"token": "t", "media_time": media_time, **values}
+    )
+
+
+@pytest.mark.parametrize(
+    ("message", "socket", "code", "text"),
+    [
+        (chunk(token="x"), SOCKET, ErrorCode.BAD_TOKEN, "token"),
+        (chunk(), OTHER_SOCKET, ErrorCode.BAD_AUDIO, "endpoint in session-opened"),
+        (chunk(sequence=0), SOCKET, ErrorCode.BAD_AUDIO, "from 1"),
+    ],
+)
+def test_rejects_a_sender(message: AudioChunk, socket: Socket, code: ErrorCode, text: str) -> None:
+    make_session().check_sender(chunk(), SOCKET)
+    with pytest.raises(AudioRejected, match=text) as rejection:
+        make_session().check_sender(message, socket)
+    assert rejection.value.code == code
+
+
+def test_rejects_impossible_audio_and_audio_after_the_end() -> None:
+    session = make_session()
+    session.check_open(chunk())
+    with pytest.raises(AudioRejected, match="too large"):
+        session.check_open(chunk(media_time=MAX_MEDIA_TIME + 1))
+    with pytest.raises(AudioRejected, match="not a whole number"):
+        session.read_chunk(chunk(pcm=b"123"), 0.0)
+    session.end = chunk(last=True)
+    with pytest.raises(AudioRejected, match="has ended"):
+        session.check_open(chunk(2))
+
+
+def test_the_end_is_received_once_everything_before_it_is_decoded() -> None:
+    session = make_session()
+    session.order.push(chunk(1), 0.0)
+    session.end = chunk(2, last=True)
+    session.order.push(session.end, 0.0)
+    assert session.received_sequence == 1
+    session.is_finished = True
+    assert session.received_sequence == 2
+
+
+class PacedClient:
+    """Sends paced audio at an injected time."""
+
+    def __init__(self, **changes: Any) -> None:
+        self.session = make_session(**changes)
+        self.now_s = self.end_s = 0.0
+
+    def send(self, duration_s: float, gap_s: float = 0.0) -> bool:
+        """Whether audio after a gap is accepted."""
+        try:
+            self.session.read_chunk(
+                chunk(duration_s=duration_s, time_s=self.end_s + gap_s), self.now_s
+            )
+        except AudioRejected:
+            return False
+        self.end_s += gap_s + duration_s
+        return True
+
+
+def test_limits_how_far_a_paced_client_is_ahead_of_the_clock() -> None:
+    client = PacedClient()
+    assert all(client.send(1.0) for _ in range(int(MAX_LEAD_S)))
+    assert not client.send(1.0)
+    client.now_s += 2.0
+    assert [client.send(1.0) for _ in range(3)] == [True, True, False]
+    client.now_s += 600.0  # interrupted for long
+    assert all(client.send(1.0) for _ in range(int(2 * MAX_LEAD_S)))
+    assert not client.send(1.0)
+    for _ in range(4 * 3600):  # the client's clock is faster by 1 in 1000
+        client.now_s += 1.0
+        assert client.send(1.001)
+    client.now_s += 600.0
+    assert client.send(1.0, gap_s=600.0)  # frames do not fill such a gap
+    assert [client.send(1.0, gap_s=9.9) for _ in range(3)] == [True, True, False]
+    assert client.send(1.0, gap_s=5.0)
+
+
+def test_a_client_may_catch_up_after_its_recognizer_was_lost() -> None:
+    client = PacedClient(epoch=2)
+    assert all(client.send(4.0) for _ in range(5))
+
+
+def test_a_resumed_session_skips_audio_before_the_grid() -> None:
+    session = make_session(epoch=2, media_time=24_000)
+    assert session.read_chunk(chunk(1, media_time=9280), 0.0) is None
+    first = session.read_chunk(chunk(2, media_time=10_080), 0.0)
+    assert first is not None
+    assert first[0] == 10_240
+    assert session.read_chunk(chunk(3, media_time=10_400), 0.0) is not None
+
+
+def test_a_live_client_stalls_once_until_audio_arrives() -> None:
+    session = make_session()
+    assert sum(session.becomes_stalled(0.01) for _ in range(100)) == 1
+    session.without_audio_s = 0.0
+    assert sum(session.becomes_stalled(0.01) for _ in range(100)) == 1
+    assert not make_session(paced=False).becomes_stalled(2 * STALLED_AFTER_S)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"not a profile",
+        MouthProfile(
+            scale=np.ones(15, np.float32),
+            offset=np.zeros(15, np.float32),
+            residual=np.zeros((2, 2, 15), np.float32),
+        ).to_bytes(bytes(32)),
+    ],
+)
+def test_a_mouth_profile_that_does_not_fit_is_not_used(content: bytes) -> None:
+    session = make_session(mouth_profile=content)
+    assert "the mouth profile is not used" in session.mouth_profile_error
+
+
+def test_a_session_gets_the_lip_frames_of_its_mouth_profile() -> None:
+    profile = MouthProfile(
+        scale=np.zeros(15, np.float32),
+        offset=np.full(15, 77, np.float32),
+        residual=np.zeros(LIPS.residual_shape, np.float32),
+    )
+    session = make_session(mouth_profile=profile.to_bytes(LIPS.digest))
+    session.stream.accept_waveform(samples_of_file(VOWELS_FILE)[:16_000])
+    RECOGNIZER.decode_streams([session.stream])
+    results = session.new_results(RECOGNIZER)
+    frames = [result for result in results if isinstance(result, LipFrame)]
+    assert len(frames) > 5
+    assert {frame.faps[0] for frame in frames} == {77.0}
+    messages = [message for result in results if (message := session.published_message(result))]
+    assert [message.sequence for message in messages] == [*range(1, len(messages) + 1)]
+
+
+def test_unpaced_audio_is_taken_in_order_up_to_a_duration() -> None:
+    one, two = make_session(paced=False), make_session(paced=False, session="two")
+    queue = UnpacedAudio()
+    samples = np.zeros((800, 1), np.float32)  # 0.1 s
+    for session in (one, two):
+        queue.append(session, (0, samples))
+        queue.append(session, None)
+    assert queue.duration_s == pytest.approx(0.2)
+
+    def take(max_s: float) -> list[tuple[str, tuple[int, int] | None]]:
+        return [
+            (session.name, item and (item[0], len(item[1]))) for session, item in queue.take(max_s)
+        ]
+
+    assert take(0.06) == [("s", (0, 480))]
+    assert queue.duration_s == pytest.approx(0.14)
+    assert take(0.06) == [("s", (960, 320)), ("s", None), ("two", (0, 160))]
+    queue.drop(two, keep_end=True)
+    assert take(1.0) == [("two", None)]
+    assert not queue
