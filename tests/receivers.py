@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pythonosc.osc_bundle import OscBundle
 
-from kouxing.services.senders import live_link, osc, vmc
-from kouxing.services.senders.face import Face
-from kouxing.services.senders.target import Target, parse_target
-from kouxing.services.senders.vtube_studio import Dialogue, parameters
+from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.services.senders.live_link import LiveLinkConnection
+from kouxing.services.senders.osc import OscConnection
+from kouxing.services.senders.protocols import parse_target
+from kouxing.services.senders.target import Target
+from kouxing.services.senders.vmc import VmcConnection
+from kouxing.services.senders.vtube_studio import Dialogue, tracking_parameters
 
 # what can be sent, each to a program that reads it otherwise
 SENT = (
@@ -35,48 +38,57 @@ Messages = list[tuple[str, list[Any]]]
 
 
 def received(url: str, faps: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what moves the avatar of a program that is sent a face of FAPs (68,)."""
-    target, face = parse_target(url), Face(faps, 0.0)
-    return np.array(_READERS[target.protocol](face, target), np.float32)
+    """Return the values that a program receives for FAPs (68,)."""
+    target = parse_target(url)
+    return np.array(_READERS[target.protocol](FaceFrame(faps, 0.0), target), np.float32)
 
 
-def _read_vmc(face: Face, target: Target) -> list[float]:
-    messages = read_osc(list(vmc.encode(face, target)))
+def _read_vmc(frame: FaceFrame, target: Target) -> list[float]:
+    messages = read_osc(list(VmcConnection(target).encode(frame)))
     return [params[1] for address, params in messages if address == "/VMC/Ext/Blend/Val"]
 
 
-def _read_plain_osc(face: Face, target: Target) -> list[float]:
-    messages = dict(read_osc(list(osc.encode(face, target))))
+def _read_plain_osc(frame: FaceFrame, target: Target) -> list[float]:
+    connection = OscConnection(target)
+    messages = dict(read_osc(list(connection.encode(frame))))
     for other in ("time", "head"):
-        del messages[target.prefix + other]
+        del messages[connection.prefix + other]
     return [value for (value,) in messages.values()]
 
 
-def _read_vtube_studio(face: Face, _target: Target) -> list[float]:
+def _read_live_link(frame: FaceFrame, target: Target) -> list[float]:
+    return list(read_live_link(LiveLinkConnection(target).encode_at(frame, 0.0))["values"])
+
+
+def _read_vtube_studio(frame: FaceFrame, _target: Target) -> list[float]:
     dialogue = Dialogue("token", lambda _: None)
-    known = [{"name": name} for name in parameters(face, is_mouth_only=True)]
+    known = [{"name": name} for name in tracking_parameters(frame, is_mouth_only=True)]
     listed = {"defaultParameters": known, "customParameters": []}
-    dialogue.answer(json.dumps({"messageType": "InputParameterListResponse", "data": listed}))
-    frame = json.loads(dialogue.frame(face, is_mouth_only=True))
-    return [each["value"] for each in frame["data"]["parameterValues"]]
+    dialogue.reply(json.dumps({"messageType": "InputParameterListResponse", "data": listed}))
+    message = json.loads(dialogue.frame_message(frame, is_mouth_only=True))
+    return [parameter["value"] for parameter in message["data"]["parameterValues"]]
 
 
 _READERS = {
     "vmc": _read_vmc,
     "osc": _read_plain_osc,
-    "livelink": lambda face, target: read_live_link(live_link.encode(face, target, 0.0))["values"],
+    "livelink": _read_live_link,
     "vts": _read_vtube_studio,
 }
 
 
 def read_osc(datagrams: list[bytes]) -> Messages:
-    """Return addresses and arguments of bundles, each small enough for one packet."""
+    """Return addresses and arguments of bundles that fit in one packet each."""
     assert all(len(datagram) <= 1500 - 28 for datagram in datagrams)
-    return [(each.address, each.params) for datagram in datagrams for each in OscBundle(datagram)]
+    return [
+        (message.address, message.params)
+        for datagram in datagrams
+        for message in OscBundle(datagram)
+    ]
 
 
 def read_live_link(datagram: bytes) -> dict[str, Any]:
-    """Return the fields of a datagram of version 6, read as Unreal does."""
+    """Return the fields of a datagram of version 6, as Unreal reads them."""
     version, id_length = struct.unpack_from(">Bi", datagram)
     offset = 5 + id_length
     device = datagram[5:offset].decode()
@@ -86,7 +98,7 @@ def read_live_link(datagram: bytes) -> dict[str, Any]:
     frame, part, rate_hz, denominator, num_values = struct.unpack_from(">ifiiB", datagram, offset)
     offset += 17
     values = struct.unpack_from(f">{num_values}f", datagram, offset)
-    assert offset + 4 * num_values == len(datagram), "bytes that nobody reads"
+    assert offset + 4 * num_values == len(datagram), "unread bytes"
     return {
         "version": version,
         "device": device,

@@ -63,12 +63,12 @@ def lost_stream() -> None:
     try:
         now_s = time.monotonic()
         service.poses.add("demo", now_s)
-        service.poses.accept_frame("demo", np.full(68, 100, np.float32), now_s)
+        service.poses.update("demo", np.full(68, 100, np.float32), now_s)
         service.on_tick(now_s + 0.5)
         assert title(window) == "kouxing: demo"
         service.on_tick(now_s + 1.2)
-        assert title(window) == "kouxing: demo (no frames come)"
-        service.poses.accept_frame("demo", np.full(68, 100, np.float32), now_s + 3.0)
+        assert title(window) == "kouxing: demo (no frames)"
+        service.poses.update("demo", np.full(68, 100, np.float32), now_s + 3.0)
         service.on_tick(now_s + 3.0)
         assert title(window) == "kouxing: demo"
         service.poses.remove("demo")

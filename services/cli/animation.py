@@ -53,7 +53,7 @@ def read_motion(source: Path, sound: Path | None) -> Motion:
     """Read a ``.fap`` file, with the sound that goes with it, if any."""
     animation = read_fap(source)
     return Motion(
-        film.frames_of(animation),
+        film.expand_frames(animation),
         animation.frame_rate_hz,
         min(animation.frame_rate_hz, _MAX_IMAGE_RATE_HZ),
         None if sound is None else read_mono_16k(sound),
@@ -114,7 +114,7 @@ def animate(
         ]
         events = recording.events
     return Motion(
-        faces[0] if len(faces) == 1 else film.beside(faces),
+        faces[0] if len(faces) == 1 else film.stack_faces(faces),
         settings[0].frame_rate_hz,
         _IMAGE_RATE_HZ,
         samples,

@@ -144,7 +144,7 @@ def send(
 ) -> None:
     """Send the face to avatars in other programs by VMC, Live Link Face, OSC or VTube Studio."""
     from kouxing.services.cli.send import send_to
-    from kouxing.services.senders.target import parse_target
+    from kouxing.services.senders.protocols import parse_target
     from kouxing.services.synthesizer.config import SynthesizerConfig
 
     config = read_settings().load(SynthesizerConfig)

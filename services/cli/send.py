@@ -110,7 +110,7 @@ def _send_frames(search: _Search, client: Client, senders: Senders) -> None:
         with contextlib.suppress(KouxingError):  # the session was closed before its last frame
             frame = None if frames is None else frames.get(STEP_S)
         if frame is not None:
-            senders.accept(frame.time_s, np.array(frame.values, np.float32))
+            senders.show(frame.time_s, np.array(frame.values, np.float32))
         elif frames is None or frames.has_ended:
             time.sleep(STEP_S)
 

@@ -1,1 +1,1 @@
-"""Driver: FAP frames in, a rendered head out (window, video)."""
+"""The driver service: FAP frames in, a rendered head out (window, video)."""

@@ -1,4 +1,4 @@
-"""Runs a driver as a process of its own."""
+"""Runs the driver as a process."""
 
 from kouxing.services.process import run_module
 

@@ -12,7 +12,7 @@ from kouxing.shared.face.config import FaceConfig
 
 
 class Framing(StrEnum):
-    """What fills the picture."""
+    """The part of the head that fills the picture."""
 
     FACE = "face"
     HEAD = "head"
@@ -20,29 +20,29 @@ class Framing(StrEnum):
 
 
 class DriverConfig(FaceConfig):
-    """The driver's own keys."""
+    """The driver's configuration keys."""
 
     view: Literal["auto", "window", "none"] = "auto"
-    """Whether to open a window; auto: where there is a display."""
+    """Whether to open a window; with auto, if there is a display."""
     session: Annotated[
         str,
         Field(pattern="^[A-Za-z0-9_-]{1,64}$"),
         Form("newest, or the name of a session (up to 64 letters, digits, '-' and '_')"),
     ] = "newest"
-    """The session that is shown; "newest": the one that opened last."""
+    """The session to show; "newest" is the one that opened last."""
     out: str = "out"
     """Folder for recorded videos."""
     head: str = "woman"
-    """woman, man, elder, child, ada, leo, rosa, mika, an .npz, or a .glb with morph targets."""
+    """Name of a built-in head, an imported .npz, or a .glb with morph targets."""
     background: str = "studio"
-    """studio, #rrggbb, or the name of a colour."""
+    """studio, #rrggbb, or the name of a color."""
     camera: Framing = Framing.FACE
-    """What fills the picture."""
+    """The part of the head that fills the picture."""
     virtual_camera: Switch = False
-    """Also be a camera for other programs."""
+    """Whether other programs can use the picture as a camera."""
     width_px: Annotated[int, Field(ge=16, le=7680, multiple_of=2)] = 1280
-    """Width of window and video; even, for H.264."""
+    """Width of window and video; even because of H.264."""
     height_px: Annotated[int, Field(ge=16, le=4320, multiple_of=2)] = 720
-    """Height of window and video; even, for H.264."""
+    """Height of window and video; even because of H.264."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 25.0
     """Images per second."""

@@ -1,4 +1,4 @@
-"""Decode and encode single pictures. Textures come from strangers' files: see ``decode``."""
+"""Decodes and encodes single pictures, also from untrusted files."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from kouxing.shared.errors import UserError
 UInt8 = NDArray[np.uint8]
 
 MAX_PIXELS = 8192 * 8192
-# first bytes: decoder. FFmpeg is not left to guess: it would take playlists, which name other files
+# first bytes: decoder. FFmpeg must not guess the format: it would open playlists of other files
 _CODECS = {b"\x89PNG": "png", b"\xff\xd8\xff": "mjpeg", b"RIFF": "webp"}
 
 
 def decode(encoded: bytes, name: str) -> UInt8:
-    """Decode a PNG, JPEG or WebP into (H, W, 4); the name is for what went wrong.
+    """Decode a PNG, JPEG or WebP into (H, W, 4); error texts contain the name.
 
     Raises
     ------
     UserError
-        If it is none, is damaged, or has more than ``MAX_PIXELS``.
+        If the format is different, or the picture is damaged or has more than ``MAX_PIXELS``.
     """
     codec = next((codec for magic, codec in _CODECS.items() if encoded.startswith(magic)), None)
     if codec is None:
-        raise UserError(f"texture {name!r} is neither PNG, JPEG nor WebP")
+        raise UserError(f"texture {name!r} is not PNG, JPEG or WebP")
     decoder: Any = av.CodecContext.create(codec, "r")
     decoder.options = {"max_pixels": str(MAX_PIXELS)}
     decoder.thread_count = 1

@@ -1,4 +1,4 @@
-"""One pose for every session that is followed, and which of them is shown."""
+"""The newest pose of each followed session, and the choice of the session to show."""
 
 from __future__ import annotations
 
@@ -8,47 +8,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.face.faps import NUM_FAPS
-from kouxing.shared.face.idle_motion import RestingFace
+from kouxing.shared.face.resting_face import FADE_S, STALL_S, RestingFace
 
 NEWEST = "newest"
-STALL_S = 1.0  # a face goes to rest after so long without frames
-FADE_S = 0.3  # time it takes to get there, and to come back
 
 Faps = NDArray[np.float32]
 
 
 @dataclass(slots=True)
 class _Pose:
-    updated_s: float  # when the newest frame came, or the session was opened
-    faps: Faps | None = None  # (68,), FAP units; None: no frame has come
+    updated_s: float  # arrival of the newest frame, or opening of the session
+    faps: Faps | None = None  # (68,), FAP units; None before the first frame
     has_ended: bool = False
 
 
 class Poses:
     """The newest FAPs of each session; shows the newest session, a named one, or the user's choice.
 
-    What the user switches to is shown until it closes, or until the user is back at the session
-    that would be shown anyway.
+    The user's choice is valid until that session closes, or until the user returns to the default.
 
     Parameters
     ----------
     session
         Name of the session to show; ``newest`` for the one that was opened last.
     idle_motion_seed
-        Of the face at rest; 0: it stands still.
+        Seed of the resting face; 0 for no motion.
     """
 
     def __init__(self, session: str = NEWEST, idle_motion_seed: int = 0) -> None:
         self._configured = session
         self._switched_to = ""
-        self._poses: dict[str, _Pose] = {}  # in the order in which the sessions were opened
+        self._poses: dict[str, _Pose] = {}  # in order of opening
         self._rest = RestingFace(idle_motion_seed)
-        self._face = np.zeros(NUM_FAPS, np.float32)  # of a session, that was shown last,
-        self._share, self._shown_s = 0.0, 0.0  # its share, and when that was
+        self._face = np.zeros(NUM_FAPS, np.float32)  # the last session frame that was shown
+        self._share, self._shown_s = 0.0, 0.0  # its share in the picture, and the time of that
 
     @property
     def shown(self) -> str:
-        """Name of the session that is shown; empty if there is none."""
+        """Name of the session that is shown; empty if no session is shown."""
         return self._switched_to or self._default
 
     @property
@@ -58,26 +55,26 @@ class Poses:
         return self._configured if self._configured in self._poses else ""
 
     def add(self, session: str, now_s: float) -> None:
-        """Take a session in, whose frames are to come."""
+        """Add a session."""
         self._poses[session] = _Pose(now_s)
 
     def remove(self, session: str) -> None:
-        """Forget a session; if no other takes its place its face fades to rest."""
+        """Remove a session. Its face fades to rest unless another session replaces it."""
         if session == self._switched_to:
             self._switched_to = ""
         del self._poses[session]
 
-    def accept_frame(self, session: str, faps: Faps, now_s: float) -> None:
-        """Take a session's newest FAPs, shape ``(68,)``, FAP units."""
+    def update(self, session: str, faps: Faps, now_s: float) -> None:
+        """Set a session's newest FAPs (68,)."""
         self._poses[session].faps = faps
         self._poses[session].updated_s = now_s
 
     def end(self, session: str) -> None:
-        """Expect no more frames of a session."""
+        """Mark a session that will send no more frames."""
         self._poses[session].has_ended = True
 
     def switch(self, step: int) -> None:
-        """Show the session that was opened after (1) or before (-1) the one that is shown."""
+        """Show the session that was opened after (step 1) or before (step -1) the current one."""
         names = list(self._poses)
         if names:
             start = names.index(self.shown) if self.shown else (-1 if step > 0 else 0)
@@ -85,12 +82,12 @@ class Poses:
             self._switched_to = "" if picked == self._default else picked
 
     def is_stalled(self, now_s: float) -> bool:
-        """Return whether frames of the shown session are missing."""
+        """Return whether the shown session has stopped sending frames."""
         pose = self._poses.get(self.shown)
         return pose is not None and not pose.has_ended and now_s - pose.updated_s > STALL_S
 
     def faps(self, now_s: float) -> Faps:
-        """Return the FAPs (68,) to show: the newest, or while none come a fade to rest.
+        """Return the FAPs (68,) to show; without new frames the face fades to rest.
 
         Times must not decrease.
         """
@@ -102,15 +99,14 @@ class Poses:
             self._share = min(self._share + step, 1.0)
         else:
             self._share = max(self._share - step, 0.0)
-        rest = self._rest.at(now_s)
-        return rest + np.float32(self._share) * (self._face - rest)
+        return self._rest.blend(self._face, self._share, now_s)
 
     def caption(self, now_s: float) -> str:
-        """Say which session is shown, and what is to be known about it."""
+        """Describe the shown session for the window title."""
         if not self.shown:
             return "" if self._configured == NEWEST else f"waiting for {self._configured}"
         names = list(self._poses)
         caption = self.shown
         if len(names) > 1:
-            caption += f", {names.index(self.shown) + 1} of {len(names)} (Tab: the next)"
-        return f"{caption} (no frames come)" if self.is_stalled(now_s) else caption
+            caption += f", {names.index(self.shown) + 1} of {len(names)} (Tab: next)"
+        return f"{caption} (no frames)" if self.is_stalled(now_s) else caption

@@ -1,4 +1,4 @@
-"""The videos of the sessions that are recorded, drawn a little at a time."""
+"""The open videos of recorded sessions, drawn in small steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Float32 = NDArray[np.float32]
 
 
 class Recordings:
-    """Feeds each session's frames and sound to its video, and draws when there is time.
+    """Passes each session's frames and sound to its video, and draws images when time permits.
 
     Parameters
     ----------
@@ -24,9 +24,9 @@ class Recordings:
     on_written
         Called with the session and its finished video.
     on_failed
-        Called with the session and the reason why it gets no video.
+        Called with the session and the reason why it has no video.
     on_image
-        Called after each image that was drawn.
+        Called after each image.
     """
 
     def __init__(
@@ -42,19 +42,19 @@ class Recordings:
         self._on_failed = on_failed
         self._on_image = on_image
         self._open: dict[str, Recording] = {}
-        self._ending: list[tuple[str, Recording]] = []  # all frames are in; some are to be drawn
+        self._ending: list[tuple[str, Recording]] = []  # complete, but not all images are drawn
 
     @property
     def is_done(self) -> bool:
-        """Whether no video is under way."""
+        """Whether no video is open."""
         return not self._open and not self._ending
 
     def is_open(self, session: str) -> bool:
-        """Return whether a session's video still takes frames."""
+        """Return whether a session's video still accepts frames."""
         return session in self._open
 
     def begin(self, session: str) -> None:
-        """Open a session's video, unless it is open."""
+        """Open a session's video, unless it is already open."""
         if session in self._open:
             return
         try:
@@ -62,26 +62,26 @@ class Recordings:
         except (UserError, OSError) as error:
             self._on_failed(session, str(error))
 
-    def accept_frame(self, session: str, time_s: float, faps: Float32) -> None:
-        """Take a FAP frame (68,) of a session, recorded or not."""
+    def add_frame(self, session: str, time_s: float, faps: Float32) -> None:
+        """Add a FAP frame (68,), if the session is recorded."""
         if session in self._open:
-            self._open[session].accept_frame(time_s, faps)
+            self._open[session].add_frame(time_s, faps)
 
-    def accept_sound(self, session: str, media_time: int, samples: Float32) -> None:
-        """Take sound of shape ``(n,)``, 16 kHz, of a session, recorded or not."""
+    def add_sound(self, session: str, media_time: int, samples: Float32) -> None:
+        """Add sound (n,), 16 kHz, if the session is recorded."""
         if session in self._open:
             try:
-                self._open[session].accept_sound(media_time, samples)
+                self._open[session].add_sound(media_time, samples)
             except UserError as error:
                 self._fail(session, self._open.pop(session), error)
 
     def end(self, session: str) -> None:
-        """Finish a session's video with the frames that have come."""
+        """Finish a session's video with the frames that have arrived."""
         if session in self._open:
             self._ending.append((session, self._open.pop(session)))
 
     def draw_until(self, end_s: float) -> None:
-        """Draw the images that are due, in turns, until a time of the monotonic clock."""
+        """Draw due images of all videos in turn, until a time of the monotonic clock."""
         due = list(self._open)
         while due and time.monotonic() < end_s:
             due = [session for session in due if self._draw_image(session)]
@@ -89,7 +89,7 @@ class Recordings:
             self._finish_first()
 
     def close_early(self) -> list[str]:
-        """Keep what has been drawn of every video; return their sessions."""
+        """Save the finished part of every video; return their sessions."""
         for session in list(self._open):
             self.end(session)
         cut_short = [session for session, _ in self._ending]

@@ -32,8 +32,8 @@ from kouxing.shared.wire.face import EndOfFaps, FapFrame, SetFace
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import ErrorCode
 
-DRAW_BUDGET_S = 0.2  # for videos in one turn of the loop, so that heartbeats go on
-LAST_FRAME_LIMIT_S = 10.0  # for a closed session's last frames to arrive
+DRAW_BUDGET_S = 0.2  # time for videos per loop iteration; heartbeats must continue
+LAST_FRAME_LIMIT_S = 10.0  # wait for the last frames of a closed session
 
 
 @dataclass(slots=True)
@@ -42,7 +42,7 @@ class _Session:
 
     start: StartSession
     follower: ServiceFollower
-    leave_by_s: float | None = None  # the session is closed; the last frames are on their way
+    leave_by_s: float | None = None  # set once the session has closed
 
 
 class DriverService(Service):
@@ -72,19 +72,19 @@ class DriverService(Service):
         """Follow a session's frames; confirm once the subscriptions are in effect."""
         session = self._sessions.get(start.session)
         if session is not None and session.start.token != start.token:
-            self._leave(session)  # another one of the same name
+            self._leave(session)  # a different session with the same name
             session = None
         if session is None:
             session = self._sessions[start.session] = self._make_session(start)
             self.poses.add(start.session, time.monotonic())
         session.start = start
-        if start.record:  # after a crash the same video goes on
+        if start.record:  # after a crash the same video continues
             self._recordings.begin(start.session)
         session.follower.start(start.epoch, start.endpoints)
         return False
 
     def stop_session(self, session: str) -> None:
-        """Follow a session no longer; one that is recorded only after its last frame."""
+        """Stop following a session; a recorded session continues until its last frame."""
         left = self._sessions.get(session)
         if left is None:
             return
@@ -104,20 +104,20 @@ class DriverService(Service):
         self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
 
     def on_drain(self) -> bool:
-        """Finish the videos that are under way."""
+        """Finish the open videos."""
         for session in list(self._sessions.values()):
             self._leave(session)
         self._recordings.draw_until(time.monotonic() + DRAW_BUDGET_S)
         return self._recordings.is_done
 
     def on_shutdown(self) -> None:
-        """Keep what was drawn of the videos that could not be finished in time."""
+        """Save the unfinished part of the remaining videos."""
         for session in self._recordings.close_early():
-            LOG.warning("the video ends early", extra={"session": session})
+            LOG.warning("the video ends early: no time to finish it", extra={"session": session})
         self.view.close()
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Name the sessions followed, so that control can say which of them are no more."""
+        """Return the followed sessions; control answers which of them no longer exist."""
         return dict.fromkeys(self._sessions, SessionInput())
 
     # --- sessions ------------------------------------------------------------------------------
@@ -141,12 +141,12 @@ class DriverService(Service):
 
     def _on_frame(self, frame: FapFrame) -> None:
         faps = np.frombuffer(frame.values, "<f4").astype(np.float32)
-        self.poses.accept_frame(frame.session, faps, time.monotonic())
-        self._recordings.accept_frame(frame.session, to_seconds(frame.media_time), faps)
+        self.poses.update(frame.session, faps, time.monotonic())
+        self._recordings.add_frame(frame.session, to_seconds(frame.media_time), faps)
 
     def _on_sound(self, sound: Sound) -> None:
         samples = np.frombuffer(sound.pcm, "<i2").astype(np.float32) / np.float32(32768)
-        self._recordings.accept_sound(sound.session, sound.media_time, samples)
+        self._recordings.add_sound(sound.session, sound.media_time, samples)
 
     def _on_end(self, end: EndOfFaps) -> None:
         self.poses.end(end.session)
@@ -156,7 +156,7 @@ class DriverService(Service):
             self._leave(session)
 
     def _leave(self, session: _Session) -> None:
-        """Close a session's subscriptions and finish its video with what has come."""
+        """Close a session's subscriptions and finish its video with the frames received so far."""
         name = session.start.session
         del self._sessions[name]
         session.follower.close()
@@ -167,7 +167,7 @@ class DriverService(Service):
         is_stalled = self.poses.is_stalled(now_s)
         if is_stalled and not self._was_stalled:
             LOG.warning(
-                "no FAP frames for %g s: the face goes to rest",
+                "no FAP frames for %g s: the face fades to rest",
                 STALL_S,
                 extra={"session": self.poses.shown},
             )

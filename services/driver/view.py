@@ -1,4 +1,4 @@
-"""What shows a face live: a window, a virtual camera, both or neither."""
+"""The live view of a face: a window, a virtual camera, both or neither."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
 
 
 class View:
-    """Opens what the configuration asks for, and draws a face there.
+    """Opens the configured outputs and draws a face there.
 
     Parameters
     ----------
     config
         The driver's configuration.
     on_switch
-        Called with 1 or -1 when the user asks for the next or the previous session.
+        Called with 1 or -1 when the user switches to the next or previous session.
 
     Raises
     ------
     UserError
-        If the configuration names no head or background, or what it demands is not there.
+        If the head or background is unknown, or a required output is not available.
     """
 
     def __init__(self, config: DriverConfig, on_switch: Callable[[int], None]) -> None:
@@ -42,7 +42,7 @@ class View:
         self._background = background(config.background)
         if self._background is None:
             raise UserError(
-                "driver.background: a window and MP4 have no transparency; give a colour"
+                "driver.background: windows and MP4 files cannot be transparent; give a color"
             )
         self._camera = camera(self._head, config.camera)
         self._renderer: Renderer | None = None
@@ -55,22 +55,22 @@ class View:
 
     @property
     def is_live(self) -> bool:
-        """Whether anybody can see the face."""
+        """Whether the face is visible anywhere."""
         return self._is_window_open or self._virtual_camera is not None
 
     def show(self, faps: NDArray[np.float32], caption: str, now_s: float) -> None:
-        """Draw a face (68,) and say in the window's title whose it is."""
+        """Draw a face (68,) and set the window's caption."""
         if self._window is not None and self._is_window_open:
             self._window.set_caption(caption)
             self._is_window_open = self._window.draw(faps)
             if not self._is_window_open:
                 LOG.info("the window was closed")
-                self._window.hide()  # videos under way go on drawing in its context
+                self._window.hide()  # open videos continue to use its context
         if self._virtual_camera is not None:
             self._virtual_camera.draw(faps, now_s)
 
     def renderer(self) -> Renderer:
-        """Return what draws beside the window, for videos and the virtual camera; made once."""
+        """Return the renderer of videos and virtual camera; it is created once."""
         if self._renderer is None:
             self._renderer = Renderer(
                 self._head,
@@ -83,7 +83,7 @@ class View:
         return self._renderer
 
     def close(self) -> None:
-        """Give the virtual camera back."""
+        """Release the virtual camera."""
         if self._virtual_camera is not None:
             self._virtual_camera.close()
 
@@ -92,9 +92,10 @@ class View:
         has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
         if config.view == "none" or (config.view == "auto" and not has_display):
             return None
-        from kouxing.services.driver.render.window import Window  # noqa: PLC0415 - glfw starts processes
+        # glfw starts processes on import
+        from kouxing.services.driver.render.window import Window  # noqa: PLC0415
 
-        head = load_head(config.head, "coarse")  # live, smooth motion is worth more than outlines
+        head = load_head(config.head, "coarse")  # live, smooth motion matters more than outlines
         try:
             return Window(
                 head,

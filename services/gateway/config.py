@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator
 
 from kouxing.services.gateway.connection_quota import ADDRESS_SHARE
-from kouxing.services.senders.target import parse_target
+from kouxing.services.senders.protocols import parse_target
 from kouxing.shared.config import BoundHost, BoundPort, Form, Switch, Texts
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig

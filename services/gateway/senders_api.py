@@ -14,8 +14,9 @@ import numpy as np
 from aiohttp import web
 
 from kouxing.services.gateway import wire
+from kouxing.services.senders.protocols import parse_target
 from kouxing.services.senders.senders import Senders
-from kouxing.services.senders.target import Target, parse_delay_s, parse_target
+from kouxing.services.senders.target import Target, parse_delay_s
 from kouxing.shared.clock import to_seconds
 from kouxing.shared.errors import UserError
 from kouxing.shared.logs import LOG
@@ -41,7 +42,7 @@ class SendersApi:
     def send_frame(self, media_time: int, values: bytes) -> None:
         """Send a frame: 68 little-endian float32, FAP units."""
         faps = np.frombuffer(values, "<f4").astype(np.float32)
-        self._senders.accept(to_seconds(media_time), faps)
+        self._senders.show(to_seconds(media_time), faps)
 
     def close(self) -> None:
         """Stop all senders."""
@@ -61,7 +62,7 @@ class SendersApi:
             elif isinstance(stop, str):
                 self._senders.stop(stop)
             elif isinstance(delay_ms, int | float):
-                self._senders.delay(parse_delay_s(delay_ms))
+                self._senders.set_delay(parse_delay_s(delay_ms))
             else:
                 raise UserError(
                     "expected 'start' or 'stop' with an address such as vmc://, or 'delay_ms'"

@@ -35,7 +35,7 @@ from kouxing.services.gateway.whip import WhipClients
 from kouxing.shared.bus import Socket
 from kouxing.shared.clock import to_samples
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.idle_motion import REST_RATE_HZ, RestingFace
+from kouxing.shared.face.resting_face import RESTING_RATE_HZ, RestingFace
 from kouxing.shared.keys import Peer
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, PhoneInventory, load_inventory
@@ -237,8 +237,8 @@ class GatewayService(Service):
     def on_tick(self, now_s: float) -> None:
         """Move the face at rest, and request the status of the services."""
         if self._viewers.has_viewers and now_s >= self._rest_due_s:
-            self._rest_due_s = max(self._rest_due_s + 1.0 / REST_RATE_HZ, now_s)
-            self._viewers.show_rest(self._resting_face.at(now_s).astype("<f4").tobytes())
+            self._rest_due_s = max(self._rest_due_s + 1.0 / RESTING_RATE_HZ, now_s)
+            self._viewers.show_rest(self._resting_face.faps(now_s).astype("<f4").tobytes())
         is_answered = self._report_s >= self._request_s
         if now_s - self._request_s > (STATUS_INTERVAL_S if is_answered else STATUS_TIMEOUT_S):
             self._request_s = now_s

@@ -1,1 +1,1 @@
-"""The face in other programs: avatars that speak VMC, Live Link Face, OSC or VTube Studio's API."""
+"""Sends the face to avatar programs by VMC, Live Link Face, OSC or VTube Studio's API."""

@@ -1,4 +1,4 @@
-"""Runs a synthesizer as a process of its own."""
+"""Runs the synthesizer as a process."""
 
 from kouxing.services.process import run_module
 

@@ -1,7 +1,7 @@
-"""Phones of several recognizers, one after the other, numbered as if they came from one.
+"""Renumbers the phones of successive recognizers as if they came from one recognizer.
 
-A recognizer that takes the place of a lost one counts phones anew. Those of the lost one that were
-not final are void. One that comes again keeps its place, so that the mouth notices nothing.
+A recognizer that replaces a lost one numbers phones from 0. Phones of the lost recognizer that were
+not final are void. If the new recognizer finds a void phone again, the phone keeps its index.
 """
 
 from __future__ import annotations
@@ -10,42 +10,42 @@ from dataclasses import replace
 
 from kouxing.shared.phones.events import Phone
 
-_SAME_S = 0.05  # between the onsets of a phone that two recognizers tell
+_SAME_S = 0.05  # maximum onset difference of a phone found by two recognizers
 
 
 class PhoneNumbers:
-    """Gives each phone of a session an index of its own."""
+    """Gives each phone of a session a unique index."""
 
     def __init__(self) -> None:
-        self._base = 0  # of the recognizer's indices
-        self._next = 0  # after the greatest index given
-        self._places: dict[int, int] = {}  # of void phones that came again, by their new index
-        self._open: dict[int, Phone] = {}  # not final, by index
-        self._void: dict[int, Phone] = {}  # not final when another recognizer began
+        self._base = 0  # added to the recognizer's indices
+        self._next = 0  # after the greatest index
+        self._indices: dict[int, int] = {}  # indices of void phones that were found again
+        self._open: dict[int, Phone] = {}  # phones that are not final, by index
+        self._void: dict[int, Phone] = {}  # phones of lost recognizers that were not final
 
     def restart(self) -> None:
-        """Another recognizer begins."""
+        """Start with another recognizer."""
         self._void |= self._open
         self._open.clear()
-        self._places.clear()
+        self._indices.clear()
         self._base = self._next
 
-    def place(self, phone: Phone) -> Phone:
-        """Return a phone of the recognizer, or a revision, with its index among all phones."""
-        index = self._places.get(phone.index, self._base + phone.index)
-        again = [each.index for each in self._void.values() if _is_same(each, phone)]
+    def renumber(self, phone: Phone) -> Phone:
+        """Return a phone or revision with its index in the session."""
+        index = self._indices.get(phone.index, self._base + phone.index)
+        again = [void.index for void in self._void.values() if _is_same(void, phone)]
         if again and index not in self._open:
-            index = self._places[phone.index] = again[0]
+            index = self._indices[phone.index] = again[0]
             del self._void[index]
-        placed = replace(phone, index=index)
+        renumbered = replace(phone, index=index)
         self._next = max(self._next, index + 1)
         self._open.pop(index, None)
         if not phone.final:
-            self._open[index] = placed
-        return placed
+            self._open[index] = renumbered
+        return renumbered
 
     def take_withdrawn(self) -> list[Phone]:
-        """Return the void phones that did not come again, withdrawn; each once."""
+        """Return the void phones that were not found again, as withdrawn phones, and forget them."""
         withdrawn = [replace(phone, duration_s=0.0, final=True) for phone in self._void.values()]
         self._void.clear()
         return withdrawn

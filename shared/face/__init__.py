@@ -1,1 +1,1 @@
-"""MPEG-4 FAPs, their files, and blendshapes as sums of FAPs."""
+"""MPEG-4 FAPs, ``.fap`` files, idle motion, and blendshapes as sums of FAPs."""

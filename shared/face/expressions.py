@@ -1,4 +1,4 @@
-"""What clients choose of expressions: their names, strengths, and for how long they stay."""
+"""Expressions that a client can request: names, strengths and duration."""
 
 from __future__ import annotations
 
@@ -7,50 +7,50 @@ from enum import StrEnum
 
 from kouxing.shared.errors import UserError
 
-MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS = 0.5, 2.0  # 1: as the lip model moves the mouth
+MIN_EXPRESSIVENESS, MAX_EXPRESSIVENESS = 0.5, 2.0  # at 1 the lip model's movements are unchanged
 MAX_HOLD_S = 3600.0
-DEFAULT_HOLD_S = 3.0  # that expressions stay before they fade
+DEFAULT_HOLD_S = 3.0  # expressions fade after this time
 
 
 class ExpressionName(StrEnum):
-    """What a face can show beside speech."""
+    """Expressions that the face can show in addition to speech."""
 
-    JOY = "joy"  # these six are FAP 2's, in its order
+    JOY = "joy"  # the first six are those of FAP 2, in its order
     SADNESS = "sadness"
     ANGER = "anger"
     FEAR = "fear"
     DISGUST = "disgust"
     SURPRISE = "surprise"
-    SMILE = "smile"  # these four are both sides of ARKit's shapes
+    SMILE = "smile"  # the last four combine the left and right ARKit shapes
     BROW_UP = "brow_up"
     BROW_DOWN = "brow_down"
     SQUINT = "squint"
 
 
 def check_expressions(strengths: Mapping[str, object], hold_s: object) -> None:
-    """Check what a user asks for.
+    """Check requested expressions.
 
     Raises
     ------
     UserError
-        If there is no such expression, or a strength or the time is out of range.
+        If an expression is unknown, or a strength or the time is out of range.
     """
     for name, strength in strengths.items():
         if name not in [*ExpressionName]:
-            raise UserError(f"there is no expression {name!r}; use {', '.join(ExpressionName)}")
+            raise UserError(f"unknown expression {name!r}; use {', '.join(ExpressionName)}")
         if not _is_number(strength, 1.0):
-            raise UserError(f"{name} is {strength}; give a strength from 0 to 1")
+            raise UserError(f"expression {name}: strength {strength} is not between 0 and 1")
     if not _is_number(hold_s, MAX_HOLD_S):
         raise UserError(f"hold_s is {hold_s}; give 0 to {MAX_HOLD_S:g} seconds")
 
 
 def check_expressiveness(amount: object) -> float:
-    """Return how much the mouth is to move, if that is in range.
+    """Return the expressiveness if it is in range.
 
     Raises
     ------
     UserError
-        If it is not.
+        If the value is out of range.
     """
     if not _is_number(amount, MAX_EXPRESSIVENESS, MIN_EXPRESSIVENESS):
         raise UserError(

@@ -1,15 +1,17 @@
 """Read and write MPEG-4 ``.fap`` text files, version 2.1, as Xface and Greta do.
 
-The first line is ``2.1 NAME FPS NFRAMES``; NAME may hold blanks. Each frame has two lines: a mask
-of 68 digits, and the frame's number with one value for each 1 in the mask. A ``#`` begins a comment
-line. What differs in the wild and is accepted: Greta's mask has a 69th digit and its FAP 1 one
-number, where Xface has four (and six for FAP 2); digits of the mask may stand without blanks;
-values may be ``inf`` or ``nan`` (taken as 0); a file may set only the inner or only the outer lips
-(the others follow them).
+The first line is ``2.1 NAME FPS NFRAMES``; NAME may contain spaces. Each frame has two lines: a
+mask of 68 digits, then the frame number and one value for each 1 in the mask. Lines that start with
+``#`` are comments. The reader also accepts these variants:
+
+- Greta's mask has a 69th digit, and its FAP 1 has one number instead of four (FAP 2: six).
+- The digits of a mask may be joined.
+- Values may be ``inf`` or ``nan``, which count as 0.
+- A file may set only the inner or only the outer lips; the others then follow.
 
 FAP 1 is ``viseme_select1 viseme_select2 viseme_blend viseme_def`` and FAP 2 ``expression_select1
 expression_intensity1 expression_select2 expression_intensity2 init_face expression_def`` (ISO/IEC
-14496-2, annex C); a single number selects one at full strength.
+14496-2, annex C). A single number selects one viseme or expression at full strength.
 """
 
 from __future__ import annotations
@@ -26,17 +28,17 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import NUM_FAPS
 
 _VERSION = "2.1"
-MAX_BYTES = 256 * 1024 * 1024  # hours
+MAX_BYTES = 256 * 1024 * 1024  # several hours
 _GRETA_MASK_DIGITS = NUM_FAPS + 1
-# highest values of the numbers that a set FAP 1 and FAP 2 bring; the flags at their ends say
-# nothing to a head whose shapes are given, and programs write anything there
+# Maximum of each number of FAP 1 and FAP 2. The flags at the end have no meaning for a head with
+# given shapes, and programs write any value there.
 _ANY = 2**31
 _VISEME_LIMITS = (14, 14, 63, _ANY)
 _EXPRESSION_LIMITS = (6, 63, 6, 63, _ANY, _ANY)
-# what a selection alone stands for: all of it
+# numbers that follow a selection on its own
 _VISEME_ALONE = (0, 63, 0)
 _EXPRESSION_ALONE = (63, 0, 0, 0, 0)
-# inner lip FAP: the outer one
+# inner lip FAP: outer lip FAP
 _LIP_PAIRS = {
     4: 51, 5: 52, 6: 53, 7: 54, 8: 55, 9: 56, 10: 57, 11: 58, 12: 59, 13: 60,
 }  # fmt: skip
@@ -44,17 +46,17 @@ _LIP_PAIRS = {
 
 @dataclass(frozen=True, slots=True)
 class FapAnimation:
-    """Frames at a constant rate."""
+    """FAP frames at a constant rate."""
 
     name: str
     frame_rate_hz: float
-    faps: NDArray[np.float32]  # (num_frames, 68), FAP units; FAP 1 and 2: the first selection
-    visemes: NDArray[np.int64] | None = None  # (num_frames, 4), the numbers of FAP 1; None: unset
-    expressions: NDArray[np.int64] | None = None  # (num_frames, 6), those of FAP 2
+    faps: NDArray[np.float32]  # (num_frames, 68), FAP units; FAP 1 and 2 hold the first selection
+    visemes: NDArray[np.int64] | None = None  # (num_frames, 4), the numbers of FAP 1; None if unset
+    expressions: NDArray[np.int64] | None = None  # (num_frames, 6), the numbers of FAP 2
 
 
 class _BadFileError(Exception):
-    """A line and what is wrong in it."""
+    """Reports the line and the reason."""
 
     def __init__(self, line_number: int, reason: str) -> None:
         super().__init__(f"line {line_number}: {reason}")
@@ -66,11 +68,11 @@ def read_fap(path: Path) -> FapAnimation:
     Raises
     ------
     UserError
-        The file cannot be read or is no such file; the text names the line and the reason.
+        If the file cannot be read or is not a valid ``.fap`` file; the text names the line.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise UserError(f"{path} is larger than {MAX_BYTES // 2**20} MiB; cut it into parts")
+            raise UserError(f"{path} is larger than {MAX_BYTES // 2**20} MiB; split it")
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}; give a .fap file") from error
@@ -85,12 +87,12 @@ def write_fap(
 ) -> None:
     """Write a ``.fap`` file.
 
-    Greta's have a longer mask, whole numbers and one number for FAP 1; FAP 2 is left out there.
+    The style "greta" has a longer mask, whole numbers, one number for FAP 1, and no FAP 2.
 
     Raises
     ------
     UserError
-        The file cannot be written.
+        If the file cannot be written.
     """
     visemes, expressions = animation.visemes, animation.expressions
     low = animation.faps[:, 2:]
@@ -99,7 +101,7 @@ def write_fap(
         visemes = None if visemes is None else visemes[:, :1]
         rows = [[f"{value:.0f}" for value in row] for row in low]
     else:
-        # nine digits give every float32 back
+        # nine digits represent every float32 exactly
         rows = [[f"{value:.9g}" for value in row] for row in low]
     for high in (expressions, visemes):
         if high is not None:
@@ -113,7 +115,7 @@ def write_fap(
     try:
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}; choose another place") from error
+        raise UserError(f"cannot write {path}: {error.strerror}; choose another path") from error
 
 
 def _parse(text: str) -> FapAnimation:
@@ -128,7 +130,7 @@ def _parse(text: str) -> FapAnimation:
         raise _BadFileError(lines[-1][0], f"the file ends after {complete} of {num_frames} frames")
     if len(lines) > 1 + 2 * num_frames:
         raise _BadFileError(
-            lines[1 + 2 * num_frames][0], f"more than the {num_frames} frames of the first line"
+            lines[1 + 2 * num_frames][0], f"the header announces only {num_frames} frames"
         )
     faps = np.zeros((num_frames, NUM_FAPS), dtype=np.float32)
     visemes = np.zeros((num_frames, len(_VISEME_LIMITS)), dtype=np.int64)
@@ -145,7 +147,7 @@ def _parse(text: str) -> FapAnimation:
         first_number = number if first_number is None else first_number
         if number != first_number + frame:
             raise _BadFileError(
-                line_number, f"frame {number} where {first_number + frame} must follow"
+                line_number, f"found frame {number}, expected frame {first_number + frame}"
             )
         used |= mask
     faps[:, 0], faps[:, 1] = visemes[:, 0], expressions[:, 0]
@@ -174,10 +176,10 @@ def _parse_header(line_number: int, words: list[str]) -> tuple[str, float, int]:
     except ValueError:
         frame_rate_hz = math.nan
     if not 1.0 <= frame_rate_hz <= 1000.0:
-        raise _BadFileError(line_number, f"frame rate '{words[-2]}' is not within 1 to 1000")
-    num_frames = _parse_int(line_number, words[-1], "a count of frames")
+        raise _BadFileError(line_number, f"frame rate '{words[-2]}' is not between 1 and 1000")
+    num_frames = _parse_int(line_number, words[-1], "a number of frames")
     if num_frames < 0:
-        raise _BadFileError(line_number, f"{num_frames} frames")
+        raise _BadFileError(line_number, f"the number of frames is {num_frames}")
     return " ".join(words[1:-2]), frame_rate_hz, num_frames
 
 
@@ -196,19 +198,19 @@ def _parse_mask(line_number: int, line: str) -> NDArray[np.bool_]:
             f"expected a mask of {NUM_FAPS} (Greta: {_GRETA_MASK_DIGITS}) digits 0 or 1",
         )
     if digits[NUM_FAPS:] == "1":
-        raise _BadFileError(line_number, "the mask sets a 69th FAP, which the standard has not")
+        raise _BadFileError(line_number, "the mask sets a 69th FAP; the standard has only 68")
     return np.array([digit == "1" for digit in digits[:NUM_FAPS]])
 
 
 def _parse_values(
     line_number: int, words: list[str], mask: NDArray[np.bool_]
 ) -> tuple[list[int], list[int], NDArray[np.float32]]:
-    """Numbers of FAP 1 (4) and of FAP 2 (6), and the values of the other set FAPs."""
+    """Return the numbers of FAP 1 (4) and FAP 2 (6), and the other values in the mask."""
     try:
         values = [float(word) for word in words[1:]]
     except ValueError:
         raise _BadFileError(line_number, "a value is not a number") from None
-    # how many numbers FAP 1 and 2 have shows in the length of the line
+    # the length of the line shows how many numbers FAP 1 and 2 have
     for num_viseme in (len(_VISEME_LIMITS), 1) if mask[0] else (0,):
         for num_expression in (len(_EXPRESSION_LIMITS), 1) if mask[1] else (0,):
             high = num_viseme + num_expression
@@ -220,7 +222,9 @@ def _parse_values(
                     _parse_high(line_number, 2, values[num_viseme:high], _EXPRESSION_LIMITS),
                     sane.astype(np.float32),
                 )
-    raise _BadFileError(line_number, f"{len(values)} values, the mask asks for {int(mask.sum())}")
+    raise _BadFileError(
+        line_number, f"found {len(values)} values, the mask sets {int(mask.sum())} FAPs"
+    )
 
 
 def _parse_high(
@@ -233,6 +237,6 @@ def _parse_high(
     for value, limit in zip(given, limits, strict=True):
         if not (0 <= value <= limit and value == int(value)):
             raise _BadFileError(
-                line_number, f"FAP {fap} has {value:g}; a whole number from 0 to {limit} is due"
+                line_number, f"FAP {fap} is {value:g}; give a whole number from 0 to {limit}"
             )
     return [int(value) for value in given]

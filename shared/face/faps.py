@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib import resources
 
 NUM_FAPS = 68
-MASK_BYTES = 9  # one bit a FAP, least significant bit of the first byte is FAP 1
+MASK_BYTES = 9  # one bit per FAP; FAP 1 is the least significant bit of the first byte
 FAP_UNITS_PER_FAPU = 1024.0
 RADIANS_PER_ANGLE_UNIT = 1e-5
 
@@ -22,10 +22,10 @@ class Fap:
 
     number: int  # 1 to 68
     name: str
-    fapu: str  # MNS MW IRISD ES ENS AU, empty for FAP 1 and 2
-    direction: str  # where positive values lead; "left" is the subject's left
+    fapu: str  # unit: MNS MW IRISD ES ENS AU; empty for FAP 1 and 2
+    direction: str  # direction of positive values; "left" is the subject's left
     bidirectional: bool
-    feature_points: tuple[str, ...]  # the points it moves, as "2.1"
+    feature_points: tuple[str, ...]  # points that this FAP moves, such as "2.1"
 
 
 def _read_table() -> tuple[Fap, ...]:
@@ -44,6 +44,6 @@ def _read_table() -> tuple[Fap, ...]:
 
 
 FAPS = _read_table()
-# What a mouth is made of: jaw, lips, tongue.
-MOUTH_FAPS = (*range(3, 15), 16, 17, *range(44, 48), *range(51, 61))
+MOUTH_FAPS = (*range(3, 15), 16, 17, *range(44, 48), *range(51, 61))  # jaw, lips and tongue
+NUM_MOUTH_FAPS = len(MOUTH_FAPS)
 FAP_NUMBER = {fap.name: fap.number for fap in FAPS}

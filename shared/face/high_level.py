@@ -1,12 +1,16 @@
 """FAP 1 (viseme) and FAP 2 (expression) as sums of low-level FAPs.
 
 ISO/IEC 14496-2, annex C: FAP 1 blends two of 14 visemes, FAP 2 two of six expressions. The
-standard describes their looks in words; the values here (``high_level.tsv``) are those of Crystal
-TTVS (Tsinghua HCSI, Apache-2.0) for the expressions and for the Mandarin visemes nearest to the
-standard's English ones. Deviations: "th", "tS dZ S" and "r" are mixed from several of these; the
-tongue's tip rises in "th", "t d" and "n l", its body in "k g" and "I", and the lower lip draws in
-for "f v"; brows, lids and cheeks move less far than there, where brows would cross and the middle
-of a worried brow sink; and disgust pulls up both sides of the lip.
+standard describes them only in words. The values in ``high_level.tsv`` are from Crystal TTVS
+(Tsinghua HCSI, Apache-2.0): its expressions, and its Mandarin visemes that are closest to the
+standard's English ones. Deviations:
+
+- "th", "tS dZ S" and "r" are mixtures of several Mandarin visemes.
+- The tip of the tongue rises in "th", "t d" and "n l"; its body rises in "k g" and "I".
+- The lower lip draws in for "f v".
+- Brows, lids and cheeks move less. With the original values, brows would cross and the middle of a
+  worried brow would sink.
+- Disgust raises both sides of the lip.
 """
 
 from __future__ import annotations
@@ -26,7 +30,7 @@ FULL = 63  # highest viseme_blend and expression_intensity
 
 
 def fap_table(name: str) -> tuple[list[dict[str, str]], Float32]:
-    """Read a table beside this module: its rows, and their columns ``fapN`` as FAPs (rows, 68)."""
+    """Read a table of this package: its rows, and its columns ``fapN`` as FAPs (rows, 68)."""
     text = resources.files("kouxing.shared.face").joinpath(name).read_text("utf-8")
     rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
     values = np.zeros((len(rows), NUM_FAPS), np.float32)
@@ -48,14 +52,9 @@ EXPRESSION_NAMES, EXPRESSIONS = _read("expression")  # (7, 68), row 0 is neutral
 
 
 def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
-    """Blend two visemes into low-level FAPs (68,).
+    """Blend two visemes (0 for none, 1 to 14) into low-level FAPs (68,).
 
-    Parameters
-    ----------
-    select1, select2
-        Visemes 1 to 14; 0 for none.
-    blend
-        0 (all of the second) to 63 (all of the first).
+    ``blend`` goes from 0 (second viseme only) to 63 (first viseme only).
 
     Raises
     ------
@@ -72,14 +71,10 @@ def viseme_faps(select1: int, select2: int, blend: float) -> Float32:
 def expression_faps(
     select1: int, intensity1: float, select2: int = 0, intensity2: float = 0.0
 ) -> Float32:
-    """Add two expressions, each by its intensity, into low-level FAPs (68,).
+    """Add two expressions into low-level FAPs (68,).
 
-    Parameters
-    ----------
-    select1, select2
-        1 joy, 2 sadness, 3 anger, 4 fear, 5 disgust, 6 surprise; 0 for none.
-    intensity1, intensity2
-        0 to 63.
+    Expressions: 1 joy, 2 sadness, 3 anger, 4 fear, 5 disgust, 6 surprise; 0 for none. Intensities
+    go from 0 to 63.
 
     Raises
     ------
@@ -96,4 +91,4 @@ def expression_faps(
 def _check(name: str, values: tuple[float, ...], highest: int) -> None:
     for value in values:
         if not 0 <= value <= highest:
-            raise UserError(f"{name} is {value}; give 0 to {highest}")
+            raise UserError(f"{name} is {value}; give a value from 0 to {highest}")

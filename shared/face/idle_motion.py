@@ -1,14 +1,14 @@
-"""Blinks, gaze, breath and small head motion, so that the face is not a mask with a mouth.
+"""Idle motion: blinks, gaze, breath and small head motion.
 
-Figures: about 17 to 20 blinks a minute in conversation, intervals skewed (log-normal), the lid
-falls in about 80 ms and rises twice as slowly (Bentivoglio et al. 1997; VanderWerf et al. 2003).
-Saccades last 21 ms and 2.2 ms a degree (Bahill et al. 1975); most fixations of a speaker rest on
-the listener, and those of somebody who pauses to think do so less (Kendon 1967). Head turns of
-about a degree, slower than 1.5 Hz; breath, 14 times a minute, moves the head by a third of one.
-When the head turns, the eyes turn back (vestibulo-ocular reflex).
+Blinks: 17 to 20 per minute in conversation, at log-normal intervals. The lid falls in about 80 ms
+and rises half as fast (Bentivoglio et al. 1997; VanderWerf et al. 2003). Gaze: saccades last 21 ms
+plus 2.2 ms per degree (Bahill et al. 1975). Speakers look at the listener during most fixations,
+but less often while they pause to think (Kendon 1967). Head: turns of about one degree, slower than
+1.5 Hz. Breath: 14 times a minute, a third of a degree of head motion. The eyes compensate head
+turns (vestibulo-ocular reflex).
 
-Everything follows from the seed, the time and the states, and of these only the newest count: who
-begins in the midst soon shows the same face as who has shown it from the beginning.
+The motion depends only on the seed, the time and recent states. A generator that starts late soon
+makes the same motion as one that started with the session.
 """
 
 from __future__ import annotations
@@ -19,32 +19,31 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
+from kouxing.shared.face.faps import FAP_NUMBER, RADIANS_PER_ANGLE_UNIT
+from kouxing.shared.face.smoothing import smooth_step, smoothing_share
 
-_DEGREE = math.pi / 180.0 / 1e-5  # in the FAPs' angle unit, 1e-5 rad
+_DEGREE = math.pi / 180.0 / RADIANS_PER_ANGLE_UNIT
 
 _BLINK_MEDIAN_S = 3.0
 _BLINK_LOG_SD = 0.5
 _BLINK_MIN_S = 0.6
 _LID_FALL_S, _LID_SHUT_S, _LID_RISE_S = 0.08, 0.03, 0.16
-UPPER_LID, LOWER_LID = 900.0, 150.0  # together a little over the open eye's 1024
+UPPER_LID, LOWER_LID = 900.0, 150.0  # the sum slightly exceeds the open eye's 1024
 
 _FIXATION_MEAN_S = 1.4
 _FIXATION_MIN_S = 0.3
-_REACTION_S = 0.15  # after which the gaze follows another state
-_GAZE_SD_DEG = (0.5, 0.4)  # on the listener, sideways and up or down
-_GLANCE_SD_DEG = (5.0, 2.5)
+_REACTION_S = 0.15  # the gaze follows a new state after this time
+_GAZE_SD_DEG = (0.5, 0.4)  # fixations on the listener: horizontal, vertical
+_GLANCE_SD_DEG = (5.0, 2.5)  # other fixations
 _GLANCE_LIMIT_DEG = 12.0
-_LID_PER_GAZE = 0.012  # FAP units of the upper lid for each unit of gaze downwards
+_LID_PER_GAZE = 0.012  # FAP units of the upper lid per unit of downward gaze
 
 _HEAD_SD_DEG = (0.9, 1.1, 0.6)  # pitch, yaw, roll while speaking
 _HEAD_HZ = (0.07, 1.4)
 _NUM_WAVES = 9
-_LISTENING_HEAD = 0.35  # head motion of a listener, as a share of a speaker's
-_SPEAKING_S = 0.8  # time constant between the two
+_LISTENING_HEAD = 0.35  # head motion while listening, relative to speaking
+_SPEAKING_S = 0.8  # time constant of the change between them
 _BREATH_HZ, _BREATH_DEG = 0.23, 0.35
-
-REST_RATE_HZ = 25.0  # of faces that are shown without a session
 
 _LIDS_UPPER = [FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_t_r_eyelid"] - 1]
 _LIDS_LOWER = [FAP_NUMBER["close_b_l_eyelid"] - 1, FAP_NUMBER["close_b_r_eyelid"] - 1]
@@ -54,25 +53,19 @@ _HEAD = [FAP_NUMBER[f"head_{axis}"] - 1 for axis in ("pitch", "yaw", "roll")]
 
 
 class State(Enum):
-    """What somebody does, which the eyes and the head tell."""
+    """Conversational state; it controls gaze and head motion."""
 
     LISTENING = "listening"
     SPEAKING = "speaking"
-    THINKING = "thinking"  # in a pause of one's own speech
+    THINKING = "thinking"  # a pause within one's own speech
 
 
-# share of the fixations that rest on the listener
+# share of the fixations on the listener
 _ON_LISTENER = {State.LISTENING: 0.8, State.SPEAKING: 0.88, State.THINKING: 0.5}
 
 
 class IdleMotion:
-    """Eyes and head over time; times must not decrease.
-
-    Parameters
-    ----------
-    seed : int
-        The same seed gives the same motion.
-    """
+    """Motion of eyes and head; the same seed gives the same motion. Times must not decrease."""
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
@@ -94,24 +87,21 @@ class IdleMotion:
         self._blink_s = self._draw_blink(0.0)
         self._gaze_from = self._gaze_to = np.zeros(2)
         self._saccade_s, self._saccade_length_s = 0.0, 0.03
-        self._fixation = 0  # number of it
+        self._fixation = 0  # its number
         self._fixation_end_s = self._draw_fixation(0.0)
-        self._reaction_s = math.inf  # when the gaze follows another state
+        self._reaction_s = math.inf  # when the gaze follows a new state
 
     def apply(
         self, faps: NDArray[np.float32], time_s: float, state: State = State.LISTENING
     ) -> None:
-        """Add the motion at a time since the first frame to FAPs (68,), in place.
-
-        A speaker's head moves more than a listener's.
-        """
+        """Add the motion, at a time since the first frame, to FAPs (68,) in place."""
         if state is not self._state:
             self._state = state
             self._reaction_s = min(self._reaction_s, time_s + _REACTION_S)
         elapsed_s = max(time_s - self._time_s, 0.0)
         self._time_s = time_s
         goal = _LISTENING_HEAD if state is State.LISTENING else 1.0
-        self._liveliness += (goal - self._liveliness) * -math.expm1(-elapsed_s / _SPEAKING_S)
+        self._liveliness += (goal - self._liveliness) * smoothing_share(elapsed_s, _SPEAKING_S)
         angles = 2.0 * np.pi * self._wave_hz * time_s + self._wave_phase
         head = self._liveliness * np.sum(self._wave_size * np.sin(angles), axis=1)
         breath = math.sin(2.0 * math.pi * _BREATH_HZ * time_s + self._breath_phase)
@@ -119,11 +109,11 @@ class IdleMotion:
         yaw, pitch = self._gaze(time_s)
         lid = self._lid(time_s)
         faps[_HEAD] += head.astype(np.float32)
-        # the eyes stay on what they look at while the head turns
+        # the gaze target stays in place while the head turns
         faps[_EYES_PITCH] += pitch - head[0]
         faps[_EYES_YAW] += yaw - head[1]
         faps[_LIDS_UPPER] += _LID_PER_GAZE * (pitch - head[0])
-        # from wherever an expression has put the lids
+        # start from the lid position that an expression has set
         faps[_LIDS_UPPER] += lid * (UPPER_LID - faps[_LIDS_UPPER])
         faps[_LIDS_LOWER] += lid * (LOWER_LID - faps[_LIDS_LOWER])
 
@@ -135,16 +125,16 @@ class IdleMotion:
         return after_s + _FIXATION_MIN_S + float(self._fixation_rng.exponential(_FIXATION_MEAN_S))
 
     def _lid(self, time_s: float) -> float:
-        """How far the lids are shut, 0 to 1."""
+        """Return how far the lids are closed, 0 to 1."""
         while time_s > self._blink_s + _LID_FALL_S + _LID_SHUT_S + _LID_RISE_S:
             self._blink_s = self._draw_blink(self._blink_s)
         since_s = time_s - self._blink_s
         if since_s < _LID_FALL_S + _LID_SHUT_S:
-            return _smooth_step(since_s / _LID_FALL_S)
-        return 1.0 - _smooth_step((since_s - _LID_FALL_S - _LID_SHUT_S) / _LID_RISE_S)
+            return smooth_step(since_s / _LID_FALL_S)
+        return 1.0 - smooth_step((since_s - _LID_FALL_S - _LID_SHUT_S) / _LID_RISE_S)
 
     def _gaze(self, time_s: float) -> NDArray[np.float64]:
-        """Yaw (to the left) and pitch (downwards) of the gaze in space."""
+        """Return yaw (left) and pitch (down) of the gaze in space."""
         if time_s >= min(self._fixation_end_s, self._reaction_s):
             saccade_s = self._reaction_s
             while time_s >= self._fixation_end_s:
@@ -155,7 +145,7 @@ class IdleMotion:
         return self._gaze_at(time_s)
 
     def _gaze_at(self, time_s: float) -> NDArray[np.float64]:
-        done = _smooth_step((time_s - self._saccade_s) / self._saccade_length_s)
+        done = smooth_step((time_s - self._saccade_s) / self._saccade_length_s)
         return self._gaze_from + done * (self._gaze_to - self._gaze_from)
 
     def _look_at(self, target: NDArray[np.float64], saccade_s: float) -> None:
@@ -166,35 +156,8 @@ class IdleMotion:
         self._saccade_s, self._saccade_length_s = saccade_s, 0.021 + 0.0022 * size_deg
 
     def _target(self) -> NDArray[np.float64]:
-        """Where this fixation rests in the state of now: the same for the same fixation."""
+        """Return the target of the current fixation in the current state."""
         rng = np.random.default_rng([self._seed, self._fixation])
         is_on_listener = rng.random() < _ON_LISTENER[self._state]
         sd = _GAZE_SD_DEG if is_on_listener else _GLANCE_SD_DEG
         return np.clip(rng.normal(0.0, sd), -_GLANCE_LIMIT_DEG, _GLANCE_LIMIT_DEG) * _DEGREE
-
-
-class RestingFace:
-    """The face that is shown while there is no session.
-
-    Parameters
-    ----------
-    seed
-        Of its idle motion; 0: it stands still.
-    """
-
-    def __init__(self, seed: int) -> None:
-        self._motion = IdleMotion(seed) if seed else None
-        self._began_s: float | None = None
-
-    def at(self, now_s: float) -> NDArray[np.float32]:
-        """Return the FAPs (68,) at a time of any clock; times must not decrease."""
-        self._began_s = now_s if self._began_s is None else self._began_s
-        faps = np.zeros(NUM_FAPS, np.float32)
-        if self._motion is not None:
-            self._motion.apply(faps, now_s - self._began_s)
-        return faps
-
-
-def _smooth_step(part: float) -> float:
-    part = min(max(part, 0.0), 1.0)
-    return part * part * (3.0 - 2.0 * part)

@@ -1,14 +1,14 @@
-"""The sets of shapes, by what users and messages call them."""
+"""Names of the blendshape sets, as used by users and messages."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 
-MAX_SHAPES = 256  # of a set
+MAX_SHAPES = 256  # per set
 
 
 class ShapeSetName(StrEnum):
-    """Whose shapes they are."""
+    """A set of blendshapes."""
 
     ARKIT = "arkit"  # ARKit's 52 blend shapes
     OCULUS = "oculus"  # Oculus' 15 visemes

@@ -1,10 +1,10 @@
-"""Faces as weights of shapes: ARKit's 52, Oculus' 15 visemes, VRM 1's expressions; and back.
+"""Conversion between FAPs and blendshapes: ARKit's 52, Oculus' 15 visemes, VRM 1's expressions.
 
-Both directions are linear in their bases: a face of weights ``w`` is the FAPs
+Both directions are linear in the basis. A face with weights ``w`` has the FAPs
 
     f = A^T w                                     (1)
 
-and the weights nearest to given FAPs are the non-negative least-squares solution
+The weights closest to given FAPs are the bounded least-squares solution
 
     w = argmin_{0 <= w <= 1} |D (A^T w - f)|^2 + r^2 |w|^2             (2)
 
@@ -12,26 +12,26 @@ and the weights nearest to given FAPs are the non-negative least-squares solutio
 symbol  meaning                                                 unit      shape
 ======  ======================================================  ========  ========
 A       FAPs of each shape at weight 1                          FAP       (N, 68)
-D       what one FAP unit does: the travel of its feature       mm        (72, 68)
-        point, and 1.5 times how far four pairs of points part
-        the lips, for closed lips are to stay closed
-r       keeps shapes that nearly agree from rising together     mm        1
+D       effect of one FAP unit: travel of its feature point,    mm        (72, 68)
+        and 1.5 times the change of four gaps between the
+        lips, which keeps closed lips closed
+r       ridge: keeps similar shapes from rising together        mm        1
 ======  ======================================================  ========  ========
 
-What a set has no shape for counts for none of them: the head's turn (FAPs 48 to 50) for all, FAPs 1
-and 2 (``high_level`` turns these into others), and for the visemes whatever is no mouth.
+Equation (2) ignores FAPs that a set has no shape for: the head rotation (FAPs 48 to 50), FAPs 1 and
+2 (`high_level` expands them), and for the visemes everything outside the mouth.
 
-``arkit.tsv`` was measured on MakeHuman's face units (CC0); the
-visemes are those of FAP 1, whose fifteen entries are Oculus' fifteen. VRM's vowels are the visemes
-aa, ih, ou, E and oh, its blinks and looks both eyes' of ARKit. VRM adds "blink" to "blinkLeft" and
-"blinkRight", so what both eyes close by is in "blink", and only what one closes further in its own;
-its looks leave the lids to the blinks. The tongue counts half there: it tells vowels apart, but
-consonants, which have no shape, lift it, too.
+``arkit.tsv`` was measured on MakeHuman's face units (CC0). Its
+column ``live_link`` is the shape's position in Live Link Face. The Oculus visemes are the 15
+entries of FAP 1. VRM's vowels are the visemes aa, ih, ou, E and oh; its blinks and looks combine
+both eyes of ARKit. In VRM, "blink" holds what both eyes have in common, "blinkLeft" and
+"blinkRight" hold only the rest. The looks leave the lids to the blinks. The tongue has half its
+weight in VRM: it distinguishes vowels, but consonants also raise it and have no shape.
 
-Equation (2) is solved exactly, by block pivoting (J. Kim, H. Park, "Fast nonnegative matrix
-factorization", SIAM J. Scientific Computing 33(6), 2011; here with two bounds): guess which
-weights are 0, which 1 and which in between, solve for these, and move those that break a bound or
-lean away from theirs to the other side.
+Equation (2) is solved exactly by block pivoting (J. Kim, H. Park, "Fast nonnegative matrix
+factorization", SIAM J. Scientific Computing 33(6), 2011; here with two bounds): guess which weights
+are 0, which are 1 and which are in between, solve for the latter, and move the weights that violate
+a bound or an optimality condition.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ from kouxing.shared.face.shape_names import ShapeSetName
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-# lengths of an average face in mm; the eyeball's angles count by the way of the pupil
+# lengths of an average face, mm; an eye's angle counts as the distance that the pupil travels
 _FAPU_MM = {"MNS": 17.0, "MW": 48.0, "ENS": 45.0, "ES": 58.0, "IRISD": 9.0}
 _EYE_RADIUS_MM = 12.0
 _RIDGE_MM = 1.0
-_PATIENCE = 3  # exchanges of many weights that may fail to help, before they move one by one
+_PATIENCE = 3  # block exchanges without progress before single exchanges
 _ROUNDING = 1e-9
-_FACING_LIPS = ((4, 5), (51, 52), (55, 57), (56, 58))  # FAPs of the upper and of the lower lip
+_FACING_LIPS = ((4, 5), (51, 52), (55, 57), (56, 58))  # FAPs of the upper and the lower lip
 _GAP_WEIGHT = 1.5
 _LIDS = slice(18, 22)  # FAPs 19 to 22
 _TONGUE = slice(43, 47)  # FAPs 44 to 47
 
 
 def _effect_mm() -> Float64:
-    """D of equation (2)."""
+    """Return D of equation (2)."""
     lengths = [_FAPU_MM.get(fap.fapu, 0.0) / FAP_UNITS_PER_FAPU for fap in FAPS]
     travel = np.diag([mm or _EYE_RADIUS_MM * RADIANS_PER_ANGLE_UNIT for mm in lengths])
     gaps = [-travel[upper - 1] - travel[lower - 1] for upper, lower in _FACING_LIPS]
@@ -72,20 +72,20 @@ _EFFECT_MM = _effect_mm()
 
 
 class ShapeSet:
-    """Named shapes of a face.
+    """A named set of N blendshapes.
 
     Parameters
     ----------
     names
-        Of the N shapes.
+        Names of the shapes.
     basis
-        FAPs (N, 68) of each at weight 1.
+        FAPs (N, 68) of each shape at weight 1.
     solved
-        What takes their place in equation (2), (N, 68), with zeros for a shape that it leaves out.
+        Replaces the basis in equation (2); rows of zeros exclude a shape.
     effect_mm
         D of equation (2).
     finish
-        Sets, in place, the weights (N,) of shapes that equation (2) leaves out.
+        Sets the weights (N,) of excluded shapes in place.
     """
 
     def __init__(
@@ -105,21 +105,12 @@ class ShapeSet:
         self._unbounded = np.linalg.solve(self._gram, self._right)
 
     def faps(self, weights: Float32) -> Float32:
-        """Add shapes of the given weights (N,) up to FAPs (68,); equation (1)."""
+        """Return the FAPs (68,) of weights (N,), equation (1)."""
         faps: Float32 = np.asarray(weights, dtype=np.float32) @ self.basis
         return faps
 
     def weights(self, faps: Float32) -> Float32:
-        """Find the shapes that together look most like a face; equation (2).
-
-        Parameters
-        ----------
-        faps
-            Facial animation parameters (68,), FAP units.
-
-        Returns
-        -------
-        Weights (N,) from 0 to 1 in the order of ``names``.
+        """Return the weights (N,), 0 to 1, whose face is closest to FAPs (68,); equation (2).
 
         Raises
         ------
@@ -143,7 +134,7 @@ class ShapeSet:
             inner = np.flatnonzero(free)
             rows = self._gram[inner]
             weights[inner] = np.linalg.solve(rows[:, inner], right[inner] - rows @ weights)
-            lean = right - self._gram @ weights  # where a smaller misfit lies
+            lean = right - self._gram @ weights  # negative gradient
             below, above = free & (weights < -_ROUNDING), free & (weights > 1.0 + _ROUNDING)
             released = ~free & (np.where(at_one, -lean, lean) > _ROUNDING)
             wrong = np.flatnonzero(below | above | released)
@@ -153,7 +144,7 @@ class ShapeSet:
                 fewest, patience = len(wrong), _PATIENCE
             elif patience:
                 patience -= 1
-            else:  # the last of them alone: that ends surely
+            else:  # exchanging only the last one guarantees termination
                 wrong = wrong[-1:]
             free[wrong] = released[wrong]
             at_one[wrong] = above[wrong]
@@ -162,8 +153,8 @@ class ShapeSet:
 def _arkit() -> ShapeSet:
     rows, basis = fap_table("arkit.tsv")
     names = tuple(row["shape"] for row in rows)
-    # A shape to the left and that to the right would rise together for what they have in common;
-    # half of their difference stands for both.
+    # Left and right shapes would both rise for their common part. Half of their difference replaces
+    # each of them.
     solved = basis.copy()
     for name in ("jaw", "mouth"):
         left, right = (names.index(name + side) for side in ("Left", "Right"))
@@ -195,8 +186,8 @@ def _vrm() -> ShapeSet:
         [
             OCULUS.basis[[OCULUS.names.index(name) for name in vowels.values()]],
             [
-                ARKIT.basis[[ARKIT.names.index(name) for name in each]].sum(0)
-                for each in eyes.values()
+                ARKIT.basis[[ARKIT.names.index(name) for name in shapes]].sum(0)
+                for shapes in eyes.values()
             ],
         ]
     )
@@ -215,7 +206,7 @@ def _vrm() -> ShapeSet:
 
 
 ARKIT = _arkit()  # 52
-OCULUS = _oculus()  # 15; "sil" is what the others leave of 1
+OCULUS = _oculus()  # 15; "sil" is 1 minus the sum of the others
 VRM = _vrm()  # 12
 SHAPE_SETS: Mapping[str, ShapeSet] = {
     ShapeSetName.ARKIT: ARKIT,

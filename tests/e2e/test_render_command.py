@@ -23,7 +23,7 @@ from kouxing.services.cli.run import head_environment
 from kouxing.services.driver.config import DriverConfig, Framing
 from kouxing.services.driver.head.glb_export import export_glb
 from kouxing.services.driver.head.head import Head
-from kouxing.services.driver.video.film import frames_of
+from kouxing.services.driver.video.film import expand_frames
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
@@ -194,7 +194,7 @@ def test_a_definition_of_a_viseme_holds_the_whole_shape() -> None:
     faps = np.zeros((2, 68), np.float32)
     faps[:, 2] = 100
     visemes = np.array([[10, 0, 63, 0], [10, 0, 63, 1]])
-    frames = frames_of(FapAnimation("", 25.0, faps, visemes))
+    frames = expand_frames(FapAnimation("", 25.0, faps, visemes))
     assert frames[0][1][2] > 150
     assert frames[1][1][2] == 100
 

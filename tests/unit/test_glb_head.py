@@ -37,7 +37,7 @@ def own() -> Head:
 def skin(head: Head, faps: np.ndarray) -> np.ndarray:
     """Displacement of the skin in eye distances (V, 3)."""
     moved = head.deform(np.asarray(faps, np.float32)) - head.vertices
-    unit = np.linalg.norm(head.eye_centres[0] - head.eye_centres[1])
+    unit = np.linalg.norm(head.eye_centers[0] - head.eye_centers[1])
     shift: np.ndarray = moved[head.part("skin").vertices] / unit
     return shift
 
@@ -274,30 +274,30 @@ def primitive(**values: Any) -> Callable[[dict[str, Any]], None]:
         (change("accessors", 1, count=10**9), "an accessor of 1000000000 elements"),
         (many_primitives, "more than 2000 meshes"),
         (many_targets, "more than 20000000 displacements"),
-        (change("nodes", 0, translation=[1e300, 0, 0]), "not finite, or very large"),
-        (change("nodes", 0, translation=[float("nan"), 0, 0]), "no intact glTF description"),
+        (change("nodes", 0, translation=[1e300, 0, 0]), "not finite or very large"),
+        (change("nodes", 0, translation=[float("nan"), 0, 0]), "glTF description is damaged"),
         (change("nodes", 0, rotation=[0, 0.7, 0, 0.7]), "do not lie side by side"),
         (change("accessors", 0, count=5), "larger than its buffer view"),
         (change("accessors", 0, count=-1), "an accessor of -1"),
         (change("accessors", 0, byteOffset=-4), "larger than its buffer view"),
-        (change("accessors", 0, componentType=1), "no intact GLB"),
+        (change("accessors", 0, componentType=1), "is damaged or is not a GLB"),
         (change("accessors", 0, type="VEC4"), "larger than its buffer view"),
-        (change("accessors", 0, bufferView=999), "there is no bufferViews 999"),
+        (change("accessors", 0, bufferView=999), "bufferViews has no item 999"),
         (change("bufferViews", 0, byteLength=10**9), "outside the file"),
         (change("bufferViews", 0, byteOffset=-1), "outside the file"),
         (change("bufferViews", 0, byteStride=4), "larger than its buffer view"),
         (change("nodes", 0, children=[0]), "form no tree"),
-        (change("nodes", 0, children=[7]), "there is no nodes 7"),
-        (change("nodes", 0, mesh=7), "there is no meshes 7"),
-        (change("nodes", 0, matrix=[1, 2]), "no intact GLB"),
+        (change("nodes", 0, children=[7]), "nodes has no item 7"),
+        (change("nodes", 0, mesh=7), "meshes has no item 7"),
+        (change("nodes", 0, matrix=[1, 2]), "is damaged or is not a GLB"),
         (sparse, "writes outside itself"),
         (primitive(indices=0), "corner that does not exist"),
         (primitive(mode=0), "no triangles"),
-        (primitive(attributes={}), "no intact GLB"),
-        (lambda d: d["meshes"][0].pop("extras"), "too few known names"),
+        (primitive(attributes={}), "is damaged or is not a GLB"),
+        (lambda d: d["meshes"][0].pop("extras"), "too few of its morph targets"),
         (lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco"),
-        (lambda d: d.update(scene=5), "no intact GLB"),
-        (lambda d: d.update(nodes=[]), "there is no nodes 0"),
+        (lambda d: d.update(scene=5), "is damaged or is not a GLB"),
+        (lambda d: d.update(nodes=[]), "nodes has no item 0"),
     ],
 )
 def test_broken_descriptions(
@@ -313,13 +313,13 @@ def test_broken_descriptions(
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"", "no binary glTF"),
-        (b"\0" * 100, "no binary glTF"),
+        (b"", "not a binary glTF"),
+        (b"\0" * 100, "not a binary glTF"),
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
         (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "no intact glTF description"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "no intact glTF description"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "glTF description is damaged"),
+        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "glTF description is damaged"),
     ],
 )
 def test_broken_bytes(tmp_path: Path, data: bytes, said: str) -> None:
@@ -345,7 +345,7 @@ def test_every_flipped_byte_is_read_or_refused(small: Path) -> None:
 @pytest.mark.parametrize(
     ("texture", "said"),
     [
-        (b"#EXTM3U\n/etc/hostname\n", "neither PNG, JPEG nor WebP"),
+        (b"#EXTM3U\n/etc/hostname\n", "not PNG, JPEG or WebP"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), "damaged"),
         (
             b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">IIB", 30_000, 30_000, 8),

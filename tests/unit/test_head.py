@@ -115,7 +115,7 @@ def test_rotations(head: Head, name: str, point: str, about: int, axis: int, sig
     vertices = head.deform(neutral_faps(**{name: 10_000.0}))  # 0.1 rad
     vertex = head.feature_points[point]
     eye = int(name.split("_")[1] == "r")
-    pivot = head.eye_centres[eye] if "eyeball" in name else np.zeros(3)
+    pivot = head.eye_centers[eye] if "eyeball" in name else np.zeros(3)
     before, after = (np.delete(v[vertex] - pivot, about) for v in (head.vertices, vertices))
     assert sign * (vertices[vertex] - head.vertices[vertex])[axis] > 0.0005
     turned = np.arccos(before @ after / np.linalg.norm(before) / np.linalg.norm(after))

@@ -51,7 +51,7 @@ def imported(own: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
     write_glb(folder / "face.glb", parts)
     (folder / "points.tsv").write_text(lines(own, place), encoding="utf-8")
     remarks = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
-    assert remarks == ["without points, these FAPs move nothing: dilate_l_pupil, dilate_r_pupil"]
+    assert remarks == ["no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"]
     return Head.load(folder / "face.npz")
 
 
@@ -109,7 +109,7 @@ def test_eyes_head_and_shoulders(imported: Head) -> None:
     assert not turn[right].any()
     ball = imported.vertices[left]
     middle = (ball.min(axis=0) + ball.max(axis=0)) / 2
-    np.testing.assert_allclose(imported.eye_centres[0], middle, atol=1e-5)
+    np.testing.assert_allclose(imported.eye_centers[0], middle, atol=1e-5)
     nod = np.abs(moved(imported, neutral_faps(head_yaw=30_000))).max(axis=1)
     assert nod[imported.feature_points["2.1"]] > 0.01
     assert nod[np.argmin(imported.vertices[:, 1])] < 0.001
@@ -124,11 +124,11 @@ def test_obj_with_vertex_numbers_and_seams(own: Head, tmp_path: Path) -> None:
         for name, vertex in own.feature_points.items()
         if vertex < own.part("skin").vertices.stop
     ]
-    eyes = {"3.5": own.eye_centres[0], "3.6": own.eye_centres[1]}
+    eyes = {"3.5": own.eye_centers[0], "3.6": own.eye_centers[1]}
     rows += [f"{name} {' '.join(map(str, place))}  # inside" for name, place in eyes.items()]
     (tmp_path / "points.txt").write_text("\n".join(rows), encoding="utf-8")
     remarks = import_head(tmp_path / "face.obj", tmp_path / "points.txt", tmp_path / "out.npz")
-    assert "no eyeballs apart from the skin: the eyes do not turn" in remarks
+    assert "no eyeballs separate from the skin: the eyes do not rotate" in remarks
     head = Head.load(tmp_path / "out.npz")
     shift = moved(head, OPEN)
     assert shift[head.feature_points["2.3"], 1] < -0.4 * head.fapu["MNS"]
@@ -177,17 +177,17 @@ def face(own: Head, tmp_path: Path) -> Path:
     [
         ("", "no feature points"),
         ("2.1 0 0", "line 1: expected 'point x y z' or 'point vertex'"),
-        ("# good\n2.1 0 0 x", "line 2: .* no number"),
+        ("# good\n2.1 0 0 x", "line 2: .* invalid number"),
         ("2.1 nan 0 0", "line 1: expected"),
         ("2.1 1.5", "line 1: expected"),
-        ("99.1 0 0 0", "'99.1' is no MPEG-4 feature point"),
-        ("2.15 0 0 0", "'2.15' is no MPEG-4 feature point"),
-        ("2.1 0 0 0\n2.1 0 0 0", "line 2: 2.1 comes twice"),
-        ("2.1 1000000", "vertex 1000000, but there are"),
+        ("99.1 0 0 0", "'99.1' is not an MPEG-4 feature point"),
+        ("2.15 0 0 0", "'2.15' is not an MPEG-4 feature point"),
+        ("2.1 0 0 0\n2.1 0 0 0", "line 2: 2.1 occurs twice"),
+        ("2.1 1000000", "vertex 1000000, but the last vertex is"),
         ("2.1 0 -0.07 0.07", r"points are missing: 2.2, .* 8.8, 3.5 \(or its eyelids\)"),
-        ("<xfdp><fdp", "no intact XML"),
+        ("<xfdp><fdp", "invalid XML"),
         ("<!DOCTYPE x><xfdp/>", "document type"),
-        ("<xfdp><fdp name='2.1' affects='skin'/></xfdp>", "no index"),
+        ("<xfdp><fdp name='2.1' affects='skin'/></xfdp>", "index is missing"),
         ("<xfdp/>", "no feature points"),
     ],
 )
@@ -202,13 +202,13 @@ def test_bad_points(face: Path, tmp_path: Path, text: str, said: str) -> None:
     [
         (
             lambda rows: rows.replace("\n8.1\t", "\n8.1 1 0 0 #"),
-            "off the mesh, in its unit: 8.1 by 0.79",
+            "too far from the mesh, in its unit: 8.1 by 0.79",
         ),
         (lambda rows: exchange(rows, "8.3", "8.4"), "MW is not positive"),
         (lambda rows: exchange(rows, "2.1", "3.5", "3.6", "8.1"), "is not below the eyes"),
         (
             lambda rows: re.sub("\n2.4\t.*(?s:(.*\n)8.3)(\t.*)", r"\n2.4\2\g<1>8.3\2", rows),
-            "2.4 and 8.3 fall on one vertex",
+            "2.4 and 8.3 have the same vertex",
         ),
     ],
 )
@@ -258,10 +258,10 @@ def other_form(folder: Path) -> Path:
     ("make", "said"),
     [
         (no_faces, "has no faces"),
-        (garbage, "no intact mesh"),
-        (too_large, "67600 vertices; reduce it to 65535"),
-        (no_coordinate, "no (intact mesh|vertex)"),
-        (other_form, "one of the forms .obj, .glb, .ply"),
+        (garbage, "is damaged or is not a mesh"),
+        (too_large, "67600 vertices; reduce it to at most 65535"),
+        (no_coordinate, "not a (mesh|valid vertex)"),
+        (other_form, "one of the formats .obj, .glb, .ply"),
         (lambda folder: folder / "absent.obj", "no such file"),
     ],
 )

@@ -21,7 +21,7 @@ def poses_of(*sessions: str, configured: str = "newest") -> Poses:
     poses = Poses(configured)
     for number, session in enumerate(sessions, start=1):
         poses.add(session, 1.0)
-        poses.accept_frame(session, faps(number), 1.0)
+        poses.update(session, faps(number), 1.0)
     return poses
 
 
@@ -29,8 +29,8 @@ def test_frames_of_two_sessions_do_not_mix() -> None:
     poses = poses_of("a", "b")
     for number in range(10):
         now_s = 1.0 + 0.02 * number
-        poses.accept_frame("a", faps(100), now_s)
-        poses.accept_frame("b", faps(200), now_s)
+        poses.update("a", faps(100), now_s)
+        poses.update("b", faps(200), now_s)
         assert poses.faps(now_s)[0] == 200
 
 
@@ -92,10 +92,10 @@ def test_a_stalled_face_fades_to_rest_and_comes_back() -> None:
     assert not poses.is_stalled(1.9)
     assert 0 < poses.faps(2.1)[0] < 1
     assert poses.is_stalled(2.1)
-    assert poses.caption(2.1) == "a (no frames come)"
+    assert poses.caption(2.1) == "a (no frames)"
     assert not poses.faps(3.0).any()
     for number in range(25):
-        poses.accept_frame("a", faps(1), 3.0 + 0.02 * number)
+        poses.update("a", faps(1), 3.0 + 0.02 * number)
         came_back = poses.faps(3.0 + 0.02 * number)[0]
         assert came_back == pytest.approx(min(0.02 * number / FADE_S, 1.0), abs=0.01)
     assert not poses.is_stalled(3.5)
@@ -126,7 +126,7 @@ def test_a_face_without_a_session_lives_and_does_not_jump_when_one_comes_or_goes
         if 60 * 13 < number < 60 * 18:
             frame = np.zeros(NUM_FAPS, np.float32)
             session.apply(frame, now_s - 100.0)
-            poses.accept_frame("a", frame, now_s)
+            poses.update("a", frame, now_s)
         if number == 60 * 18:
             poses.remove("a")
         shown.append(poses.faps(now_s))
@@ -141,4 +141,4 @@ def test_a_face_without_a_session_lives_and_does_not_jump_when_one_comes_or_goes
 def test_the_caption_counts_the_sessions() -> None:
     poses = poses_of("a", "b", "c")
     poses.switch(-1)
-    assert poses.caption(0.0) == "b, 2 of 3 (Tab: the next)"
+    assert poses.caption(0.0) == "b, 2 of 3 (Tab: next)"

@@ -29,9 +29,9 @@ def test_images_follow_media_time_whatever_the_frame_rates(
     renderer: Renderer, tmp_path: Path
 ) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
-    recording.accept_sound(0, np.zeros(16000, np.float32))
+    recording.add_sound(0, np.zeros(16000, np.float32))
     for number in range(31):
-        recording.accept_frame(number / 30, frame(number))
+        recording.add_frame(number / 30, frame(number))
     while recording.step():
         pass
     recording.close()
@@ -44,10 +44,10 @@ def test_images_follow_media_time_whatever_the_frame_rates(
 def test_no_image_is_made_before_its_frames_have_come(renderer: Renderer, tmp_path: Path) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     assert not recording.step()
-    recording.accept_frame(0.0, frame(0))
+    recording.add_frame(0.0, frame(0))
     assert recording.step()
     assert not recording.step()
-    recording.accept_frame(0.05, frame(1))
+    recording.add_frame(0.05, frame(1))
     assert recording.step()
     assert not recording.step()
     recording.close()
@@ -58,9 +58,9 @@ def test_missing_sound_becomes_silence_and_repeated_sound_is_left_out(
 ) -> None:
     recording = Recording(tmp_path / "a.mp4", renderer, 25.0)
     loud = np.full(8000, 0.5, np.float32)
-    recording.accept_sound(8000, loud)
-    recording.accept_sound(12000, loud)
-    recording.accept_frame(0.0, frame(0))
+    recording.add_sound(8000, loud)
+    recording.add_sound(12000, loud)
+    recording.add_frame(0.0, frame(0))
     recording.step()
     recording.close()
     with av.open(str(tmp_path / "a.mp4")) as film:

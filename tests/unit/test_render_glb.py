@@ -158,7 +158,7 @@ def test_every_head_is_exported(name: str, tmp_path: Path) -> None:
 
 
 def test_unwritable_path(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cannot be written"):
+    with pytest.raises(UserError, match="cannot write"):
         export_glb(heads.load("woman", "coarse"), tmp_path / "no" / "head.glb")
     with pytest.raises(UserError, match=r"ends in \.glb"):
         export_glb(heads.load("woman", "coarse"), tmp_path / "head.png")

@@ -87,7 +87,7 @@ def test_backgrounds() -> None:
 
 @pytest.mark.parametrize(
     ("name", "said"),
-    [("nobody", "there is no head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
+    [("nobody", "unknown head"), ("my.obj", "head import"), ("my.glb", "my.glb")],
 )
 def test_no_such_head(name: str, said: str) -> None:
     with pytest.raises(UserError, match=said):

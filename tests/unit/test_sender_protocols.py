@@ -1,4 +1,4 @@
-"""What other programs read of a face: VMC, Live Link Face, OSC, VTube Studio's parameters."""
+"""Messages of the sender protocols, and target addresses."""
 
 from __future__ import annotations
 
@@ -8,19 +8,21 @@ import math
 import numpy as np
 import pytest
 
-from kouxing.services.senders import live_link, osc, vmc, vtube_studio
-from kouxing.services.senders.face import Face
-from kouxing.services.senders.target import parse_target
+from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.services.senders.live_link import LiveLinkConnection
+from kouxing.services.senders.playout_clock import PAUSE_S, WINDOW_S, PlayoutClock
+from kouxing.services.senders.protocols import connect, parse_target
+from kouxing.services.senders.vtube_studio import Denied, Dialogue, tracking_parameters
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS
-from tests.receivers import LIVE_LINK_ORDER, read_live_link, read_osc
+from tests.receivers import LIVE_LINK_ORDER, Messages, read_live_link, read_osc
 
 pytestmark = pytest.mark.unit
 
 
-def face(shapes: str = "arkit", time_s: float = 0.0, /, **weights: float) -> Face:
-    """Return a face of shapes, or of FAPs, by name."""
+def frame_of(shapes: str = "arkit", time_s: float = 0.0, /, **weights: float) -> FaceFrame:
+    """Return a frame with some shapes or FAPs, by name."""
     faps = np.zeros(NUM_FAPS, np.float32)
     for name, weight in weights.items():
         if name in FAP_NUMBER:
@@ -29,16 +31,19 @@ def face(shapes: str = "arkit", time_s: float = 0.0, /, **weights: float) -> Fac
             row = np.zeros(len(SHAPE_SETS[shapes].names), np.float32)
             row[SHAPE_SETS[shapes].names.index(name)] = weight
             faps += SHAPE_SETS[shapes].faps(row)
-    return Face(faps, time_s)
+    return FaceFrame(faps, time_s)
+
+
+def osc_messages(url: str, frame: FaceFrame) -> Messages:
+    """Return the OSC messages of a frame."""
+    return read_osc(list(connect(parse_target(url)).encode(frame)))  # type: ignore[attr-defined]
 
 
 # --- VMC -----------------------------------------------------------------------------------------
 
 
-def test_vmc_names_expressions_as_vrm_0_and_vrm_1_do() -> None:
-    shown = face("vrm", 2.5, aa=0.6, blinkLeft=0.5)
-    (datagram,) = vmc.encode(shown, parse_target("vmc://"))
-    messages = read_osc([datagram])
+def test_vmc_sends_the_names_of_vrm_0_and_vrm_1() -> None:
+    messages = osc_messages("vmc://", frame_of("vrm", 2.5, aa=0.6, blinkLeft=0.5))
     assert messages[:2] == [("/VMC/Ext/OK", [1]), ("/VMC/Ext/T", [2.5])]
     assert messages[-1] == ("/VMC/Ext/Blend/Apply", [])
     values = {params[0]: params[1] for address, params in messages if address.endswith("/Val")}
@@ -49,13 +54,13 @@ def test_vmc_names_expressions_as_vrm_0_and_vrm_1_do() -> None:
     assert values["O"] < 0.1
 
 
-def test_vmc_splits_perfect_sync_and_applies_it_once_at_the_end() -> None:
-    shown = face(jawOpen=0.7)
-    datagrams = list(vmc.encode(shown, parse_target("vmc://?shapes=arkit")))
+def test_vmc_splits_perfect_sync_into_packets_and_applies_it_once() -> None:
+    connection = connect(parse_target("vmc://?shapes=arkit"))
+    datagrams = list(connection.encode(frame_of(jawOpen=0.7)))  # type: ignore[attr-defined]
     assert len(datagrams) == 4
     messages = read_osc(datagrams)
     names = [params[0] for address, params in messages if address == "/VMC/Ext/Blend/Val"]
-    assert names[:52] == [name[0].upper() + name[1:] for name in names[52:]]  # as Unity has them
+    assert names[:52] == [name[0].upper() + name[1:] for name in names[52:]]
     assert names[52:] == list(SHAPE_SETS["arkit"].names)
     addresses = [address for address, _ in messages]
     assert addresses.count("/VMC/Ext/Blend/Apply") == 1
@@ -70,34 +75,30 @@ def test_vmc_splits_perfect_sync_and_applies_it_once_at_the_end() -> None:
         ("head_roll", (0.0, 0.0, -math.sin(0.1), math.cos(0.1))),  # tilted to its right
     ],
 )
-def test_vmc_turns_the_head_if_asked(fap: str, quaternion: tuple[float, ...]) -> None:
-    shown = face(**{fap: 0.2e5})
-    bones = [
-        params
-        for address, params in read_osc(list(vmc.encode(shown, parse_target("vmc://?head=on"))))
-        if address == "/VMC/Ext/Bone/Pos"
-    ]
+def test_vmc_rotates_the_head_if_requested(fap: str, quaternion: tuple[float, ...]) -> None:
+    frame = frame_of(**{fap: 0.2e5})
+    messages = osc_messages("vmc://?head=on", frame)
+    bones = [params for address, params in messages if address == "/VMC/Ext/Bone/Pos"]
     assert [bone[:4] for bone in bones] == [["Head", 0.0, 0.0, 0.0]]
     assert bones[0][4:] == pytest.approx(quaternion, abs=1e-6)
-    plain = read_osc(list(vmc.encode(shown, parse_target("vmc://"))))
-    assert not any(address == "/VMC/Ext/Bone/Pos" for address, _ in plain)
+    assert not any(address == "/VMC/Ext/Bone/Pos" for address, _ in osc_messages("vmc://", frame))
 
 
-def test_a_camera_may_keep_the_rest_of_the_face() -> None:
-    shown = face("vrm", aa=0.6)
-    messages = read_osc(list(vmc.encode(shown, parse_target("vmc://?only=mouth"))))
+def test_mouth_only_leaves_out_the_rest_of_the_face() -> None:
+    frame = frame_of("vrm", aa=0.6)
+    messages = osc_messages("vmc://?only=mouth", frame)
     names = {params[0] for address, params in messages if address == "/VMC/Ext/Blend/Val"}
     assert names == {*"AIUEO", "aa", "ih", "ou", "ee", "oh"}
-    parameters = vtube_studio.parameters(shown, is_mouth_only=True)
+    parameters = tracking_parameters(frame, is_mouth_only=True)
     assert not any(name.startswith(("Eye", "Face", "Brow")) for name in parameters)
 
 
-# --- Live Link Face ------------------------------------------------------------------------------
+# --- Live Link Face and OSC ----------------------------------------------------------------------
 
 
-def test_live_link_face_version_6() -> None:
-    shown = face(jawOpen=0.6, eyeBlinkRight=0.4, head_yaw=0.2e5, pitch_l_eyeball=0.1e5)
-    datagram = live_link.encode(shown, parse_target("livelink://?name=Ada"), 3600.51)
+def test_live_link_datagram() -> None:
+    frame = frame_of(jawOpen=0.6, eyeBlinkRight=0.4, head_yaw=0.2e5, pitch_l_eyeball=0.1e5)
+    datagram = LiveLinkConnection(parse_target("livelink://?name=Ada")).encode_at(frame, 3600.51)
     assert len(datagram) == 306 + len("Ada")
     fields = read_live_link(datagram)
     assert (fields["version"], len(fields["device"]), fields["name"]) == (6, 36, "Ada")
@@ -110,124 +111,115 @@ def test_live_link_face_version_6() -> None:
     assert values[55:] == pytest.approx((0.0, 0.1, 0.0, 0.0, 0.0, 0.0))
 
 
-def test_live_link_face_has_all_weights_in_their_order() -> None:
-    shown = face()
+def test_live_link_order_of_the_weights() -> None:
+    frame = frame_of()
     weights = {name: number / 52 for number, name in enumerate(SHAPE_SETS["arkit"].names)}
-    shown.weights = lambda *_, **__: weights  # type: ignore[method-assign] # each another
-    fields = read_live_link(live_link.encode(shown, parse_target("livelink://"), 0.0))
-    read = dict(zip(LIVE_LINK_ORDER, fields["values"], strict=False))
-    assert read == pytest.approx(weights)
+    frame.weights = lambda *_, **__: weights  # type: ignore[method-assign]
+    connection = LiveLinkConnection(parse_target("livelink://"))
+    fields = read_live_link(connection.encode_at(frame, 0.0))
+    assert dict(zip(LIVE_LINK_ORDER, fields["values"], strict=False)) == pytest.approx(weights)
 
 
-# --- OSC -----------------------------------------------------------------------------------------
-
-
-def test_osc_has_an_address_for_each_shape() -> None:
-    shown = face("oculus", 1.5, aa=0.5, head_pitch=math.radians(3) * 1e5)
-    messages = dict(read_osc(list(osc.encode(shown, parse_target("osc://?shapes=oculus")))))
+def test_osc_has_one_address_per_shape() -> None:
+    frame = frame_of("oculus", 1.5, aa=0.5, head_pitch=math.radians(3) * 1e5)
+    messages = dict(osc_messages("osc://?shapes=oculus", frame))
     assert messages["/kouxing/time"] == [1.5]
     assert messages["/kouxing/head"] == pytest.approx([3.0, 0.0, 0.0], abs=1e-3)
     assert messages["/kouxing/aa"] == pytest.approx([0.5], abs=0.05)
     assert len(messages) == 2 + 15
-    target = parse_target("osc://?prefix=/avatar/parameters/")
-    messages = dict(read_osc(list(osc.encode(shown, target))))
-    assert "/avatar/parameters/jawOpen" in messages
+    prefixed = dict(osc_messages("osc://?prefix=/avatar/parameters/", frame))
+    assert "/avatar/parameters/jawOpen" in prefixed
 
 
 # --- VTube Studio --------------------------------------------------------------------------------
 
 
-def test_the_mouth_of_a_live2d_model() -> None:
-    rest = vtube_studio.parameters(face(), is_mouth_only=False)
+def parameters_of(shapes: str = "arkit", **weights: float) -> dict[str, float]:
+    return tracking_parameters(frame_of(shapes, **weights), is_mouth_only=False)
+
+
+def test_vtube_studio_mouth_and_head() -> None:
+    rest = parameters_of()
     assert (rest["MouthOpen"], rest["MouthSmile"], rest["EyeOpenLeft"]) == (0.0, 0.5, 1.0)
-    wide = vtube_studio.parameters(face("vrm", aa=1.0), is_mouth_only=False)
-    round_ = vtube_studio.parameters(face("vrm", ou=0.8), is_mouth_only=False)
-    spread = vtube_studio.parameters(face("vrm", ih=0.8), is_mouth_only=False)
+    wide = parameters_of("vrm", aa=1.0)
     assert wide["MouthOpen"] == pytest.approx(1.0)
     assert wide["VoiceA"] > 0.8
-    assert round_["MouthSmile"] < 0.3
-    assert spread["MouthSmile"] > 0.7
-    turned = vtube_studio.parameters(
-        face(head_yaw=math.radians(10) * 1e5, head_pitch=math.radians(5) * 1e5), is_mouth_only=False
-    )
+    assert parameters_of("vrm", ou=0.8)["MouthSmile"] < 0.3
+    assert parameters_of("vrm", ih=0.8)["MouthSmile"] > 0.7
+    turned = parameters_of(head_yaw=math.radians(10) * 1e5, head_pitch=math.radians(5) * 1e5)
     assert turned["FaceAngleX"] == pytest.approx(10, abs=1e-3)
     assert turned["FaceAngleY"] == pytest.approx(-5, abs=1e-3)
 
 
-def test_eyes_and_brows_of_a_live2d_model() -> None:
-    rest = vtube_studio.parameters(face(), is_mouth_only=False)
+def test_vtube_studio_eyes_and_brows() -> None:
+    rest = parameters_of()
     assert (rest["EyeLeftX"], rest["EyeRightY"], rest["Brows"]) == (0.0, 0.0, 0.5)
-    left = {"eyeLookOutLeft": 0.6, "eyeLookInRight": 0.6}
-    looking = vtube_studio.parameters(
-        face(**left, eyeLookUpLeft=0.5, eyeLookUpRight=0.5), is_mouth_only=False
+    looking = parameters_of(
+        eyeLookOutLeft=0.6, eyeLookInRight=0.6, eyeLookUpLeft=0.5, eyeLookUpRight=0.5
     )
     for side in ("Left", "Right"):
         assert looking[f"Eye{side}X"] == pytest.approx(-0.6, abs=0.1)
         assert looking[f"Eye{side}Y"] == pytest.approx(0.5, abs=0.1)
-    frowning = vtube_studio.parameters(
-        face(browDownLeft=0.8, browDownRight=0.8), is_mouth_only=False
-    )
-    surprised = vtube_studio.parameters(
-        face(browInnerUp=1.0, browOuterUpLeft=1.0), is_mouth_only=False
-    )
-    assert frowning["Brows"] < 0.2
+    assert parameters_of(browDownLeft=0.8, browDownRight=0.8)["Brows"] < 0.2
+    surprised = parameters_of(browInnerUp=1.0, browOuterUpLeft=1.0)
     assert surprised["BrowLeftY"] > 0.9
     assert 0.6 < surprised["BrowRightY"] < 0.9
 
 
-def answer(kind: str, **data: object) -> str:
+def response(kind: str, **data: object) -> str:
     return json.dumps({"apiName": "VTubeStudioPublicAPI", "messageType": kind, "data": data})
 
 
-def test_vtube_studio_is_asked_for_a_token_once() -> None:
-    kept: list[str] = []
-    dialogue = vtube_studio.Dialogue("", kept.append)
-    request = json.loads(dialogue.begin())
+def test_vtube_studio_requests_a_token_once() -> None:
+    saved: list[str] = []
+    dialogue = Dialogue("", saved.append)
+    request = json.loads(dialogue.first_message())
     assert request["messageType"] == "AuthenticationTokenRequest"
     assert request["data"] == {"pluginName": "kouxing", "pluginDeveloper": "kouxing"}
     assert "Allow" in dialogue.problem
     request = json.loads(
-        dialogue.answer(answer("AuthenticationTokenResponse", authenticationToken="t"))
+        dialogue.reply(response("AuthenticationTokenResponse", authenticationToken="t"))
     )
-    assert kept == ["t"]
+    assert saved == ["t"]
     assert request["messageType"] == "AuthenticationRequest"
     assert request["data"]["authenticationToken"] == "t"
-    request = json.loads(dialogue.answer(answer("AuthenticationResponse", authenticated=True)))
+    request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=True)))
     assert request["messageType"] == "InputParameterListRequest"
     assert not dialogue.is_ready
     known = [{"name": "MouthOpen"}, {"name": "FaceAngleX"}]
-    listed = answer("InputParameterListResponse", defaultParameters=known, customParameters=[])
-    assert dialogue.answer(listed) == ""
+    listed = response("InputParameterListResponse", defaultParameters=known, customParameters=[])
+    assert dialogue.reply(listed) == ""
     assert dialogue.is_ready
-    frame = json.loads(dialogue.frame(face("vrm", aa=1.0), is_mouth_only=False))
-    assert frame["messageType"] == "InjectParameterDataRequest"
-    assert [each["id"] for each in frame["data"]["parameterValues"]] == ["MouthOpen", "FaceAngleX"]
-    assert frame["data"]["faceFound"] is True
+    message = json.loads(dialogue.frame_message(frame_of("vrm", aa=1.0), is_mouth_only=False))
+    assert message["messageType"] == "InjectParameterDataRequest"
+    values = message["data"]["parameterValues"]
+    assert [value["id"] for value in values] == ["MouthOpen", "FaceAngleX"]
+    assert message["data"]["faceFound"] is True
 
 
-def test_a_token_that_was_taken_back_is_asked_for_again() -> None:
-    dialogue = vtube_studio.Dialogue("old", lambda _: None)
-    assert json.loads(dialogue.begin())["messageType"] == "AuthenticationRequest"
-    request = json.loads(dialogue.answer(answer("AuthenticationResponse", authenticated=False)))
+def test_vtube_studio_requests_a_new_token_after_revocation() -> None:
+    dialogue = Dialogue("old", lambda _: None)
+    assert json.loads(dialogue.first_message())["messageType"] == "AuthenticationRequest"
+    request = json.loads(dialogue.reply(response("AuthenticationResponse", authenticated=False)))
     assert request["messageType"] == "AuthenticationTokenRequest"
 
 
-def test_vtube_studio_refuses() -> None:
-    dialogue = vtube_studio.Dialogue("", lambda _: None)
-    dialogue.begin()
-    with pytest.raises(vtube_studio.Denied):
-        dialogue.answer(answer("APIError", errorID=50, message="denied"))
+def test_vtube_studio_errors() -> None:
+    dialogue = Dialogue("", lambda _: None)
+    dialogue.first_message()
+    with pytest.raises(Denied):
+        dialogue.reply(response("APIError", errorID=50, message="denied"))
     for number, reason in ((1, "Start API"), (51, "press Allow"), (500, "no such")):
-        with pytest.raises(UserError, match=reason):  # and it is tried again
-            dialogue.answer(answer("APIError", errorID=number, message="no such"))
+        with pytest.raises(UserError, match=reason):
+            dialogue.reply(response("APIError", errorID=number, message="no such"))
     dialogue.is_ready = True
-    assert dialogue.answer(answer("APIError", errorID=454, message="MouthOpen")) == ""
+    assert dialogue.reply(response("APIError", errorID=454, message="MouthOpen")) == ""
     assert "another plugin" in dialogue.problem
-    dialogue.answer(answer("InjectParameterDataResponse"))
+    dialogue.reply(response("InjectParameterDataResponse"))
     assert dialogue.problem == ""
-    for nonsense in ("x", "[]", "{}", answer("AuthenticationTokenResponse")):
-        with pytest.raises(UserError, match="no VTube Studio"):
-            dialogue.answer(nonsense)
+    for nonsense in ("x", "[]", "{}", response("AuthenticationTokenResponse")):
+        with pytest.raises(UserError, match="not VTube Studio"):
+            dialogue.reply(nonsense)
 
 
 # --- addresses -----------------------------------------------------------------------------------
@@ -243,7 +235,7 @@ def test_vtube_studio_refuses() -> None:
         ("vts://[::1]:8002/", "::1", 8002),
     ],
 )
-def test_an_address_without_a_host_is_this_machine(url: str, host: str, port: int) -> None:
+def test_address_without_a_host_means_this_machine(url: str, host: str, port: int) -> None:
     target = parse_target(url)
     assert (target.host, target.port) == (host, port)
     assert target.is_local == (host != "192.168.1.20")
@@ -257,14 +249,54 @@ def test_an_address_without_a_host_is_this_machine(url: str, host: str, port: in
         ("vmc://host/path", "write vmc://HOST"),
         ("vmc://me@host", "write vmc://HOST"),
         ("vmc://host:99999", "write vmc://HOST"),
-        ("vmc://?delai=3", "there are delay"),
+        ("vmc://?delai=3", "use delay"),
         ("vmc://?shapes=fap", "vrm or arkit"),
-        ("vts://?shapes=vrm", "no option"),
+        ("vts://?shapes=vrm", "unknown option"),
         ("vmc://?delay=-1", "milliseconds"),
         ("vmc://?delay=nan", "milliseconds"),
-        ("osc://?prefix=kouxing", "begin with '/'"),
+        ("osc://?prefix=kouxing", "start with '/'"),
+        (f"osc://?prefix=/{'a' * 64}", "longer than 64"),
     ],
 )
-def test_a_wrong_address_says_what_is_expected(url: str, reason: str) -> None:
+def test_error_of_an_invalid_address(url: str, reason: str) -> None:
     with pytest.raises(UserError, match=reason):
         parse_target(url)
+
+
+# --- playout -------------------------------------------------------------------------------------
+
+
+def test_playout_removes_jitter() -> None:
+    playout, rng = PlayoutClock(), np.random.default_rng(0)
+    jitter_s = rng.uniform(0.0, 0.05, 500)
+    jitter_s[3] = 0.0
+    earliest_s = [
+        playout.earliest_s(number / 50, 100.0 + number / 50 + late_s)
+        for number, late_s in enumerate(jitter_s)
+    ]
+    steps_s = np.diff(earliest_s[int(WINDOW_S * 50) :])
+    assert np.abs(steps_s - 0.02).max() < 0.005
+    assert all(time_s <= 100.0 + n / 50 + jitter_s[n] for n, time_s in enumerate(earliest_s))
+
+
+def test_playout_follows_clock_drift() -> None:
+    playout = PlayoutClock()
+    late_s = [
+        (now_s := number / 50 * 1.001) - playout.earliest_s(number / 50, now_s)
+        for number in range(5000)
+    ]
+    assert max(late_s) < 2 * WINDOW_S * 0.0011
+
+
+def test_playout_delay_is_unchanged_after_a_pause() -> None:
+    playout = PlayoutClock()
+    for number in range(100):
+        playout.earliest_s(number / 50, number / 50)
+    stalled_s = 99 / 50
+    for number in range(100, 150):  # the face fades to rest while media time stands still
+        playout.earliest_s(stalled_s, number / 50)
+    resumed_s = [playout.earliest_s(stalled_s + n / 50, 3.0 + n / 50) for n in range(1, 50)]
+    assert resumed_s == pytest.approx([3.0 + n / 50 for n in range(1, 50)], abs=0.021)
+    later_s = 10.0 + PAUSE_S
+    assert playout.earliest_s(3.0, later_s) == later_s
+    assert playout.earliest_s(0.0, later_s) == later_s  # another session

@@ -72,7 +72,7 @@ def test_an_exception_leaves_nothing_behind(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("path", ["no/out.mp4", "."])
 def test_unwritable_path(tmp_path: Path, path: str) -> None:
-    with pytest.raises(UserError, match="cannot be written"):
+    with pytest.raises(UserError, match="cannot write"):
         VideoWriter(tmp_path / path, 64, 48, 25.0, 16000)
     assert not list(tmp_path.iterdir())
 
@@ -82,7 +82,7 @@ def test_unwritable_path(tmp_path: Path, path: str) -> None:
     [
         ((63, 48), 25.0, 16000, "even"),
         ((64, 48), 0.0001, 16000, "frame rate"),
-        ((64, 48), 25.0, 17000, "sample rate"),
+        ((64, 48), 25.0, 17000, "does not support"),
     ],
 )
 def test_bad_values(

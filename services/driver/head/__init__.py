@@ -1,1 +1,1 @@
-"""Heads: loading, deforming, importing, exporting."""
+"""Heads: loading, deformation, import and export."""

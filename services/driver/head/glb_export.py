@@ -1,32 +1,31 @@
-"""Export a head as a standard binary glTF (GLB) that a browser or an engine can move by FAPs.
+"""Exports a head as binary glTF (GLB) that a browser or an engine can animate by FAPs.
 
-Khronos glTF 2.0. Every displacement FAP is a morph target (sparse accessors), named by the FAP,
-and so is each of ARKit's 52 shapes, a sum of FAPs by ``arkit.tsv``; drive the head by the ones or
-by the others. The rotations (FAPs 23 to 26 and 48 to 50) turn nodes. ``extras.kouxing`` of the root
-node and of the scene says how a FAP becomes a weight or an angle:
+Khronos glTF 2.0. Every displacement FAP is a morph target with sparse accessors, named after the
+FAP. Each of ARKit's 52 shapes is also a morph target, the sum of FAPs in ``arkit.tsv``. Animate
+either the FAPs or the ARKit shapes. The rotations (FAPs 23 to 26 and 48 to 50) rotate nodes.
+
+``extras.kouxing`` of the root node and of the scene describes how to convert FAPs:
 
 - weight = FAP / ``unitsPerWeight``, never clamped;
-- angle in rad = FAP * 1e-5 about ``rotation.axis`` of the node ``rotation.node``; several on one
+- angle in rad = FAP * 1e-5 about ``rotation.axis`` of the node ``rotation.node``; rotations of one
   node combine as yaw * pitch * roll.
 
-Nodes: ``kouxing`` > ``body`` (joint) > ``garment``, ``head`` (joint) > ``eye_left``,
-``eye_right``, ``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``;
-and ``skin``, a mesh skinned to both joints, beside the root. Lengths are metres, y is up, the face
-looks along z.
+Nodes: ``kouxing`` > ``body`` (joint) > ``garment``, ``head`` (joint) > ``eye_left``, ``eye_right``,
+``teeth_upper``, ``teeth_lower``, ``tongue``, ``hair``, ``hair_tips``, ``lashes``. ``skin`` is a
+mesh next to the root, skinned to both joints. Lengths are in meters, y is up, the face looks along
+z.
 
-``extras.coarse`` of a mesh is an accessor of other indices: fewer triangles, on the first of its
-vertices, for viewers without a graphics card; what is seen through keeps all of its own.
+``extras.coarse`` of a mesh is an accessor of alternative indices for viewers without a graphics
+card: fewer triangles on the first vertices of the mesh. Transparent meshes have no coarse indices.
 
-With a motion there is an animation ``speech`` of the weights of every mesh and of the nodes that
-turn; between its frames it is linear.
+With a motion, an animation ``speech`` sets the weights of every mesh and the rotating nodes; it is
+linear between frames.
 
-A name that ends in ``.vrm`` makes it a VRM 1.0 avatar instead, see ``vrm``.
+The suffix ``.vrm`` makes a VRM 1.0 avatar instead, see ``vrm``.
 """
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -36,6 +35,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from kouxing.services.driver.head import vrm
+from kouxing.services.driver.head.glb_document import (
+    ELEMENT_BUFFER,
+    MAX_SHORT_VERTICES,
+    GlbDocument,
+)
 from kouxing.services.driver.head.head import ASSETS, Head, Part
 from kouxing.services.driver.head.morphs import (
     ARKIT_MORPHS,
@@ -54,10 +58,6 @@ from kouxing.shared.face.shapes import ARKIT
 
 Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
 
-_COMPONENT = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}
-_ARRAY_BUFFER, _ELEMENT_BUFFER = 34962, 34963
-_MAX_SHORT_VERTICES = 65535  # more need indices of four bytes; 65535 itself is no index
-
 _ROTATION_OF = {
     23: ("eye_left", (0, 1, 0)),
     24: ("eye_right", (0, 1, 0)),
@@ -70,112 +70,10 @@ _ROTATION_OF = {
 _TURNS_EYES = np.isin(np.arange(1, NUM_FAPS + 1), (23, 24, 25, 26))
 
 
-class _Document:
-    """The JSON chunk and the binary chunk while they grow."""
-
-    def __init__(self) -> None:
-        self.json: dict[str, list[Any]] = {
-            key: []
-            for key in (
-                "nodes", "meshes", "materials", "textures", "images", "samplers", "skins",
-                "accessors", "bufferViews", "animations",
-            )
-        }  # fmt: skip
-        self.binary = bytearray()
-
-    def add(self, kind: str, item: dict[str, Any]) -> int:
-        """Append to a list of the document and return the index."""
-        self.json[kind].append(item)
-        return len(self.json[kind]) - 1
-
-    def view(self, data: bytes, target: int | None = None) -> int:
-        """Append bytes, aligned to four."""
-        self.binary += b"\0" * (-len(self.binary) % 4)
-        view: dict[str, Any] = {
-            "buffer": 0,
-            "byteOffset": len(self.binary),
-            "byteLength": len(data),
-        }
-        if target is not None:
-            view["target"] = target
-        self.binary += data
-        return self.add("bufferViews", view)
-
-    def accessor(
-        self,
-        array: NDArray[Any],
-        kind: str,
-        *,
-        target: int | None = _ARRAY_BUFFER,
-        normalized: bool = False,
-        bounds: bool = False,
-    ) -> int:
-        """Store an array (N,) or (N, components)."""
-        item: dict[str, Any] = {
-            "bufferView": self.view(np.ascontiguousarray(array).tobytes(), target),
-            "componentType": _COMPONENT[array.dtype.str[1:]],
-            "count": len(array),
-            "type": kind,
-        }
-        if normalized:
-            item["normalized"] = True
-        if bounds:
-            lowest, highest = array.min(axis=0), array.max(axis=0)
-            item["min"], item["max"] = (
-                np.atleast_1d(lowest).tolist(),
-                np.atleast_1d(highest).tolist(),
-            )
-        return self.add("accessors", item)
-
-    def sparse_vectors(
-        self, rows: NDArray[np.intp], values: NDArray[np.float32], count: int
-    ) -> int:
-        """Store displacements (N, 3) that are zero but in ``rows``."""
-        number = np.uint16 if count <= _MAX_SHORT_VERTICES else np.uint32
-        padded = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])
-        return self.add(
-            "accessors",
-            {
-                "componentType": _COMPONENT["f4"],
-                "count": count,
-                "type": "VEC3",
-                "min": padded.min(axis=0).tolist(),
-                "max": padded.max(axis=0).tolist(),
-                "sparse": {
-                    "count": len(rows),
-                    "indices": {
-                        "bufferView": self.view(rows.astype(number).tobytes()),
-                        "componentType": _COMPONENT[np.dtype(number).str[1:]],
-                    },
-                    "values": {"bufferView": self.view(values.tobytes())},
-                },
-            },
-        )
-
-    def save(self, path: Path, **rest: Any) -> None:
-        """Write the two chunks."""
-        lists = {kind: items for kind, items in self.json.items() if items}  # none may be empty
-        document = {"asset": {"version": "2.0", "generator": "kouxing"}, **lists, **rest}
-        document["buffers"] = [{"byteLength": len(self.binary)}]
-        text = json.dumps(document, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % 4)
-        binary = bytes(self.binary) + b"\0" * (-len(self.binary) % 4)
-        length = 12 + 8 + len(text) + 8 + len(binary)
-        try:
-            with path.open("wb") as file:
-                file.write(struct.pack("<4sII", b"glTF", 2, length))
-                file.write(struct.pack("<I4s", len(text), b"JSON") + text)
-                file.write(struct.pack("<I4s", len(binary), b"BIN\0") + binary)
-        except OSError as error:
-            raise UserError(
-                f"{path} cannot be written ({error.strerror}); give another path"
-            ) from error
-
-
 def export_glb(
     head: Head, path: str | Path, motion: Sequence[Frame] = (), *, as_arkit: bool = False
 ) -> None:
-    """Write a head as GLB.
+    """Write a head as GLB or VRM.
 
     Parameters
     ----------
@@ -184,21 +82,21 @@ def export_glb(
     path
         File to write, ``.glb`` or ``.vrm``.
     motion
-        Frames of an animation: media time in seconds, FAPs (68,); none for a ``.vrm``.
+        Frames of an animation; empty for a ``.vrm``.
     as_arkit
-        Move the targets of ARKit's shapes, not those of the FAPs.
+        Whether the animation uses ARKit's shapes instead of FAPs.
 
     Raises
     ------
     UserError
-        If the name ends otherwise, or the file cannot be written.
+        If the suffix is different, or the file cannot be written.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in (".glb", ".vrm"):
         raise UserError(f"{path}: give a name that ends in .glb or .vrm")
     is_avatar = suffix == ".vrm"
     morphs = AVATAR_MORPHS if is_avatar else FAP_MORPHS + ARKIT_MORPHS
-    document = _Document()
+    document = GlbDocument()
     sampler = document.add(
         "samplers", {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
     )
@@ -242,32 +140,32 @@ def export_glb(
     )
 
 
-def _add_skeleton(document: _Document, nodes: dict[str, int]) -> None:
-    """Hang the node ``body`` on an avatar's bones."""
-    every = document.json["nodes"]
+def _add_skeleton(document: GlbDocument, nodes: dict[str, int]) -> None:
+    """Attach the node ``body`` to an avatar's bones."""
+    entries = document.json["nodes"]
     for bone, parent, place in vrm.BONES:
         if bone not in nodes:
             nodes[bone] = document.add("nodes", {"name": bone})
-        every[nodes[bone]]["translation"] = place
+        entries[nodes[bone]]["translation"] = place
         if parent:
-            every[nodes[parent]].setdefault("children", []).append(nodes[bone])
+            entries[nodes[parent]].setdefault("children", []).append(nodes[bone])
 
 
-def _avatar(document: _Document, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
-    """Return what the file says beside its lists."""
+def _avatar(document: GlbDocument, head: Head, nodes: dict[str, int]) -> dict[str, Any]:
+    """Return the VRM extension."""
     bindings: dict[str, list[tuple[int, int]]] = {morph.name: [] for morph in AVATAR_MORPHS}
     for number, node in enumerate(document.json["nodes"]):
         if "mesh" in node:
             names = document.json["meshes"][node["mesh"]]["extras"].get("targetNames", ())
             for index, name in enumerate(names):
                 bindings[name].append((number, index))
-    x, y, z = head.eye_centres.mean(axis=0).tolist()
-    about = vrm.extension(head.name, nodes, bindings, (x, y, z), is_free=_is_own(head))
-    return {"extensionsUsed": ["VRMC_vrm"], "extensions": {"VRMC_vrm": about}}
+    x, y, z = head.eye_centers.mean(axis=0).tolist()
+    extension = vrm.extension(head.name, nodes, bindings, (x, y, z), is_free=_is_built_in(head))
+    return {"extensionsUsed": ["VRMC_vrm"], "extensions": {"VRMC_vrm": extension}}
 
 
 def _add_animation(
-    document: _Document, nodes: dict[str, int], motion: Sequence[Frame], *, as_arkit: bool
+    document: GlbDocument, nodes: dict[str, int], motion: Sequence[Frame], *, as_arkit: bool
 ) -> None:
     """Add an animation of all weights and rotations."""
     times_s = np.array([time_s for time_s, _ in motion], np.float32)
@@ -279,7 +177,7 @@ def _add_animation(
     if as_arkit:
         shapes = np.array([ARKIT.weights(row) for row in faps]).T
         weights = dict(zip(ARKIT.names, shapes, strict=True))
-        turned &= {"head"}  # ARKit's own shapes turn the eyes
+        turned &= {"head"}  # ARKit has shapes for eye rotation
     curves = {(node, "rotation"): _rotation(node, faps) for node in sorted(turned)}
     for name, node in nodes.items():
         if (mesh := document.json["nodes"][node].get("mesh")) is None:
@@ -287,7 +185,9 @@ def _add_animation(
         names = document.json["meshes"][mesh].get("extras", {}).get("targetNames", ())
         if names:
             still = np.zeros(len(faps), np.float32)
-            curves[name, "weights"] = np.stack([weights.get(each, still) for each in names], axis=1)
+            curves[name, "weights"] = np.stack(
+                [weights.get(target, still) for target in names], axis=1
+            )
     times = document.accessor(times_s, "SCALAR", target=None, bounds=True)
     samplers: list[dict[str, Any]] = []
     channels: list[dict[str, Any]] = []
@@ -301,7 +201,7 @@ def _add_animation(
 
 
 def _rotation(node: str, faps: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the quaternions (num_frames, 4) of a node that FAPs turn: yaw, pitch, roll."""
+    """Return the quaternions (num_frames, 4) of a node that FAPs rotate: yaw, pitch, roll."""
     angles = np.zeros((len(faps), 3))
     for fap, (turned, axis) in _ROTATION_OF.items():
         if turned == node:
@@ -311,7 +211,7 @@ def _rotation(node: str, faps: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _carrier(head: Head, part: Part) -> str:
-    """Say what carries a part: the head, the body, or both, as the neck."""
+    """Return what a part is attached to: "head", "body", or "both" (the neck)."""
     share = np.round(head.head_weight[part.vertices] * 255)
     return "head" if share.min() == 255 else "body" if share.max() == 0 else "both"
 
@@ -321,7 +221,7 @@ def _parent(name: str, children: list[int]) -> dict[str, Any]:
 
 
 def _part_node(
-    document: _Document,
+    document: GlbDocument,
     head: Head,
     part: Part,
     textures: dict[str, int],
@@ -330,9 +230,9 @@ def _part_node(
     vertices = head.vertices[part.vertices]
     node: dict[str, Any] = {"name": part.name}
     if part.name in ("eye_left", "eye_right"):
-        centre = head.eye_centres[int(part.name == "eye_right")]
-        node["translation"] = centre.tolist()
-        vertices = vertices - centre
+        center = head.eye_centers[int(part.name == "eye_right")]
+        node["translation"] = center.tolist()
+        vertices = vertices - center
     colors = np.ones((len(vertices), 4))
     colors[:, :3] = head.colors[part.vertices]
     attributes = {
@@ -354,8 +254,8 @@ def _part_node(
 
     def add_indices(triangles: NDArray[np.uint32]) -> int:
         indices = (triangles - part.vertices.start).ravel()
-        number = np.uint16 if len(vertices) <= _MAX_SHORT_VERTICES else np.uint32
-        return document.accessor(indices.astype(number), "SCALAR", target=_ELEMENT_BUFFER)
+        number = np.uint16 if len(vertices) <= MAX_SHORT_VERTICES else np.uint32
+        return document.accessor(indices.astype(number), "SCALAR", target=ELEMENT_BUFFER)
 
     triangles = head.triangles[part.triangles]
     coarse = head.coarse_triangles[head.parts.index(part)]
@@ -395,9 +295,9 @@ def _material(part: Part, textures: dict[str, int]) -> dict[str, Any]:
 
 
 def _targets(
-    document: _Document, head: Head, part: Part, morphs: Sequence[Morph]
+    document: GlbDocument, head: Head, part: Part, morphs: Sequence[Morph]
 ) -> tuple[list[dict[str, int]], list[str]]:
-    """Morph targets of a part, and their names."""
+    """Return the morph targets of a part, and their names."""
     count = part.vertices.stop - part.vertices.start
     fields = head.basis[3 * part.vertices.start : 3 * part.vertices.stop].T.toarray()  # (68, 3 V)
     shifts = np.array([morph.faps for morph in morphs]) @ fields
@@ -416,12 +316,12 @@ def _targets(
     return targets, names
 
 
-def _is_own(head: Head) -> bool:
+def _is_built_in(head: Head) -> bool:
     return (ASSETS / f"{head.name}.npz").is_file()
 
 
 def _description(head: Head) -> dict[str, Any]:
-    """Say what a viewer needs to turn FAPs into weights and angles."""
+    """Return the data that a viewer needs to convert FAPs into weights and angles."""
     faps: list[dict[str, Any]] = []
     turning = {"head"} | {part.name for part in head.parts}
     for fap in FAPS[2:]:
@@ -451,11 +351,11 @@ def _description(head: Head) -> dict[str, Any]:
         "visemes": _shapes(VISEME_NAMES, VISEMES),
         "expressions": _shapes(EXPRESSION_NAMES, EXPRESSIONS),
         "arkit": _shapes(ARKIT.names, ARKIT.basis),
-    } | ({"licence": "CC0-1.0"} if _is_own(head) else {})
+    } | ({"licence": "CC0-1.0"} if _is_built_in(head) else {})
 
 
 def _shapes(names: tuple[str, ...], values: NDArray[np.float32]) -> list[dict[str, Any]]:
-    """List shapes as low-level FAPs."""
+    """Return shapes as low-level FAPs."""
     return [
         {"name": name, "faps": {FAPS[i].name: round(float(row[i]), 1) for i in np.flatnonzero(row)}}
         for name, row in zip(names, values, strict=True)

@@ -1,6 +1,7 @@
-"""Read binary glTF (GLB): every size is checked before anything is read by it.
+"""Reads binary glTF (GLB) files from untrusted sources: every size is checked before use.
 
 Khronos glTF 2.0, sections 3.6 (accessors), 3.7 (geometry, skins, morph targets) and 4.4 (GLB).
+pygltflib is not used because it does not check sizes and decodes neither accessors nor nodes.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ MAX_COUNT = 2_000_000  # elements of an accessor
 MAX_NODES = 20_000
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_UNDERSTOOD = {  # extensions that may be required: their data is plain glTF, or only looks
+_SUPPORTED = {  # required extensions whose data is plain glTF, or that affect only the look
     "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform", "EXT_texture_webp",
     "KHR_materials_specular", "KHR_materials_emissive_strength", "VRM", "VRMC_vrm",
 }  # fmt: skip
@@ -31,11 +32,11 @@ Float64 = NDArray[np.float64]
 
 
 class BadGlbError(Exception):
-    """What is wrong in the file."""
+    """Says what is wrong with the file."""
 
 
-def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no JSON")
+def _reject_constant(word: str) -> float:
+    raise ValueError(f"{word} is not valid JSON")
 
 
 class Glb:
@@ -46,7 +47,7 @@ class Glb:
     UserError
         If the file cannot be read.
     BadGlbError
-        If it is no GLB, or needs an extension that is not understood.
+        If it is not a valid GLB, or requires an unsupported extension.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,10 +58,12 @@ class Glb:
         except OSError as error:
             raise UserError(f"cannot read {path}: {error.strerror}") from error
         if len(data) < 20 or data[:4] != b"glTF":
-            raise BadGlbError("it is no binary glTF")
+            raise BadGlbError("it is not a binary glTF file")
         version, length = struct.unpack_from("<II", data, 4)
         if version != 2 or length > len(data):
-            raise BadGlbError(f"version {version}, {length} of {len(data)} bytes")
+            raise BadGlbError(
+                f"its header says version {version} and {length} of {len(data)} bytes"
+            )
         chunks: dict[bytes, bytes] = {}
         at = 12
         while at + 8 <= length:
@@ -70,19 +73,19 @@ class Glb:
             chunks.setdefault(kind, data[at + 8 : at + 8 + size])
             at += 8 + size
         try:
-            self.json: dict[str, Any] = json.loads(chunks[b"JSON"], parse_constant=_no_number)
-            missing = set(self.json.get("extensionsRequired", ())) - _UNDERSTOOD
+            self.json: dict[str, Any] = json.loads(chunks[b"JSON"], parse_constant=_reject_constant)
+            missing = set(self.json.get("extensionsRequired", ())) - _SUPPORTED
         except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise BadGlbError("it has no intact glTF description") from error
+            raise BadGlbError("its glTF description is damaged") from error
         if missing:
             raise BadGlbError(f"it needs {', '.join(sorted(missing))}; save it uncompressed")
         self._binary = chunks.get(b"BIN\0", b"")
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
-        """Return an entry of one of the description's lists."""
+        """Return an item of one of the lists in the description."""
         entries = self.json.get(kind, [])
         if not isinstance(index, int) or not 0 <= index < len(entries):
-            raise BadGlbError(f"there is no {kind} {index}")
+            raise BadGlbError(f"{kind} has no item {index}")
         entry: dict[str, Any] = entries[index]
         return entry
 
@@ -91,16 +94,16 @@ class Glb:
         view = self.item("bufferViews", index)
         start, size = int(view.get("byteOffset", 0)), int(view["byteLength"])
         if view.get("buffer", 0) != 0 or start < 0 or size < 0 or start + size > len(self._binary):
-            raise BadGlbError("a buffer view lies outside the file")
+            raise BadGlbError("a buffer view is outside the file")
         return self._binary[start : start + size]
 
     def accessor(self, index: object) -> Float64:
-        """Return an accessor's values (N, components), normalized ones as -1 to 1."""
+        """Return an accessor's values (N, components); normalized values are -1 to 1."""
         item = self.item("accessors", index)
         width, count = _COMPONENTS[item["type"]], int(item["count"])
         kind = np.dtype(_TYPES[item["componentType"]])
         if not 0 <= count <= MAX_COUNT:
-            raise BadGlbError(f"an accessor of {count} elements")
+            raise BadGlbError(f"an accessor has {count} elements")
         values = np.zeros((count, width), kind)
         if "bufferView" in item:
             stride = int(self.item("bufferViews", item["bufferView"]).get("byteStride", 0))
@@ -130,7 +133,7 @@ class Glb:
         return out
 
     def image(self, texture: object) -> bytes:
-        """Return the encoded image of a texture, or nothing if it lies outside the file."""
+        """Return the encoded image of a texture, or nothing if it is not in the file."""
         entry = self.item("textures", texture)
         source = entry.get("source")
         for extension in entry.get("extensions", {}).values():
@@ -147,20 +150,20 @@ class Glb:
             return b""
 
     def nodes(self) -> list[tuple[int, Float64]]:
-        """List the nodes of the scene with their places in the world (4, 4), parents first."""
+        """Return the nodes of the scene with their world matrices (4, 4), parents first."""
         scenes = self.json.get("scenes", [])
         scene = scenes[self.json.get("scene", 0)] if scenes else {}
         roots = scene.get("nodes", range(len(self.json.get("nodes", []))))
-        waiting = [(int(root), np.eye(4)) for root in roots]
-        found: dict[int, Float64] = {}
-        while waiting:
-            number, above = waiting.pop(0)
+        queue = [(int(root), np.eye(4)) for root in roots]
+        worlds: dict[int, Float64] = {}
+        while queue:
+            number, parent = queue.pop(0)
             node = self.item("nodes", number)
-            if number in found or len(found) > MAX_NODES:
-                raise BadGlbError("its nodes form no tree")
-            found[number] = above @ _placed(node)
-            waiting += [(int(child), found[number]) for child in node.get("children", [])]
-        return list(found.items())
+            if number in worlds or len(worlds) > MAX_NODES:
+                raise BadGlbError("its nodes are not a tree")
+            worlds[number] = parent @ _local_matrix(node)
+            queue += [(int(child), worlds[number]) for child in node.get("children", [])]
+        return list(worlds.items())
 
     def _strided(
         self, view: object, start: int, shape: tuple[int, int], kind: np.dtype[Any], stride: int = 0
@@ -177,19 +180,19 @@ class Glb:
         return np.ndarray(shape, kind, data, start, (stride, kind.itemsize))
 
 
-def _placed(node: dict[str, Any]) -> Float64:
-    """Matrix (4, 4) of a node in its parent."""
+def _local_matrix(node: dict[str, Any]) -> Float64:
+    """Return the matrix (4, 4) of a node relative to its parent."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
-    turn = np.array(
+    rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-    placed = np.eye(4)
-    placed[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
-    placed[:3, 3] = node.get("translation", (0, 0, 0))
-    return placed
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix

@@ -1,22 +1,21 @@
 """A user's GLB as a head: its morph targets become the linear basis of FAPs.
 
-Targets are known by their names: FAPs, ARKit's blend shapes, or Oculus' visemes (with ARKit's
-shapes for what is not the mouth). For the last two, a FAP frame ``f`` is given to the shapes whose
-FAPs ``A`` come nearest,
+Targets are recognized by name: FAPs, ARKit's blendshapes, or Oculus' visemes (plus ARKit's shapes
+outside the mouth). For ARKit and Oculus, a FAP frame ``f`` is expressed by the shapes whose FAPs
+``A`` are closest,
 
     w(f) = argmin |D (A^T w - f)|^2 + r^2 |w|^2 = (A D^2 A^T + r^2 I)^-1 A D^2 f
 
-with the travel ``D`` of a FAP's feature point by one unit. That is linear in ``f``, so the head
-has one displacement field a FAP like any other; what a file has no shape for, others express as
-far as they can. Weights below 0, which move a shape's vertices the other way, are meant.
-
-======  ========================================  ====  ========
-symbol  meaning                                   unit  shape
-======  ========================================  ====  ========
-A       FAPs of each shape at weight 1            FAP   (N, 68)
-D       travel by one FAP unit                    m     (68,)
-r       keeps shapes that nearly agree small      m     1
-======  ========================================  ====  ========
+with ``D``, the travel of a FAP's feature point per unit. This is linear in ``f``, so the head has
+one displacement field per FAP. FAPs without a shape are approximated by other shapes. Negative
+weights are allowed; they move a shape's vertices in the opposite direction.
+======  ============================================  ====  ========
+symbol  meaning                                       unit  shape
+======  ============================================  ====  ========
+A       FAPs of each shape at weight 1                FAP   (N, 68)
+D       travel by one FAP unit                        m     (68,)
+r       ridge: keeps weights of similar shapes small  m     1
+======  ============================================  ====  ========
 """
 
 from __future__ import annotations
@@ -34,16 +33,16 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, NUM_FAPS, RADIANS_PER_ANGLE_UNIT
 from kouxing.shared.face.shapes import ARKIT, OCULUS
 
-EYE_DISTANCE_M = 0.055  # to which a head is scaled
-# the units of an average face, in eye distances
-FAPU_SHARES = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}
-PIVOT = np.array([0.0, -0.66, -1.42])  # from between the eyes to the head's pivot, in eye distances
-MOUTH = np.array([0.0, -1.2, 0.25])  # likewise
-_HEAD_WIDTH = 2.9  # likewise, ears included
+EYE_DISTANCE_M = 0.055  # heads are scaled to this
+FAPU_SHARES = {"MNS": 0.36, "MW": 0.83, "ENS": 0.86, "ES": 1.0, "IRISD": 0.16}  # eye distances
+# offsets from the middle between the eyes, in eye distances
+PIVOT = np.array([0.0, -0.66, -1.42])
+MOUTH = np.array([0.0, -1.2, 0.25])
+_HEAD_WIDTH = 2.9  # including ears, in eye distances
 _EYE_RADIUS_M = 0.012
 _RIDGE_M = 0.001
-_TRAVEL_M = 0.01  # how far a strong FAP moves its point
-_FADE = (-2.1, -3.2)  # heights from the eyes between which the neck stops following the head
+_TRAVEL_M = 0.01  # typical displacement of a feature point by a strong FAP
+_FADE = (-2.1, -3.2)  # heights relative to the eyes where the neck stops following the head
 _MIN_ARKIT, _MIN_OCULUS, _MIN_FAPS = 12, 8, 12
 
 _FAP_NAMES = {plain(fap.name): fap for fap in FAPS[2:]}
@@ -56,68 +55,62 @@ def read_glb(path: Path) -> Head:
     Raises
     ------
     UserError
-        If the file is no such GLB; the text says what it lacks.
+        If the file is not such a GLB; the text says what is missing.
     """
     try:
         glb = Glb(path)
-        with np.errstate(invalid="ignore", over="ignore"):  # what comes out is checked
+        with np.errstate(invalid="ignore", over="ignore"):  # the results are checked
             pieces = read_pieces(glb)
             names = sorted({name for piece in pieces for name in piece.shapes})
-            known = recognise(names)
+            known = recognize(names)
             return _head(path.stem, glb, pieces, known)
     except BadGlbError as error:
         raise UserError(f"{path}: {error}") from error
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as error:
-        raise UserError(f"{path} is no intact GLB ({error!r})") from error
+        raise UserError(f"{path} is damaged or is not a GLB file ({error!r})") from error
 
 
-def recognise(names: list[str]) -> Names:
-    """Find what the morph targets of a file stand for.
-
-    Parameters
-    ----------
-    names
-        As ``plain`` gives them.
-
-    Returns
-    -------
-    FAPs (68,) of each known name at weight 1.
+def recognize(names: list[str]) -> Names:
+    """Return the FAPs (68,) at weight 1 of each recognized target name, as ``plain`` returns it.
 
     Raises
     ------
     BadGlbError
-        If too few are known.
+        If too few names are recognized.
     """
     faps: Names = {name: np.zeros(NUM_FAPS) for name in _FAP_NAMES}
     for name, fap in _FAP_NAMES.items():
         angle = fap.fapu == "AU"
         faps[name][fap.number - 1] = 1 / RADIANS_PER_ANGLE_UNIT if angle else FAP_UNITS_PER_FAPU
     arkit, oculus = (
-        {plain(name): row.astype(float) for name, row in zip(each.names, each.basis, strict=True)}
-        for each in (ARKIT, OCULUS)
+        {
+            plain(name): row.astype(float)
+            for name, row in zip(shapes.names, shapes.basis, strict=True)
+        }
+        for shapes in (ARKIT, OCULUS)
     )
     oculus = {"viseme" + name: faps for name, faps in oculus.items() if faps.any()}
-    # Ready Player Me writes the vowels so
+    # Ready Player Me uses these names for vowels
     oculus |= {
         "viseme" + new: oculus["viseme" + old]
         for new, old in (("i", "ih"), ("o", "oh"), ("u", "ou"))
     }
     still = {name: row for name, row in arkit.items() if not re.match("jaw|mouth|tongue", name)}
-    found = []
-    for kind, least, table, rest in (
+    counts = []
+    for kind, minimum, table, rest in (
         ("FAPs", _MIN_FAPS, faps, {}),
         ("ARKit shapes", _MIN_ARKIT, arkit, {}),
         ("Oculus visemes", _MIN_OCULUS, oculus, still),
     ):
         known = [name for name in names if name in table]
-        if len(known) >= least:
+        if len(known) >= minimum:
             return {name: (table | rest)[name] for name in names if name in table or name in rest}
-        found.append(f"{len(known)} of at least {least} {kind}")
+        counts.append(f"{len(known)} of at least {minimum} {kind}")
     seen = (
         f" Its targets: {', '.join(names[:8])}{', ...' if len(names) > 8 else ''}." if names else ""
     )
     raise BadGlbError(
-        f"its morph targets have too few known names ({'; '.join(found)}).{seen}"
+        f"too few of its morph targets have known names ({'; '.join(counts)}).{seen}"
         " Name them as ARKit (jawOpen, mouthPucker, ...) or Oculus (viseme_aa, viseme_PP, ...) does"
     )
 
@@ -130,16 +123,16 @@ def _head(name: str, glb: Glb, pieces: list[Piece], known: Names) -> Head:
     for piece in pieces:
         piece.shapes = {name: shift for name, shift in piece.shapes.items() if name in known}
     eyes = _eyes(pieces, names)
-    if eyes[0, 0] < eyes[1, 0]:  # it looks along -z, as VRM 0 does
+    if eyes[0, 0] < eyes[1, 0]:  # it faces -z, like VRM 0
         for piece in pieces:
             piece.vertices *= [-1, 1, -1]
             piece.shapes = {name: shift * [-1, 1, -1] for name, shift in piece.shapes.items()}
         eyes *= [-1, 1, -1]
     unit = float(np.linalg.norm(eyes[0] - eyes[1]))
     if not 1e-6 < unit < 1e6:
-        raise BadGlbError("its eyes, by their shapes or names, lie in one place")
+        raise BadGlbError("both eyes, found by shapes or names, are at the same place")
     if eyes[0, 0] - eyes[1, 0] < 0.5 * unit:
-        raise BadGlbError("its eyes do not lie side by side; let y be up and the face look along z")
+        raise BadGlbError("its eyes are not side by side; y must be up and the face look along z")
     scale, middle = EYE_DISTANCE_M / unit, eyes.mean(axis=0)
     pivot = _pivot(glb, middle, unit)
     world = np.concatenate([piece.vertices for piece in pieces])
@@ -155,27 +148,27 @@ def _head(name: str, glb: Glb, pieces: list[Piece], known: Names) -> Head:
         head_weight=weight,
         fapu=standard_fapu(),
         feature_points={},
-        eye_centres=(eyes - pivot) * scale,
+        eye_centers=(eyes - pivot) * scale,
     )
     return assemble(name, arrays)
 
 
 def standard_fapu() -> dict[str, float]:
-    """FAPUs of an average face, in m and rad."""
+    """Return the FAPUs of an average face, m and rad."""
     lengths = {name: share * EYE_DISTANCE_M for name, share in FAPU_SHARES.items()}
     return lengths | {"AU": RADIANS_PER_ANGLE_UNIT}
 
 
 def fade(height: Float64) -> Float64:
-    """Share of the head's turn (V,) by the height over the eyes in eye distances."""
+    """Return the share (V,) of the head rotation by height above the eyes, in eye distances."""
     share = np.clip((height - _FADE[1]) / (_FADE[0] - _FADE[1]), 0, 1)
     faded: Float64 = share**2 * (3 - 2 * share)
     return faded
 
 
 def _eyes(pieces: list[Piece], names: list[str]) -> Float64:
-    """Middles of the left and the right eye (2, 3): by the eyeballs, the lids, or the mouth."""
-    found = []
+    """Return the centers of the left and right eye (2, 3), from the eyeballs, lids or mouth."""
+    centers = []
     for side in ("left", "right"):
         balls = [
             piece.vertices
@@ -185,11 +178,11 @@ def _eyes(pieces: list[Piece], names: list[str]) -> Float64:
         lids = _moved(pieces, [f"eyeblink{side}"])
         if balls:
             whole = np.concatenate(balls)
-            found.append((whole.min(axis=0) + whole.max(axis=0)) / 2)
+            centers.append((whole.min(axis=0) + whole.max(axis=0)) / 2)
         elif lids is not None:
-            found.append(lids)
-    if len(found) == 2:
-        return np.array(found)
+            centers.append(lids)
+    if len(centers) == 2:
+        return np.array(centers)
     mouth = _moved(pieces, [name for piece in pieces for name in piece.shapes])
     skin = max((piece for piece in pieces if piece.shapes), key=lambda piece: len(piece.vertices))
     near = np.abs(skin.vertices[:, 1] - (mouth if mouth is not None else skin.vertices.mean(0))[1])
@@ -201,7 +194,7 @@ def _eyes(pieces: list[Piece], names: list[str]) -> Float64:
 
 
 def _moved(pieces: list[Piece], names: list[str]) -> Float64 | None:
-    """Mean place of what some shapes move."""
+    """Return the mean position of the vertices that some shapes move."""
     total, place = 0.0, np.zeros(3)
     for piece in pieces:
         for name in set(names) & set(piece.shapes):
@@ -212,7 +205,7 @@ def _moved(pieces: list[Piece], names: list[str]) -> Float64 | None:
 
 
 def _pivot(glb: Glb, middle: Float64, unit: float) -> Float64:
-    """Place of the joint that the head turns about."""
+    """Return the position of the joint that the head rotates about."""
     for number, place in glb.nodes():
         node = glb.item("nodes", number)
         word = re.split(r"[.:|_ ]", str(node.get("name", "")).lower())[-1]
@@ -223,13 +216,13 @@ def _pivot(glb: Glb, middle: Float64, unit: float) -> Float64:
 
 
 def _head_weight(pieces: list[Piece], height: Float64) -> Float64:
-    """Share of the head's turn (V,); heights over the eyes are in eye distances."""
+    """Return the share (V,) of the head rotation; heights above the eyes are in eye distances."""
     shares = [piece.head_weight for piece in pieces if piece.head_weight is not None]
     return np.concatenate(shares) if len(shares) == len(pieces) else fade(height)
 
 
 def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:
-    """Weight of each shape by one unit of every FAP (68,); the module's equation."""
+    """Return each shape's weight per unit of every FAP (68,), by the module's equation."""
     names = sorted(known)
     shapes = np.array([known[name] for name in names])
     if names[0] in _FAP_NAMES:
@@ -238,13 +231,13 @@ def _weights_by_fap(known: Names, *, gaze: bool) -> dict[str, Float64]:
     matrix = shapes * travel
     gram = matrix @ matrix.T + _RIDGE_M**2 * np.eye(len(shapes))
     weights = np.linalg.solve(gram, matrix * travel)
-    # what a shape does by less than 0.1 mm at 1 cm of travel is noise that would fill the basis
+    # a shape that moves less than 0.1 mm at 1 cm of travel is noise that would fill the basis
     weights[np.abs(weights) < 0.01 * travel / _TRAVEL_M] = 0
     return dict(zip(names, weights, strict=True))
 
 
 def _fields(piece: Piece, weights: dict[str, Float64]) -> Fields:
-    """Displacement (V, 3) of a piece's vertices by one unit of each FAP, m."""
+    """Return the displacements (V, 3) of a piece by one unit of each FAP, m."""
     names = [name for name in piece.shapes if name in weights]
     if not names:
         return {}
@@ -257,7 +250,7 @@ def _fields(piece: Piece, weights: dict[str, Float64]) -> Fields:
 
 
 def _travel_m(gaze: bool) -> Float64:
-    """Travel of a FAP's feature point by one unit, m; 0 for what no shape is to express."""
+    """Return the travel of a FAP's feature point per unit, m; 0 for FAPs to ignore."""
     fapu = standard_fapu()
     travel = np.zeros(NUM_FAPS)
     for fap in FAPS[2:]:

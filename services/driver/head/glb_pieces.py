@@ -1,4 +1,4 @@
-"""Reads the meshes of a GLB as pieces in one frame, with their morph targets and skeleton."""
+"""Reads the meshes of a GLB as pieces in common axes, with morph targets and skeleton."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from kouxing.shared.errors import UserError
 MAX_VERTICES = 300_000
 MAX_TRIANGLES = 1_000_000
 MAX_PIECES = 2_000
-MAX_SHIFTS = 20_000_000  # vertices that all morph targets together move
-MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # all textures together
+MAX_SHIFTS = 20_000_000  # displacements of all morph targets
+MAX_TEXTURE_PIXELS = 2 * picture.MAX_PIXELS  # sum over all textures
 MAX_COORDINATE = 1e9
 
 
 def plain(name: str) -> str:
-    """Reduce a target's name to what tells it apart: ``Face.mouthSmile_L`` is mouthsmileleft."""
+    """Reduce a target's name to its distinctive part: ``Face.mouthSmile_L`` is mouthsmileleft."""
     word = re.split(r"[.:|]", name)[-1]
     for short, side in (("l", "left"), ("r", "right")):
         word = re.sub(rf"[_\- ]{short}$", side, word, flags=re.IGNORECASE)
@@ -29,7 +29,7 @@ def plain(name: str) -> str:
 
 
 def read_pieces(glb: Glb) -> list[Piece]:
-    """Gather the triangles of the scene, with what moves them."""
+    """Return the triangles of the scene with everything that moves them."""
     nodes = glb.nodes()
     places = dict(nodes)
     turn_shares = _turn_shares(glb, places)
@@ -46,13 +46,13 @@ def read_pieces(glb: Glb) -> list[Piece]:
             count = int(glb.item("accessors", primitive["attributes"]["POSITION"])["count"])
             num_vertices += count
             num_shifts += count * len(primitive.get("targets", []))
-            for limit, found, what in (  # a small file may name the same data many times
+            for limit, count_so_far, what in (  # a small file may refer to the same data repeatedly
                 (MAX_VERTICES, num_vertices, "vertices; decimate it"),
-                (MAX_SHIFTS, num_shifts, "displacements; leave out morph targets"),
+                (MAX_SHIFTS, num_shifts, "displacements; remove morph targets"),
                 (MAX_TRIANGLES, num_triangles, "triangles; decimate it"),
                 (MAX_PIECES, len(pieces) + 1, "meshes; join them"),
             ):
-                if found > limit:
+                if count_so_far > limit:
                     raise BadGlbError(f"it has more than {limit} {what}")
             piece = _piece(glb, node, mesh, primitive, places, place, turn_shares)
             if piece.head_weight is None and turn_shares:
@@ -66,7 +66,7 @@ def read_pieces(glb: Glb) -> list[Piece]:
 
 
 def _check_textures(pieces: list[Piece]) -> None:
-    """Decode every texture once; one that glTF's core does not know becomes a PNG."""
+    """Decode every texture once; formats outside the glTF core are converted to PNG."""
     known = {b"": b""}
     num_pixels = 0
     for piece in pieces:
@@ -84,7 +84,7 @@ def _check_textures(pieces: list[Piece]) -> None:
 
 
 def _turn_shares(glb: Glb, nodes: dict[int, Float64]) -> dict[int, float]:
-    """Return each node's share of the head's turn: 1 below a node named head, less on the neck."""
+    """Return each node's share of the head rotation: 1 below a node "head", less on the neck."""
     share: dict[int, float] = {}
     for number in nodes:  # parents come first
         node = glb.item("nodes", number)
@@ -113,7 +113,7 @@ def _piece(
         given = glb.accessor(primitive["indices"]).astype(np.int64)
         index = given[:, 0] if given.shape[1] == 1 else np.array([-1])
     if points.shape[1] != 3 or (len(index) and not 0 <= index.min() <= index.max() < count):
-        raise BadGlbError("a triangle has a corner that does not exist")
+        raise BadGlbError("a triangle refers to a missing vertex")
     uv = (
         glb.accessor(attributes["TEXCOORD_0"])
         if "TEXCOORD_0" in attributes
@@ -132,7 +132,7 @@ def _piece(
     if "skin" in node and "JOINTS_0" in attributes:
         placed, weight = _skinned(glb, node["skin"], attributes, places, turn_shares)
     if not len(uv) == len(colors) == len(placed) == count:
-        raise BadGlbError("the attributes of a mesh differ in length")
+        raise BadGlbError("the attributes of a mesh have different lengths")
     shapes = {}
     targets = primitive.get("targets", [])
     target_names = (mesh.get("extras") or {}).get("targetNames", [])
@@ -140,12 +140,12 @@ def _piece(
         if "POSITION" in target:
             shift = glb.accessor(target["POSITION"])
             if shift.shape != points.shape:
-                raise BadGlbError(f"morph target {name} does not fit its mesh")
+                raise BadGlbError(f"morph target {name} does not match its mesh")
             shapes[plain(str(name))] = np.einsum("vij,vj->vi", placed[:, :3, :3], shift)
     vertices = np.einsum("vij,vj->vi", placed[:, :3, :3], points) + placed[:, :3, 3]
     for values in (vertices, uv, colors, *shapes.values()):
         if not (np.abs(values) < MAX_COORDINATE).all():
-            raise BadGlbError("a coordinate or colour is not finite, or very large")
+            raise BadGlbError("a coordinate or color is not finite or very large")
     return Piece(
         name=str(node.get("name") or mesh.get("name") or "part"),
         vertices=vertices,
@@ -166,7 +166,7 @@ def _skinned(
     places: dict[int, Float64],
     turn_shares: dict[int, float],
 ) -> tuple[Float64, Float64 | None]:
-    """Matrix (V, 4, 4) of every vertex in the rest pose, and its share of the head's turn (V,)."""
+    """Return each vertex's rest matrix (V, 4, 4) and its share of the head rotation (V,)."""
     entry = glb.item("skins", skin)
     joints = [int(joint) for joint in entry["joints"]]
     bones = np.array([places[joint] for joint in joints])
@@ -176,7 +176,7 @@ def _skinned(
     which = glb.accessor(attributes["JOINTS_0"]).astype(np.int64)
     weights = glb.accessor(attributes["WEIGHTS_0"])
     if which.shape != weights.shape or (which.size and which.max() >= len(joints)):
-        raise BadGlbError("a mesh hangs on a joint that does not exist")
+        raise BadGlbError("a mesh refers to a missing joint")
     weights = weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9)
     share = np.array([turn_shares.get(joint, 0.0) for joint in joints])
     placed = np.einsum("vk,vkij->vij", weights, bones[which])

@@ -1,10 +1,10 @@
-"""The talking head: one mesh, one linear basis of facial animation parameters.
+"""The talking head: a mesh and a linear basis of facial animation parameters.
 
-Every FAP but the rotations is a displacement field over the vertices, so a face is
+Every FAP except the rotations is a displacement field over the vertices, so a face is
 
     v(f) = v_0 + sum_k f_k * B_k
 
-followed by the turns of the eyeballs (FAPs 23 to 26) and of the head (FAPs 48 to 50).
+followed by the rotations of the eyeballs (FAPs 23 to 26) and of the head (FAPs 48 to 50).
 
 ======  ===========================================  =====  ==============
 symbol  meaning                                      unit   shape
@@ -14,9 +14,9 @@ f       facial animation parameters                  FAP    (68,)
 B       displacement by one FAP unit                 m      (68, V, 3)
 ======  ===========================================  =====  ==============
 
-ISO/IEC 14496-2 annex C (FAPs, FAPUs and feature points); Li 2011, section 2.1 (zones of influence
-round the feature points). Deviation: a zone is weighted by distances along the surface, and the
-lips between their feature points by a smooth (biharmonic) interpolation, see ``training.heads``.
+Sources: ISO/IEC 14496-2 annex C (FAPs, FAPUs, feature points); Li 2011, section 2.1 (zones of
+influence around feature points). Deviation: zone weights use distances along the surface, and the
+lips between feature points are interpolated smoothly (biharmonic), see ``training.heads``.
 
 Axes: x to the subject's left, y up, z to the front; the origin is the pivot of the head.
 """
@@ -39,7 +39,7 @@ from kouxing.shared.face.faps import FAP_NUMBER, NUM_FAPS, RADIANS_PER_ANGLE_UNI
 FORMAT = "kouxing head 1"
 ASSETS = Path(__file__).parent / "assets"
 DEFAULT_HEAD = "woman"
-MAX_BYTES = 512 * 1024 * 1024  # size of an unpacked file
+MAX_BYTES = 512 * 1024 * 1024  # unpacked size of a file
 
 Detail = Literal["fine", "coarse"]
 Float32 = NDArray[np.float32]
@@ -47,74 +47,40 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A run of vertices and triangles with a material of its own."""
+    """A range of vertices and triangles with one material."""
 
     name: str
     vertices: slice  # rows of Head.vertices
     triangles: slice  # rows of Head.triangles
     texture: str  # key of Head.textures
     roughness: float  # 0 to 1
-    transparent: bool  # the texture's alpha counts
-    double_sided: bool  # its inside is seen, too
+    transparent: bool  # the texture has alpha
+    double_sided: bool  # the inside is visible
 
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """A head that FAPs move.
-
-    Attributes
-    ----------
-    name
-        The asset's name.
-    parts
-        Skin, garment, eyes, teeth, tongue, hair and lashes.
-    vertices
-        Neutral face (V, 3), m.
-    triangles
-        Vertex numbers (F, 3), counter-clockwise seen from outside.
-    coarse_triangles
-        Each part's triangles (C, 3) in the coarse head, on the same vertices.
-    uv
-        Texture coordinates (V, 2), v downwards.
-    colors
-        Linear factors on the texture (V, 3), 0 to 1: baked ambient occlusion and tint.
-    head_weight
-        Share of the head's turn that a vertex follows (V,), 0 on the shoulders.
-    basis
-        Displacement of the coordinates by one FAP unit, sparse (3 V, 68), m.
-    fapu
-        ``MNS MW ENS ES IRISD`` in m, ``AU`` in rad.
-    feature_points
-        Vertex of each MPEG-4 feature point on the mesh, by its name ("2.1").
-    eye_centres
-        Left and right (2, 3), m.
-    textures
-        Encoded images (JPEG or PNG) by name.
-    shading
-        How the normals follow the vertices.
-    cel
-        Drawn with one tone of light and one of shade, as cartoons are.
-    """
+    """A head with V vertices and F triangles that FAPs move."""
 
     name: str
-    parts: tuple[Part, ...]
-    vertices: Float32
-    triangles: NDArray[np.uint32]
-    coarse_triangles: tuple[NDArray[np.uint32], ...]
-    uv: Float32
-    colors: Float32
-    head_weight: Float32
-    basis: sparse.csr_array
-    fapu: dict[str, float]
-    feature_points: dict[str, int]
-    eye_centres: Float32
-    textures: dict[str, bytes]
+    parts: tuple[Part, ...]  # skin, garment, eyes, teeth, tongue, hair, lashes
+    vertices: Float32  # (V, 3), neutral face, m
+    triangles: NDArray[np.uint32]  # (F, 3), counter-clockwise from outside
+    coarse_triangles: tuple[NDArray[np.uint32], ...]  # of each part in the coarse head, (C, 3)
+    uv: Float32  # (V, 2), v downwards
+    colors: Float32  # (V, 3), linear factors on the texture: ambient occlusion and tint
+    head_weight: Float32  # (V,), share of the head rotation, 0 on the shoulders
+    basis: sparse.csr_array  # (3 V, 68), displacement by one FAP unit, m
+    fapu: dict[str, float]  # MNS MW ENS ES IRISD in m, AU in rad
+    feature_points: dict[str, int]  # vertex by point name, such as "2.1"
+    eye_centers: Float32  # (2, 3), left and right, m
+    textures: dict[str, bytes]  # encoded JPEG or PNG by name
     shading: Shading
-    cel: bool = False
+    cel: bool = False  # cartoon shading with one light and one dark tone
 
     @property
     def normals(self) -> Float32:
-        """Normals of the neutral face (V, 3), unit length."""
+        """Unit normals of the neutral face (V, 3)."""
         return self.shading.rest
 
     @classmethod
@@ -124,51 +90,43 @@ class Head:
         Parameters
         ----------
         path
-            Name of a head that comes with the package, or path of an ``.npz``.
+            Name of a built-in head, or path of an ``.npz``.
         detail
-            "fine" for pictures to keep, "coarse" (a quarter of the skin's triangles) for speed;
-            the feature points move alike in both.
+            "fine" for quality, "coarse" (a quarter of the skin's triangles) for speed; feature
+            points move equally in both.
 
         Raises
         ------
         UserError
-            If there is no such head, or the file is no head.
+            If the head does not exist, or the file is not a head.
         """
         file = Path(path)
         if file.suffix != ".npz":
             file = ASSETS / f"{path}.npz"
         if "\0" in str(path) or len(file.name) > 255 or not file.is_file():
             known = ", ".join(sorted(asset.stem for asset in ASSETS.glob("*.npz")))
-            raise UserError(f"there is no head {str(path)!r}; give the path of an .npz or: {known}")
+            raise UserError(
+                f"unknown head {str(path)!r}; give the path of an .npz or one of {known}"
+            )
         try:
             return assemble(file.stem, read_arrays(file, MAX_BYTES), detail)
         except (
             OSError, ValueError, TypeError, AttributeError, KeyError, IndexError, MemoryError,
         ) as error:  # fmt: skip
             raise UserError(
-                f"{file} is no intact head ({error}); make one with kouxing head import"
+                f"{file} is damaged or is not a head ({error}); make one with kouxing head import"
             ) from error
 
     def part(self, name: str) -> Part:
-        """Find a part by its name."""
+        """Return a part by name."""
         return next(part for part in self.parts if part.name == name)
 
     def deform(self, faps: Float32) -> Float32:
-        """Move the vertices.
-
-        Parameters
-        ----------
-        faps
-            Facial animation parameters (68,), FAP units. FAPs 1 and 2 are ignored.
-
-        Returns
-        -------
-        Vertices (V, 3), m.
-        """
+        """Return the vertices (V, 3), m, moved by FAPs (68,); FAPs 1 and 2 are ignored."""
         return self._turn(self._bend(faps), faps, points=True)
 
     def pose(self, faps: Float32) -> tuple[Float32, Float32]:
-        """Move the vertices and find their normals, both (V, 3)."""
+        """Return the vertices moved by FAPs (68,), and their normals, both (V, 3)."""
         vertices = self._bend(faps)
         normals = self.shading.normals(vertices)
         return self._turn(vertices, faps, points=True), self._turn(normals, faps, points=False)
@@ -180,16 +138,16 @@ class Head:
         return self.vertices + moved.reshape(-1, 3)
 
     def _turn(self, rows: Float32, faps: Float32, *, points: bool) -> Float32:
-        """Turn eyeballs and head; ``rows`` are points, or normals that no centre shifts."""
+        """Rotate eyeballs and head; ``rows`` are points or normals."""
         angle = np.asarray(faps, dtype=np.float64) * RADIANS_PER_ANGLE_UNIT
         for side, (name, yaw, pitch) in enumerate((("eye_left", 23, 25), ("eye_right", 24, 26))):
             if angle[yaw - 1] or angle[pitch - 1]:
                 turn = _rotation(angle[yaw - 1], angle[pitch - 1], 0.0)
-                centre = self.eye_centres[side] * np.float32(points)
-                for part in self.parts:  # an eye may have several, or none
+                center = self.eye_centers[side] * np.float32(points)
+                for part in self.parts:  # an eye may have several parts, or no part
                     if part.name.startswith(name):
-                        where = part.vertices
-                        rows[where] = (rows[where] - centre) @ turn.T + centre
+                        selected = part.vertices
+                        rows[selected] = (rows[selected] - center) @ turn.T + center
         pitch, yaw, roll = angle[47:50]
         if pitch or yaw or roll:
             turned = rows @ _rotation(yaw, pitch, roll).T
@@ -198,7 +156,7 @@ class Head:
 
 
 def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
-    """Matrix (3, 3) of a turn: to the subject's left, down, and tilted to the subject's right."""
+    """Return the matrix (3, 3) of yaw (left), pitch (down) and roll (right)."""
     cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
     cr, sr = np.cos(roll), np.sin(roll)
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -208,18 +166,18 @@ def _rotation(yaw: float, pitch: float, roll: float) -> Float32:
 
 
 def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail = "fine") -> Head:
-    """Build a head out of the arrays of its file.
+    """Build a head from the arrays of its file.
 
     Raises
     ------
     ValueError, KeyError, IndexError
-        If they do not fit each other.
+        If the arrays are not consistent.
     """
     if str(arrays["format"]) != FORMAT:
         raise ValueError(f"format {arrays['format']}, expected {FORMAT}")
     _check(arrays)
     coarse = detail == "coarse"
-    # a part's coarse vertices come first, so that the coarse head is a selection of rows
+    # coarse vertices come first in each part, so the coarse head is a selection of rows
     first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
     ends = after_coarse if coarse else after
     kept = np.concatenate([np.arange(a, b) for a, b in zip(first, ends, strict=True)])
@@ -228,37 +186,36 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
 
     parts, triangles, coarse_triangles = [], [], []
     num_triangles = 0
-    bounds = arrays["part_triangles"].astype(np.int64)  # fine first, fine end, coarse first, end
+    bounds = arrays["part_triangles"].astype(np.int64)  # fine start and end, coarse start and end
     for row, part_name in enumerate(arrays["part_names"].astype(str)):
-        fine_own, coarse_own = (
+        fine_part, coarse_part = (
             place[arrays["triangles"][start:end].astype(np.int64)]
             for start, end in (bounds[row, :2], bounds[row, 2:])
         )
-        own = coarse_own if coarse else fine_own
-        if len(own) == 0 or len(coarse_own) == 0 or own.min() < 0:
+        part_triangles = coarse_part if coarse else fine_part
+        if len(part_triangles) == 0 or len(coarse_part) == 0 or part_triangles.min() < 0:
             raise ValueError(f"part {part_name} refers to missing vertices")
-        triangles.append(own.astype(np.uint32))
-        coarse_triangles.append(coarse_own.astype(np.uint32))
+        triangles.append(part_triangles.astype(np.uint32))
+        coarse_triangles.append(coarse_part.astype(np.uint32))
         from_vertex = int(place[first[row]])
         parts.append(
             Part(
                 name=str(part_name),
                 vertices=slice(from_vertex, from_vertex + int(ends[row] - first[row])),
-                triangles=slice(num_triangles, num_triangles + len(own)),
+                triangles=slice(num_triangles, num_triangles + len(part_triangles)),
                 texture=str(arrays["part_textures"][row]),
                 roughness=float(arrays["part_roughness"].astype(float)[row]),
                 transparent=bool(arrays["part_transparent"][row]),
                 double_sided=bool(arrays["part_double_sided"][row]),
             )
         )
-        num_triangles += len(own)
+        num_triangles += len(part_triangles)
 
     faces = np.concatenate(triangles)
     vertices = arrays["vertices"].astype(np.float32)[kept]
     basis = _basis(arrays, place, len(kept))
     welds = place[arrays["welds"].astype(np.int64)[kept]] if "welds" in arrays else None
     shading = Shading.of(vertices, faces, basis, welds)
-    centres = arrays["eye_centres"].astype(np.float32)
     return Head(
         name=name,
         parts=tuple(parts),
@@ -284,7 +241,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
                 strict=True,
             )
         },
-        eye_centres=centres,
+        eye_centers=arrays["eye_centres"].astype(np.float32),
         textures={
             key.removeprefix("texture_"): value.astype(np.uint8).tobytes()
             for key, value in arrays.items()
@@ -295,7 +252,7 @@ def assemble(name: str, arrays: dict[str, NDArray[np.generic]], detail: Detail =
 
 
 def _check(arrays: dict[str, NDArray[np.generic]]) -> None:
-    """See whether the arrays fit each other, as far as nothing else finds out."""
+    """Check the consistency of arrays that later steps do not check."""
     count, num_parts = len(arrays["vertices"]), len(arrays["part_names"])
     for key, shape in (
         ("vertices", (count, 3)), ("uv", (count, 2)), ("colors", (count, 3)),
@@ -304,28 +261,28 @@ def _check(arrays: dict[str, NDArray[np.generic]]) -> None:
         ("triangles", (len(arrays["triangles"]), 3)),
     ):  # fmt: skip
         if arrays[key].shape != shape:
-            raise ValueError(f"{key} of shape {arrays[key].shape}, expected {shape}")
+            raise ValueError(f"{key} has shape {arrays[key].shape}, expected {shape}")
     first, after_coarse, after = arrays["part_vertices"].astype(np.int64).T
     if not (
         np.array_equal(np.append(first, count), np.append(0, after))
         and (first <= after_coarse).all()
         and (after_coarse <= after).all()
     ):
-        raise ValueError("the parts do not share out the vertices")
+        raise ValueError("the parts do not cover the vertices exactly once")
     if len(set(arrays["part_names"].tolist())) < num_parts:
-        raise ValueError("two parts have one name")
+        raise ValueError("two parts have the same name")
     missing = {f"texture_{name}" for name in arrays["part_textures"].tolist()} - arrays.keys()
     if missing:
         raise ValueError(f"{', '.join(sorted(missing))} is missing")
     left, right = arrays["eye_centres"].astype(np.float64)
     if not (np.isfinite(arrays["vertices"].astype(np.float32)).all() and left[0] > right[0]):
-        raise ValueError("a vertex is not finite, or the eyes are exchanged")
+        raise ValueError("a vertex is not finite, or the eyes are swapped")
 
 
 def _basis(
     arrays: dict[str, NDArray[np.generic]], place: NDArray[np.int64], num_vertices: int
 ) -> sparse.csr_array:
-    """Gather the displacement fields as a sparse matrix (3 V, 68)."""
+    """Return the displacement fields as a sparse matrix (3 V, 68)."""
     bounds = arrays["field_bounds"].astype(np.int64)
     column = np.repeat(arrays["field_faps"].astype(np.int64) - 1, np.diff(bounds))
     unit = np.repeat(arrays["field_units"].astype(np.float64), np.diff(bounds))
@@ -343,12 +300,12 @@ def _basis(
 
 
 def neutral_faps(**values: float) -> Float32:
-    """Make FAPs (68,) that are zero but for the named ones.
+    """Return FAPs (68,) that are zero except for the named ones.
 
     Raises
     ------
     UserError
-        If a name is no FAP.
+        If a name is not a FAP.
 
     Examples
     --------
@@ -358,6 +315,6 @@ def neutral_faps(**values: float) -> Float32:
     faps = np.zeros(NUM_FAPS, dtype=np.float32)
     for fap_name, value in values.items():
         if fap_name not in FAP_NUMBER:
-            raise UserError(f"{fap_name!r} is no FAP; the names are in shared/faps.tsv")
+            raise UserError(f"{fap_name!r} is not a FAP; shared/face/faps.tsv lists the names")
         faps[FAP_NUMBER[fap_name] - 1] = value
     return faps

@@ -1,12 +1,11 @@
-"""Displacement fields of the FAPs on any face, from its feature points.
+"""Displacement fields of the FAPs on any face, computed from its feature points.
 
-The same constructions as for the package's own heads (``training.heads.zones``), with all lengths
-measured in the face's own units: zones whose weight falls as a raised cosine of the distances along
-the surface to the moving and to the fixed vertices (Li 2011, section 2.1), and for lips, lids and
-brows the smoothest field that is 1 at its own point and 0 at the others.
+The built-in heads use the same constructions (``training.heads.zones``). Here all lengths are
+relative to the face. Zones have weights that fall as a raised cosine of the surface distances to
+the moving and fixed vertices (Li 2011, section 2.1). Lips, lids and brows use the smoothest field
+that is 1 at its point and 0 at the other points.
 
-A field holds what its FAP does at one FAP unit, m. Points that a file does not give leave their
-FAPs without effect.
+A field is the displacement by one FAP unit, m. FAPs of missing points have no effect.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ AXES = {
     "right": (0, -1.0),
     "forward": (2, 1.0),
 }
-CORNER_SLOPE = 0.37  # slope of the lips' curve seen from above, near the corners
-_LID_SLOPE = 0.15  # a closing lid comes forward round the eyeball
-_HINGE = 1.34  # eye distances from the chin back to the jaw's axis
-# FAP, its point, core that moves as a whole and reach, in eye distances
+CORNER_SLOPE = 0.37  # slope of the lip curve near the corners, seen from above
+_LID_SLOPE = 0.15  # a closing lid moves forward around the eyeball
+_HINGE = 1.34  # distance from the chin back to the jaw's axis, eye distances
+# FAP, feature point, radius that moves as a whole, and reach, in eye distances
 _ZONES = (
     (18, "2.10", 0.04, 0.47), (39, "5.1", 0.18, 0.72), (40, "5.2", 0.18, 0.72),
     (41, "5.3", 0.09, 0.54), (42, "5.4", 0.09, 0.54), (61, "9.1", 0.05, 0.29),
@@ -47,20 +46,20 @@ _FACE = (
 
 
 class FaceFields:
-    """All fields of a skin.
+    """The fields of a skin.
 
     Parameters
     ----------
     vertices
-        The skin's vertices (V, 3), m; y is up, the face looks along z.
+        Vertices of the skin (V, 3), m; y is up, the face looks along z.
     triangles
         Vertex numbers (F, 3).
     points
-        Vertex of each feature point on the skin; at least those of ``INNER``, ``OUTER``, 2.1, 2.10.
+        Vertex of each feature point; at least those in ``INNER`` and ``OUTER``, 2.1 and 2.10.
     eyes
-        Middles of the left and the right eye (2, 3), m.
+        Centers of the left and right eye (2, 3), m.
     fapu
-        Lengths, m.
+        FAPU lengths, m.
     """
 
     def __init__(
@@ -83,23 +82,23 @@ class FaceFields:
         self._zones()
 
     def jaw_fields(self, vertices: Float) -> Fields:
-        """Fields (V, 3) of what moves with the jaw: lower teeth, tongue."""
+        """Return the fields (V, 3) of parts that move with the jaw: lower teeth, tongue."""
         lever = self._lever(vertices[:, 2])
         whole = np.ones(len(vertices))
         moved = {3: lever, 14: whole, 15: lever}
         return {fap: self._along(fap, weight) for fap, weight in moved.items()}
 
     def tongue_fields(self, vertices: Float, rows: Index, tip: int, body: int | None) -> Fields:
-        """Fields (R, 3) of a tongue, without its share of the jaw's motion.
+        """Return the fields (R, 3) of a tongue, without the jaw's motion.
 
         Parameters
         ----------
         vertices
-            Of the whole mesh (V, 3), m.
+            Vertices of the whole mesh (V, 3), m.
         rows
             Vertices of the tongue (R,).
         tip, body
-            Vertices of 6.1 and, if it is known, 6.2.
+            Vertices of the points 6.1 and, if known, 6.2.
         """
         z = vertices[rows, 2]
         root = z.min()
@@ -123,7 +122,7 @@ class FaceFields:
         return self._geodesics.distance(self._all(*names))
 
     def _along(self, fap: int, weight: Float) -> Float:
-        """Field (V, 3) that moves along the axis of a FAP."""
+        """Return a field (V, 3) along the axis of a FAP."""
         entry = FAPS[fap - 1]
         axis, sign = AXES[entry.direction]
         field = np.zeros((len(weight), 3))
@@ -141,7 +140,7 @@ class FaceFields:
         x, y, z = self._vertices.T
         unit, width = self._unit, self._fapu["MW"]
         lips = self._at("2.2")
-        # what lies behind the lips: the palate, the cheeks' inside, the floor of the mouth
+        # surfaces behind the lips: palate, inner cheeks, floor of the mouth
         self._behind = (np.abs(x - lips[0]) < 0.62 * width) & (z < lips[2] - 0.41 * unit)
         nose = (
             y > self._at("8.1")[1] + 0.75 * (lips[1] + self._fapu["MNS"] - self._at("8.1")[1])
@@ -153,7 +152,7 @@ class FaceFields:
         for fap in FAPS[2:]:
             if fap.direction in ("up", "down") and set(fap.feature_points) & set(names):
                 self._add(fap.number, self._lip_y[fap.feature_points[0]])
-        # halfway points follow their corner by half, so that a narrowed mouth keeps its shape
+        # points halfway to a corner move half as far, so that a narrow mouth keeps its shape
         corners = ("2.4", "2.5", "8.3", "8.4")
         between = ("2.6", "2.8", "2.7", "2.9", "8.5", "8.7", "8.6", "8.8")
         middles = ("2.2", "2.3", "8.1", "8.2")
@@ -163,7 +162,7 @@ class FaceFields:
             half = single[:, 4 + 2 * row : 6 + 2 * row].sum(axis=1)
             self._lip_x[name] = single[:, row] + 0.45 * half
             self._add(fap_x, self._lip_x[name])
-            # a corner slides along the curve of the lips: outwards is backwards
+            # a corner slides along the curve of the lips: outward motion is also backward
             self.fields[fap_x][:, 2] = (
                 -CORNER_SLOPE * self._lip_x[name] * width / FAP_UNITS_PER_FAPU
             )
@@ -199,7 +198,7 @@ class FaceFields:
             self._add(fap, left)
 
     def _lever(self, z: Float) -> Float:
-        """How far a place follows the turn of the jaw, 1 at the chin."""
+        """Return how far a depth follows the jaw rotation, 1 at the chin."""
         chin = self._at("2.1")[2]
         lever: Float = np.maximum(z - chin + _HINGE * self._unit, 0) / (_HINGE * self._unit)
         return lever
@@ -239,12 +238,12 @@ class FaceFields:
     def _zones(self) -> None:
         for fap, name, core, reach in _ZONES:
             if name in self._points:
-                # a zone of the nose stops at the nose's other points, one of a cheek at all of them
+                # a zone ends at the other points of the face
                 others = [other for other in _FACE if other != name]
                 near = self._geodesics.distance(self._all(name))
                 fixed = np.union1d(np.flatnonzero(near > reach * self._unit), self._all(*others))
                 moving = np.setdiff1d(np.flatnonzero(near <= core * self._unit), fixed)
                 moving = np.union1d(moving, self._all(name))
                 self._add(fap, self._geodesics.zone(moving, np.setdiff1d(fixed, moving)))
-                if name in ("5.1", "5.2"):  # a puffed cheek comes forward, too
+                if name in ("5.1", "5.2"):  # a puffed cheek also moves forward
                     self.fields[fap][:, 2] = 0.5 * np.abs(self.fields[fap][:, 0])

@@ -1,9 +1,9 @@
-"""Make a head that FAPs move out of a mesh and its feature points.
+"""Makes a head from a mesh and its feature points.
 
-The surface on which 8.1 lies is the skin; it gets the fields of ``import_fields``. What hangs
-together apart from it is told by where it lies: eyeballs turn, what lies in the mouth below the
-lips (lower teeth, tongue) goes with the jaw, what lies on the skin (lashes, brows, beard) follows
-it, and the rest keeps still on the head.
+The connected surface that contains point 8.1 is the skin; it gets the fields of ``import_fields``.
+The role of other connected surfaces follows from their position. Eyeballs rotate. Objects in the
+mouth below the lips (lower teeth, tongue) follow the jaw. Objects on the skin (lashes, brows,
+beard) follow the skin. The rest only follows the head.
 """
 
 from __future__ import annotations
@@ -33,42 +33,42 @@ from kouxing.services.driver.head.surface import Geodesics
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, RADIANS_PER_ANGLE_UNIT
 
-MAX_VERTICES = 65_535  # more would need larger numbers in the GLB for the page
+MAX_VERTICES = 65_535  # limit of 16-bit indices in the page's GLB
 NEEDED = ("2.1", *sorted(INNER), "2.10", *sorted(OUTER))
 _MOVING = {name for fap in FAPS for name in fap.feature_points}
-_SNAP = 0.15  # eye distances within which a point must lie on the mesh
-_BESIDE = ("3.5", "3.6", "7.1", "3.13", "3.14")  # points that need not lie on it
+_SNAP = 0.15  # maximum distance of a point from the mesh, eye distances
+_OFF_SURFACE = ("3.5", "3.6", "7.1", "3.13", "3.14")  # points that are not on the surface
 
 Index = NDArray[np.int64]
 
 
 def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
-    """Write a head (``.npz``) made of a mesh and its feature points.
+    """Write a head (``.npz``) made from a mesh and its feature points.
 
     Parameters
     ----------
     mesh
-        A face at rest, mouth closed, in one of ``mesh_file.MESH_SUFFIXES``; y is up.
+        A face at rest with a closed mouth, in a format of ``mesh_file.MESH_SUFFIXES``; y is up.
     points
-        As ``points_file.read_points`` takes them.
+        A file for ``points_file.read_points``.
     output
         Head to write.
 
     Returns
     -------
-    Remarks for the user: what will not move, and why.
+    Remarks for the user about parts that will not move.
 
     Raises
     ------
     UserError
-        If a file cannot be read or written, or the mesh and the points make no face.
+        If a file cannot be read or written, or the mesh and points are not a face.
     """
     if output.suffix != ".npz":
-        raise UserError(f"{output}: a head is an .npz file; give such a name")
+        raise UserError(f"{output}: give a name that ends in .npz")
     pieces = read_mesh(mesh)
     count = sum(len(piece.vertices) for piece in pieces)
     if count > MAX_VERTICES:
-        raise UserError(f"{mesh} has {count} vertices; reduce it to {MAX_VERTICES} at most")
+        raise UserError(f"{mesh} has {count} vertices; reduce it to at most {MAX_VERTICES}")
     given = read_points(points)
     arrays, remarks = _Import(
         mesh, points, pieces, _places(mesh, points, pieces, given), given
@@ -77,14 +77,14 @@ def import_head(mesh: Path, points: Path, output: Path) -> list[str]:
         with output.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
     except OSError as error:
-        if output.is_file():  # no half a head
+        if output.is_file():  # incomplete
             output.unlink()
-        raise UserError(f"{output} cannot be written: {error.strerror}") from error
+        raise UserError(f"cannot write {output}: {error.strerror}") from error
     return remarks
 
 
 def _places(mesh: Path, path: Path, pieces: list[Piece], points: Points) -> dict[str, Float64]:
-    """Coordinates of every point, in the mesh's own axes."""
+    """Return the coordinates of every point in the mesh's own axes."""
     vertices, named = numbered_vertices(mesh, pieces)
     places = {}
     for name, place in points.places.items():
@@ -92,17 +92,18 @@ def _places(mesh: Path, path: Path, pieces: list[Piece], points: Points) -> dict
             places[name] = place
         else:
             mesh_name, number = place
-            own = named.get(mesh_name, vertices)
-            if number >= len(own):
+            candidates = named.get(mesh_name, vertices)
+            if number >= len(candidates):
                 raise UserError(
-                    f"{path}: {name} is vertex {number}, but there are {len(own)} (from 0)"
+                    f"{path}: {name} is vertex {number}, but the last vertex is"
+                    f" {len(candidates) - 1}"
                 )
-            places[name] = own[number]
+            places[name] = candidates[number]
     return places
 
 
 class _Import:
-    """One import, step by step."""
+    """The steps of one import."""
 
     def __init__(
         self, mesh: Path, path: Path, pieces: list[Piece], places: dict[str, Float64], given: Points
@@ -130,13 +131,13 @@ class _Import:
         height = (self._vertices[order, 1] - self._eyes.mean(axis=0)[1]) / EYE_DISTANCE_M
         arrays = pack(
             pieces,
-            fields=[{fap: field[own] for fap, field in fields.items()} for own in rows],
+            fields=[{fap: field[selected] for fap, field in fields.items()} for selected in rows],
             head_weight=fade(height),
             fapu=fapu | {"AU": RADIANS_PER_ANGLE_UNIT},
             feature_points={
                 name: int(place[first_of[vertex]]) for name, vertex in self._points.items()
             },
-            eye_centres=self._eyes,
+            eye_centers=self._eyes,
         )
         return arrays, self._remarks
 
@@ -164,8 +165,8 @@ class _Import:
         sideways = left - right
         if unit == 0 or down[1] < 0.8 * np.linalg.norm(down) or abs(sideways[0]) < 0.8 * unit:
             raise self._fail(
-                "the chin (2.1) is not below the eyes (3.5, 3.6); turn the mesh so that y is up and"
-                " the face looks along z"
+                "the chin (2.1) is not below the eyes (3.5, 3.6); rotate the mesh so that y is up"
+                " and the face looks along z"
             )
         turn = np.array([1.0, 1.0, 1.0]) if sideways[0] > 0 else np.array([-1.0, 1.0, -1.0])
         pivot = places.get("7.1", middle + PIVOT * turn * unit)
@@ -181,10 +182,10 @@ class _Import:
         return turned
 
     def _join(self) -> None:
-        """Join vertices that stand in one place, and find what hangs together."""
+        """Merge vertices at the same position, and find the connected surfaces."""
         first = np.cumsum([0] + [len(piece.vertices) for piece in self._pieces])
         uv = np.concatenate([piece.uv for piece in self._pieces])
-        flat = np.ptp(uv, axis=0).max() == 0  # without texture places nothing tells a slit
+        flat = np.ptp(uv, axis=0).max() == 0  # slits are visible only in texture coordinates
         same = weld(self._vertices, np.arange(len(uv))[:, None] if flat else uv)
         _, self._weld_of = np.unique(same, return_inverse=True)
         count = int(self._weld_of.max()) + 1
@@ -203,21 +204,21 @@ class _Import:
         _, self._component = csgraph.connected_components(graph, directed=False)
 
     def _snap(self, places: dict[str, Float64]) -> None:
-        """Find the vertex of every point."""
+        """Find the vertex of each point."""
         used = np.unique(self._triangles)
         tree = cKDTree(self._welded[used])
         self._points: dict[str, int] = {}
         off = []
         for name, place in places.items():
             distance, row = tree.query(self._to_head(place))
-            if name in _BESIDE:
+            if name in _OFF_SURFACE:
                 continue
             if distance <= _SNAP * EYE_DISTANCE_M:
                 self._points[name] = int(used[row])
             elif name in _MOVING or name in NEEDED:
                 off.append(f"{name} by {distance / self._scale:.3g}")
         if off:
-            raise self._fail(f"points lie off the mesh, in its unit: {', '.join(off)}")
+            raise self._fail(f"points are too far from the mesh, in its unit: {', '.join(off)}")
         skin = np.flatnonzero(self._component == self._component[self._points["8.1"]])
         local = np.full(len(self._welded), -1)
         local[skin] = np.arange(len(skin))
@@ -227,17 +228,15 @@ class _Import:
         lips = {name: self._points[name] for name in (*INNER, *OUTER, "2.1", "2.10")}
         apart = [name for name, vertex in lips.items() if local[vertex] < 0]
         if apart:
-            raise self._fail(
-                f"{', '.join(apart)} and 8.1 lie on meshes that do not hang together; join them"
-            )
+            raise self._fail(f"{', '.join(apart)} and 8.1 are on separate meshes; join the meshes")
         seen: dict[int, str] = {}
         for name, vertex in lips.items():
             if vertex in seen:
-                raise self._fail(f"{seen[vertex]} and {name} fall on one vertex; set them apart")
+                raise self._fail(f"{seen[vertex]} and {name} have the same vertex; separate them")
             seen[vertex] = name
 
     def _part_lips(self, places: dict[str, Float64]) -> None:
-        """Take inner points of closed lips to the lip that they belong to."""
+        """Move inner points of closed lips to the correct lip."""
         skin, local, inside = self._skin
         if local[self._points["8.2"]] < 0:
             return
@@ -249,8 +248,10 @@ class _Import:
         for name in (*UPPER_LIP[:3], *LOWER_LIP[:3]):
             here = self._to_head(places[name])
             near = np.array(tree.query_ball_point(here, 0.05 * EYE_DISTANCE_M), dtype=np.int64)
-            own, other = (to_upper, to_lower) if name in UPPER_LIP else (to_lower, to_upper)
-            near = near[own[near] < other[near]]
+            this_lip, other_lip = (
+                (to_upper, to_lower) if name in UPPER_LIP else (to_lower, to_upper)
+            )
+            near = near[this_lip[near] < other_lip[near]]
             if len(near):
                 best = near[np.argmin(np.linalg.norm(self._welded[skin[near]] - here, axis=1))]
                 self._points[name] = int(skin[best])
@@ -258,7 +259,7 @@ class _Import:
     # --- what moves -----------------------------------------------------------------------------
 
     def _measure(self) -> dict[str, float]:
-        """FAPUs, m."""
+        """Return the FAPUs, m."""
 
         def height(name: str) -> float:
             return float(self._welded[self._points[name], 1])
@@ -279,13 +280,13 @@ class _Import:
         wrong = [name for name, length in fapu.items() if length <= 0]
         if wrong:
             raise self._fail(
-                f"{', '.join(wrong)} is not positive: left and right, or above and below, are"
-                " exchanged (left is the face's own left, at positive x)"
+                f"{', '.join(wrong)} is not positive: left and right, or upper and lower points,"
+                " are swapped (left is the subject's left, at positive x)"
             )
         return fapu
 
     def _move(self, face: FaceFields, fapu: dict[str, float]) -> tuple[Fields, NDArray[np.int8]]:
-        """Fields (V, 3) of all vertices, and for each one 1 on the left eye, 2 on the right one."""
+        """Return the fields (V, 3), and per vertex 1 (left eye), 2 (right eye) or 0."""
         skin = self._skin[0]
         fields = {fap: np.zeros_like(self._welded) for fap in face.fields}
         for fap, field in face.fields.items():
@@ -327,11 +328,11 @@ class _Import:
                 for fap, field in face.fields.items():
                     fields[fap][rows] = share * field[nearest]
         if (roles == 0).all():
-            self._remarks.append("no eyeballs apart from the skin: the eyes do not turn")
+            self._remarks.append("no eyeballs separate from the skin: the eyes do not rotate")
         return {fap: field[self._weld_of] for fap, field in fields.items()}, roles[self._weld_of]
 
     def _eye_of(self, middle: Float64, size: Float64) -> int:
-        """Say whether a body is the left eyeball (1), the right one (2), or none (0)."""
+        """Return 1 for the left eyeball, 2 for the right eyeball, 0 for other objects."""
         round_enough = size.min() > 0.4 * size.max() and 0.1 < size.max() / EYE_DISTANCE_M < 0.9
         for number, eye in enumerate(self._eyes, start=1):
             if round_enough and np.linalg.norm(middle - eye) < 0.35 * EYE_DISTANCE_M:
@@ -339,17 +340,17 @@ class _Import:
         return 0
 
     def _split(self, roles: NDArray[np.int8]) -> tuple[list[Piece], list[Index]]:
-        """Part pieces so that each eyeball is one of its own; rows of the vertices of each."""
+        """Split pieces so that each eyeball is separate; return them and their vertex rows."""
         pieces, rows = [], []
         first = 0
         for piece in self._pieces:
-            own = roles[first : first + len(piece.vertices)]
+            piece_roles = roles[first : first + len(piece.vertices)]
             for role, name in ((0, piece.name), (1, "eye_left"), (2, "eye_right")):
-                kept = np.flatnonzero(own == role)
-                shown = (own[piece.triangles] == role).all(axis=1)
+                kept = np.flatnonzero(piece_roles == role)
+                shown = (piece_roles[piece.triangles] == role).all(axis=1)
                 if not shown.any():
                     continue
-                number = np.full(len(own), -1)
+                number = np.full(len(piece_roles), -1)
                 number[kept] = np.arange(len(kept))
                 pieces.append(
                     replace(
@@ -362,7 +363,7 @@ class _Import:
                     )
                 )
                 rows.append(kept + first)
-            first += len(own)
+            first += len(piece_roles)
         return pieces, rows
 
     def _remark_on(self, fields: Fields, points: dict[str, int]) -> None:
@@ -372,10 +373,12 @@ class _Import:
             if fap.number not in fields and fap.fapu != "AU" and fap.number not in (27, 28)
         ]
         if still:
-            self._remarks.append(f"without points, these FAPs move nothing: {', '.join(still)}")
+            self._remarks.append(
+                f"no points for these FAPs, so they have no effect: {', '.join(still)}"
+            )
         skin, _, inside = self._skin
         along = Geodesics(self._welded[skin], inside).distance(np.array([points["2.2"]]))
         if along[points["2.3"]] < 0.05 * EYE_DISTANCE_M:
             self._remarks.append(
-                "the lips are joined between 2.2 and 2.3: the mouth cannot open; cut it open"
+                "the lips are joined between 2.2 and 2.3, so the mouth cannot open; cut it open"
             )

@@ -1,4 +1,4 @@
-"""Reads a user's mesh file (OBJ, PLY, GLB) as pieces in one frame."""
+"""Reads a user's mesh file (OBJ, PLY, GLB) as pieces in common axes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from kouxing.shared.errors import UserError
 
 MAX_MESH_BYTES = 256 * 1024 * 1024  # size of a file
 MESH_SUFFIXES = (".obj", ".glb", ".ply")
-_NO_DIFFUSE = [102, 102, 102]  # what trimesh makes up
-_SKIN_COLOUR = (0.58, 0.40, 0.32)  # linear, where a file brings none
+_NO_DIFFUSE = [102, 102, 102]  # trimesh's default
+_SKIN_COLOR = (0.58, 0.40, 0.32)  # linear, for meshes without color
 
 
 def read_mesh(path: Path) -> list[Piece]:
-    """Read the triangles of a mesh file; GLB with its skeleton's rest pose, others by trimesh.
+    """Read the triangles of a mesh file; a GLB is read in its skeleton's rest pose.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def read_mesh(path: Path) -> list[Piece]:
     """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        raise UserError(f"{path}: give a mesh in one of the forms {', '.join(MESH_SUFFIXES)}")
+        raise UserError(f"{path}: give a mesh in one of the formats {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     if path.stat().st_size > MAX_MESH_BYTES:
@@ -40,15 +40,15 @@ def read_mesh(path: Path) -> list[Piece]:
         if suffix == ".glb":
             pieces = read_pieces(Glb(path))
         else:
-            with warnings.catch_warnings(action="ignore"):  # trimesh's, on its own guesses
+            with warnings.catch_warnings(action="ignore"):  # trimesh warns about its own guesses
                 options: dict[str, Any] = {"split_objects": True} if suffix == ".obj" else {}
                 scene = trimesh.load_scene(path, process=False, **options)
             meshes: list[Any] = list(scene.dump())
             pieces = [_from_trimesh(mesh) for mesh in meshes if len(getattr(mesh, "faces", ()))]
     except BadGlbError as error:
         raise UserError(f"{path}: {error}") from error
-    except Exception as error:  # trimesh's loaders raise whatever goes wrong in them
-        raise UserError(f"{path} is no intact mesh ({error})") from error
+    except Exception as error:  # trimesh's loaders raise arbitrary exceptions
+        raise UserError(f"{path} is damaged or is not a mesh ({error})") from error
     if not pieces:
         raise UserError(f"{path} has no faces; export the mesh with its triangles")
     return pieces
@@ -59,9 +59,9 @@ def _from_trimesh(mesh: Any) -> Piece:
     if not np.isfinite(vertices).all():
         raise ValueError("a coordinate is not finite")
     visual, texture = mesh.visual, b""
-    uv, colors = np.zeros((len(vertices), 2)), np.full((len(vertices), 3), _SKIN_COLOUR)
+    uv, colors = np.zeros((len(vertices), 2)), np.full((len(vertices), 3), _SKIN_COLOR)
     if getattr(visual, "uv", None) is not None and len(visual.uv) == len(vertices):
-        uv = np.asarray(visual.uv, dtype=np.float64) * [1, -1] + [0, 1]  # ours run downwards
+        uv = np.asarray(visual.uv, dtype=np.float64) * [1, -1] + [0, 1]  # this package has v down
         image = getattr(visual.material, "image", None)
         diffuse = getattr(visual.material, "diffuse", None)
         if image is not None:
@@ -87,31 +87,31 @@ def _from_trimesh(mesh: Any) -> Piece:
 
 
 def numbered_vertices(mesh: Path, pieces: list[Piece]) -> tuple[Float64, dict[str, Float64]]:
-    """Return the vertices (V, 3) in the order of the file, all of them and by their mesh's name.
+    """Return the vertices (V, 3) in file order: all of them, and by mesh name.
 
     Raises
     ------
     UserError
-        If a line of an OBJ file is no vertex.
+        If a vertex line of an OBJ file is invalid.
     """
-    # in the pieces of an OBJ file a vertex may come several times, once for each texture place
+    # the pieces of an OBJ file repeat a vertex for each texture coordinate
     if mesh.suffix.lower() != ".obj":
         return np.concatenate([p.vertices for p in pieces]), {p.name: p.vertices for p in pieces}
     rows: list[list[float]] = []
-    begins: dict[str, int] = {}
+    starts: dict[str, int] = {}
     for line in mesh.read_text(encoding="utf-8", errors="replace").splitlines():
         words = line.split()
         if words[:1] == ["v"]:
             try:
                 x, y, z = map(float, words[1:4])
             except ValueError:
-                raise UserError(f"{mesh}: {line.strip()!r} is no vertex") from None
+                raise UserError(f"{mesh}: {line.strip()!r} is not a valid vertex") from None
             rows.append([x, y, z])
         elif words[:1] in (["o"], ["g"]) and len(words) > 1:
-            begins.setdefault(words[1], len(rows))
+            starts.setdefault(words[1], len(rows))
     vertices = np.array(rows)
-    ends = [*list(begins.values())[1:], len(rows)]
+    ends = [*list(starts.values())[1:], len(rows)]
     named = {
-        name: vertices[a:b] for (name, a), b in zip(begins.items(), ends, strict=True) if b > a
+        name: vertices[a:b] for (name, a), b in zip(starts.items(), ends, strict=True) if b > a
     }
     return vertices, named if len(named) > 1 else {}

@@ -20,16 +20,16 @@ EMOTIONS = {"happy": "joy", "angry": "anger", "sad": "sadness", "surprised": "su
 
 
 class Morph(NamedTuple):
-    """A morph target to be made."""
+    """A morph target to export."""
 
     name: str
     faps: Float32  # (68,) at weight 1
-    min_shift_m: float = _MIN_SHIFT_M  # smaller displacements are left out
-    turns_eyes: bool = True  # it moves the eyeballs; else nodes turn them
+    min_shift_m: float = _MIN_SHIFT_M  # smaller displacements are omitted
+    turns_eyes: bool = True  # whether it moves the eyeballs; otherwise nodes rotate them
 
 
 def units_per_weight(fapu: str) -> float:
-    """Return the FAP units of a weight of 1, by the unit of the FAP."""
+    """Return the FAP units of weight 1 for a FAP with this unit."""
     return _ANGLE_UNITS_PER_WEIGHT if fapu == "AU" else FAP_UNITS_PER_FAPU
 
 

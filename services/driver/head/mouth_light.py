@@ -1,8 +1,8 @@
-"""How much light falls on teeth and tongue: little through a small mouth or behind pushed lips.
+"""Light on teeth and tongue; little light passes a small mouth or protruding lips.
 
-The light comes through the gap of the lips, of height ``h``, onto teeth at a depth ``d`` behind it.
-What a tooth sees of the outside grows with ``h`` and falls with ``d``; the form below is chosen by
-eye. ``services/gateway/page/mouth-light.js`` does the same.
+The light passes the gap between the lips, of height ``h``, onto teeth at a depth ``d``. It
+increases with ``h`` and decreases with ``d``; the formula was chosen by eye.
+``services/gateway/page/mouth-light.js`` is the same function.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _FLOOR = 0.08
 
 
 def mouth_light(faps: NDArray[np.float32]) -> float:
-    """Share of the light, 0 to 1, for FAPs (68,)."""
+    """Return the share of the light, 0 to 1, for FAPs (68,)."""
     height = max(-float(faps[3] + faps[4]), 0.0)
     depth = max(_DEPTH + float(faps[15] + faps[16]) / 2, 0.0)
     through = height / (height + _SPREAD * depth**2 / _DEPTH + 1e-6)

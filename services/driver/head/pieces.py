@@ -1,4 +1,4 @@
-"""The pieces of a mesh in one frame, and how they become the parts of a head."""
+"""The pieces of a mesh, and how they become the parts of a head."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from kouxing.services.driver import picture
 from kouxing.services.driver.head.glb_file import Float64
 from kouxing.services.driver.head.head import FORMAT
 
-_MIN_SHIFT_M = 2e-9  # smaller displacements by one FAP unit are left out
+_MIN_SHIFT_M = 2e-9  # smaller displacements by one FAP unit are omitted
 _WHITE = np.full((2, 2, 3), 255, np.uint8)
-_NODES = ("kouxing", "body", "head")  # nodes of an exported GLB that are no parts
+_NODES = ("kouxing", "body", "head")  # nodes of an exported GLB that are not parts
 _MAX_NAME_LENGTH = 60
 
-Fields = dict[int, Float64]  # FAP: displacement (V, 3) by one unit, m
+Fields = dict[int, Float64]  # FAP: displacements (V, 3) by one unit, m
 
 
 @dataclass(slots=True)
 class Piece:
-    """A primitive in the axes of the scene."""
+    """A primitive in scene axes."""
 
     name: str
     vertices: Float64
@@ -32,15 +32,15 @@ class Piece:
     colors: Float64
     texture: bytes
     material: dict[str, Any]
-    head_weight: Float64 | None  # None: no skeleton says
-    shapes: dict[str, Float64] = field(default_factory=dict)  # by lower-case name
+    head_weight: Float64 | None  # None without a skeleton
+    shapes: dict[str, Float64] = field(default_factory=dict)  # displacements by plain target name
 
 
 def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
-    """Find for each vertex (V,) the first one that stands in its place.
+    """Return for each vertex (V,) the first vertex at the same position.
 
-    Vertices with the same texture coordinates, too, are kept apart: nothing but a slit, such as
-    between closed lips, makes a program write a vertex twice like that.
+    Vertices whose texture coordinates are also equal stay separate. Programs write such duplicates
+    only for a slit, such as between closed lips.
     """
     _, first, place = np.unique(
         np.round(vertices / 1e-6).astype(np.int64), axis=0, return_index=True, return_inverse=True
@@ -55,7 +55,7 @@ def weld(vertices: NDArray[Any], uv: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def part_names(pieces: list[Piece]) -> list[str]:
-    """Name every part differently, eyeballs as the rest of the program knows them."""
+    """Return a unique name for each part; eyeballs get the names that the package uses."""
     names: list[str] = []
     taken, last = set(_NODES), dict[str, int]()
     for piece in pieces:
@@ -81,19 +81,19 @@ def pack(
     head_weight: Float64,
     fapu: dict[str, float],
     feature_points: dict[str, int],
-    eye_centres: Float64,
+    eye_centers: Float64,
 ) -> dict[str, NDArray[Any]]:
-    """Arrange pieces as the arrays of a head's file, see ``services.driver.head.head.assemble``.
+    """Convert pieces to the arrays of a head file, see ``head.assemble``.
 
     Parameters
     ----------
     pieces
         In the head's axes, m.
     fields
-        The displacement fields of each piece.
+        Displacement fields of each piece.
     head_weight
-        Share of the head's turn of all vertices (V,).
-    fapu, feature_points, eye_centres
+        Share (V,) of the head rotation, for all vertices.
+    fapu, feature_points, eye_centers
         As in ``Head``.
     """
     first = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
@@ -141,7 +141,7 @@ def pack(
         "fapu": np.array(list(fapu.values())),
         "feature_point_names": np.array(list(feature_points), dtype=str),
         "feature_points": np.array(list(feature_points.values()), dtype=np.int64),
-        "eye_centres": eye_centres.astype(np.float32),
+        "eye_centres": eye_centers.astype(np.float32),
         "field_faps": np.array(faps, dtype=np.int64),
         "field_units": np.ones(len(faps)),
         "field_bounds": np.array(ends),

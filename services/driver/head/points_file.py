@@ -1,10 +1,10 @@
-"""Read where the MPEG-4 feature points of a mesh lie.
+"""Reads the positions of MPEG-4 feature points on a mesh.
 
-Two forms: text lines ``point x y z`` (in the mesh's own axes and lengths) or ``point vertex``
-(numbered from 0 in the order of the file), apart by blanks or tabs, ``#`` begins a comment; and
-XfaceEd's ``.fdp`` (XML), whose ``<fdp name="2.1" affects="MESH" index="VERTEX">`` names a vertex of
-a mesh and whose ``<fapu>`` holds lengths. The zones and weights of an ``.fdp`` are not taken over:
-the fields come out of the surface, as those of the package's own heads do.
+Two formats are accepted. Text files have lines ``point x y z``, in the mesh's own axes and unit, or
+``point vertex``, counted from 0 in file order; ``#`` starts a comment. XfaceEd's ``.fdp`` files
+(XML) name a vertex of a mesh by ``<fdp name="2.1" affects="MESH" index="VERTEX">`` and lengths by
+``<fapu>``. The zones and weights of an ``.fdp`` file are ignored: fields are computed from the
+surface, as for the built-in heads.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from kouxing.shared.errors import UserError
 
 MAX_BYTES = 16 * 1024 * 1024
-# ISO/IEC 14496-2, annex C: how many points each group has
+# ISO/IEC 14496-2, annex C: number of points per group
 _GROUP_SIZES = {2: 14, 3: 14, 4: 6, 5: 4, 6: 4, 7: 1, 8: 10, 9: 15, 10: 10, 11: 6}
 _LENGTHS = ("MNS", "MW", "ENS", "ES", "IRISD")
 
@@ -30,18 +30,10 @@ Place = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """What a file says.
+    """The contents of a file."""
 
-    Attributes
-    ----------
-    places
-        Point: coordinates (3,), or a vertex as (mesh name or "", number).
-    fapu
-        Lengths that the file gives, in the mesh's own unit.
-    """
-
-    places: dict[str, Place | tuple[str, int]]
-    fapu: dict[str, float] = field(default_factory=dict)
+    places: dict[str, Place | tuple[str, int]]  # coordinates (3,), or (mesh name or "", vertex)
+    fapu: dict[str, float] = field(default_factory=dict)  # lengths in the mesh's own unit
 
 
 def read_points(path: Path) -> Points:
@@ -50,7 +42,7 @@ def read_points(path: Path) -> Points:
     Raises
     ------
     UserError
-        If it cannot be read or holds something else; the text names the line where there is one.
+        If the file cannot be read or is invalid; the text names the line if possible.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -60,9 +52,7 @@ def read_points(path: Path) -> Points:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     points = _from_xml(path, text) if text.lstrip().startswith("<") else _from_lines(path, text)
     if not points.places:
-        raise UserError(
-            f"{path}: it has no feature points; write lines such as '2.1 0.0 -0.07 0.07'"
-        )
+        raise UserError(f"{path} has no feature points; write lines such as '2.1 0.0 -0.07 0.07'")
     return points
 
 
@@ -71,13 +61,13 @@ def _from_lines(path: Path, text: str) -> Points:
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.partition("#")[0].split()
         if not words or (number == 1 and not words[0][0].isdigit()):
-            continue  # empty, or the names of the columns
+            continue  # empty line, or column names
         where = f"{path}, line {number}"
         name = _known(words[0], where, places)
         try:
             values = [float(word) for word in words[1:]]
         except ValueError:
-            raise UserError(f"{where}: {line.strip()!r} has a value that is no number") from None
+            raise UserError(f"{where}: {line.strip()!r} contains an invalid number") from None
         if len(values) == 3 and all(map(math.isfinite, values)):
             places[name] = np.array(values)
         elif len(values) == 1 and values[0] >= 0 and values[0] == int(values[0]):
@@ -89,11 +79,11 @@ def _from_lines(path: Path, text: str) -> Points:
 
 def _from_xml(path: Path, text: str) -> Points:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise UserError(f"{path}: an .fdp file has no document type; remove it")
+        raise UserError(f"{path}: .fdp files must not have a document type; remove it")
     try:
         root = ET.fromstring(text)  # noqa: S314 - entities are refused above
     except ET.ParseError as error:
-        raise UserError(f"{path}: no intact XML: {error}") from error
+        raise UserError(f"{path}: invalid XML: {error}") from error
     places: dict[str, Place | tuple[str, int]] = {}
     for entry in root.iter("fdp"):
         if "name" not in entry.attrib:
@@ -103,9 +93,9 @@ def _from_xml(path: Path, text: str) -> Points:
         try:
             number = int(entry.attrib["index"])
         except (KeyError, ValueError):
-            raise UserError(f"{where}: it has no index of a vertex") from None
+            raise UserError(f"{where}: the vertex index is missing or invalid") from None
         if number < 0:
-            raise UserError(f"{where}: vertex {number}")
+            raise UserError(f"{where}: the vertex index {number} is negative")
         places[name] = (entry.attrib.get("affects", ""), number)
     fapu = {}
     for entry in root.iter("fapu"):
@@ -122,7 +112,7 @@ def _from_xml(path: Path, text: str) -> Points:
 def _known(name: str, where: str, places: dict[str, Place | tuple[str, int]]) -> str:
     match = re.fullmatch(r"(\d+)\.(\d+)", name)
     if not match or not 1 <= int(match[2]) <= _GROUP_SIZES.get(int(match[1]), 0):
-        raise UserError(f"{where}: {name!r} is no MPEG-4 feature point")
+        raise UserError(f"{where}: {name!r} is not an MPEG-4 feature point")
     if name in places:
-        raise UserError(f"{where}: {name} comes twice")
+        raise UserError(f"{where}: {name} occurs twice")
     return name

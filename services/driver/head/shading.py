@@ -14,11 +14,11 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Shading:
-    """Normals of a surface that a basis bends."""
+    """Normals of a deformable surface."""
 
-    rest: Float32  # (V, 3), of the neutral face
-    triangles: NDArray[np.uint32]  # those the basis bends
-    vertices: NDArray[np.int64]  # theirs
+    rest: Float32  # (V, 3), normals of the neutral face
+    triangles: NDArray[np.uint32]  # triangles that the basis deforms
+    vertices: NDArray[np.int64]  # vertices whose normals change
     incidence: sparse.csr_array  # (vertices, triangles)
 
     @classmethod
@@ -29,15 +29,15 @@ class Shading:
         basis: sparse.csr_array,
         welds: NDArray[np.int64] | None = None,
     ) -> Shading:
-        """Find what bends.
+        """Find the parts that deform.
 
         Parameters
         ----------
         vertices, triangles, basis
             As in ``Head``.
         welds
-            Number (V,) of the vertex whose normal each one has; several stand in one place where a
-            texture is cut. By default each has its own.
+            Index (V,) of the vertex that shares its normal with each vertex; several vertices have
+            one position at texture seams. By default no normals are shared.
         """
         same = np.arange(len(vertices)) if welds is None else welds
         welded = same[triangles.astype(np.int64)]
@@ -45,7 +45,7 @@ class Shading:
         moves[same[np.unique(basis.nonzero()[0] // 3)]] = True
         turns = np.zeros(len(vertices), dtype=bool)
         turns[welded[moves[welded].any(axis=1)]] = True
-        around = turns[welded].any(axis=1)  # a normal needs every triangle round its vertex
+        around = turns[welded].any(axis=1)  # a normal depends on all triangles at its vertex
         soft = np.flatnonzero(turns[same])
         return cls(
             rest=_normals(vertices, triangles, welded)[same],
@@ -55,12 +55,12 @@ class Shading:
         )
 
     def normals(self, vertices: Float32) -> Float32:
-        """Find the normals (V, 3) of bent vertices (V, 3)."""
+        """Return the normals (V, 3) of deformed vertices (V, 3)."""
         normals = self.rest.copy()
         a, b, c = vertices[self.triangles.T]
         soft = self.incidence @ _cross(b - a, c - a)
         length = np.sqrt(np.einsum("ij,ij->i", soft, soft))[:, None]
-        # where triangles have no area the neutral normal stays
+        # keep the neutral normal where triangles have no area
         normals[self.vertices] = np.where(
             length > 1e-14, soft / np.maximum(length, 1e-14), normals[self.vertices]
         )
@@ -68,7 +68,7 @@ class Shading:
 
 
 def _cross(a: Float32, b: Float32) -> Float32:
-    """Cross products by columns: numpy's own is several times slower on thin arrays."""
+    """Cross products by columns; numpy's own function is several times slower on thin arrays."""
     out = np.empty_like(a)
     out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
@@ -90,5 +90,5 @@ def _normals(
     a, b, c = vertices[triangles.T]
     normals = _incidence(welded, len(vertices)) @ _cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    ahead = np.array([0.0, 0.0, 1.0])  # for vertices whose triangles have no area
+    ahead = np.array([0.0, 0.0, 1.0])  # for vertices without triangle area
     return np.where(length > 1e-12, normals / np.maximum(length, 1e-20), ahead).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Surfaces made of quads: Catmull-Clark subdivision, geodesic distances and zones of influence.
+"""Surfaces: Catmull-Clark subdivision, geodesic distances, zones of influence, smooth fields.
 
 E. Catmull, J. Clark, "Recursively generated B-spline surfaces on arbitrary topological meshes",
 Computer-Aided Design 10(6), 1978.
@@ -16,17 +16,12 @@ Index = NDArray[np.int64]
 
 
 def edges_of(quads: Index) -> tuple[Index, Index]:
-    """List the undirected edges.
-
-    Parameters
-    ----------
-    quads
-        Vertex numbers (F, 4), or those of triangles (F, 3).
+    """Return the undirected edges of quads (F, 4) or triangles (F, 3).
 
     Returns
     -------
-    Edges (E, 2) with the smaller number first, and the edge number (as ``quads``) that follows each
-    corner.
+    Edges (E, 2), smaller vertex number first, and the number of the edge after each corner, in the
+    shape of ``quads``.
     """
     pairs = np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2)
     edges, which = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
@@ -36,10 +31,8 @@ def edges_of(quads: Index) -> tuple[Index, Index]:
 def catmull_clark(quads: Index, num_vertices: int) -> tuple[sparse.csr_array, Index]:
     """Subdivide once.
 
-    Returns
-    -------
-    The matrix (V + E + F, V) that makes the new vertices out of the old ones, in the order moved
-    old vertices, edge points, face points; and the new quads (4 F, 4).
+    Returns ------- The matrix (V + E + F, V) from the old to the new vertices (moved old vertices,
+    edge points, face points), and the new quads (4 F, 4).
     """
     num_faces = len(quads)
     edges, edge_of_corner = edges_of(quads)
@@ -100,7 +93,7 @@ def triangles_of(quads: Index) -> Index:
 
 
 def vertex_normals(vertices: Float, triangles: Index) -> Float:
-    """Mean of the touching triangles' normals, weighted by area, of unit length (V, 3)."""
+    """Return the unit normals (V, 3): area-weighted means over the adjacent triangles."""
     a, b, c = (vertices[triangles[:, corner]] for corner in range(3))
     area = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)
@@ -111,7 +104,7 @@ def vertex_normals(vertices: Float, triangles: Index) -> Float:
 
 
 def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, Index]:
-    """Cut away what lies above height 0.
+    """Remove everything above height 0.
 
     Parameters
     ----------
@@ -120,31 +113,31 @@ def clip(height: Float, triangles: Index, values: Float) -> tuple[Float, Index, 
     triangles
         Vertex numbers (F, 3).
     values
-        What to interpolate at the cut (V, D).
+        Values to interpolate at the cut (V, D).
 
     Returns
     -------
-    Values (W, D) of the old and the new vertices, triangles (G, 3), and the edges (E, 2) along the
-    cut, in the direction of their triangles.
+    Values (W, D) of old and new vertices, triangles (G, 3), and the edges (E, 2) of the cut in the
+    direction of their triangles.
     """
     above = height[triangles] > 0
     kept = triangles[~above.any(axis=1)].tolist()
     rows = list(values)
-    made: dict[tuple[int, int], int] = {}
+    new_rows: dict[tuple[int, int], int] = {}
     rim = []
 
     def cut(i: int, j: int) -> int:
         key = (min(i, j), max(i, j))
-        if key not in made:
+        if key not in new_rows:
             share = height[i] / (height[i] - height[j])
-            made[key] = len(rows)
+            new_rows[key] = len(rows)
             rows.append(values[i] + share * (values[j] - values[i]))
-        return made[key]
+        return new_rows[key]
 
     for corners, high in zip(triangles, above, strict=True):
         if not high.any() or high.all():
             continue
-        # turn the triangle so that the corner that is alone on its side comes first
+        # rotate the corners so that the single corner on its side of the cut comes first
         alone = int(np.argmax(high)) if high.sum() == 1 else int(np.argmin(high))
         a, b, c = (int(vertex) for vertex in np.roll(corners, -alone))
         p, q = cut(a, b), cut(a, c)
@@ -170,16 +163,18 @@ class Geodesics:
         )
 
     def distance(self, sources: Index) -> Float:
-        """Distance (V,) of every vertex from the nearest source; inf where none is reached."""
-        found: Float = csgraph.dijkstra(self._graph, directed=False, indices=sources, min_only=True)
-        return found
+        """Return the distance (V,) to the nearest source; inf where no source is connected."""
+        distance: Float = csgraph.dijkstra(
+            self._graph, directed=False, indices=sources, min_only=True
+        )
+        return distance
 
     def zone(self, moving: Index, fixed: Index) -> Float:
-        """Weight every vertex (V,): 1 on ``moving``, 0 on ``fixed``, a raised cosine between.
+        """Return weights (V,): 1 on ``moving``, 0 on ``fixed``, a raised cosine in between.
 
         ``w = 1/2 - 1/2 cos(pi dF / (dF + dM))`` with the geodesic distances ``dM`` and ``dF`` to
-        the two sets. The falloff is that of Li 2011, section 2.1; a distance along the surface
-        keeps the upper lip where it is when the chin, near it in space, moves.
+        the two sets, as in Li 2011, section 2.1. Distances along the surface keep the upper lip in
+        place when the chin, which is close in space, moves.
         """
         to_moving, to_fixed = self.distance(moving), self.distance(fixed)
         reached = np.isfinite(to_moving)
@@ -194,22 +189,11 @@ class Geodesics:
 def smoothest(
     vertices: Float, triangles: Index, points: Index | list[Index], fixed: Index
 ) -> Float:
-    """Interpolate between points as smoothly as the surface allows.
+    """Return the smoothest fields (V, P) with value 1 at ``points[p]`` and 0 at the other points.
 
-    Minimises the squared Laplacian (cotangent weights) integrated over the surface.
-
-    Parameters
-    ----------
-    vertices, triangles
-        The surface.
-    points
-        Vertices (P,), or groups of vertices that move as one.
-    fixed
-        Vertices where every field is 0, but for those among the points.
-
-    Returns
-    -------
-    Fields (V, P): field ``p`` is 1 at ``points[p]`` and 0 at the other points.
+    They minimize the squared Laplacian (cotangent weights) integrated over the surface. ``points``
+    are vertices or groups of vertices that move together. Fields are also 0 at ``fixed`` vertices
+    that are not among the points.
     """
     num_vertices = len(vertices)
     laplacian, area = _laplacian(vertices, triangles)

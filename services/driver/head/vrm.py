@@ -1,8 +1,8 @@
-"""What makes a GLB a VRM 1.0 avatar: a skeleton, and the extension ``VRMC_vrm``.
+"""The additions that turn a GLB into a VRM 1.0 avatar: a skeleton and the extension ``VRMC_vrm``.
 
-VRM Consortium, "VRMC_vrm-1.0". Each expression is a morph target: those of the shapes "vrm", four
-emotions, and ARKit's 52 for programs with "perfect sync". The format demands a whole body: the head
-gets the bones of one that stands in a T, without a mesh.
+VRM Consortium, "VRMC_vrm-1.0". Each expression is a morph target: the shape set "vrm", four
+emotions, and ARKit's 52 shapes for programs with "perfect sync". The format requires a whole body,
+so the head gets the bones of a body in T-pose without a mesh.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from kouxing.services.driver.head.morphs import EMOTIONS
 from kouxing.shared.face.shapes import ARKIT, VRM
 
 Place = tuple[float, float, float]
-Bindings = Mapping[str, Sequence[tuple[int, int]]]  # morph: nodes, and its number in each
+Bindings = Mapping[str, Sequence[tuple[int, int]]]  # morph: pairs of node and target index
 
-_LOOK_DEGREES = {  # that ARKit's shapes turn the eyes by
+_LOOK_DEGREES = {  # eye rotation of ARKit's shapes
     "rangeMapHorizontalInner": 24.6,
     "rangeMapHorizontalOuter": 24.6,
     "rangeMapVerticalDown": 17.8,
@@ -31,11 +31,12 @@ _LIMBS: tuple[tuple[str, str, Place], ...] = (
     ("LowerArm", "UpperArm", (0.26, 0, 0)),
     ("Hand", "LowerArm", (0.24, 0, 0)),
 )
-# Each bone with its parent, which comes first, and its place in m from there; the floor is at 0.
+# Each bone with its parent and its position relative to the parent, m; parents first, the floor at
+# 0.
 BONES: tuple[tuple[str, str, Place], ...] = (
     ("hips", "", (0, 0.93, 0)),
     ("spine", "hips", (0, 0.12, 0)),
-    ("body", "spine", (0, 0.45, 0)),  # the head's pivot; no bone of the format
+    ("body", "spine", (0, 0.45, 0)),  # the head's pivot; not a bone of the format
     *(
         (side + name, side + parent if parent[0].isupper() else parent, (sign * x, y, z))
         for side, sign in (("left", 1), ("right", -1))
@@ -47,20 +48,20 @@ BONES: tuple[tuple[str, str, Place], ...] = (
 def extension(
     name: str, nodes: Mapping[str, int], bindings: Bindings, eyes: Place, *, is_free: bool
 ) -> dict[str, Any]:
-    """Describe an avatar.
+    """Return the contents of the extension.
 
     Parameters
     ----------
     name
-        Its own.
+        Name of the avatar.
     nodes
         Node of each bone.
     bindings
-        Where the morph targets are.
+        Location of the morph targets.
     eyes
-        From the head's pivot to between the eyes, m.
+        Offset from the head's pivot to the point between the eyes, m.
     is_free
-        It is under CC0; else nothing is allowed but to its author.
+        Whether the avatar is under CC0; otherwise only its author may use it.
     """
     bones = ["head", *(bone for bone, _, _ in BONES if bone != "body")]
     return {
@@ -68,8 +69,8 @@ def extension(
         "meta": _meta(name, is_free=is_free),
         "humanoid": {"humanBones": {bone: {"node": nodes[bone]} for bone in bones}},
         "expressions": {
-            "preset": {each: _expression(bindings[each]) for each in (*VRM.names, *EMOTIONS)},
-            "custom": {each: _expression(bindings[each]) for each in ARKIT.names},
+            "preset": {name: _expression(bindings[name]) for name in (*VRM.names, *EMOTIONS)},
+            "custom": {name: _expression(bindings[name]) for name in ARKIT.names},
         },
         "lookAt": {
             "type": "expression",

@@ -1,4 +1,4 @@
-"""Where a head is seen from."""
+"""The camera of a picture."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
 
-_MIN_ASPECT = 0.7  # narrower pictures show more above and below, so that the face still fits
+_MIN_ASPECT = 0.7  # narrower pictures show more above and below so that the face still fits
 
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """Where a head is seen from; lengths in m, in the head's axes."""
+    """Camera position and lens; lengths in m, in the head's axes."""
 
     position: tuple[float, float, float] = (0.0, 0.030, 1.015)
     target: tuple[float, float, float] = (0.0, 0.018, 0.0)
     field_of_view_deg: float = 15.0  # vertical
 
     def view_projection(self, width_px: int, height_px: int) -> Float32:
-        """Make the matrix (4, 4) from the head's axes to the picture's."""
+        """Return the matrix (4, 4) from the head's axes to clip space."""
         eye = np.array(self.position)
         ahead = np.array(self.target) - eye
         ahead /= np.linalg.norm(ahead)

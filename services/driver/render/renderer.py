@@ -1,4 +1,4 @@
-"""Draw a head with OpenGL, without a display (EGL) or into a window that is already there."""
+"""Draws a head with OpenGL, either offscreen (EGL) or in an existing window."""
 
 from __future__ import annotations
 
@@ -21,52 +21,52 @@ from kouxing.shared.errors import UserError
 UInt8 = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
-Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB, middle and edge
+Background = tuple[tuple[float, ...], tuple[float, ...]] | None  # sRGB of center and edge
 
-BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))  # sRGB, middle and edge
+BACKGROUND = ((0.62, 0.69, 0.75), (0.36, 0.43, 0.50))
 DEBIAN_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri"
 
 
 def standalone_context() -> moderngl.Context:
-    """Open OpenGL 3.3 without a display.
+    """Create an OpenGL 3.3 context without a display.
 
     Raises
     ------
     UserError
-        If the GL libraries are missing or give no context.
+        If the GL libraries are missing or cannot create a context.
     """
     try:
-        # macOS has no EGL; its own OpenGL needs no display.
+        # macOS has no EGL; its OpenGL needs no display
         settings: dict[str, Any] = {} if sys.platform == "darwin" else {"backend": "egl"}
         return moderngl.create_standalone_context(require=330, **settings)
     except Exception as error:  # moderngl raises bare Exception
         missing = [name for name in ("EGL", "GL") if ctypes.util.find_library(name) is None]
-        found = f"lib{' and lib'.join(missing)} not found" if missing else str(error)
+        reason = f"lib{' and lib'.join(missing)} not found" if missing else str(error)
         raise UserError(
-            f"OpenGL does not start without a display ({found}); install the Debian packages"
+            f"OpenGL cannot start without a display ({reason}); install the Debian packages"
             f" {DEBIAN_PACKAGES}"
         ) from error
 
 
 class Renderer:
-    """Pictures of one head.
+    """Draws pictures of one head.
 
     Parameters
     ----------
     head
-        Whom to draw.
+        Head to draw.
     width_px, height_px
         Size of a picture.
     background
-        sRGB colours of the middle and the edge, each 0 to 1; None for transparent pictures.
+        sRGB colors of the center and the edge, each 0 to 1; None for transparent pictures.
     samples
-        Anti-aliasing samples a pixel; 0 for none.
+        Anti-aliasing samples per pixel; 0 for none.
     camera
-        Where from.
+        Viewpoint.
     context
-        OpenGL context of a window; by default one without a display.
+        OpenGL context of a window; by default a new offscreen context.
     on_screen
-        Draw into that window (``draw_on_screen``) and not beside it (``draw``).
+        Whether to draw into the window (``draw_on_screen``) instead of offscreen (``draw``).
 
     Raises
     ------
@@ -87,7 +87,7 @@ class Renderer:
         on_screen: bool = False,
     ) -> None:
         if width_px < 1 or height_px < 1:
-            raise UserError(f"a picture of {width_px} x {height_px} pixels; give a positive size")
+            raise UserError(f"cannot draw {width_px} x {height_px} pixels; give a positive size")
         self.head = head
         self.transparent = background is None
         self._background = background
@@ -142,7 +142,7 @@ class Renderer:
 
     @property
     def description(self) -> str:
-        """What draws, as OpenGL names it."""
+        """Name of the graphics driver."""
         return str(self._context.info["GL_RENDERER"])
 
     def resize(self, width_px: int, height_px: int) -> None:
@@ -155,7 +155,7 @@ class Renderer:
             self._result = self._framebuffer(0)
             multi = self._samples > 1
             self._canvas = self._framebuffer(self._samples) if multi else self._result
-            # copying an empty picture takes less time than clearing and painting the background
+            # copying a prepared picture is faster than clearing and painting the background
             self._blank = self._framebuffer(self._samples if multi else 0)
             self._clear(self._blank)
 
@@ -167,12 +167,7 @@ class Renderer:
         return target
 
     def draw(self, faps: Float32) -> UInt8:
-        """Draw one picture.
-
-        Parameters
-        ----------
-        faps
-            Facial animation parameters (68,), FAP units.
+        """Draw FAPs (68,).
 
         Returns
         -------
@@ -183,7 +178,7 @@ class Renderer:
         return self._read()
 
     def stages_s(self, faps: Float32) -> dict[str, float]:
-        """Draw one picture and say how long deform, upload, draw and read back take, s."""
+        """Draw one picture; return the durations of deform, upload, draw and read-back, seconds."""
         times = [time.perf_counter()]
 
         def passed() -> None:
@@ -220,7 +215,7 @@ class Renderer:
         return _unmixed(pixels) if self.transparent else pixels
 
     def draw_on_screen(self, faps: Float32) -> None:
-        """Draw into the window the context came from."""
+        """Draw into the window that the context belongs to."""
         screen = self._context.screen
         screen.viewport = (0, 0, *self.size)
         self._clear(screen)
@@ -228,13 +223,13 @@ class Renderer:
         self._paint(screen)
 
     def _clear(self, target: Any) -> None:
-        """Leave nothing but the background."""
+        """Fill with the background."""
         target.use()
         target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
         self._context.enable_only(moderngl.NOTHING)
         if self._background is not None:
-            middle, edge = self._background
-            self._backdrop_program["middle"] = middle
+            center, edge = self._background
+            self._backdrop_program["center"] = center
             self._backdrop_program["edge"] = edge
             self._backdrop.render()
 
@@ -251,7 +246,7 @@ class Renderer:
                 context.enable_only(moderngl.DEPTH_TEST | culled)
                 self._draw_part(part)
         context.enable_only(moderngl.DEPTH_TEST | moderngl.BLEND)
-        # the second pair keeps the alpha of transparent pictures right
+        # the second pair keeps the alpha channel of transparent pictures correct
         factors: Any = (
             moderngl.SRC_ALPHA,
             moderngl.ONE_MINUS_SRC_ALPHA,
@@ -279,13 +274,13 @@ class Renderer:
         self._arrays[part.name].render()
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         if self._own_context:
             self._context.release()
 
 
 def _unmixed(pixels: UInt8) -> UInt8:
-    """Take the black background out of the colours where it shines through (H, W, 4)."""
+    """Remove the black background from translucent pixels (H, W, 4)."""
     out = pixels.copy()
     row, column = np.nonzero((pixels[..., 3] > 0) & (pixels[..., 3] < 255))
     mixed = pixels[row, column].astype(np.float32)

@@ -1,4 +1,4 @@
-"""How a head is shown: which one, from where, and before what."""
+"""The head, camera and background of a picture."""
 
 from __future__ import annotations
 
@@ -14,60 +14,59 @@ from kouxing.services.driver.render.camera import Camera
 from kouxing.services.driver.render.renderer import BACKGROUND, Background
 from kouxing.shared.errors import UserError
 
-COLOURS = {
+COLORS = {
     "black": "#000000", "white": "#ffffff", "grey": "#808080", "green": "#00b140",
     "blue": "#0047bb",
 }  # fmt: skip
 
-
-# height of the picture's middle above the eyes and distance of the camera, both in eye distances
-# (FAPU ES)
+# height of the picture's center above the eyes and distance of the camera, in eye distances (FAPU
+# ES)
 _FRAMINGS = {
     Framing.FACE: (-0.267, 20.0),
     Framing.HEAD: (-0.25, 26.0),
     Framing.MOUTH: (-1.20, 6.0),
 }
-_RISE = 0.0114  # height of the camera above the middle, as a share of its distance
+_RISE = 0.0114  # height of the camera above the center, as a share of its distance
 
 
 def load_head(name: str = DEFAULT_HEAD, detail: Detail = "fine") -> Head:
-    """Read a head that comes with the package, an ``.npz``, or a GLB with morph targets.
+    """Read a built-in head, an ``.npz``, or a GLB with morph targets.
 
     Raises
     ------
     UserError
-        If there is no such head, or the file holds none.
+        If the head does not exist, or the file is not a head.
     """
     path = Path(name)
     if path.suffix.lower() == ".glb":
         return read_glb(path)
     if path.suffix.lower() in (".obj", ".gltf", ".stl", ".ply", ".fbx", ".wrl"):
-        raise UserError(f"{path} has no shapes that move; see kouxing head import --help")
+        raise UserError(f"{path} has no morph targets; see kouxing head import --help")
     return Head.load(path, detail)
 
 
 def camera(
     head: Head, framing: Framing = Framing.FACE, yaw_deg: float = 0.0, pitch_deg: float = 0.0
 ) -> Camera:
-    """Place the camera before a head.
+    """Place the camera in front of a head.
 
     Parameters
     ----------
     head
-        Whom to show.
+        Head to show.
     framing
-        What fills the picture.
+        The part of the head that fills the picture.
     yaw_deg
-        How far the camera goes round to the subject's left.
+        Camera angle to the subject's left.
     pitch_deg
-        How far it goes up.
+        Camera angle upwards.
     """
-    eyes = head.eye_centres.mean(axis=0)
-    unit_m = float(head.eye_centres[0, 0] - head.eye_centres[1, 0])
+    eyes = head.eye_centers.mean(axis=0)
+    unit_m = float(head.eye_centers[0, 0] - head.eye_centers[1, 0])
     height, distance = _FRAMINGS[framing]
     target = np.array([eyes[0], eyes[1] + height * unit_m, 0.0])
     yaw, pitch = np.radians(yaw_deg), np.radians(pitch_deg) + np.arctan(_RISE)
-    if framing is Framing.MOUTH:  # seen from near, it is the middle and not the pivot of the head
+    if framing is Framing.MOUTH:  # from close up, aim at the face instead of the head's pivot
         target[2] = eyes[2]
     ahead = [np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)]
     position = target + (distance * unit_m) * np.array(ahead)
@@ -75,27 +74,27 @@ def camera(
 
 
 def background(text: str) -> Background:
-    """Read a background: studio, transparent, a colour's name or ``#rrggbb``.
+    """Parse a background: studio, transparent, the name of a color, or ``#rrggbb``.
 
     Returns
     -------
-    sRGB colours of the middle and the edge, 0 to 1; None for transparent.
+    sRGB colors of the center and the edge, 0 to 1; None for transparent.
 
     Raises
     ------
     UserError
-        If it is none of these.
+        If the text is not a background.
     """
     word = text.strip().lower()
     if word == "studio":
         return BACKGROUND
     if word == "transparent":
         return None
-    code = COLOURS.get(word, word).removeprefix("#")
+    code = COLORS.get(word, word).removeprefix("#")
     if not re.fullmatch(r"[0-9a-f]{6}", code):
         raise UserError(
-            f"background {text!r}: write studio, transparent, #rrggbb, or one of"
-            f" {', '.join(COLOURS)}"
+            f"unknown background {text!r}; write studio, transparent, #rrggbb, or one of"
+            f" {', '.join(COLORS)}"
         )
     color = tuple(int(code[i : i + 2], 16) / 255 for i in (0, 2, 4))
     return color, color

@@ -1,4 +1,4 @@
-"""The shaders (GLSL) and the materials that they draw; how light falls is in ``light.glsl``."""
+"""The GLSL shaders and the materials of a head; the lighting is in ``light.glsl``."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import kouxing.shared.face
 
 LIGHT = Path(kouxing.shared.face.__file__).with_name("light.glsl").read_text(encoding="utf-8")
 
-# Light is worked out at the vertices (they lie about 1 mm apart) and interpolated: on software GL
-# that takes a third of the time of lighting every pixel. Only the eyes' small highlights need it.
+# Lighting is computed at the vertices, about 1 mm apart, and interpolated. In software GL this
+# takes a third of the time of lighting every pixel. Only the small highlights of the eyes are lit
+# per pixel.
 VERTEX = f"""
 #version 330
 {LIGHT}
@@ -63,12 +64,12 @@ void main() {{
 
 BACKDROP = """
 #version 330
-uniform vec3 middle;
+uniform vec3 center;
 uniform vec3 edge;
 in vec2 place;
 out vec4 color;
 void main() {
-    color = vec4(mix(middle, edge, min(1.0, dot(place, place) * 0.55)), 1.0);
+    color = vec4(mix(center, edge, min(1.0, dot(place, place) * 0.55)), 1.0);
 }
 """
 
@@ -83,8 +84,8 @@ void main() {
 """
 
 EYES = ("eye_left", "eye_right")
-IN_MOUTH = ("teeth_upper", "teeth_lower", "tongue")  # lit through the lips
-HAIR = ("hair", "hair_tips")  # strands that run down
+IN_MOUTH = ("teeth_upper", "teeth_lower", "tongue")  # receives light through the lips
+HAIR = ("hair", "hair_tips")  # vertical strands
 
 # part: (wrap of the key light by channel, gloss exponent, strength of the highlight)
 MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
@@ -99,4 +100,4 @@ MATERIALS: dict[str, tuple[tuple[float, float, float], float, float]] = {
     "hair_tips": ((0.3, 0.3, 0.3), 80.0, 0.22),
     "lashes": ((0.0, 0.0, 0.0), 8.0, 0.0),
 }
-PLAIN = ((0.3, 0.3, 0.3), 14.0, 0.08)  # parts with no material known here
+PLAIN = ((0.3, 0.3, 0.3), 14.0, 0.08)  # other parts

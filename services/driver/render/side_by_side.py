@@ -1,4 +1,4 @@
-"""Several faces beside each other in one picture, each with a caption."""
+"""Several faces side by side in one picture, each with a caption."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from PIL import Image, ImageDraw, ImageFont
 
 from kouxing.services.driver.render.renderer import Float32, Renderer, UInt8
 
-_CAPTION_SHARE = 1 / 20  # height of its letters, as a share of the picture's
+_CAPTION_SHARE = 1 / 20  # height of the letters, as a share of the picture
 
 
 class SideBySide:
-    """Draws as many faces as there are captions, from left to right.
+    """Draws one face per caption, from left to right.
 
     Parameters
     ----------
     renderer
-        What draws one of them.
+        Renderer of a single face.
     captions
-        What stands under each.
+        Texts below the faces.
     """
 
     def __init__(self, renderer: Renderer, captions: Sequence[str]) -> None:
@@ -31,19 +31,19 @@ class SideBySide:
         self._captions = _draw_captions(captions, width_px, height_px)
 
     def draw(self, faps: Float32) -> UInt8:
-        """Draw one picture of faces (num_faces, 68); shape as ``Renderer.draw``."""
-        faces = np.concatenate([self._renderer.draw(each) for each in faps], axis=1)
+        """Draw faces (num_faces, 68); the picture has the format of ``Renderer.draw``."""
+        faces = np.concatenate([self._renderer.draw(face) for face in faps], axis=1)
         picture = Image.fromarray(faces)
         picture.paste("white", mask=self._captions)
         return np.asarray(picture)
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         self._renderer.close()
 
 
 def _draw_captions(captions: Sequence[str], width_px: int, height_px: int) -> Image.Image:
-    """Write each caption in the middle below its face; return how much of it covers a pixel."""
+    """Return the coverage of each pixel by the captions, centered below the faces."""
     mask = Image.new("L", (width_px * len(captions), height_px))
     pen = ImageDraw.Draw(mask)
     font = ImageFont.load_default(max(height_px * _CAPTION_SHARE, 8))

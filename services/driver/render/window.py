@@ -1,4 +1,4 @@
-"""Show a head in a window."""
+"""Shows a head in a window."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ TITLE = "kouxing"
 
 
 class Window:
-    """A resizable window with a head in it; edges are smoothed where a graphics card draws.
+    """A resizable window with a head; edges are anti-aliased if there is a graphics card.
 
     Parameters
     ----------
     head
-        Whom to show.
+        Head to show.
     width_px, height_px
-        Size at first.
+        Initial size.
     background, camera
-        As the renderer takes them.
+        As for ``Renderer``.
     on_switch
-        Called with 1 (Tab, right arrow, a click) or -1 (shift and Tab, left arrow).
+        Called with 1 (Tab, right arrow, click) or -1 (Shift+Tab, left arrow).
 
     Raises
     ------
     UserError
-        If there is no display, or no OpenGL 3.3 on it.
+        If there is no display, or the display has no OpenGL 3.3.
     """
 
     def __init__(
@@ -50,11 +50,9 @@ class Window:
     ) -> None:
         self._on_switch = on_switch
         self._caption = ""
-        glfw.ERROR_REPORTING = "ignore"  # the results are checked here
+        glfw.ERROR_REPORTING = "ignore"  # results are checked below
         if not glfw.init():
-            raise UserError(
-                "there is no display to open a window on; set DISPLAY, or write a video instead"
-            )
+            raise UserError("no display for a window; set DISPLAY, or write a video instead")
         self._open(width_px, height_px, num_samples=0)
         if not _draws_in_software(self._context):
             glfw.destroy_window(self._window)
@@ -80,33 +78,23 @@ class Window:
         self._window = glfw.create_window(width_px, height_px, TITLE, None, None)
         if not self._window:
             glfw.terminate()
-            raise UserError("the display offers no OpenGL 3.3; update its driver or install Mesa")
+            raise UserError("the display has no OpenGL 3.3; update its driver or install Mesa")
         glfw.make_context_current(self._window)
         glfw.swap_interval(1)
         self._context = moderngl.create_context(require=330)
 
     @property
     def context(self) -> moderngl.Context:
-        """The window's OpenGL context, for renderers that draw beside it."""
+        """The window's OpenGL context, which other renderers can share."""
         return self._context
 
     def draw(self, faps: Float32) -> bool:
-        """Show one picture and handle what the user did to the window.
-
-        Parameters
-        ----------
-        faps
-            Facial animation parameters (68,), FAP units.
-
-        Returns
-        -------
-        False once the user has closed the window.
-        """
+        """Show FAPs (68,) and process user input; return False after the window was closed."""
         glfw.poll_events()
         if glfw.window_should_close(self._window):
             return False
         width_px, height_px = glfw.get_framebuffer_size(self._window)
-        if width_px and height_px:  # both 0 while iconified
+        if width_px and height_px:  # both are 0 while minimized
             if (width_px, height_px) != self._renderer.size:
                 self._renderer.resize(width_px, height_px)
             self._renderer.draw_on_screen(faps)
@@ -114,13 +102,13 @@ class Window:
         return True
 
     def set_caption(self, caption: str) -> None:
-        """Show a caption beside the program's name in the title."""
+        """Show a caption after the program's name in the title."""
         if caption != self._caption:
             self._caption = caption
             glfw.set_window_title(self._window, f"{TITLE}: {caption}" if caption else TITLE)
 
     def hide(self) -> None:
-        """Take the window off the screen; its context stays."""
+        """Hide the window; its context stays valid."""
         glfw.hide_window(self._window)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""FAP frames or a FAP file to a video or pictures, without running services."""
+"""Renders FAP frames or a FAP file to a video or pictures, without running services."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from numpy.typing import NDArray
 
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
-from kouxing.services.driver.video.recording import Recording, between
+from kouxing.services.driver.video.recording import Recording, interpolate
 from kouxing.services.driver.video.writer import write_picture
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation
 from kouxing.shared.face.high_level import expression_faps, viseme_faps
 
-# media time in seconds; FAPs (68,), side by side (num_faces, 68)
+# media time in seconds, and FAPs (68,); for faces side by side (num_faces, 68)
 Frame = tuple[float, NDArray[np.float32]]
 
 
-def frames_of(animation: FapAnimation) -> list[Frame]:
-    """Return the frames of a FAP file with what FAP 1 and FAP 2 select added to the others.
+def expand_frames(animation: FapAnimation) -> list[Frame]:
+    """Return the frames of a FAP file, with FAP 1 and FAP 2 expanded into the other FAPs.
 
-    A frame that defines a viseme or an expression (``viseme_def``, ``expression_def``) holds the
-    whole shape in its other FAPs; there nothing is added.
+    A frame that defines a viseme or expression (``viseme_def``, ``expression_def``) already has the
+    whole shape in its other FAPs, so nothing is added.
     """
     faps = animation.faps.copy()
     for number in range(len(faps)):
@@ -40,8 +40,8 @@ def frames_of(animation: FapAnimation) -> list[Frame]:
     return [(number / animation.frame_rate_hz, row) for number, row in enumerate(faps)]
 
 
-def beside(faces: Sequence[list[Frame]]) -> list[Frame]:
-    """Join the frames of several faces, which are at the same times, for ``SideBySide``."""
+def stack_faces(faces: Sequence[list[Frame]]) -> list[Frame]:
+    """Combine the frames of several faces, at the same times, for ``SideBySide``."""
     return [
         (frames[0][0], np.stack([faps for _, faps in frames]))
         for frames in zip(*faces, strict=True)
@@ -57,22 +57,22 @@ def render_video(
     samples: NDArray[np.float32] | None = None,
     on_progress: Callable[[float], None] = lambda _share: None,
 ) -> int:
-    """Write a video, or a picture for every image of it; return the number of images.
+    """Write a video or one picture per image; return the number of images.
 
     Parameters
     ----------
     frames
-        At least one; the last one is held while the sound goes on.
+        At least one; the last one is held until the sound ends.
     path
-        As ``kouxing.services.driver.video.open_writer`` takes it.
+        As for ``open_writer``.
     renderer
-        What draws.
+        Draws the images.
     frame_rate_hz
-        Images a second.
+        Images per second.
     samples
-        Sound, 16 kHz mono, shape ``(n,)``.
+        Sound (n,), 16 kHz mono.
     on_progress
-        Told the share that is done.
+        Called with the finished share, 0 to 1.
 
     Raises
     ------
@@ -82,11 +82,11 @@ def render_video(
     recording = Recording(path, renderer, frame_rate_hz, sound=samples is not None)
     try:
         if samples is not None:
-            recording.accept_sound(0, samples)
+            recording.add_sound(0, samples)
             if len(samples) / MEDIA_RATE_HZ > frames[-1][0]:
                 frames = [*frames, (len(samples) / MEDIA_RATE_HZ, frames[-1][1])]
         for time_s, faps in frames:
-            recording.accept_frame(time_s, faps)
+            recording.add_frame(time_s, faps)
         while recording.step():
             on_progress(min(1.0, recording.duration_s / max(frames[-1][0], 1e-9)))
     except BaseException:
@@ -104,11 +104,12 @@ def render_picture(
     Raises
     ------
     UserError
-        If the face does not last so long, or the file cannot be written.
+        If the time is outside the animation, or the file cannot be written.
     """
     last_s = frames[-1][0]
     if not 0 <= at_s <= last_s:
-        raise UserError(f"--at {at_s:g}: the face lasts from 0 to {last_s:g} s")
+        raise UserError(f"--at {at_s:g} is outside the animation; give 0 to {last_s:g} seconds")
     times_s = [time_s for time_s, _ in frames]
     after = min(int(np.searchsorted(times_s, at_s, side="right")), len(frames) - 1)
-    write_picture(path, renderer.draw(between(frames[max(after - 1, 0)], frames[after], at_s)))
+    pair = frames[max(after - 1, 0)], frames[after]
+    write_picture(path, renderer.draw(interpolate(*pair, at_s)))

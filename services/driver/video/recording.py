@@ -1,7 +1,7 @@
-"""One session's video as its FAP frames and sound arrive.
+"""The video of one session, written while its FAP frames and sound arrive.
 
-Images are made at the video's own rate from the FAP frames around them, by media time, so the
-video is in sync whatever the rates are and however late the frames come.
+Images are interpolated between FAP frames by media time, at the video's own rate. The video is in
+sync at any rates and with late frames.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from kouxing.services.driver.video.writer import open_writer
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 
-MAX_SILENCE_S = 600.0  # inserted for missing sound
+MAX_SILENCE_S = 600.0  # longest gap in the sound that is filled with silence
 Faps = NDArray[np.float32]
 
 
@@ -28,15 +28,15 @@ class Recording:
     Parameters
     ----------
     path
-        As ``open_writer`` takes it.
+        As for ``open_writer``.
     renderer
-        What draws; its background decides whether the video is transparent.
+        Draws the images; a transparent background makes a transparent video.
     frame_rate_hz
-        Images a second.
+        Images per second.
     sound
-        Whether there will be sound.
+        Whether the video has sound.
     overwrite
-        Whether a video of that name is replaced; if not, ``close`` adds a number to ``path``.
+        Whether to replace an existing file; otherwise ``close`` adds a number to ``path``.
 
     Raises
     ------
@@ -74,22 +74,22 @@ class Recording:
         """Length of the picture so far."""
         return self.num_images / self._frame_rate_hz
 
-    def accept_frame(self, time_s: float, faps: Faps) -> None:
-        """Take a FAP frame as the renderer draws it; times do not decrease."""
+    def add_frame(self, time_s: float, faps: Faps) -> None:
+        """Add a FAP frame; times do not decrease."""
         if not self._frames or time_s > self._frames[-1][0]:
             self._frames.append((time_s, faps))
 
-    def accept_sound(self, media_time: int, samples: NDArray[np.float32]) -> None:
-        """Take sound of shape ``(n,)``; what is missing before it becomes silence.
+    def add_sound(self, media_time: int, samples: NDArray[np.float32]) -> None:
+        """Add sound (n,); a gap before it is filled with silence.
 
         Raises
         ------
         UserError
-            If very much is missing, or the file cannot be written.
+            If the gap is too long, or the file cannot be written.
         """
         missing = media_time - self._num_samples
         if missing > MAX_SILENCE_S * MEDIA_RATE_HZ:
-            raise UserError(f"{missing / MEDIA_RATE_HZ:.0f} s of sound are missing; no video")
+            raise UserError(f"no video: {missing / MEDIA_RATE_HZ:.0f} s of sound are missing")
         if missing > 0:
             samples = np.concatenate([np.zeros(missing, np.float32), samples])
         elif missing < 0:
@@ -98,7 +98,7 @@ class Recording:
         self._num_samples += len(samples)
 
     def step(self) -> bool:
-        """Render one image if the FAP frames for it are here; return whether one was due."""
+        """Render one image if its FAP frames have arrived; return whether an image was rendered."""
         time_s = self.num_images / self._frame_rate_hz
         while len(self._frames) > 1 and self._frames[1][0] <= time_s:
             self._frames.popleft()
@@ -108,7 +108,7 @@ class Recording:
         if time_s > last_s:
             return False
         after = self._frames[min(1, len(self._frames) - 1)]
-        self._writer.write_image(self._renderer.draw(between(self._frames[0], after, time_s)))
+        self._writer.write_image(self._renderer.draw(interpolate(self._frames[0], after, time_s)))
         self.num_images += 1
         return True
 
@@ -117,14 +117,14 @@ class Recording:
         self.path = self._writer.close()
 
     def discard(self) -> None:
-        """Give the unfinished file up."""
+        """Delete the unfinished file."""
         self._writer.discard()
 
 
-def between(before: tuple[float, Faps], after: tuple[float, Faps], time_s: float) -> Faps:
-    """Return the FAPs at a time between two frames; outside, the nearer frame's."""
-    (begin_s, begin), (end_s, end) = before, after
-    if end_s <= begin_s:
-        return begin
-    weight = np.float32(np.clip((time_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
-    return begin + (end - begin) * weight
+def interpolate(before: tuple[float, Faps], after: tuple[float, Faps], time_s: float) -> Faps:
+    """Return the FAPs at a time between two frames; outside, those of the nearer frame."""
+    (start_s, start), (end_s, end) = before, after
+    if end_s <= start_s:
+        return start
+    weight = np.float32(np.clip((time_s - start_s) / (end_s - start_s), 0.0, 1.0))
+    return start + (end - start) * weight

@@ -1,4 +1,4 @@
-"""Show the head as a camera that other programs (calls, OBS) can choose."""
+"""Offers the head as a camera that other programs, such as video calls or OBS, can select."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from kouxing.shared.errors import UserError, install_command
 
 
 class VirtualCamera:
-    """Sends pictures to the system's virtual camera, through the library pyvirtualcam.
+    """Sends pictures to the system's virtual camera, through pyvirtualcam.
 
     Raises
     ------
     UserError
-        If the library is not installed or the system has no such camera.
+        If pyvirtualcam is not installed or the system has no virtual camera.
     """
 
     def __init__(self, renderer: Renderer, frame_rate_hz: float) -> None:
@@ -34,8 +34,8 @@ class VirtualCamera:
             self._camera = library.Camera(*renderer.size, frame_rate_hz)
         except RuntimeError as error:
             raise UserError(
-                f"driver.virtual_camera: this system has none ({error}); on Linux 'modprobe"
-                " v4l2loopback', elsewhere start OBS's virtual camera once"
+                f"driver.virtual_camera: this system has no virtual camera ({error}); on Linux run"
+                " 'modprobe v4l2loopback', elsewhere start OBS's virtual camera once"
             ) from error
         self.device: str = self._camera.device
 
@@ -46,5 +46,5 @@ class VirtualCamera:
             self._camera.send(np.ascontiguousarray(self._renderer.draw(faps)))
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Release the camera."""
         self._camera.close()

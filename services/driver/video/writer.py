@@ -1,7 +1,7 @@
-"""Write pictures and sound in sync: MP4, MOV, WebM; or pictures alone: WebP, PNG files.
+"""Writes pictures and sound in sync: MP4, MOV, WebM; or pictures only: WebP, PNG files.
 
-Picture ``n`` is shown at ``n / frame_rate_hz``, sound sample ``n`` is heard at
-``n / sample_rate_hz``, both from the file's start.
+Picture ``n`` is shown at ``n / frame_rate_hz`` and sound sample ``n`` is played at
+``n / sample_rate_hz``, both from the start of the file.
 
 ======================  ====================================  ==============================
 file                    opaque                                with a transparent background
@@ -9,7 +9,7 @@ file                    opaque                                with a transparent
 ``.mp4``                H.264 and AAC                         not possible
 ``.mov``                H.264 and AAC                         ProRes 4444 and AAC
 ``.webm``               VP9 and Opus                          VP9 with alpha and Opus
-``.webp``               WebP, animated for ever, no sound     WebP with alpha, no sound
+``.webp``               WebP, loops forever, no sound         WebP with alpha, no sound
 folder, ``name%05d``    PNG, no sound                         PNG with alpha, no sound
 ======================  ====================================  ==============================
 """
@@ -41,12 +41,12 @@ UInt8 = NDArray[np.uint8]
 AAC_RATES_HZ = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 OPUS_RATES_HZ = (8000, 12000, 16000, 24000, 48000)
 VIDEO_SUFFIXES = (".mp4", ".mov", ".webm", ".webp")
-_NUMBER = re.compile(r"%0?\d?d")  # in the name of a sequence's pictures
+_NUMBER = re.compile(r"%0?\d?d")  # in the file name of a picture sequence
 
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """How a stream of pictures is encoded."""
+    """Encoder settings of pictures."""
 
     name: str
     pixels: str
@@ -55,11 +55,11 @@ class _Codec:
 
 @dataclass(frozen=True, slots=True)
 class _Format:
-    """What a file's suffix stands for."""
+    """Container and codecs of a file suffix."""
 
     opaque: _Codec
     transparent: _Codec | None
-    sound: str | None  # its codec
+    sound: str | None  # codec
     sample_rates_hz: tuple[int, ...]
     options: dict[str, str] = field(default_factory=dict)  # of the container
 
@@ -70,20 +70,20 @@ _PRORES = _Codec("prores_ks", "yuva444p10le", {"profile": "4444"})
 _VP9_OPTIONS = {"crf": "24", "b": "0", "deadline": "good", "cpu-used": "6"}
 _VP9 = _Codec("libvpx-vp9", "yuv420p", _VP9_OPTIONS)
 _VP9_ALPHA = _Codec("libvpx-vp9", "yuva420p", _VP9_OPTIONS)
-# at less quality, what moves leaves traces
+# lower quality leaves traces of motion
 _WEBP = _Codec("libwebp_anim", "bgra", {"quality": "80"})
 _INDEX_FIRST = {"movflags": "faststart"}
-_FOR_EVER = {"loop": "0"}
+_LOOP_FOREVER = {"loop": "0"}
 _FORMATS = {
     ".mp4": _Format(_H264, None, "aac", AAC_RATES_HZ, _INDEX_FIRST),
     ".mov": _Format(_H264, _PRORES, "aac", AAC_RATES_HZ, _INDEX_FIRST),
     ".webm": _Format(_VP9, _VP9_ALPHA, "libopus", OPUS_RATES_HZ),
-    ".webp": _Format(_WEBP, _WEBP, None, (), _FOR_EVER),
+    ".webp": _Format(_WEBP, _WEBP, None, (), _LOOP_FOREVER),
 }
 
 
 class Writer(Protocol):
-    """Where pictures and sound go."""
+    """A destination for pictures and sound."""
 
     def write_image(self, image: UInt8) -> None:
         """Append a picture (H, W, 3), or (H, W, 4) with alpha, sRGB."""
@@ -92,10 +92,10 @@ class Writer(Protocol):
         """Append mono sound (N,), -1 to 1."""
 
     def close(self) -> Path:
-        """Finish what was written; return its name."""
+        """Finish the output; return its path."""
 
     def discard(self) -> None:
-        """Give up what was written."""
+        """Delete the unfinished output."""
 
 
 def open_writer(
@@ -107,14 +107,14 @@ def open_writer(
     transparent: bool = False,
     overwrite: bool = True,
 ) -> Writer:
-    """Open what the name stands for: a video, or for a folder or ``name%05d.png`` pictures.
+    """Open a writer for a path: a video, or pictures in a folder or named like ``name%05d.png``.
 
     The parameters are those of ``VideoWriter``; pictures are always overwritten.
 
     Raises
     ------
     UserError
-        If the name is none of these, or it cannot be written.
+        If the path is not a valid output, or cannot be written.
     """
     check_name(path)
     if path.suffix in _FORMATS:
@@ -130,19 +130,19 @@ def open_writer(
 
 
 def check_name(path: Path, others: Iterable[str] = ()) -> None:
-    """See whether a name stands for a video or for pictures, in a folder that exists.
+    """Check that a path is a valid output in an existing folder.
 
     Parameters
     ----------
     path
-        The name.
+        Output path.
     others
-        Further suffixes that the user may choose instead.
+        Further suffixes to suggest in the error text.
 
     Raises
     ------
     UserError
-        If it does not.
+        If the path is not valid.
     """
     if path.suffix not in _FORMATS and not is_sequence(path):
         raise UserError(
@@ -154,7 +154,7 @@ def check_name(path: Path, others: Iterable[str] = ()) -> None:
 
 
 def is_sequence(path: Path) -> bool:
-    """Say whether a name stands for one picture a frame."""
+    """Return whether a path means one picture per frame."""
     if path.suffix == ".png":
         return _NUMBER.search(path.name) is not None
     return path.is_dir() or not path.suffix
@@ -166,23 +166,23 @@ class VideoWriter:
     Parameters
     ----------
     path
-        File to write, of ``VIDEO_SUFFIXES``.
+        Output with one of ``VIDEO_SUFFIXES``.
     width_px, height_px
         Even numbers.
     frame_rate_hz
-        Pictures a second, 1 to 1000.
+        Pictures per second, 1 to 1000.
     sample_rate_hz
-        One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``; None for no sound. ``.webp``
-        has none.
+        One of ``AAC_RATES_HZ`` or, for ``.webm``, ``OPUS_RATES_HZ``. None for no sound; ``.webp``
+        never has sound.
     transparent
-        The pictures have an alpha channel.
+        Whether pictures have an alpha channel.
     overwrite
-        Whether ``close`` replaces a file of that name; if not, a number is added to the name.
+        Whether ``close`` replaces an existing file; otherwise it adds a number to the name.
 
     Raises
     ------
     UserError
-        If the file cannot be written or a value does not fit.
+        If the file cannot be written or a value is not possible.
     """
 
     def __init__(
@@ -202,19 +202,19 @@ class VideoWriter:
         codec = form.transparent if transparent else form.opaque
         if codec is None:
             raise UserError(
-                f"{self._path}: MP4 has no transparency; write .mov, .webm, or pictures (a folder)"
+                f"{self._path}: MP4 cannot be transparent; write .mov, .webm or pictures (a folder)"
             )
         if width_px < 2 or height_px < 2 or width_px % 2 or height_px % 2:
             raise UserError(
-                f"a video of {width_px} x {height_px} pixels; give even, positive sizes"
+                f"cannot make a video of {width_px} x {height_px} pixels; give even, positive sizes"
             )
         if not 1 <= frame_rate_hz <= 1000:
-            raise UserError(f"a frame rate of {frame_rate_hz} Hz; give one from 1 to 1000")
+            raise UserError(f"the frame rate {frame_rate_hz} Hz is not between 1 and 1000")
         sound_codec = None if sample_rate_hz is None else form.sound
         if sound_codec is not None and sample_rate_hz not in form.sample_rates_hz:
             rates = ", ".join(str(rate) for rate in form.sample_rates_hz)
             raise UserError(
-                f"{sound_codec} has no sample rate of {sample_rate_hz} Hz; give one of {rates}"
+                f"{sound_codec} does not support {sample_rate_hz} Hz; give one of {rates}"
             )
         self._shape = (height_px, width_px, 4 if transparent else 3)
         self._sample_rate_hz = sample_rate_hz
@@ -224,7 +224,7 @@ class VideoWriter:
         try:
             if self._path.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "it is a folder")
-            self._unfinished.touch()  # FFmpeg would open it only at the first packet
+            self._unfinished.touch()  # FFmpeg opens it only with the first packet
             container = self._path.suffix.removeprefix(".") or "mp4"
             self._container = av.open(
                 str(self._unfinished), "w", format=container, options=form.options
@@ -239,7 +239,7 @@ class VideoWriter:
         context: Any = self._video.codec_context
         context.time_base = 1 / rate
         context.thread_count = 1
-        # players guess the colours of a file that does not name them, by its size
+        # players guess the color space of a file from its size unless the file states it
         context.color_primaries = context.color_trc = context.colorspace = Colorspace.ITU709
         context.color_range = ColorRange.MPEG
         self._sound: Any = None
@@ -299,7 +299,7 @@ class VideoWriter:
             raise _unwritable(self._path, error) from error
 
     def close(self) -> Path:
-        """Finish the file and give it its name, which is returned."""
+        """Finish the file under its final name; return its path."""
         self._mux(self._video.encode(None))
         if self._num_samples:
             self._mux(self._sound.encode(None))
@@ -312,25 +312,25 @@ class VideoWriter:
             raise _unwritable(self._path, error) from error
 
     def discard(self) -> None:
-        """Give the unfinished file up."""
+        """Delete the unfinished file."""
         with contextlib.suppress(OSError):
             self._container.close()
         self._unfinished.unlink(missing_ok=True)
 
 
 class PictureSequence:
-    """One PNG file a picture; what is there already is replaced.
+    """One PNG file per picture; existing files are replaced.
 
     Parameters
     ----------
     path
-        A folder, in which ``00000.png`` and so on are written, or a name such as
-        ``face%05d.png`` in a folder that exists.
+        A folder for ``00000.png`` and so on, or a name such as ``face%05d.png`` in an existing
+        folder.
 
     Raises
     ------
     UserError
-        If the folder cannot be made.
+        If the folder cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -345,19 +345,19 @@ class PictureSequence:
 
     def write_image(self, image: UInt8) -> None:
         """Write a picture (H, W, 3) or (H, W, 4), sRGB."""
-        name = _NUMBER.sub(lambda found: found[0] % self._num_images, self._pattern.name, count=1)
+        name = _NUMBER.sub(lambda match: match[0] % self._num_images, self._pattern.name, count=1)
         write_picture(self._pattern.with_name(name), image)
         self._num_images += 1
 
     def write_sound(self, samples: Float32) -> None:
-        """Leave the sound out."""
+        """Ignore the sound."""
 
     def close(self) -> Path:
-        """Return the name that the numbers are filled into."""
+        """Return the name pattern."""
         return self._pattern
 
     def discard(self) -> None:
-        """Keep the pictures that are there."""
+        """Keep the pictures written so far."""
 
 
 def write_picture(path: Path, image: UInt8) -> None:
@@ -375,7 +375,7 @@ def write_picture(path: Path, image: UInt8) -> None:
 
 
 def _reserve(path: Path) -> Path:
-    """Create an empty file of this name or, if there is one, of the next free one; return it."""
+    """Create an empty file with this name or, if it exists, with the next free one; return it."""
     free, number = path, 1
     while True:
         try:
@@ -389,6 +389,6 @@ def _reserve(path: Path) -> Path:
 
 def _unwritable(path: Path, error: OSError) -> UserError:
     return UserError(
-        f"{path} cannot be written ({error.strerror or error}); give a path in a folder"
-        " that exists and may be written"
+        f"cannot write {path} ({error.strerror or error}); give a path in an existing, writable"
+        " folder"
     )

@@ -1,8 +1,8 @@
-"""What every lip model offers: mouth FAPs from what is known of the speech so far.
+"""The interface of lip models: mouth FAPs from sound events.
 
-A model is loaded once and shared by all sessions; each session has a stream of its own. A new kind
-of lips is a package beside ``dynamic_visemes``, a ``LipModelName`` and an entry in
-``load.LIP_MODELS``.
+A lip model is loaded once and shared by all sessions; each session has its own stream. To add a lip
+model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_MODEL``, see
+``registry``.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from kouxing.shared.phones.events import SoundEvent
 
 
 class Articulation(Protocol):
-    """What is being said, as far as the lip model knows: modifiers ask for it."""
+    """What the lip model knows about the current speech; used by modifiers."""
 
     @property
     def syllable_onsets_s(self) -> NDArray[np.float64]:
-        """When each syllable's vowel begins, shape (num_syllables,), rising; media time."""
+        """Media time of each syllable's vowel onset, shape (num_syllables,), rising."""
 
     def usual_level_db(self, time_s: float) -> float | None:
-        """Level, relative to the speaker's mean, of what is said at a time; None if unknown."""
+        """Return the usual level of the speech at a time, relative to the speaker's mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,28 +36,28 @@ class MouthFrame:
 
 
 class LipStream(Protocol):
-    """One session's lips. Frame times rise."""
+    """The lips of one session. Frame times rise."""
 
-    def accept(self, event: SoundEvent) -> None:
-        """Take an event. Those that this kind of lips does not use are ignored."""
+    def add_event(self, event: SoundEvent) -> None:
+        """Add an event; events that the lip model does not use are ignored."""
 
     def frame_at(self, time_s: float) -> MouthFrame:
-        """Return the mouth at a media time from all events up to the delay after it."""
+        """Return the mouth at a media time, given all events up to the delay after it."""
 
     def relax(self, step_s: float) -> MouthFrame:
-        """Lead the mouth to rest, by one more step, while media time stands still."""
+        """Return the mouth one step closer to rest while media time stands still."""
 
     def flush(self) -> None:
-        """Drop what is known (an interruption); the frames to come lead to rest."""
+        """Drop the known events (an interruption); the next frames lead to rest."""
 
 
 class LipModel(Protocol):
-    """Lips that any number of sessions share.
+    """A lip model, shared by any number of sessions.
 
     Attributes
     ----------
     amplitude_applies
-        Whether the openings are still to be scaled with the level of the voice.
+        Whether the amplitude modifier may scale the openings with the level of the voice.
     """
 
     amplitude_applies: ClassVar[bool]
@@ -72,5 +72,5 @@ class LipModel(Protocol):
         frame_rate_hz
             Frames per second of media time.
         delay_s
-            How much sound after a frame is known when the frame is made.
+            How much audio after a frame is known when the frame is made.
         """

@@ -1,15 +1,15 @@
-"""How far the mouth opens: with the level of the voice, and with the rate of speech.
+"""Scales mouth openings with the level of the voice and the rate of speech.
 
-Louder speech opens jaw and lips further (Lombard speech; Schulman 1989), fast speech less: Zhang
-2021 names both as open. What is shut stays shut, since only openings are scaled.
+Louder speech opens jaw and lips further (Lombard speech; Schulman 1989), fast speech less. Zhang 2021
+names both as open questions. Only openings are scaled, so closures stay closed.
 
-The level is compared with what is usual for the viseme that is said (an open vowel is louder than
-a closed one without any effort) and for the speaker, so that the microphone's gain does not
-matter. Levels are known at once, phones a tenth of a second later: with a short delay, a level
-above that of the phone known so far also foretells the next vowel.
+The level is compared with the usual level of the current viseme, because open vowels are naturally
+louder than closed ones, and with the speaker's mean, so that microphone gain has no effect. Levels
+are known at once, phones about 0.1 s later. With a short delay, a level above that of the known phone
+therefore predicts the next vowel.
 
-The rate counts twice. Visemes that follow each other fast fall short of their targets by blending,
-which explains about half of what lips show; the other half is `_PER_RATE` (see docs/visemes.md).
+The rate acts twice. Blending makes fast visemes miss their targets, which explains about half of the
+reduction in real lips; `_PER_RATE` is the other half (see docs/visemes.md).
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.lip_model import Articulation
-from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext
+from kouxing.shared.face.smoothing import TwoPoleFilter
 
 _PER_DB = 0.03
-_MAX_DB = 15.0  # of a difference that counts
-_PAUSE_DB = 25.0  # a level this far below the mean is no speech
-_INITIAL_MEAN_DB = -26.0  # dBFS, until the speaker is known
-_INITIAL_MEAN_LEVELS = 10.0  # weight of that, in levels
-_MAX_MEAN_LEVELS = 300.0  # the speaker's mean adapts over this many
-_LEAD_S = 0.05  # levels are used this long before their frame, if known: the filters' delay
-_FILTER_S = 0.025  # time constant of each of two filters; slower ones fit real lips worse
+_MAX_DB = 15.0  # larger level differences are clipped
+_PAUSE_DB = 25.0  # levels this far below the mean are not speech
+_INITIAL_MEAN_DB = -26.0  # dBFS
+_INITIAL_MEAN_LEVELS = 10.0  # weight of the initial mean, in levels
+_MAX_MEAN_LEVELS = 300.0  # adaptation period of the speaker's mean, in levels
+_LEAD_S = 0.05  # levels act this long before their frame, if known: the delay of the filter
+_FILTER_S = 0.025  # time constant of each pole; slower filters match real lips less well
 
 _USUAL_RATE_HZ = 5.0  # syllables per second
 _PER_RATE = -0.03
-_NUM_INTERVALS = 4  # between syllables, from which the rate is measured
-_MAX_INTERVAL_S = 0.6  # longer ones are pauses
+_NUM_INTERVALS = 4  # syllable intervals in a rate measurement
+_MAX_INTERVAL_S = 0.6  # longer intervals are pauses
 _MIN_GAIN, _MAX_GAIN = 0.4, 1.4
 
 # FAPs that open the mouth, and the sign of opening
@@ -45,33 +46,31 @@ _OPENING_SIGNS = np.array(list(_OPENING.values()), dtype=np.float32)
 
 
 class Amplitude:
-    """A gain for the opening of the mouth, smooth whatever comes."""
+    """A smooth gain for mouth openings."""
 
     def __init__(self) -> None:
         self._levels: deque[tuple[float, float]] = deque()
         self._mean_db = _INITIAL_MEAN_DB
         self._num_levels = _INITIAL_MEAN_LEVELS
         self._goal = 1.0
-        self._halfway = self._gain = 1.0  # two filters in a row: no corner in the gain
+        self._gain = TwoPoleFilter(1.0)
 
-    def apply(self, faps: NDArray[np.float32], moment: Moment) -> None:
+    def apply(self, faps: NDArray[np.float32], context: FrameContext) -> None:
         """Scale the openings of a frame, FAPs (68,), in place."""
-        self._levels += [level for level in moment.levels if all(map(math.isfinite, level))]
-        until_s = min(moment.known_s, moment.time_s + _LEAD_S)
+        self._levels += [level for level in context.levels if all(map(math.isfinite, level))]
+        until_s = min(context.known_s, context.time_s + _LEAD_S)
         while self._levels and self._levels[0][0] <= until_s:
-            self._follow_level(moment.articulation, *self._levels.popleft())
-        goal = self._goal * _rate_gain(moment.articulation.syllable_onsets_s, until_s)
-        goal = min(max(goal, _MIN_GAIN), _MAX_GAIN) if moment.amplitude_applies else 1.0
-        share = -math.expm1(-moment.step_s / _FILTER_S)
-        self._halfway += (goal - self._halfway) * share
-        self._gain += (self._halfway - self._gain) * share
-        if self._gain != 1.0:
+            self._add_level(context.articulation, *self._levels.popleft())
+        goal = self._goal * _rate_gain(context.articulation.syllable_onsets_s, until_s)
+        goal = min(max(goal, _MIN_GAIN), _MAX_GAIN) if context.amplitude_applies else 1.0
+        gain = self._gain.step(goal, context.step_s, _FILTER_S)
+        if gain != 1.0:
             opening = faps[_OPENING_FAPS]
             faps[_OPENING_FAPS] = np.where(
-                opening * _OPENING_SIGNS > 0.0, opening * np.float32(self._gain), opening
+                opening * _OPENING_SIGNS > 0.0, opening * np.float32(gain), opening
             )
 
-    def _follow_level(self, articulation: Articulation, time_s: float, level_db: float) -> None:
+    def _add_level(self, articulation: Articulation, time_s: float, level_db: float) -> None:
         usual_db = articulation.usual_level_db(time_s)
         if usual_db is None or level_db < self._mean_db - _PAUSE_DB:
             return
@@ -83,9 +82,9 @@ class Amplitude:
 
 
 def _rate_gain(syllable_onsets_s: NDArray[np.float64], until_s: float) -> float:
-    """Gain for the rate of the last syllables that began before ``until_s``."""
-    num_begun = int(np.searchsorted(syllable_onsets_s, until_s, side="right"))
-    intervals = np.diff(syllable_onsets_s[max(num_begun - _NUM_INTERVALS - 1, 0) : num_begun])
+    """Return the gain for the rate of the last syllables before ``until_s``."""
+    num_started = int(np.searchsorted(syllable_onsets_s, until_s, side="right"))
+    intervals = np.diff(syllable_onsets_s[max(num_started - _NUM_INTERVALS - 1, 0) : num_started])
     intervals = intervals[(intervals > 0.0) & (intervals < _MAX_INTERVAL_S)]
     if not intervals.size:
         return 1.0

@@ -1,11 +1,10 @@
-"""Blend visemes by their dominance.
+"""Blends visemes by their dominance.
 
 Source: Wang & Cai 2003, eq. 6 (all visemes and silences); Li et al. 2011, eq. 9-11 (the pair of
-visemes around a time, which is all that a live synthesizer has to know).
+visemes around a time, which is sufficient for a live synthesizer).
 
-Both are the same quotient over different sets of visemes, so one function blends and another
-chooses. A softmax over log weights replaces the quotient: the weights of the silences overflow as
-plain numbers.
+Both are the same quotient over different sets of visemes, so one function blends and another selects.
+A softmax over log weights replaces the quotient, because the silences' weights would overflow.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 
 
 def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights along the first axis that sum to one."""
+    """Return weights that sum to one along the first axis."""
     weights: NDArray[np.float64] = np.exp(log_weights - np.max(log_weights, axis=0))
     weights /= np.sum(weights, axis=0)
     return weights
@@ -34,18 +33,9 @@ def softmax(log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
 def log_weights(
     parameters: VisemeParameters, timeline: Timeline, time_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Log weights of all visemes and silences.
+    """Return the log weights (num_visemes + num_silences, num_times, num_mouth_faps).
 
-    Parameters
-    ----------
-    parameters : VisemeParameters
-    timeline : Timeline
-    time_s : array (num_times,)
-        Seconds.
-
-    Returns
-    -------
-    array (num_visemes + num_silences, num_times, num_mouth_faps)
+    ``time_s`` has shape (num_times,).
     """
     p, c = parameters, parameters.c
     time = time_s[:, None]  # (F, 1)
@@ -64,7 +54,7 @@ def log_weights(
     )
     start_s = timeline.silence_start_s[:, None, None]  # (S, 1, 1)
     end_s = timeline.silence_end_s[:, None, None]
-    # before and after all speech one of the two is infinite, and the other alone remains
+    # before and after all speech, one of the two is infinite and only the other remains
     silent = log_pause(
         log_right_silence(start_s + p.offset_right_s - time, p.alpha_right, p.theta_right, c),
         log_left_silence(end_s + p.offset_left_s - time, p.alpha_left, p.theta_left, c),
@@ -80,7 +70,7 @@ def _close_lips(
     tau: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Apply the closure rule (Wang & Cai 2003, eq. 7) to the visemes that close."""
+    """Apply the closure rule (Wang & Cai 2003, eq. 7) to closing visemes."""
     closed = weights
     for row in np.flatnonzero(parameters.closes[viseme].any(axis=1)):
         faps = np.flatnonzero(parameters.closes[viseme[row]])
@@ -89,17 +79,17 @@ def _close_lips(
             continue
         if closed is weights:
             closed = weights.copy()
-        at = np.ix_(near, faps)
+        selected = np.ix_(near, faps)
         others = np.delete(weights, row, axis=0)[:, near[:, None], faps]
         log_others = (
             np.logaddexp.reduce(others, axis=0)
             if len(others)
             else np.full((near.size, faps.size), -np.inf)
         )
-        closed[row][at] = log_closure(
-            weights[row][at],
-            np.maximum(log_others, weights[row][at] - 50.0),
-            tau[row][at],
+        closed[row][selected] = log_closure(
+            weights[row][selected],
+            np.maximum(log_others, weights[row][selected] - 50.0),
+            tau[row][selected],
             parameters.closure_reach_s,
             parameters.closure_ratio,
         )
@@ -109,21 +99,9 @@ def _close_lips(
 def blend(
     parameters: VisemeParameters, timeline: Timeline, time_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Mouth FAPs at the given times from all visemes and silences of a timeline.
+    """Return the mouth FAPs (num_times, num_mouth_faps) of a timeline at times (num_times,).
 
-    Wang & Cai 2003, eq. 6; over the pair around a time, Li 2011, eq. 11.
-
-    Parameters
-    ----------
-    parameters : VisemeParameters
-    timeline : Timeline
-    time_s : array (num_times,)
-        Seconds.
-
-    Returns
-    -------
-    array (num_times, num_mouth_faps)
-        FAP units.
+    With all visemes this is Wang & Cai 2003, eq. 6; with the pair around a time, Li 2011, eq. 11.
     """
     num_silences = len(timeline.silence_start_s)
     if not len(timeline.viseme) + num_silences:
@@ -137,16 +115,12 @@ def blend(
 
 
 def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray[np.bool_]:
-    """Choose the visemes that act at a time: the pair around it, and all within ``reach_s``.
+    """Return which visemes act at a time, as a mask: the pair around it, and all within ``reach_s``.
 
-    With ``reach_s`` 0 this is the pair of Li 2011, eq. 11, from apex to apex; the longer the
-    reach, the nearer to the full model.
-
-    Returns
-    -------
-    array (num_visemes,) of bool
+    With ``reach_s`` 0 this is the pair of Li 2011, eq. 11, from apex to apex. A longer reach is
+    closer to the full model.
     """
-    chosen = (timeline.apex_start_s < time_s + reach_s) & (timeline.apex_end_s > time_s - reach_s)
+    active = (timeline.apex_start_s < time_s + reach_s) & (timeline.apex_end_s > time_s - reach_s)
     following = int(np.searchsorted(timeline.apex_start_s, time_s, side="right"))
-    chosen[max(following - 1, 0) : following + 1] = True
-    return chosen
+    active[max(following - 1, 0) : following + 1] = True
+    return active

@@ -1,7 +1,6 @@
-"""Lips that must meet (b p m, f): shown late rather than never.
+"""Closures (b p m, f) that are recognized after their apex are shown late instead of never.
 
-A closure may be recognised after its apex has passed. One that is late by less than ``_MAX_LATE_S``
-is postponed to where the mouth can still show it.
+A closure that is late by less than ``_MAX_LATE_S`` is postponed to a time at which it can be shown.
 """
 
 from __future__ import annotations
@@ -15,45 +14,36 @@ from numpy.typing import NDArray
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import VisemeParameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline
 
-_MAX_LATE_S = 0.1  # a closure recognised later than this after its apex is not shown
-_CATCH_UP_S = 0.04  # a late one takes this long
-_MIN_TRANSITION_S = 0.02  # of lips that must meet at once
-_CLOSED = 10.0  # a lip counts as closed within this distance of its target, FAP units
+_MAX_LATE_S = 0.1  # closures recognized later than this after their apex are not shown
+_CATCH_UP_S = 0.04  # time from the last frame to a postponed apex
+_MIN_TRANSITION_S = 0.02  # shortest transition to a closure
+_CLOSED = 10.0  # lip counts as closed within this distance of its target, FAP units
 
 
 class ClosureTracker:
-    """Which closures have been shown, and which are postponed.
-
-    Parameters
-    ----------
-    parameters : VisemeParameters
-    frame_rate_hz : float
-    """
+    """Tracks which closures have been shown and which are postponed."""
 
     def __init__(self, parameters: VisemeParameters, frame_rate_hz: float) -> None:
         self._target = parameters.target
         self._frame_s = 1.0 / frame_rate_hz
         self._closes: NDArray[np.bool_] = parameters.closes > 0.0  # (num_visemes, num_mouth_faps)
         self._any_closes = np.logical_or.reduce(self._closes, axis=1)  # (num_visemes,)
-        self._shown: set[int] = set()  # indices of phones
-        self._postponed_s: dict[int, float] = {}  # index of a phone -> its apex
+        self._shown: set[int] = set()  # phone indices
+        self._postponed_s: dict[int, float] = {}  # phone index -> apex
 
     def postpone(self, timeline: Timeline, last_s: float, time_s: float) -> tuple[Timeline, bool]:
-        """Move the closures whose apex passed before they were recognised.
+        """Move closures whose apex passed before they were recognized.
 
         Parameters
         ----------
-        timeline : Timeline
-        last_s : float
-            Time of the last frame, seconds.
-        time_s : float
-            Time of the next frame, seconds.
+        timeline
+            The visemes.
+        last_s, time_s
+            Times of the last and the next frame, seconds.
 
         Returns
         -------
-        tuple of (Timeline, bool)
-            The timeline with late closures where they can be shown, and whether one is moved for
-            the first time.
+        The timeline with late closures moved, and whether a closure was moved for the first time.
         """
         start_s, end_s = timeline.apex_start_s.copy(), timeline.apex_end_s.copy()
         is_new = False
@@ -72,21 +62,9 @@ class ClosureTracker:
     def shorten(
         self, duration_s: NDArray[np.float64], timeline: Timeline, time_s: float
     ) -> NDArray[np.float64]:
-        """Let a transition that begins at a time end where a lip must close.
+        """Shorten a transition that starts at ``time_s`` so that it ends before the next closures.
 
-        Parameters
-        ----------
-        duration_s : array (num_mouth_faps,)
-            Of the transition, seconds.
-        timeline : Timeline
-            The visemes to come.
-        time_s : float
-            Seconds.
-
-        Returns
-        -------
-        array (num_mouth_faps,)
-            Seconds, no longer than ``duration_s``.
+        ``duration_s`` and the result have shape (num_mouth_faps,).
         """
         shortened = duration_s.copy()
         for row in self._closing_rows(timeline):
@@ -97,7 +75,7 @@ class ClosureTracker:
         return shortened
 
     def note(self, timeline: Timeline, time_s: float, mouth: NDArray[np.float64]) -> None:
-        """Note which closures the mouth, FAPs (num_mouth_faps,), shows at a time."""
+        """Record which closures the mouth, FAPs (num_mouth_faps,), shows at a time."""
         for row in self._closing_rows(timeline):
             if timeline.apex_start_s[row] - self._frame_s <= time_s:
                 viseme = timeline.viseme[row]
@@ -106,7 +84,7 @@ class ClosureTracker:
                     self._shown.add(int(timeline.phone_index[row]))
 
     def forget(self, indices: Iterable[int]) -> None:
-        """Forget some phones."""
+        """Forget phones."""
         for index in indices:
             self._shown.discard(index)
             self._postponed_s.pop(index, None)

@@ -1,8 +1,8 @@
-"""The dynamic visemes' initial parameters, set by hand: training starts from them.
+"""Initial parameters of the dynamic visemes, set by hand; training starts from them.
 
-Static targets are published ones (``targets.tsv``). Dominances and decays are estimates: the
-feature that makes a consonant heard stays (lips shut for labials, teeth shut for sibilants); all
-else gives way to the vowel, and more so the further back the tongue articulates.
+Static targets are published values (``targets.tsv``). Dominances and decays are estimates. The
+feature that defines a consonant dominates (closed lips for labials, closed teeth for sibilants). Its
+other features yield to the vowel, more for consonants that are articulated further back.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    NUM_MOUTH_FAPS,
     VisemeParameters,
     columns,
 )
@@ -23,11 +22,13 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     static_targets,
 )
 
+from kouxing.shared.face.faps import NUM_MOUTH_FAPS
+
 _JAW_FAPS = (3, 14)
 _ROUNDING_FAPS = (6, 7, 16, 17, 53, 54)  # mouth width and protrusion
 _TONGUE_FAPS = (44, 45, 46, 47)
 
-# Consonants' visemes: dominance over lip height, jaw and rounding, and their decay.
+# consonant visemes: dominance over lip height, jaw and rounding, and decay
 CONSONANTS = {
     "b": (3.0, 1.2, 0.4, 55.0),
     "f": (2.0, 1.2, 0.6, 55.0),
@@ -40,16 +41,16 @@ CONSONANTS = {
 }
 _VOWEL_THETA = 42.0
 _ROUNDED_ALPHA = 2.0
-_ROUNDED_THETA_MINUS = 28.0  # lips round early
+_ROUNDED_THETA_MINUS = 28.0  # lips start rounding early
 _SILENCE_THETA = 40.0
 _SILENCE_OFFSET_S = 0.12  # the mouth opens before the voice and closes after it
 _INITIAL_C = 1.3
-_MEAN_DISTANCE_S = 0.115  # between apexes: there the decays of all exponents are equal
+_MEAN_DISTANCE_S = 0.115  # mean distance of apexes, where the decays of all exponents are equal
 _CONSONANT_LEVEL_DB = -12.0  # relative to vowels
 
 
 def initial_parameters(c: float = _INITIAL_C) -> VisemeParameters:
-    """Parameters set by hand, for an exponent ``c``."""
+    """Return the parameters for an exponent ``c``."""
     shape = (len(VISEMES), NUM_MOUTH_FAPS)
     decay = _MEAN_DISTANCE_S ** (_INITIAL_C - c)
     alpha, closes = np.ones(shape), np.zeros(shape)

@@ -1,7 +1,7 @@
-"""Parameters of the dynamic visemes, and the file that holds them.
+"""Parameters of the dynamic visemes, and their file format.
 
-Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta_plus, t_o and T,
-for closures C and T; per FAP the silence models; one exponent c.
+Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta_plus, t_o and T, for
+closures C and T; per FAP the silence models; one exponent c.
 """
 
 from __future__ import annotations
@@ -16,21 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
-    VISEMES,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEMES
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 
 FORMAT = "kouxing viseme parameters 2"
-NUM_MOUTH_FAPS = len(MOUTH_FAPS)
 
 _PER_VISEME = ("alpha", "theta_minus", "theta_plus", "offset_s", "target", "closes")
 _PER_SILENCE = (
     "alpha_left", "alpha_right", "theta_left", "theta_right", "offset_left_s", "offset_right_s",
     "neutral",
 )  # fmt: skip
-_LIMITS = {  # lowest and highest value that makes sense
+_LIMITS = {  # minimum and maximum
     "alpha": (1e-3, 1e3),
     "theta": (1e-2, 1e4),
     "offset": (-0.5, 0.5),
@@ -46,19 +43,19 @@ _LIMITS = {  # lowest and highest value that makes sense
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VisemeParameters:
-    """Everything the dominance model needs.
+    """The parameters of the dominance model.
 
-    Arrays per viseme have shape (num_visemes, num_mouth_faps), rows as ``visemes.VISEMES``, columns
-    as ``visemes.MOUTH_FAPS``; arrays of the silences have shape (num_mouth_faps,).
+    Viseme arrays have shape (num_visemes, num_mouth_faps), with rows as ``visemes.VISEMES`` and
+    columns as ``MOUTH_FAPS``; silence arrays have shape (num_mouth_faps,).
     """
 
     alpha: NDArray[np.float64]  # dominance at the apex
     theta_minus: NDArray[np.float64]  # decay before the apex, s**-c
     theta_plus: NDArray[np.float64]  # decay after the apex, s**-c
-    offset_s: NDArray[np.float64]  # t_o: the FAP's apex minus the acoustic one, seconds
+    offset_s: NDArray[np.float64]  # t_o: the FAP's apex minus the acoustic apex, seconds
     target: NDArray[np.float64]  # T, FAP units
-    closes: NDArray[np.float64]  # 1 where the closure rule holds, else 0
-    level_db: NDArray[np.float64]  # (num_visemes,) usual level beside the speaker's mean
+    closes: NDArray[np.float64]  # 1 where the closure rule applies, else 0
+    level_db: NDArray[np.float64]  # (num_visemes,) usual level relative to the speaker's mean
     alpha_left: NDArray[np.float64]
     alpha_right: NDArray[np.float64]
     theta_left: NDArray[np.float64]  # s**-c
@@ -83,14 +80,14 @@ class VisemeParameters:
             if value.shape != shape:
                 raise UserError(
                     f"viseme parameters: {field.name} has shape {value.shape}, expected {shape}; "
-                    "train them again or restore the file"
+                    "restore the file, or train again"
                 )
             key = field.name if field.name in _LIMITS else field.name.split("_")[0]
             low, high = _LIMITS[key]
             if not np.all((value >= low) & (value <= high)):
                 raise UserError(
-                    f"viseme parameters: {field.name} is not within {low:g} to {high:g}; "
-                    "train them again or restore the file"
+                    f"viseme parameters: {field.name} is not between {low:g} and {high:g}; "
+                    "restore the file, or train again"
                 )
 
 
@@ -102,20 +99,14 @@ def save_parameters(
     learnt_from: Sequence[str] = (),
     chosen_with: Sequence[str] = (),
 ) -> None:
-    """Write parameters as JSON, one line for each viseme and array.
+    """Write parameters as JSON, one line per viseme and array.
 
-    Parameters
-    ----------
-    parameters : VisemeParameters
-    path : Path
-    source : str
-        Whose they are.
-    learnt_from, chosen_with : sequence of str
-        Names of clips that an honest score leaves out.
+    ``source`` describes their origin. ``learnt_from`` and ``chosen_with`` are names of clips that a
+    fair evaluation must exclude.
     """
 
     def line(name: str, values: NDArray[np.float64]) -> str:
-        # seven digits: far below what a face shows, and the same on every machine
+        # seven digits are precise enough and equal on all machines
         return f"{json.dumps(name)}: [{', '.join(f'{value:.7g}' for value in values)}]"
 
     visemes = ",\n".join(
@@ -146,17 +137,17 @@ def save_parameters(
 
 
 def load_parameters(path: Path | None = None) -> VisemeParameters:
-    """Read parameters from ``path``, or those that come with the program.
+    """Read parameters from a file, or the built-in ones.
 
     Raises
     ------
     UserError
-        The file cannot be read or what it holds makes no sense.
+        If the file cannot be read, or its contents are invalid.
     """
     try:
         data = _read(path)
         if data["format"] != FORMAT or data["faps"] != list(MOUTH_FAPS):
-            raise ValueError(f"not a file of '{FORMAT}'")
+            raise ValueError(f"the format is not '{FORMAT}'")
         _clips_of(data)
         arrays = {
             name: np.array([data["visemes"][viseme][name] for viseme in VISEMES], dtype=float)
@@ -180,7 +171,7 @@ def load_parameters(path: Path | None = None) -> VisemeParameters:
 
 
 def clips_seen(path: Path | None = None) -> frozenset[str]:
-    """Return the names of the clips that parameters were learnt from or chosen with."""
+    """Return the names of the clips that were used for training or selection."""
     return _clips_of(_read(path))
 
 
@@ -199,5 +190,5 @@ def _read(path: Path | None) -> dict[str, Any]:
 
 
 def columns(faps: Sequence[int]) -> NDArray[np.intp]:
-    """Columns of the parameter arrays that hold the given FAPs."""
+    """Return the columns of FAPs in the parameter arrays."""
     return np.array([MOUTH_FAPS.index(fap) for fap in faps], dtype=np.intp)

@@ -1,14 +1,13 @@
-"""From recognised phones to visemes on the time axis, with the silences between them.
+"""Places visemes and silences on the time axis.
 
 Source: Li et al. 2011, 2.3.1 (compound finals become several visemes), Wang & Cai 2003, section 3
-(where silence models stand).
+(positions of the silence models).
 
-The *apex* of a viseme is the time at which it acts most (the papers' centre). Deviations: a viseme
-longer than twice ``EDGE_S`` has an interval as its apex, so that a long vowel is held instead of
-fading from its middle on; the distance in eq. 5 is measured from the nearer end of the interval.
-Shorter visemes have the paper's single time. Live, an expected viseme follows the last phone known:
-a vowel comes after every initial, and an initial after most vowels, so the mouth sets out in time
-for a phone that will be recognised late.
+The *apex* of a viseme is the time of its maximum effect (the papers' center). Deviations: The apex of
+a viseme longer than twice ``EDGE_S`` is an interval, so that a long vowel is held instead of fading
+from its middle. Eq. 5 then uses the distance to the nearer end. Live, an expected viseme follows the
+last known phone, because a vowel follows every initial and an initial follows most vowels. The mouth
+thus starts in time for a phone that will be recognized late.
 """
 
 from __future__ import annotations
@@ -27,30 +26,29 @@ from kouxing.shared.phones.inventory import PhoneInventory
 EXPECTED = -1
 MAX_HOLD_S = 1.5  # a phone lasts up to this long beyond its estimate if nothing follows
 _HOLD_SOFTNESS_S = 0.03
-_HOLD_FACTOR = 2.0  # below, a long vowel half closes before it is held
-_RECOGNISED_AFTER_S = 0.09  # most phones are recognised within this time after their onset
-_EXPECTED_AFTER_S = 0.3  # how long the expected viseme lasts before the mouth relaxes
-# What usually follows looks like: a middling vowel; after a vowel, a mouth less open, which keeps
-# its rounding.
+_HOLD_FACTOR = 2.0  # with lower values a long vowel closes halfway before it is held
+_RECOGNIZED_AFTER_S = 0.09  # most phones are recognized within this time after their onset
+_EXPECTED_AFTER_S = 0.3  # the mouth relaxes after the expected viseme has lasted this long
+# expected visemes: a medium vowel; after a vowel, a less open mouth that keeps its rounding
 _EXPECTED_AFTER_INITIAL, _EXPECTED_AFTER_VOWEL, _EXPECTED_AFTER_ROUNDED = "ei", "i", "u"
 _ROUNDED_AT_THE_END = frozenset({"o", "ou", "u", "v"})
-EDGE_S = 0.08  # a viseme's apex is at most this far from its beginning and its end
+EDGE_S = 0.08  # maximum distance of a viseme's apex from its start and end
 _MIN_PHONE_S = 0.01
-_TOUCHING_S = 0.03  # a shorter hole between two phones is a rounding of their times, no pause
-_MAX_ERROR_S = 0.3  # an estimated end may be this much too early
+_TOUCHING_S = 0.03  # shorter gaps between phones are rounding errors
+_MAX_ERROR_S = 0.3  # an estimated end may be too early by this time
 _EXPECTED_EDGE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class OpenPhone:
-    """The last phone, where nothing is known of what follows.
+    """The last phone, if its successor is unknown.
 
-    The last two visemes of its timeline are the phone's last and the expected one, and the last
-    silence follows them.
+    The last two visemes of the timeline are this phone's last viseme and the expected viseme. The
+    last silence follows them.
     """
 
     end_s: float  # estimated, seconds
-    is_held: bool  # it ends in a viseme that vowels end in: what has lasted long goes on
+    is_held: bool  # its last viseme is one of a vowel, which may be held
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,45 +61,45 @@ class Timeline:
     phone_index: NDArray[np.int64]  # (num_visemes,) Phone.index, EXPECTED for the expected viseme
     silence_start_s: NDArray[np.float64]  # (num_silences,) end of speech; -inf before all speech
     silence_end_s: NDArray[np.float64]  # (num_silences,) start of speech; inf after all speech
-    syllable_s: NDArray[np.float64]  # (num_syllables,) when each syllable's vowel begins
+    syllable_s: NDArray[np.float64]  # (num_syllables,) onset of each syllable's vowel
     open_phone: OpenPhone | None = None
 
-    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
-        """Timeline with the chosen visemes, by mask or by rows, and all silences and syllables."""
+    def select(self, selected: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
+        """Return a timeline with the selected visemes (mask or rows), all silences and syllables."""
         return replace(
             self,
-            viseme=self.viseme[chosen],
-            apex_start_s=self.apex_start_s[chosen],
-            apex_end_s=self.apex_end_s[chosen],
-            phone_index=self.phone_index[chosen],
+            viseme=self.viseme[selected],
+            apex_start_s=self.apex_start_s[selected],
+            apex_end_s=self.apex_end_s[selected],
+            phone_index=self.phone_index[selected],
             open_phone=None,
         )
 
     def same_visemes(self, other: Timeline) -> bool:
-        """Tell whether another timeline has the same visemes of the same phones, at any times."""
+        """Return whether another timeline has the same visemes of the same phones, at any times."""
         return np.array_equal(self.viseme, other.viseme) and np.array_equal(
             self.phone_index, other.phone_index
         )
 
     def nearest(self, time_s: float) -> int | None:
-        """Row, in ``VisemeParameters``, of the viseme nearest to a time; None if there is none."""
+        """Return the ``VisemeParameters`` row of the viseme nearest to a time; None if empty."""
         if not len(self.viseme):
             return None
         distance_s = np.maximum(self.apex_start_s - time_s, time_s - self.apex_end_s)
         return int(self.viseme[np.argmin(distance_s)])
 
     def extend_open_phone(self, known_s: float) -> Timeline:
-        """Let an open phone last: with the sound known up to ``known_s``, nothing follows it yet.
+        """Extend the open phone, given that the audio is known up to ``known_s``.
 
-        What began `_RECOGNISED_AFTER_S` before would be known. The phone's end moves from the
-        estimate to there, smoothly, and that of a held one beyond, since what has lasted long is
-        not about to end; by up to ``MAX_HOLD_S``.
+        A successor that started `_RECOGNIZED_AFTER_S` earlier would be known. The phone's end moves
+        smoothly from the estimate to that time. A held phone moves beyond it, because a long phone
+        is likely to continue. The extension is at most ``MAX_HOLD_S``.
         """
         if self.open_phone is None:
             return self
-        begun_s = known_s - _RECOGNISED_AFTER_S
+        no_successor_before_s = known_s - _RECOGNIZED_AFTER_S
         overdue_s = _HOLD_SOFTNESS_S * np.logaddexp(
-            0.0, (begun_s - self.open_phone.end_s) / _HOLD_SOFTNESS_S
+            0.0, (no_successor_before_s - self.open_phone.end_s) / _HOLD_SOFTNESS_S
         )
         factor = _HOLD_FACTOR if self.open_phone.is_held else 1.0
         later_s = min(factor * float(overdue_s), MAX_HOLD_S)
@@ -129,14 +127,14 @@ def build_timeline(
 
     Parameters
     ----------
-    phones : sequence of Phone
-        One for each index, in any order; silence ends the speech before it.
-    inventory : PhoneInventory
-        Their language.
-    speech_ends_s : sequence of float
-        Further times at which speech is known to have ended, seconds.
-    live : bool
-        More phones may follow: the last one is open unless speech is known to have ended, and the
+    phones
+        One per index, in any order; silence ends the speech before it.
+    inventory
+        The language.
+    speech_ends_s
+        Further times at which speech ended, seconds.
+    live
+        Whether more phones may follow. If so, the last phone is open unless speech has ended, and
         durations of phones that are not final are estimates.
     """
     in_order = sorted(phones, key=lambda phone: (phone.onset_s, phone.index))
@@ -155,7 +153,7 @@ def build_timeline(
         following = spoken[number + 1] if number + 1 < len(spoken) else None
         next_onset_s = following.onset_s if following is not None else np.inf
         if not phone.final and next_onset_s - phone.onset_s < _MIN_PHONE_S:
-            continue  # the recognizer changed its mind
+            continue  # revised to almost nothing
         bound_s = next((end for end in quiet_s if phone.onset_s < end < next_onset_s), next_onset_s)
         end_s = min(phone.onset_s + max(phone.duration_s, _MIN_PHONE_S), bound_s)
         estimated = live and not phone.final
@@ -194,14 +192,14 @@ def build_timeline(
     )
 
 
-# Row in VisemeParameters, start and end of the apex in seconds, index of the phone.
+# VisemeParameters row, start and end of the apex in seconds, phone index
 _PlacedViseme: TypeAlias = tuple[int, float, float, int]
 
 
 def _placed_visemes(
     phone: Phone, next_symbol: str | None, end_s: float, inventory: PhoneInventory
 ) -> list[_PlacedViseme]:
-    """Visemes of a phone that lasts until ``end_s``."""
+    """Place the visemes of a phone that lasts until ``end_s``."""
     placed, start_s = [], phone.onset_s
     for viseme, share in visemes_of(phone.symbol, next_symbol, inventory):
         length_s = share * (end_s - phone.onset_s)
@@ -214,7 +212,7 @@ def _placed_visemes(
 
 
 def _expected_after(symbol: str, inventory: PhoneInventory) -> str:
-    """Viseme that the mouth sets out for after the last phone known."""
+    """Return the viseme expected after the last known phone."""
     if symbol in inventory.initials:
         return _EXPECTED_AFTER_INITIAL
     if inventory.visemes[symbol][-1][0] in _ROUNDED_AT_THE_END:
@@ -223,6 +221,6 @@ def _expected_after(symbol: str, inventory: PhoneInventory) -> str:
 
 
 def _is_held(symbol: str, inventory: PhoneInventory) -> bool:
-    """Tell whether a phone ends in a viseme that vowels end in."""
+    """Return whether a phone ends in the last viseme of a vowel."""
     last_viseme = inventory.visemes[symbol][-1][0]
     return any(inventory.visemes[vowel][-1][0] == last_viseme for vowel in inventory.vowels)

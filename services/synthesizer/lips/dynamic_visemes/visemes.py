@@ -1,9 +1,8 @@
-"""The visemes of this lip model, and how a language's phones become visemes.
+"""The visemes of this lip model, and the conversion of phones to visemes.
 
-Which visemes a phone goes through, its language's inventory tells. The visemes are those of Li et
-al. 2011, table 1, named after a phone each. A second, rounded variant of a consonant that stands
-before a rounded vowel follows Crystal.TTVS (Tsinghua University, Apache-2.0), as do the static
-targets in ``targets.tsv``.
+The language's inventory lists the visemes of each phone. The visemes are those of Li et al. 2011,
+table 1, each named after a phone. The rounded variants of consonants before rounded vowels, and the
+static targets in ``targets.tsv``, are from Crystal.TTVS (Tsinghua University, Apache-2.0).
 """
 
 from __future__ import annotations
@@ -25,27 +24,18 @@ VISEMES = (
 )
 VISEME_INDEX = {viseme: index for index, viseme in enumerate(VISEMES)}
 
-# What must meet for a closed mouth: every upper and lower lip height, inner and outer.
-LIP_HEIGHT_FAPS = (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)
-# Lip to teeth: the lower lip alone.
-LOWER_LIP_FAPS = (5, 10, 11, 52, 57, 58)
+LIP_HEIGHT_FAPS = (4, 5, 8, 9, 10, 11, 51, 52, 55, 56, 57, 58)  # lips meet
+LOWER_LIP_FAPS = (5, 10, 11, 52, 57, 58)  # lower lip meets the teeth
 CLOSURE_FAPS = {"b": LIP_HEIGHT_FAPS, "f": LOWER_LIP_FAPS}
 
 ROUNDED_VISEMES = frozenset({"u", "v"})
 
 
 def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) -> VisemeShares:
-    """Visemes of a phone in order, each with its share of the phone's duration.
+    """Return the visemes of a phone in order, each with its share of the phone's duration.
 
-    Parameters
-    ----------
-    phone : str
-        One of the inventory's.
-    next_phone : str or None
-        The phone that follows without a pause, if it is known: before one that begins rounded,
-        some phones have another viseme.
-    inventory : PhoneInventory
-        The language.
+    ``next_phone`` is the phone that follows without a pause, if known. Some phones have another
+    viseme before a rounded phone.
     """
     rounded = inventory.before_rounded.get(phone)
     if (
@@ -58,24 +48,24 @@ def visemes_of(phone: str, next_phone: str | None, inventory: PhoneInventory) ->
 
 
 def check_visemes(inventory: PhoneInventory) -> None:
-    """Check that a language names visemes of this model only.
+    """Check that a language uses only visemes of this model.
 
     Raises
     ------
     UserError
-        Naming those that the model lacks.
+        If a viseme is unknown.
     """
     named = {viseme for shares in inventory.visemes.values() for viseme, _ in shares}
-    lacking = sorted({*named, *inventory.before_rounded.values()} - VISEME_INDEX.keys())
-    if lacking:
+    unknown = sorted({*named, *inventory.before_rounded.values()} - VISEME_INDEX.keys())
+    if unknown:
         raise UserError(
-            f"language {inventory.language}: phones.tsv names the visemes {', '.join(lacking)}; "
-            f"known: {', '.join(VISEMES)}"
+            f"language {inventory.language}: phones.tsv contains the unknown visemes "
+            f"{', '.join(unknown)}; use {', '.join(VISEMES)}"
         )
 
 
 def static_targets() -> NDArray[np.float64]:
-    """Read the static targets T, shape (num_visemes, num_mouth_faps), in FAP units."""
+    """Read the static targets T (num_visemes, num_mouth_faps), FAP units."""
     text = (
         resources.files("kouxing.services.synthesizer.lips.dynamic_visemes")
         .joinpath("targets.tsv")
@@ -83,6 +73,6 @@ def static_targets() -> NDArray[np.float64]:
     )
     lines = [line.split("\t") for line in text.splitlines() if not line.startswith("#")]
     if lines[0][1:] != [str(fap) for fap in MOUTH_FAPS]:
-        raise UserError("targets.tsv: the columns are not the mouth FAPs; restore the file")
+        raise UserError("targets.tsv does not have the columns of the mouth FAPs; restore the file")
     rows = {row[0]: [float(value) for value in row[1:]] for row in lines[1:]}
     return np.array([rows[viseme] for viseme in VISEMES])

@@ -1,9 +1,9 @@
-"""The lips' contour at any opening R, and the FAPs that belong to it.
+"""The lip contour and the FAPs at an opening R.
 
-Source: Zhang et al. 2021, section 3. Four lines of five MPEG-4 feature points each, whose corners
-are shared, make 16 points. How far a point travels up was measured once. A Ferguson curve, cubic
-pieces joined with two continuous derivatives, goes through a line's points ``(x_j, dy_j)``: it
-tells the travel at any ``x``, so a contour may have any number of points:
+Source: Zhang et al. 2021, section 3. Four lines of five MPEG-4 feature points with shared corners
+have 16 points. The upward travel of each point was measured once. A Ferguson curve, a piecewise cubic
+with two continuous derivatives, passes through a line's points ``(x_j, dy_j)`` and gives the travel
+at any ``x``, so a contour may have any number of points:
 
     l(x) = y(x) + R dy(x)                                                          (eq. 4)
 
@@ -16,11 +16,11 @@ dy      travel up for R = 1                           mouth widths  (num_points,
 R       opening, 0 (closed) to 5 (widest)             1             (num_frames,)
 ======  ============================================  ============  ======================
 
-``lip_points.tsv`` has the points and says how they were measured.
+``lip_points.tsv`` contains the points and describes how they were measured.
 
-Deviations: the closed lip is a Ferguson curve, too, and its upper edge goes through the two peaks
-of Cupid's bow besides. The curve's ends are free (natural splines). As in the paper, lips move
-vertically only: corners neither come together nor come forward, so /u/ is a small opening.
+Deviations: The closed lip is also a Ferguson curve, and its upper edge passes through the two peaks
+of Cupid's bow. The curves have free ends (natural splines). As in the paper, lips move only
+vertically: the corners do not move, so /u/ is a small opening.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
+from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_UNITS_PER_FAPU, FAPS, MOUTH_FAPS
 
 Array = NDArray[np.float64]
 
-# feature points from the subject's right to the left, as a viewer reads them
+# feature points from the subject's right to the left
 LINES = {
     "outer upper": ("8.4", "8.6", "8.1", "8.5", "8.3"),
     "inner upper": ("2.5", "2.7", "2.2", "2.6", "2.4"),
     "inner lower": ("2.5", "2.9", "2.3", "2.8", "2.4"),
     "outer lower": ("8.4", "8.8", "8.2", "8.7", "8.3"),
 }
-_ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without a travel
+_ONLY_CLOSED = {"outer upper": ("8.9", "8.10")}  # points of the closed line without travel
 _MOUTH_WIDTHS_PER_MNS = 0.39  # of the head "woman"
 _MAX_TRAVEL = 1500.0  # FAP units
 _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
@@ -55,16 +55,16 @@ _FAP_UNIT = _MOUTH_WIDTHS_PER_MNS / FAP_UNITS_PER_FAPU
 
 @dataclass(frozen=True, slots=True)
 class LipPoint:
-    """A feature point of the closed mouth, and how far it travels."""
+    """A feature point of the closed mouth, and its travel."""
 
     x: float  # mouth widths
     y: float
-    fap: int | None  # that moves it vertically
+    fap: int | None  # moves the point vertically
     travel: float  # FAP units at R = 5
 
     @property
     def rise(self) -> float:
-        """Travel up for R = 1, mouth widths; 0 without a FAP."""
+        """Upward travel for R = 1, mouth widths; 0 without a FAP."""
         if self.fap is None:
             return 0.0
         sign = 1.0 if FAPS[self.fap - 1].direction == "up" else -1.0
@@ -80,11 +80,11 @@ class LipLine:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The x of both corners, mouth widths."""
+        """x of both corners, mouth widths."""
         return float(self.travel.x[0]), float(self.travel.x[-1])
 
     def heights(self, x: ArrayLike, openings: ArrayLike) -> Array:
-        """Return the heights l (num_frames, num_points) at x (num_points,) for R (num_frames,)."""
+        """Return l (num_frames, num_points) at x (num_points,) for R (num_frames,)."""
         opening = np.asarray(openings, dtype=np.float64)[:, None]
         heights: Array = self.closed(x) + opening * self.travel(x)  # Zhang 2021, eq. 4
         return heights
@@ -92,7 +92,7 @@ class LipLine:
 
 @lru_cache
 def lip_points() -> dict[str, LipPoint]:
-    """Return the points of ``lip_points.tsv`` by their names."""
+    """Return the points of ``lip_points.tsv`` by name."""
     return parse_lip_points((resources.files(__package__) / "lip_points.tsv").read_text("utf-8"))
 
 
@@ -102,8 +102,7 @@ def parse_lip_points(text: str) -> dict[str, LipPoint]:
     Raises
     ------
     UserError
-        If a point is missing, stands on the wrong side of its neighbour or is moved by a FAP of
-        another point, or a travel is no number or larger than a mouth can open.
+        If a point is missing, out of order, moved by a FAP of another point, or out of range.
     """
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     points = {}
@@ -116,19 +115,21 @@ def parse_lip_points(text: str) -> dict[str, LipPoint]:
                 float(row["travel"] or 0.0),
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise UserError(f"the lips' feature points are damaged: {row}: {error!r}") from None
+            raise UserError(f"the lip feature points are damaged: {row}: {error!r}") from None
     for name, point in points.items():
         if point.fap is not None and (
             point.fap not in MOUTH_FAPS or name not in FAPS[point.fap - 1].feature_points
         ):
-            raise UserError(f"the lips' feature points are damaged: FAP {point.fap} moves {name}")
+            raise UserError(
+                f"the lip feature points are damaged: FAP {point.fap} does not move {name}"
+            )
         if not (abs(point.travel) <= _MAX_TRAVEL and np.isfinite([point.x, point.y]).all()):
-            raise UserError(f"the lips' feature points are damaged: {name} is out of range")
+            raise UserError(f"the lip feature points are damaged: {name} is out of range")
     for line, members in LINES.items():
         x = [points[name].x for name in members if name in points and points[name].fap]
         if len(x) < len(members) or not (np.diff(x) > 0.0).all():
             raise UserError(
-                f"the lips' feature points are damaged: the {line} line needs {', '.join(members)}"
+                f"the lip feature points are damaged: the {line} line needs {', '.join(members)}"
                 " from right to left, each with its FAP"
             )
     return points
@@ -136,7 +137,7 @@ def parse_lip_points(text: str) -> dict[str, LipPoint]:
 
 @lru_cache
 def lip_lines() -> dict[str, LipLine]:
-    """Return the four lines by their names."""
+    """Return the four lines by name."""
     return {name: _line(name) for name in LINES}
 
 
@@ -156,24 +157,17 @@ def _ferguson(x: list[float], y: list[float]) -> CubicSpline:
 
 
 def contour(openings: ArrayLike, num_points: int = 41) -> Array:
-    """Return the lips' contour.
-
-    Parameters
-    ----------
-    openings
-        R (num_frames,), 0 to 5.
-    num_points
-        Of each line, evenly spaced along x; at least 2.
+    """Return the lip contour for openings R (num_frames,), 0 to 5.
 
     Returns
     -------
-    Array
-        Points x, y in mouth widths, shape (num_frames, 4, num_points, 2), lines as ``LINES``.
+    Points x, y in mouth widths, shape (num_frames, 4, num_points, 2): lines as in ``LINES``, points
+    evenly spaced along x.
 
     Raises
     ------
     ValueError
-        If an opening is out of range, or there are too few points.
+        If an opening is out of range, or ``num_points`` is less than 2.
 
     Examples
     --------
@@ -182,7 +176,7 @@ def contour(openings: ArrayLike, num_points: int = 41) -> Array:
     """
     opening = _checked(openings)
     if num_points < 2:
-        raise ValueError(f"a line has at least 2 points, got {num_points}")
+        raise ValueError(f"num_points is {num_points}; give at least 2")
     points = np.empty((len(opening), len(LINES), num_points, 2))
     for row, line in enumerate(lip_lines().values()):
         x = np.linspace(*line.ends, num_points)
@@ -192,20 +186,9 @@ def contour(openings: ArrayLike, num_points: int = 41) -> Array:
 
 
 def faps_of(openings: ArrayLike) -> Array:
-    """Return the mouth's FAPs for openings.
+    """Return the mouth FAPs (num_frames, num_mouth_faps) for openings R (num_frames,), 0 to 5.
 
-    Jaw and lips' feature points travel as measured; the head's lips follow between them. FAPs that
-    do not move the mouth vertically are 0.
-
-    Parameters
-    ----------
-    openings
-        R (num_frames,), 0 to 5.
-
-    Returns
-    -------
-    Array
-        FAP units, shape (num_frames, num_mouth_faps), in the order of ``MOUTH_FAPS``.
+    Jaw and lip feature points travel as measured; the other FAPs are 0.
 
     Raises
     ------
@@ -223,5 +206,5 @@ def _checked(openings: ArrayLike) -> Array:
     if opening.ndim != 1:
         raise ValueError(f"expected openings of shape (num_frames,), got {opening.shape}")
     if not ((opening >= 0.0) & (opening <= MAX_OPENING)).all():
-        raise ValueError(f"an opening is between 0 and {MAX_OPENING:g}")
+        raise ValueError(f"openings must be between 0 and {MAX_OPENING:g}")
     return opening

@@ -1,7 +1,7 @@
-"""Draw the mouth in two dimensions: SVG text, or pictures.
+"""Draws the mouth in two dimensions, as SVG text or pictures.
 
-A drawing is a list of filled outlines and of labels, in pixels, y downwards. ``svg`` and
-``rasterize`` turn it into a file's text and into a picture.
+A drawing is a list of outlines and labels, in pixels, y downwards. ``svg`` and ``rasterize`` convert
+it to the text of a file and to a picture.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ _POINTS_OF_LINE = 61
 _UPPER_LIP, _LOWER_LIP, _SHINE = "#b5505a", "#c9626b", "#da8288"
 _INSIDE, _TEETH, _TONGUE = "#3a1418", "#f6f1e7", "#a84a52"
 _INK, _FAINT_INK, PAPER = "#222222", "#777777", "#ffffff"
-# mouth widths, from the inner corners: where the upper teeth end, the tongue at rest begins
+# lower edge of the upper teeth and position of the tongue, mouth widths from the inner corners
 _TEETH_EDGE, _TEETH_HALF_WIDTH, _TEETH_ROUNDNESS = -0.085, 0.30, 0.05
 _TONGUE_BELOW_TEETH, _TONGUE_HALF_WIDTH = 0.045, 0.27
 _LINE_PX_PER_WIDTH = 0.006
-# the box around a mouth at any opening, mouth widths
+# bounding box of a mouth at any opening, mouth widths
 WIDTH, HIGHEST, LOWEST = 1.16, 0.24, -0.44
-_ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # as Pillow calls them
-_FINER = 3  # pictures are drawn so much larger, then averaged
-# files of fonts with Chinese characters, on Linux, macOS and Windows
+_ANCHORS = {"start": "ls", "middle": "ms", "end": "rs"}  # Pillow's names
+_SUPERSAMPLING = 3
+# font files with Chinese characters on Linux, macOS and Windows
 _CHINESE_FONTS = (
     "NotoSansCJK-Regular.ttc",
     "NotoSansSC-Regular.otf",
@@ -50,11 +50,11 @@ _CHINESE_FONTS = (
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A filled polygon, or an open line if it has no fill."""
+    """A filled polygon, or an open line."""
 
     points: Array  # (num_points, 2), pixels
     color: str  # "#rrggbb"
-    line_px: float | None = None  # None: filled
+    line_px: float | None = None  # line width; None for a filled polygon
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +63,15 @@ class Label:
 
     text: str
     x: float  # pixels
-    y: float  # of its base line
+    y: float  # baseline
     size_px: float
     color: str = _INK
-    anchor: Literal["start", "middle", "end"] = "middle"  # what of the text is at x
+    anchor: Literal["start", "middle", "end"] = "middle"  # the part of the text at x
 
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """Outlines, in the order in which they cover each other, and labels."""
+    """Outlines, from back to front, and labels."""
 
     width_px: int
     height_px: int
@@ -87,22 +87,22 @@ def mouth(opening: float, center_px: tuple[float, float], width_px: float) -> li
     opening
         R, 0 to 5.
     center_px
-        Where the middle of the closed mouth is.
+        Center of the closed mouth.
     width_px
-        From corner to corner.
+        Distance of the corners.
     """
     outer_upper, inner_upper, inner_lower, outer_lower = contour([opening], _POINTS_OF_LINE)[0]
     x, top, bottom = inner_upper[:, 0], inner_upper[:, 1], inner_lower[:, 1]
-    # upper teeth hang from the skull: the lips uncover them
+    # the upper teeth do not move; the lips uncover them
     edge = _TEETH_EDGE + _TEETH_ROUNDNESS * ((x - 0.5) / _TEETH_HALF_WIDTH) ** 2
     teeth = np.clip(edge, bottom, top)
-    # the tongue lies behind the lower lip
+    # the tongue is behind the lower lip
     bow = 1.0 - ((x - 0.5) / _TONGUE_HALF_WIDTH) ** 2
     highest = max(0.0, _TEETH_EDGE - _TONGUE_BELOW_TEETH - float(bottom.min()))
     tongue = np.clip(bottom + 0.8 * highest * bow, bottom, top)
     near_teeth = np.abs(x - 0.5) < _TEETH_HALF_WIDTH + 0.03
     near_tongue = np.abs(x - 0.5) < _TONGUE_HALF_WIDTH
-    # light falls on the middle of the lower lip
+    # highlight in the middle of the lower lip
     of_lower = np.interp(x, outer_lower[:, 0], outer_lower[:, 1])
     share = 0.5 + 0.16 * (1.0 - ((x - 0.5) / 0.25) ** 2)
     on_lip = np.abs(x - 0.5) < 0.25
@@ -116,9 +116,9 @@ def mouth(opening: float, center_px: tuple[float, float], width_px: float) -> li
 
     everywhere = np.ones(len(x), dtype=bool)
     line_px = _LINE_PX_PER_WIDTH * width_px
-    lips = np.concatenate([outer_upper, outer_lower[::-1]])
-    parts = [
-        Outline(lips, _LOWER_LIP),
+    both_lips = np.concatenate([outer_upper, outer_lower[::-1]])
+    outlines = [
+        Outline(both_lips, _LOWER_LIP),
         Outline(np.concatenate([outer_upper, inner_upper[::-1]]), _UPPER_LIP),
         Outline(between(shine_high, shine_low, on_lip), _SHINE),
         Outline(between(top, bottom, everywhere), _INSIDE),
@@ -131,70 +131,63 @@ def mouth(opening: float, center_px: tuple[float, float], width_px: float) -> li
     def placed(points: Array) -> Array:
         return np.array(center_px) + (points - [0.5, 0.0]) * [width_px, -width_px]
 
-    return [Outline(placed(part.points), part.color, part.line_px) for part in parts]
+    return [Outline(placed(line.points), line.color, line.line_px) for line in outlines]
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
-    """A mouth to draw, with what is said."""
+class LabeledMouth:
+    """A mouth to draw, with its time and speech."""
 
     time_s: float
     opening: float  # R
     phone: str
-    syllable: str = ""  # that begins here
+    syllable: str = ""  # a syllable that starts here
 
 
-def strip(moments: Sequence[Moment], mouths_a_row: int, mouth_px: float) -> Drawing:
-    """Draw mouths in rows, each with its phone and its time, below the syllables.
+def strip(mouths: Sequence[LabeledMouth], max_columns: int, mouth_px: float) -> Drawing:
+    """Draw mouths in order of time, in rows, with syllables above, phones and times below.
 
-    Parameters
-    ----------
-    moments
-        In order of time.
-    mouths_a_row
-        At most.
-    mouth_px
-        Width of a mouth.
+    ``mouth_px`` is the width of a mouth.
     """
-    columns = max(1, min(mouths_a_row, len(moments)))
-    rows = -(-len(moments) // columns)
+    columns = max(1, min(max_columns, len(mouths)))
+    rows = -(-len(mouths) // columns)
     cell_px = WIDTH * mouth_px
     text_px = 0.115 * mouth_px
     mouth_height_px = (HIGHEST - LOWEST) * mouth_px
     row_px = mouth_height_px + 5.0 * text_px
     drawing = Drawing(round(columns * cell_px), round(rows * row_px + text_px))
-    for number, moment in enumerate(moments):
+    for number, labeled in enumerate(mouths):
         left, top = number % columns * cell_px, number // columns * row_px
         middle = left + 0.5 * cell_px
-        lips_top = top + 1.9 * text_px
-        if moment.syllable:
-            label = Label(moment.syllable, middle, top + 1.4 * text_px, 1.2 * text_px)
+        mouth_top = top + 1.9 * text_px
+        if labeled.syllable:
+            label = Label(labeled.syllable, middle, top + 1.4 * text_px, 1.2 * text_px)
             drawing.labels.append(label)
-        center = (middle, lips_top + HIGHEST * mouth_px)
-        drawing.outlines.extend(mouth(moment.opening, center, mouth_px))
-        below = lips_top + mouth_height_px
-        drawing.labels.append(Label(moment.phone, middle, below + 1.1 * text_px, text_px))
-        time = f"{moment.time_s:.2f} s"
+        center = (middle, mouth_top + HIGHEST * mouth_px)
+        drawing.outlines.extend(mouth(labeled.opening, center, mouth_px))
+        below = mouth_top + mouth_height_px
+        drawing.labels.append(Label(labeled.phone, middle, below + 1.1 * text_px, text_px))
+        time = f"{labeled.time_s:.2f} s"
         drawing.labels.append(
             Label(time, middle, below + 2.3 * text_px, 0.85 * text_px, _FAINT_INK)
         )
     return drawing
 
 
-def image(moment: Moment, width_px: int, height_px: int) -> Drawing:
-    """Draw one mouth that fills a picture, with its time and what is said."""
+def image(labeled: LabeledMouth, width_px: int, height_px: int) -> Drawing:
+    """Draw one mouth that fills a picture, with its time and speech."""
     drawing = Drawing(width_px, height_px)
     text_px = 0.06 * height_px
     mouth_px = min(width_px / WIDTH, (height_px - 3.0 * text_px) / (HIGHEST - LOWEST))
     center = (0.5 * width_px, 0.5 * text_px + HIGHEST * mouth_px)
-    drawing.outlines.extend(mouth(moment.opening, center, mouth_px))
+    drawing.outlines.extend(mouth(labeled.opening, center, mouth_px))
     below = height_px - text_px
     drawing.labels.append(
-        Label(f"{moment.time_s:.2f} s", text_px, below, text_px, _FAINT_INK, "start")
+        Label(f"{labeled.time_s:.2f} s", text_px, below, text_px, _FAINT_INK, "start")
     )
-    drawing.labels.append(Label(moment.syllable, 0.5 * width_px, below, 1.4 * text_px))
+    drawing.labels.append(Label(labeled.syllable, 0.5 * width_px, below, 1.4 * text_px))
     drawing.labels.append(
-        Label(moment.phone, width_px - text_px, below, text_px, _FAINT_INK, "end")
+        Label(labeled.phone, width_px - text_px, below, text_px, _FAINT_INK, "end")
     )
     return drawing
 
@@ -227,13 +220,13 @@ def svg(drawing: Drawing) -> str:
 
 
 def can_draw(text: str) -> bool:
-    """Whether ``rasterize`` has a font for a text."""
+    """Return whether ``rasterize`` has a font for a text."""
     return text.isascii() or _chinese_font(1.0) is not None
 
 
 @lru_cache
 def _chinese_font(size_px: float) -> ImageFont.FreeTypeFont | None:
-    """Return the first of ``_CHINESE_FONTS`` that is installed; None if there is none."""
+    """Return the first installed font of ``_CHINESE_FONTS``, or None."""
     for name in _CHINESE_FONTS:
         try:
             return ImageFont.truetype(name, size_px)
@@ -249,21 +242,21 @@ def _font(text: str, size_px: float) -> ImageFont.FreeTypeFont | ImageFont.Image
 
 def rasterize(drawing: Drawing) -> UInt8:
     """Return a drawing as a picture (height_px, width_px, 3), sRGB."""
-    fine = Image.new("RGB", (drawing.width_px * _FINER, drawing.height_px * _FINER), PAPER)
+    fine = Image.new("RGB", (drawing.width_px * _SUPERSAMPLING, drawing.height_px * _SUPERSAMPLING), PAPER)
     pen = ImageDraw.Draw(fine)
     for outline in drawing.outlines:
-        points = [(x * _FINER, y * _FINER) for x, y in outline.points.tolist()]
+        points = [(x * _SUPERSAMPLING, y * _SUPERSAMPLING) for x, y in outline.points.tolist()]
         if len(points) < 2:
             continue
         if outline.line_px is None:
             pen.polygon(points, fill=outline.color)
         else:
-            width = max(1, round(outline.line_px * _FINER))
+            width = max(1, round(outline.line_px * _SUPERSAMPLING))
             pen.line(points, fill=outline.color, width=width, joint="curve")
     for label in drawing.labels:
-        font = _font(label.text, max(label.size_px * _FINER, 1.0))
+        font = _font(label.text, max(label.size_px * _SUPERSAMPLING, 1.0))
         pen.text(
-            (label.x * _FINER, label.y * _FINER),
+            (label.x * _SUPERSAMPLING, label.y * _SUPERSAMPLING),
             label.text,
             label.color,
             font,

@@ -1,15 +1,15 @@
-"""The table of this lip model: what is usual of each phone.
+"""The table of this lip model: typical values of each phone.
 
-One file for each language stands beside this one, ``mandarin.tsv``; ``kouxing train ferguson``
-makes it, and its first lines say from what.
+Each language has one file in this package, such as ``mandarin.tsv``. ``kouxing train ferguson``
+writes it, and its first lines name the training data.
 
 =============== ===================================================================================
 column          meaning
 =============== ===================================================================================
 phone           symbol; each of the language's phones once
 opening         R, 0 (closed) to 5; 0 for silence
-duration_s      usual length, seconds
-crossings       greatest zero-crossing rate, 0 to 1, where a syllable begins with the phone
+duration_s      typical duration, seconds
+crossings       maximum zero-crossing rate, 0 to 1, at the start of a syllable with this phone
 level           vowels: level of influence, 1 (strongest) to 4; else empty
 influence       vowels: influence factor D of the level, 0 to 1; else empty
 =============== ===================================================================================
@@ -22,21 +22,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 
-from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.inventory import PhoneInventory
 
+MAX_OPENING = 5.0
 COLUMNS = ("phone", "opening", "duration_s", "crossings", "level", "influence")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhoneTable:
-    """What is usual of each phone, by its symbol."""
+    """Typical values by phone symbol."""
 
     opening: Mapping[str, float]  # R, 0 to 5
     duration_s: Mapping[str, float]
-    crossings: Mapping[str, float]  # where a syllable begins
-    level: Mapping[str, int]  # of influence, 1 to 4, of each vowel
+    crossings: Mapping[str, float]  # at the start of a syllable
+    level: Mapping[str, int]  # level of influence of each vowel, 1 to 4
     influence: Mapping[str, float]  # D of each vowel
 
 
@@ -46,14 +46,14 @@ def load_table(inventory: PhoneInventory) -> PhoneTable:
     Raises
     ------
     UserError
-        If there is none, or it is damaged.
+        If the language has no table, or the table is damaged.
     """
     file = (
         resources.files("kouxing.services.synthesizer.lips.ferguson") / f"{inventory.language}.tsv"
     )
     if not file.is_file():
         raise UserError(
-            f"the ferguson lips have no table for {inventory.language}; choose another lip model"
+            f"the lip model ferguson has no table for {inventory.language}; use another lip model"
         )
     return parse_table(file.read_text("utf-8"), inventory)
 
@@ -64,7 +64,7 @@ def parse_table(text: str, inventory: PhoneInventory) -> PhoneTable:
     Raises
     ------
     UserError
-        If phones are missing, or a value is no number or out of range.
+        If phones are missing, or a value is invalid or out of range.
     """
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     rows = {row["phone"]: row for row in csv.DictReader(lines, delimiter="\t") if "phone" in row}
@@ -79,19 +79,20 @@ def parse_table(text: str, inventory: PhoneInventory) -> PhoneTable:
             },
         )
     except (KeyError, ValueError, TypeError) as error:
-        raise UserError(f"the table of the ferguson lips is damaged: {error}") from None
-    is_right = (
-        all(0.0 <= one <= MAX_OPENING for one in table.opening.values())
-        and all(0.0 < one < 10.0 for one in table.duration_s.values())
-        and all(0.0 <= one <= 1.0 for one in (*table.crossings.values(), *table.influence.values()))
+        raise UserError(f"the table of the lip model ferguson is damaged: {error}") from None
+    shares = (*table.crossings.values(), *table.influence.values())
+    is_valid = (
+        all(0.0 <= opening <= MAX_OPENING for opening in table.opening.values())
+        and all(0.0 < duration_s < 10.0 for duration_s in table.duration_s.values())
+        and all(0.0 <= share <= 1.0 for share in shares)
     )
-    if not is_right:
-        raise UserError("the table of the ferguson lips is damaged: a value is out of range")
+    if not is_valid:
+        raise UserError("the table of the lip model ferguson is damaged: a value is out of range")
     return table
 
 
 def format_table(table: PhoneTable, inventory: PhoneInventory, about: list[str]) -> str:
-    """Write a table as text, below lines that say how it was made."""
+    """Return a table as text, after comment lines about its origin."""
     rows = [
         (
             phone,

@@ -1,14 +1,14 @@
-"""When each phone of a known text is spoken, from the pieces of its sound.
+"""Times of the phones of a known text, from the segments of its recording.
 
-Source: Zhang et al. 2021, section 5, eq. 5 (*reconstructed*): in a syllable that begins at T_x and
-lasts T_l, phone n begins at T_n = T_x + D T_l. D, the influence factor, has four levels; finals of
-a higher level take in more of the consonant before them.
+Source: Zhang et al. 2021, section 5, eq. 5 (*reconstructed*): in a syllable that starts at T_x and
+lasts T_l, phone n starts at T_n = T_x + D T_l. The influence factor D has four levels; finals of a
+higher level overlap more of the preceding consonant.
 
-The paper has one piece for each syllable. Energy and zero crossings do not find exactly those, so
-syllables are assigned to pieces first: a piece may hold several syllables, several pieces may make
-one, and a piece may be none, a breath or a noise. Dynamic programming finds the assignment that
-costs least: by the syllables' usual lengths, at the rate of the whole recording, and by whether it
-hisses where a syllable begins with s, and does not where one begins with m.
+The paper has one segment per syllable. Energy and zero crossings do not find exactly these, so
+syllables are first assigned to segments. A segment may contain several syllables, several segments
+may form one syllable, and a segment may be a breath or noise. Dynamic programming finds the cheapest
+assignment. Costs depend on the syllables' typical durations, at the rate of the whole recording, and
+on whether zero crossings match the first consonant of each syllable.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.ferguson.endpoints import SLICE_S, Piece, pieces_of
+from kouxing.services.synthesizer.lips.ferguson.endpoints import SLICE_S, Segment, segment_speech
 from kouxing.services.synthesizer.lips.ferguson.table import PhoneTable
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress
@@ -28,38 +28,33 @@ from kouxing.shared.phones.inventory import Syllable
 
 Array = NDArray[np.float64]
 
-# Chosen on recordings of the training split, by the error of the syllables' onsets.
-_LENGTH_SPREAD = 0.5  # standard deviation of a syllable's length, in natural logarithms
-_HISS_SPREAD = 0.12  # standard deviation of the zero-crossing rate where a syllable begins
-_MAX_COST_OF_HISS = 8.0
-_COST_OF_SPLIT = 1.0  # of each boundary that no piece shows
-_COST_OF_MERGE = 2.0  # of each boundary within a syllable
-_COST_OF_PAUSE_S = 0.05  # a pause within a syllable costs 1 for each of these
-_COST_OF_NOISE = 2.0  # of a piece that is no speech, and 1 for each of these
-_COST_OF_NOISE_S = 0.1
+# Chosen on recordings of the training split, by the error of syllable onsets.
+_DURATION_SD = 0.5  # standard deviation of a syllable's log duration
+_HISS_SD = 0.12  # standard deviation of the zero-crossing rate at a syllable onset
+_MAX_HISS_COST = 8.0
+_SPLIT_COST = 1.0  # per syllable boundary within a segment
+_MERGE_COST = 2.0  # per segment boundary within a syllable
+_PAUSE_COST_S = 0.05  # pause duration within a syllable that costs 1
+_NOISE_COST = 2.0  # of a segment without speech
+_NOISE_COST_S = 0.1  # noise duration that costs 1 more
 _MAX_MERGED = 4
-_ONSET_SLICES = 7  # in which a consonant hisses
+_ONSET_SLICES = 7  # duration of a hissing consonant
 MAX_SYLLABLES = 5000
 
 
 def time_text(
     slices: Sequence[Progress], syllables: Sequence[Syllable], table: PhoneTable
 ) -> list[Phone]:
-    """Find when each phone of a text is spoken.
+    """Return the phones of a text with their times; gaps between them are pauses.
 
     Parameters
     ----------
     slices
-        The sound, from its beginning to its end.
+        The whole recording.
     syllables
-        Of the text, in order.
+        Syllables of the text, in order.
     table
-        Usual lengths and zero crossings of the phones, and influence factors.
-
-    Returns
-    -------
-    list of Phone
-        All phones in order; holes between them are pauses.
+        Typical durations and zero crossings of the phones, and influence factors.
 
     Raises
     ------
@@ -67,7 +62,7 @@ def time_text(
         If there is no speech, no text, or too much text.
     """
     if not syllables:
-        raise UserError("the text is empty; give the words that are spoken")
+        raise UserError("the text is empty; give the spoken words")
     if len(syllables) > MAX_SYLLABLES:
         raise UserError(
             f"the text has {len(syllables)} syllables; give at most {MAX_SYLLABLES} at once"
@@ -94,10 +89,10 @@ def time_text(
 def phone_onsets(
     syllable: Syllable, start_s: float, end_s: float, table: PhoneTable
 ) -> list[float]:
-    """Return when the phones of a syllable begin, seconds (eq. 5).
+    """Return the onsets of the phones of a syllable, seconds (eq. 5).
 
-    An initial is followed by its final by the final's influence factor; a further phone (r-colour)
-    takes its usual share of the rest.
+    The final follows its initial by its influence factor. A third phone (r-coloring) gets its typical
+    share of the remaining time.
     """
     onsets_s = [start_s]
     rest = list(syllable)
@@ -105,38 +100,33 @@ def phone_onsets(
         start_s += table.influence[rest[1]] * (end_s - start_s)  # Zhang 2021, eq. 5
         onsets_s.append(start_s)
         rest = rest[1:]
-    lengths_s = np.cumsum([table.duration_s[phone] for phone in rest])
-    onsets_s += [start_s + (end_s - start_s) * one / lengths_s[-1] for one in lengths_s[:-1]]
+    ends_s = np.cumsum([table.duration_s[phone] for phone in rest])
+    onsets_s += [start_s + (end_s - start_s) * time_s / ends_s[-1] for time_s in ends_s[:-1]]
     return [float(onset_s) for onset_s in onsets_s]
 
 
 def syllable_times(
     slices: Sequence[Progress], syllables: Sequence[Syllable], table: PhoneTable
 ) -> Array:
-    """Assign syllables to pieces of the sound.
-
-    Returns
-    -------
-    array (num_syllables, 2)
-        Start and end of each syllable, seconds.
+    """Return start and end of each syllable (num_syllables, 2), seconds.
 
     Raises
     ------
     UserError
         If there is no speech.
     """
-    pieces = pieces_of(slices)
-    if not pieces:
-        raise UserError("no speech was found; check that text and recording belong together")
+    segments = segment_speech(slices)
+    if not segments:
+        raise UserError("found no speech; check that text and recording belong together")
     text = _Text(
-        usual_s=np.array([sum(table.duration_s[phone] for phone in one) for one in syllables]),
-        crossings=np.array([table.crossings[one[0]] for one in syllables]),
+        duration_s=np.array([sum(table.duration_s[phone] for phone in phones) for phones in syllables]),
+        crossings=np.array([table.crossings[phones[0]] for phones in syllables]),
     )
     times_s = np.zeros((len(syllables), 2))
-    for group in _cheapest_assignment(pieces, text, Hiss(slices)):
-        start_s, end_s = pieces[group.first_piece].start_s, pieces[group.last_piece].end_s
-        usual_s = text.usual_s[group.syllables]
-        share = np.concatenate([[0.0], np.cumsum(usual_s) / usual_s.sum()])
+    for group in _cheapest_assignment(segments, text, Hiss(slices)):
+        start_s, end_s = segments[group.first_segment].start_s, segments[group.last_segment].end_s
+        duration_s = text.duration_s[group.syllables]
+        share = np.concatenate([[0.0], np.cumsum(duration_s) / duration_s.sum()])
         edges_s = start_s + (end_s - start_s) * share
         times_s[group.syllables] = np.stack([edges_s[:-1], edges_s[1:]], axis=1)
     return times_s
@@ -144,98 +134,93 @@ def syllable_times(
 
 @dataclass(frozen=True, slots=True)
 class _Text:
-    """What is usual of each syllable."""
+    """Typical values of each syllable."""
 
-    usual_s: Array  # (num_syllables,) length
-    crossings: Array  # (num_syllables,) greatest zero-crossing rate where it begins
+    duration_s: Array  # (num_syllables,)
+    crossings: Array  # (num_syllables,) maximum zero-crossing rate at the onset
 
 
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """Syllables and pieces that belong together; one piece or one syllable."""
+    """Segments and syllables that belong together: one segment or one syllable."""
 
-    first_piece: int
-    last_piece: int
+    first_segment: int
+    last_segment: int
     syllables: slice
 
 
 class Hiss:
-    """The greatest zero-crossing rate within a consonant's length of any time.
-
-    Parameters
-    ----------
-    slices
-        The sound; at least one.
-    """
+    """The maximum zero-crossing rate within a consonant's duration after any time."""
 
     def __init__(self, slices: Sequence[Progress]) -> None:
         self._start_s = slices[0].time_s - SLICE_S
-        rate = np.array([one.zero_crossing_rate for one in slices])
+        rate = np.array([slice_.zero_crossing_rate for slice_ in slices])
         smooth = 0.5 * (rate + np.concatenate([rate[:1], rate[:-1]]))
         ahead = np.pad(smooth, (0, _ONSET_SLICES - 1), mode="edge")
-        self._greatest = np.lib.stride_tricks.sliding_window_view(ahead, _ONSET_SLICES).max(axis=1)
+        self._maximum = np.lib.stride_tricks.sliding_window_view(ahead, _ONSET_SLICES).max(axis=1)
 
     def at(self, times_s: Array) -> Array:
-        """Return the rate of a consonant that begins at each of some times, 0 to 1."""
+        """Return the rate, 0 to 1, of a consonant that starts at each time."""
         slices = np.rint((times_s - self._start_s) / SLICE_S).astype(np.intp)
-        greatest: Array = self._greatest[np.clip(slices, 0, len(self._greatest) - 1)]
-        return greatest
+        maximum: Array = self._maximum[np.clip(slices, 0, len(self._maximum) - 1)]
+        return maximum
 
 
-def _cheapest_assignment(pieces: Sequence[Piece], text: _Text, hiss: Hiss) -> list[_Group]:
-    """Assign every syllable; cost[p, s] is that of the first p pieces and s syllables."""
-    num_pieces, num_syllables = len(pieces), len(text.usual_s)
-    until_s = np.concatenate([[0.0], np.cumsum(text.usual_s)])
-    rate = sum(piece.end_s - piece.start_s for piece in pieces) / until_s[-1]
-    max_split = min(num_syllables, 4 + 2 * -(-num_syllables // num_pieces))
-    cost = np.full((num_pieces + 1, num_syllables + 1), np.inf)
-    cost[0, 0] = 0.0
-    taken = np.zeros((num_pieces + 1, num_syllables + 1, 2), dtype=np.int16)
+def _cheapest_assignment(segments: Sequence[Segment], text: _Text, hiss: Hiss) -> list[_Group]:
+    """Assign every syllable; total_cost[n, s] is for the first n segments and s syllables."""
+    num_segments, num_syllables = len(segments), len(text.duration_s)
+    until_s = np.concatenate([[0.0], np.cumsum(text.duration_s)])
+    rate = sum(segment.end_s - segment.start_s for segment in segments) / until_s[-1]
+    max_split = min(num_syllables, 4 + 2 * -(-num_syllables // num_segments))
+    total_cost = np.full((num_segments + 1, num_syllables + 1), np.inf)
+    total_cost[0, 0] = 0.0
+    best = np.zeros((num_segments + 1, num_syllables + 1, 2), dtype=np.int16)
 
-    def offer(row: int, merged: int, num: int, price: Array | float) -> None:
-        """Offer to end any ``num`` syllables with piece ``row``, begun ``merged`` before."""
-        total = cost[row - merged, : num_syllables + 1 - num] + price
-        is_better = total < cost[row, num:]
-        cost[row, num:][is_better] = total[is_better]
-        taken[row, num:][is_better] = merged, num
+    def consider(row: int, merged: int, num: int, cost: Array | float) -> None:
+        """Consider ending any ``num`` syllables with segment ``row``, the last of ``merged``."""
+        total = total_cost[row - merged, : num_syllables + 1 - num] + cost
+        is_better = total < total_cost[row, num:]
+        total_cost[row, num:][is_better] = total[is_better]
+        best[row, num:][is_better] = merged, num
 
-    def hiss_price(times_s: Array, first: int, num: int) -> Array:
-        """Price that syllable ``first`` of any ``num`` begins at each of some times."""
-        usual = text.crossings[first : num_syllables + 1 - num + first]
-        misfit = 0.5 * ((hiss.at(times_s) - usual) / _HISS_SPREAD) ** 2
-        return np.minimum(misfit, _MAX_COST_OF_HISS)
+    def hiss_cost(times_s: Array, first: int, num: int) -> Array:
+        """Return the cost of onsets of the ``first``-th of ``num`` syllables at some times."""
+        typical = text.crossings[first : num_syllables + 1 - num + first]
+        misfit = 0.5 * ((hiss.at(times_s) - typical) / _HISS_SD) ** 2
+        return np.minimum(misfit, _MAX_HISS_COST)
 
-    for row in range(1, num_pieces + 1):
-        start_s, length_s = pieces[row - 1].start_s, pieces[row - 1].end_s - pieces[row - 1].start_s
-        offer(row, 1, 0, _COST_OF_NOISE + length_s / _COST_OF_NOISE_S)
+    for row in range(1, num_segments + 1):
+        start_s = segments[row - 1].start_s
+        length_s = segments[row - 1].end_s - start_s
+        consider(row, 1, 0, _NOISE_COST + length_s / _NOISE_COST_S)
         for num in range(1, max_split + 1):
-            usual_s = until_s[num:] - until_s[:-num]
-            price = num * _misfit(length_s / (rate * usual_s)) + _COST_OF_SPLIT * (num - 1)
+            typical_s = until_s[num:] - until_s[:-num]
+            cost = num * _misfit(length_s / (rate * typical_s)) + _SPLIT_COST * (num - 1)
             for first in range(num):
-                before_s = until_s[first : first + len(usual_s)] - until_s[: len(usual_s)]
-                price += hiss_price(start_s + length_s * before_s / usual_s, first, num)
-            offer(row, 1, num, price)
+                before_s = until_s[first : first + len(typical_s)] - until_s[: len(typical_s)]
+                cost += hiss_cost(start_s + length_s * before_s / typical_s, first, num)
+            consider(row, 1, num, cost)
         for merged in range(2, min(_MAX_MERGED, row) + 1):
-            group = pieces[row - merged : row]
-            pause_s = sum(after.start_s - one.end_s for one, after in pairwise(group))
-            lasting_s = group[-1].end_s - group[0].start_s
-            price = _misfit(lasting_s / (rate * text.usual_s)) + _COST_OF_MERGE * (merged - 1)
-            price += hiss_price(np.full(num_syllables, group[0].start_s), 0, 1)
-            offer(row, merged, 1, price + pause_s / _COST_OF_PAUSE_S)
-    return _trace_back(taken)
+            group = segments[row - merged : row]
+            pause_s = sum(after.start_s - before.end_s for before, after in pairwise(group))
+            group_s = group[-1].end_s - group[0].start_s
+            cost = _misfit(group_s / (rate * text.duration_s)) + _MERGE_COST * (merged - 1)
+            cost += hiss_cost(np.full(num_syllables, group[0].start_s), 0, 1)
+            consider(row, merged, 1, cost + pause_s / _PAUSE_COST_S)
+    return _trace_back(best)
 
 
 def _misfit(ratio: Array) -> Array:
-    """Cost of a length, relative to the usual one."""
-    misfit: Array = 0.5 * (np.log(ratio) / _LENGTH_SPREAD) ** 2
+    """Return the cost of a duration relative to the typical one."""
+    misfit: Array = 0.5 * (np.log(ratio) / _DURATION_SD) ** 2
     return misfit
 
 
-def _trace_back(taken: NDArray[np.int16]) -> list[_Group]:
-    row, column = taken.shape[0] - 1, taken.shape[1] - 1
+def _trace_back(best: NDArray[np.int16]) -> list[_Group]:
+    row, column = best.shape[0] - 1, best.shape[1] - 1
     groups = []
     while row:
-        merged, num = (int(one) for one in taken[row, column])
+        merged, num = (int(value) for value in best[row, column])
         if num:
             groups.append(_Group(row - merged, row - 1, slice(column - num, column)))
         row, column = row - merged, column - num

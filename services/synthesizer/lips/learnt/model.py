@@ -1,18 +1,18 @@
-"""Learnt lips live: lip frames and phones in, mouth FAPs out.
+"""Live learnt lips: predicted lip frames and phones in, mouth FAPs out.
 
-    lip frames -> steady -> closures -> track -> transition
+    lip frames -> stabilize -> closures -> lip track -> transition
     phones -> dynamic visemes -> tongue
 
-The recognizer makes lip frames of the sound itself (``LipFrame``), 50 a second while somebody
-speaks. Trembling is steadied: a change fades the more, the smaller it is. Closures are decided with
-the recognised phones (`closures`); each lasts for two lip frames at least, so that none flutters.
-What no camera tracks, tongue and jaw thrust, comes from the dynamic visemes. The sound tells how
-far the mouth opens, so no amplitude is applied.
+The recognizer predicts lip frames from the audio (``LipFrame``), 50 per second during speech. Small
+changes are reduced, because they are jitter. Recognized phones take part in the decision about
+closures (`closures`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which cameras
+do not track, come from the dynamic visemes. The lip frames already contain the effect of loudness, so
+the amplitude modifier is off.
 
-A lip frame is shaped once, when its face is due, by what is known then; none waits for the next.
-Where frames are late, a *transition* leads the mouth to them, continuous in position and velocity.
-After the last lip frame the mouth goes to rest within 150 ms. As long as a recognizer has sent no
-lip frame at all, the dynamic visemes move the whole mouth.
+A lip frame is processed once, when its FAP frame is due, without waiting for the next lip frame. If
+lip frames are late, a *transition* keeps the mouth continuous in position and velocity. After the
+last lip frame the mouth moves to rest within 150 ms. Until the first lip frame arrives, the dynamic
+visemes move the whole mouth.
 """
 
 from __future__ import annotations
@@ -25,52 +25,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import NUM_MOUTH_FAPS
-from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import (
-    NO_TRANSITION,
-    Motion,
-    Rest,
-    Transition,
-    motionless,
-)
 from kouxing.services.synthesizer.lips.learnt.closures import (
     ClosingPhones,
     ClosureRule,
     close_lips,
     lip_to_teeth,
     log_odds_of,
-    part_lips,
+    separate_lips,
     shut_share,
 )
 from kouxing.services.synthesizer.lips.learnt.track import HOLD_S, MAX_GAP_S, LipTrack
 from kouxing.services.synthesizer.lips.lip_model import Articulation, MouthFrame
-from kouxing.shared.face.faps import MOUTH_FAPS
+from kouxing.services.synthesizer.lips.trajectory import (
+    NO_TRANSITION,
+    FapState,
+    RestTransition,
+    Transition,
+    still,
+)
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, SoundEvent, SpeechChange
 
 Array = NDArray[np.float64]
 
 _UNTRACKED_FAPS = (14, 44, 45, 46, 47)  # jaw thrust and tongue
-_TRANSITION_S = 0.04  # from one track to the next
-_SLOW_TRANSITION_S = 0.14  # to rest after an interruption, and back from rest
-_REST_S = 0.15  # to rest when no sound comes
-_FLUSHED_S = 0.3  # of sound, whose lip frames may still be on their way after an interruption
+_TRANSITION_S = 0.04  # duration of the change to a new track
+_SLOW_TRANSITION_S = 0.14  # the same after an interruption, and from rest
+_REST_S = 0.15  # duration of the way to rest without sound
+_FLUSHED_S = 0.3  # audio whose lip frames may arrive after an interruption
 _MEMORY_S = 0.5
-_TEETH_LOG_ODDS = 1.0  # that a phone f needs: the sound tells lip to teeth too badly
-_SHUT_SHARE = 0.5  # of the way to a closure, from which on lips count as shut
-_TREMBLING = 10.0  # FAP units: changes of this size are halved, smaller ones fade, larger ones stay
-_MAX_FAP = 4000.0  # FAP units; more is no mouth
-_SAME = 1e-6  # FAP units, and FAP units per second
+_TEETH_LOG_ODDS = 1.0  # threshold for a phone f
+_SHUT_SHARE = 0.5  # lips count as closed from this share of the way to a closure
+_JITTER = 10.0  # FAP units: changes of this size are halved, smaller changes are reduced further
+_MAX_FAP = 4000.0  # FAP units; larger values are invalid
+_EPSILON = 1e-6  # FAP units, and FAP units per second
 
-_WIDTH_FAPS = (6, 7, 53, 54)  # of the mouth's corners, which move a third as far
+_WIDTH_FAPS = (6, 7, 53, 54)  # mouth corners, which move a third as far
 _UNTRACKED = [MOUTH_FAPS.index(fap) for fap in _UNTRACKED_FAPS]
-_TREMBLING_POWER = np.array(
-    [(_TREMBLING / 3.0 if fap in _WIDTH_FAPS else _TREMBLING) ** 2 for fap in MOUTH_FAPS]
+_JITTER_SQUARED = np.array(
+    [(_JITTER / 3.0 if fap in _WIDTH_FAPS else _JITTER) ** 2 for fap in MOUTH_FAPS]
 )
 
 
 @dataclass(frozen=True, slots=True)
 class LearntLips:
-    """Lips from sound, with the tongue of the dynamic visemes."""
+    """The lip model that uses predicted lip frames, with the tongue of the dynamic visemes."""
 
     amplitude_applies: ClassVar[bool] = False
 
@@ -85,7 +84,7 @@ class LearntLips:
 
 
 class LearntStream:
-    """One session of learnt lips; implements ``LipStream``."""
+    """A session of learnt lips; implements ``LipStream``."""
 
     def __init__(
         self,
@@ -103,118 +102,118 @@ class LearntStream:
         self._bilabials, self._labiodentals = (
             ClosingPhones(visemes.inventory, viseme, rule) for viseme in ("b", "f")
         )
-        self._waiting: deque[LipFrame] = deque()  # not yet due
+        self._queue: deque[LipFrame] = deque()  # not due yet
         self._newest_s = -np.inf  # time of the newest lip frame
-        self._steady = self._neutral  # the last lip frame, steadied
-        self._shares = (0.0, 0.0)  # how far the last two lip frames are shut
-        self._has_lips = False  # a lip frame has come
+        self._stable = self._neutral  # the last lip frame, stabilized
+        self._shares = (0.0, 0.0)  # closure shares of the last two lip frames
+        self._has_lip_frames = False
         self._is_speaking = False
-        self._deaf_until_s = -np.inf  # lip frames of the sound up to here were interrupted
-        self._known_s = start_s  # the newest lip frame knew the sound up to here
+        self._flushed_until_s = -np.inf  # ignore lip frames of the audio up to here
+        self._known_s = start_s  # the newest lip frame depends on the audio up to here
         self._track = LipTrack(self._neutral)
         self._transition, self._transition_start_s = NO_TRANSITION, start_s
-        self._rest: Rest | None = None  # while media time stands still
-        self._late_s = 0.0  # by which the newest lip frame came after its face was due
+        self._rest: RestTransition | None = None  # while media time stands still
+        self._late_s = 0.0  # lateness of the newest lip frame
         self._time_s = start_s  # of the last frame
-        self._mouth = motionless(self._neutral)
+        self._mouth = still(self._neutral)
         self._tongue = self._neutral
 
-    def accept(self, event: SoundEvent) -> None:
-        """Take a lip frame, a phone, a revision, or a change of voice activity."""
-        self._visemes.accept(event)
+    def add_event(self, event: SoundEvent) -> None:
+        """Add a lip frame, a phone, a revision, or a change of voice activity."""
+        self._visemes.add_event(event)
         match event:
             case LipFrame():
-                self._accept_lips(event)
+                self._add_lip_frame(event)
             case Phone():
                 for phones in (self._bilabials, self._labiodentals):
-                    phones.accept(event, self._time_s)
+                    phones.add(event, self._time_s)
             case SpeechChange():
-                self._deaf_until_s = -np.inf
+                self._flushed_until_s = -np.inf
                 self._is_speaking = event.active
 
-    def _accept_lips(self, frame: LipFrame) -> None:
+    def _add_lip_frame(self, frame: LipFrame) -> None:
         numbers = (frame.time_s, frame.delay_s, frame.closure)
-        is_mouth = np.isfinite(numbers).all() and (np.abs(frame.faps) < _MAX_FAP).all()
+        is_valid = np.isfinite(numbers).all() and (np.abs(frame.faps) < _MAX_FAP).all()
         is_new = frame.time_s > self._newest_s
-        if not is_mouth or not is_new or frame.time_s + frame.delay_s <= self._deaf_until_s:
+        if not is_valid or not is_new or frame.time_s + frame.delay_s <= self._flushed_until_s:
             return
-        self._waiting.append(frame)
+        self._queue.append(frame)
         self._newest_s = frame.time_s
         self._known_s = frame.time_s + frame.delay_s
-        self._has_lips = True
+        self._has_lip_frames = True
 
     def flush(self) -> None:
-        """Drop what is known and return to rest within 150 ms."""
+        """Drop the known events and return to rest within 150 ms."""
         self._visemes.flush()
-        self._waiting.clear()
+        self._queue.clear()
         for phones in (self._bilabials, self._labiodentals):
             phones.clear()
         self._track = LipTrack(self._neutral)
-        self._deaf_until_s = self._known_s + _FLUSHED_S
-        self._lead_to(motionless(self._neutral), _SLOW_TRANSITION_S)
+        self._flushed_until_s = self._known_s + _FLUSHED_S
+        self._start_transition(still(self._neutral), _SLOW_TRANSITION_S)
 
     def frame_at(self, time_s: float) -> MouthFrame:
         """Return the mouth at a media time, seconds; times rise."""
-        spoken = self._visemes.frame_at(time_s)
-        self._tongue = spoken.faps
-        if self._has_lips:
+        visemes = self._visemes.frame_at(time_s)
+        self._tongue = visemes.faps
+        if self._has_lip_frames:
             self._follow_track(time_s)
         else:
             step_s = max(time_s - self._time_s, 1e-3)
-            self._mouth = Motion(spoken.faps, (spoken.faps - self._mouth.value) / step_s)
+            self._mouth = FapState(visemes.faps, (visemes.faps - self._mouth.value) / step_s)
             self._rest = None
         self._time_s = time_s
-        return self._frame(spoken.articulation)
+        return self._frame(visemes.articulation)
 
     def relax(self, step_s: float) -> MouthFrame:
-        """Lead the mouth to rest by one more step; media time stands still."""
-        spoken = self._visemes.relax(step_s)
-        self._tongue = spoken.faps
+        """Return the mouth one step closer to rest."""
+        visemes = self._visemes.relax(step_s)
+        self._tongue = visemes.faps
         if self._rest is None:
-            self._rest = Rest(self._mouth, self._neutral, _REST_S)
+            self._rest = RestTransition(self._mouth, self._neutral, _REST_S)
         self._mouth = self._rest.step(step_s)
-        return self._frame(spoken.articulation)
+        return self._frame(visemes.articulation)
 
     def _follow_track(self, time_s: float) -> None:
         before = self._track.at(self._time_s)
         self._extend_track(time_s)
         now = self._track.at(self._time_s)
         if self._rest is not None:
-            self._lead_to(now, _SLOW_TRANSITION_S)
+            self._start_transition(now, _SLOW_TRANSITION_S)
         elif _differs(before, now):
-            self._lead_to(now, _TRANSITION_S)
-        left = self._transition.at(time_s - self._transition_start_s)
-        self._mouth = self._track.at(time_s) + left
+            self._start_transition(now, _TRANSITION_S)
+        difference = self._transition.at(time_s - self._transition_start_s)
+        self._mouth = self._track.at(time_s) + difference
 
-    def _lead_to(self, target: Motion, duration_s: float) -> None:
-        """Lead the mouth from where it is to another motion."""
+    def _start_transition(self, target: FapState, duration_s: float) -> None:
+        """Start a transition from the current mouth to a target."""
         self._transition = Transition(self._mouth - target, np.full(NUM_MOUTH_FAPS, duration_s))
         self._transition_start_s = self._time_s
         self._rest = None
 
     def _extend_track(self, time_s: float) -> None:
-        """Let the track reach a time, as far as lip frames have come."""
+        """Extend the track to a time, if enough lip frames have arrived."""
         self._track.forget_before(self._time_s)
         for phones in (self._bilabials, self._labiodentals):
             phones.forget_before(time_s - _MEMORY_S)
-        while self._waiting and self._track.end_s < time_s:
-            frame = self._waiting.popleft()
-            self._track.append(frame.time_s, self._shaped(frame))
-            # lips of a longer delay than the face's come late
+        while self._queue and self._track.end_s < time_s:
+            frame = self._queue.popleft()
+            self._track.append(frame.time_s, self._process(frame))
+            # lip frames with a longer delay than the face are late
             self._late_s = max(0.0, frame.delay_s - self._delay_s)
         self._track.hold_s = HOLD_S + self._late_s if self._is_speaking else 0.0
 
-    def _shaped(self, frame: LipFrame) -> Array:
-        """Return the FAPs of the next lip frame, steadied and with its closures."""
+    def _process(self, frame: LipFrame) -> Array:
+        """Return the FAPs of the next lip frame, stabilized and with closures."""
         faps = frame.faps.astype(np.float64)
         if frame.time_s - self._track.end_s <= MAX_GAP_S:
-            change = faps - self._steady
-            faps = self._steady + change**3 / (change**2 + _TREMBLING_POWER)
+            change = faps - self._stable
+            faps = self._stable + change**3 / (change**2 + _JITTER_SQUARED)
         else:
             self._shares = (0.0, 0.0)
-        self._steady = faps
+        self._stable = faps
         faps = faps.copy()
-        part_lips(faps)
+        separate_lips(faps)
         rule = self._rule
         teeth = self._labiodentals.log_odds(frame.time_s) - _TEETH_LOG_ODDS
         closure = rule.log_odds(
@@ -223,7 +222,7 @@ class LearntStream:
         lip_to_teeth(faps, shut_share(teeth, rule.doubt))
         share = shut_share(closure, rule.doubt)
         before, newest = self._shares
-        if before < _SHUT_SHARE <= newest:  # it has just begun, and lasts for two frames at least
+        if before < _SHUT_SHARE <= newest:  # a new closure lasts at least two frames
             share = max(share, newest)
         self._shares = (newest, share)
         close_lips(faps, share)
@@ -235,8 +234,8 @@ class LearntStream:
         return MouthFrame(faps, articulation)
 
 
-def _differs(one: Motion, other: Motion) -> bool:
+def _differs(one: FapState, other: FapState) -> bool:
     return bool(
-        np.abs(one.value - other.value).max() > _SAME
-        or np.abs(one.slope - other.slope).max() > _SAME
+        np.abs(one.value - other.value).max() > _EPSILON
+        or np.abs(one.velocity - other.velocity).max() > _EPSILON
     )

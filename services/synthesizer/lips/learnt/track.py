@@ -1,8 +1,8 @@
-"""A mouth over time, from lip frames.
+"""A continuous mouth trajectory from lip frames.
 
-Lip frames are joined by cubic Hermite splines. The slope at a frame is that of the line from the
-frame before, so position and velocity are continuous and no frame waits for the next one. Where
-frames are missing, the mouth goes to rest and comes back.
+Lip frames are joined by cubic Hermite splines. The velocity at a frame is that of the line from the
+previous frame, so position and velocity are continuous without waiting for the next frame. If frames
+are missing, the mouth moves to rest and back.
 """
 
 from __future__ import annotations
@@ -13,64 +13,59 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import Motion, motionless
+from kouxing.services.synthesizer.lips.trajectory import FapState, still
 
 Array = NDArray[np.float64]
 
-HOLD_S = 0.04  # a frame that is late may come this long after it was due
+HOLD_S = 0.04  # tolerated lateness of a frame
 CLOSE_S = 0.1  # from the last frame to rest
 _OPEN_S = 0.06  # from rest to the first frame
-MAX_GAP_S = CLOSE_S + _OPEN_S  # between two frames that are joined
+MAX_GAP_S = CLOSE_S + _OPEN_S  # maximum distance of two frames that are joined
 
 
 @dataclass(frozen=True, slots=True)
 class _Knot:
     time_s: float
-    motion: Motion
+    state: FapState
 
 
 class LipTrack:
-    """The mouth at any time.
-
-    Parameters
-    ----------
-    neutral
-        The mouth at rest, shape (num_mouth_faps,), FAP units.
+    """A mouth trajectory that starts at rest, mouth FAPs (num_mouth_faps,).
 
     Attributes
     ----------
     hold_s : float
-        How long the last frame holds before the mouth goes to rest.
+        How long the last frame is held before the mouth moves to rest.
     """
 
     def __init__(self, neutral: Array) -> None:
         self.hold_s = 0.0
-        self._rest = motionless(neutral)
+        self._rest = still(neutral)
         self._knots: list[_Knot] = []
 
     @property
     def end_s(self) -> float:
-        """Time of the last frame, seconds; before the first one minus infinity."""
+        """Time of the last frame, seconds; minus infinity before the first frame."""
         return self._knots[-1].time_s if self._knots else -np.inf
 
     def append(self, time_s: float, faps: Array) -> None:
-        """Add a frame behind the last one: media time, FAPs (num_mouth_faps,)."""
-        slope = np.zeros_like(faps)
+        """Append a frame: media time, FAPs (num_mouth_faps,)."""
+        velocity = np.zeros_like(faps)
         if time_s - self.end_s <= MAX_GAP_S:
-            slope = (faps - self._knots[-1].motion.value) / (time_s - self.end_s)
+            velocity = (faps - self._knots[-1].state.value) / (time_s - self.end_s)
         else:
             if self._knots:
                 self._knots.append(_Knot(self.end_s + CLOSE_S, self._rest))
             self._knots.append(_Knot(time_s - _OPEN_S, self._rest))
-        self._knots.append(_Knot(time_s, Motion(faps, slope)))
+        self._knots.append(_Knot(time_s, FapState(faps, velocity)))
 
     def forget_before(self, time_s: float) -> None:
-        """Forget frames that no time from here on needs."""
+        """Forget frames that are not needed from a time on."""
         first = bisect_right(self._knots, time_s, key=lambda knot: knot.time_s) - 1
         del self._knots[: max(0, first)]
 
-    def at(self, time_s: float) -> Motion:
-        """Return the mouth and its velocity at a media time."""
+    def at(self, time_s: float) -> FapState:
+        """Return the mouth at a media time."""
         knots = self._knots
         if not knots or time_s < knots[0].time_s:
             return self._rest
@@ -79,30 +74,30 @@ class LipTrack:
         after = bisect_right(knots, time_s, key=lambda knot: knot.time_s)
         if after == len(knots):
             return self._rest
-        return _between(knots[after - 1], knots[after], time_s)
+        return _interpolate(knots[after - 1], knots[after], time_s)
 
     def _after_the_last(self) -> list[_Knot]:
-        value = self._knots[-1].motion.value
+        value = self._knots[-1].state.value
         rest = _Knot(self.end_s + self.hold_s + CLOSE_S, self._rest)
         if self.hold_s == 0.0:
             return [rest]
-        return [_Knot(self.end_s + self.hold_s, motionless(value)), rest]
+        return [_Knot(self.end_s + self.hold_s, still(value)), rest]
 
 
-def _between(one: _Knot, other: _Knot, time_s: float) -> Motion:
-    """Return the cubic Hermite spline from one knot to another at a time between them."""
-    duration_s = other.time_s - one.time_s
-    u = (time_s - one.time_s) / duration_s
-    begin, end = one.motion, other.motion
-    step = end.value - begin.value
+def _interpolate(before: _Knot, after: _Knot, time_s: float) -> FapState:
+    """Return the cubic Hermite spline between two knots at a time."""
+    duration_s = after.time_s - before.time_s
+    u = (time_s - before.time_s) / duration_s
+    start, end = before.state, after.state
+    step = end.value - start.value
     value = (
-        begin.value
+        start.value
         + u * u * (3.0 - 2.0 * u) * step
-        + u * (1.0 - u) * duration_s * ((1.0 - u) * begin.slope - u * end.slope)
+        + u * (1.0 - u) * duration_s * ((1.0 - u) * start.velocity - u * end.velocity)
     )
-    slope = (
+    velocity = (
         6.0 * u * (1.0 - u) * step / duration_s
-        + (1.0 - u) * (1.0 - 3.0 * u) * begin.slope
-        + u * (3.0 * u - 2.0) * end.slope
+        + (1.0 - u) * (1.0 - 3.0 * u) * start.velocity
+        + u * (3.0 * u - 2.0) * end.velocity
     )
-    return Motion(value, slope)
+    return FapState(value, velocity)

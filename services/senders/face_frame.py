@@ -1,4 +1,4 @@
-"""One frame of a face, in the terms of other programs."""
+"""One frame of a face in the terms of other programs."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _EYES = [
     for name in ("yaw_l_eyeball", "pitch_l_eyeball", "yaw_r_eyeball", "pitch_r_eyeball")
 ]
 _LIPS = [FAP_NUMBER[name] - 1 for name in ("lower_t_midlip", "raise_b_midlip")]
-_OPEN_LIPS = 880.0  # FAP units from one lip to the other in a wide "a"
-_NO_MOUTH = ("brow", "eye", "blink", "look", "cheekSquint", "nose")  # how shapes' names begin
+_OPEN_LIPS = 880.0  # FAP units between the lips in a wide "a"
+_NO_MOUTH = ("brow", "eye", "blink", "look", "cheekSquint", "nose")  # prefixes of shape names
 
 Angles = tuple[float, float, float]
 
 
-class Face:
-    """A face that is shown; what a program takes of it is worked out once for all targets.
+class FaceFrame:
+    """A frame for all targets; each conversion is computed once.
 
     Parameters
     ----------
     faps
-        Facial animation parameters (68,), FAP units.
+        FAPs (68,).
     time_s
-        Media time, seconds; at rest it goes on from the last frame's, and before any from 0.
+        Media time, seconds. At rest it continues from the last frame, or from 0.
     """
 
     def __init__(self, faps: NDArray[np.float32], time_s: float) -> None:
@@ -39,7 +39,7 @@ class Face:
         self._weights: dict[str, dict[str, float]] = {}
 
     def weights(self, shapes: str, *, is_mouth_only: bool = False) -> dict[str, float]:
-        """Return weights from 0 to 1 by name, of one of ``SHAPE_SETS``."""
+        """Return the weights, 0 to 1, of one of ``SHAPE_SETS`` by shape name."""
         if shapes not in self._weights:
             shape_set = SHAPE_SETS[shapes]
             values = shape_set.weights(self.faps).tolist()
@@ -51,17 +51,17 @@ class Face:
 
     @property
     def head(self) -> Angles:
-        """How far the head is turned down, to its left, and tilted to its right; rad."""
+        """Pitch (down), yaw (to the subject's left) and roll (to the subject's right), rad."""
         pitch, yaw, roll = (self.faps[_HEAD] * RADIANS_PER_ANGLE_UNIT).tolist()
         return pitch, yaw, roll
 
     @property
     def eyes(self) -> tuple[float, float, float, float]:
-        """How far the left eye is turned to the left and down, and the right one; rad."""
+        """Yaw (left) and pitch (down) of the left eye, then of the right eye, rad."""
         yaw_l, pitch_l, yaw_r, pitch_r = (self.faps[_EYES] * RADIANS_PER_ANGLE_UNIT).tolist()
         return yaw_l, pitch_l, yaw_r, pitch_r
 
     @cached_property
     def opening(self) -> float:
-        """How far the lips are apart, from 0 to 1 (a wide "a")."""
+        """Distance between the lips, 0 to 1 (a wide "a")."""
         return max(0.0, min(1.0, -float(self.faps[_LIPS].sum()) / _OPEN_LIPS))

@@ -1,0 +1,124 @@
+"""Connections to targets: the common interface, and datagrams."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import ClassVar
+
+from kouxing.services.senders.face_frame import FaceFrame
+from kouxing.services.senders.target import Target
+
+RETRY_S = 1.0
+_REFUSED_S = 1.0  # without a refusal for this time, a program is listening
+
+Options = Mapping[str, tuple[str, ...]]
+COMMON_OPTIONS: Options = {"delay": ("0",), "only": ("face", "mouth")}
+
+
+class Connection(ABC):
+    """A connection to a target; it reconnects by itself.
+
+    Each protocol is one subclass, listed in ``protocols.PROTOCOLS``.
+
+    Attributes
+    ----------
+    default_port
+        Port on which programs of this protocol listen.
+    options
+        Option names and their values, the default first; no values: any text.
+    problem
+        Why frames do not reach the target; empty if no problem is known.
+    """
+
+    default_port: ClassVar[int]
+    options: ClassVar[Options] = COMMON_OPTIONS
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+        self.problem = ""
+
+    @abstractmethod
+    async def run(self) -> None:
+        """Keep the connection open until cancelled, or until only the user can help."""
+
+    @abstractmethod
+    def send(self, frame: FaceFrame) -> bool:
+        """Send a frame immediately; return whether it was sent."""
+
+
+class DatagramConnection(Connection):
+    """UDP. Receipt is not confirmed, but this machine reports when no program listens on it."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target)
+        self._socket: socket.socket | None = None
+        self._refused_s = -_REFUSED_S
+
+    @abstractmethod
+    def encode(self, frame: FaceFrame) -> Iterable[bytes]:
+        """Return the datagrams of a frame."""
+
+    async def run(self) -> None:
+        """Resolve the host and open a socket; repeat after a network change."""
+        try:
+            while True:
+                if self._socket is None:
+                    try:
+                        self._socket = await self._open()
+                        self.problem = ""
+                    except OSError as error:
+                        self.problem = f"cannot reach {self.target.host}: {error.strerror}"
+                await asyncio.sleep(RETRY_S)
+        finally:
+            self._close()
+
+    def send(self, frame: FaceFrame) -> bool:
+        """Send the datagrams of a frame; drop those that the system does not accept."""
+        if self._socket is None:
+            return False
+        now_s = time.monotonic()
+        try:
+            for datagram in self.encode(frame):
+                self._socket.send(datagram)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            self._refused_s = now_s
+            address = f"{self.target.host}:{self.target.port}"
+            if error.errno == errno.ECONNREFUSED:
+                self.problem = f"no program listens on {address}: turn its receiver on"
+            else:
+                self.problem = f"cannot reach {address}: {error.strerror}"
+                self._close()
+            return False
+        if now_s - self._refused_s < _REFUSED_S:
+            return False
+        self.problem = ""
+        return True
+
+    def _close(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    async def _open(self) -> socket.socket:
+        addresses = await asyncio.get_running_loop().getaddrinfo(
+            self.target.host, self.target.port, type=socket.SOCK_DGRAM
+        )
+        # most receivers listen on IPv4 only, and localhost resolves to both
+        family, kind, protocol, _, address = min(
+            addresses, key=lambda candidate: candidate[0] != socket.AF_INET
+        )
+        udp = socket.socket(family, kind, protocol)
+        try:
+            udp.setblocking(False)
+            udp.connect(address)
+        except OSError:
+            udp.close()
+            raise
+        return udp

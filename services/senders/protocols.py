@@ -1,0 +1,77 @@
+"""The table of sender protocols, and the parser of target addresses."""
+
+from __future__ import annotations
+
+from urllib.parse import parse_qsl, urlsplit
+
+from kouxing.services.senders.connection import Connection
+from kouxing.services.senders.live_link import LiveLinkConnection
+from kouxing.services.senders.osc import OscConnection
+from kouxing.services.senders.target import Target, parse_delay_s
+from kouxing.services.senders.vmc import VmcConnection
+from kouxing.services.senders.vtube_studio_connection import VTubeStudioConnection
+from kouxing.shared.errors import UserError
+
+LOOPBACK = "127.0.0.1"
+MAX_TEXT = 64  # characters of an option without fixed values
+PROTOCOLS: dict[str, type[Connection]] = {
+    "vmc": VmcConnection,
+    "livelink": LiveLinkConnection,
+    "osc": OscConnection,
+    "vts": VTubeStudioConnection,
+}
+_FORMS = [f"{name}://HOST:{connection.default_port}" for name, connection in PROTOCOLS.items()]
+FORMS = f"{', '.join(_FORMS[:-1])} or {_FORMS[-1]}"
+
+
+def connect(target: Target) -> Connection:
+    """Return a connection to a target; ``run`` opens it."""
+    return PROTOCOLS[target.protocol](target)
+
+
+def parse_target(url: str) -> Target:
+    """Return the target of an address such as ``vmc://127.0.0.1:39540?delay=120``.
+
+    Raises
+    ------
+    UserError
+        If the address is not valid; the text says what is expected.
+    """
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        raise UserError(f"{url!r} is not a valid address; write {FORMS}") from None
+    protocol = PROTOCOLS.get(parts.scheme)
+    is_bare = parts.path in ("", "/") and not parts.fragment and parts.username is None
+    if protocol is None or not is_bare or not url.isprintable() or " " in url:
+        raise UserError(f"{url!r} is not a valid address; write {FORMS}")
+    options = _parse_options(url, parts.query, protocol)
+    try:
+        delay_s = parse_delay_s(options["delay"])
+    except UserError as error:
+        raise UserError(f"{url}: {error}") from None
+    return Target(
+        url=url,
+        protocol=parts.scheme,
+        host=host or LOOPBACK,
+        port=port or protocol.default_port,
+        options=options,
+        delay_s=delay_s,
+    )
+
+
+def _parse_options(url: str, query: str, protocol: type[Connection]) -> dict[str, str]:
+    options = {name: next(iter(values), "") for name, values in protocol.options.items()}
+    for name, value in parse_qsl(query, keep_blank_values=True):
+        if name not in options:
+            raise UserError(f"{url}: unknown option {name!r}; use {', '.join(options)}")
+        allowed = protocol.options[name]
+        if len(allowed) > 1 and value not in allowed:
+            raise UserError(f"{url}: {name} must be {' or '.join(allowed)}")
+        if len(value) > MAX_TEXT:
+            raise UserError(f"{url}: {name} is longer than {MAX_TEXT} characters")
+        options[name] = value
+    if not options.get("prefix", "").startswith("/") and options.get("prefix"):
+        raise UserError(f"{url}: prefix must start with '/'")
+    return options

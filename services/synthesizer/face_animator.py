@@ -1,0 +1,347 @@
+"""The face of one session, without sockets: sound events in, FAP frames out.
+
+    events -> lip model -> modifiers -> frames
+
+Frames are clocked by media time, so they do not depend on the arrival times of events. The caller
+decides when a stream has stalled and requests frames that lead to rest (`FaceAnimator.relax`).
+
+The face moves continuously when another recognizer takes over (`change_recognizer`), when this face
+replaces the one of another process (`resume`), and when the lip model changes (`set_lip_model`). A
+*transition* of all FAPs then leads the difference between old and new frames to zero. Lips that
+must close for speech close during the transition as well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.services.synthesizer.lips.lip_model import LipModel, MouthFrame
+from kouxing.services.synthesizer.lips.trajectory import FapState, Transition
+from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
+from kouxing.services.synthesizer.modifiers.expression import Expression, mix
+from kouxing.services.synthesizer.modifiers.expressiveness import JAW, Expressiveness
+from kouxing.services.synthesizer.modifiers.idle_motion import SpeechIdleMotion
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext, Modifier
+from kouxing.services.synthesizer.phone_numbers import PhoneNumbers
+from kouxing.shared.clock import MAX_GAP_S
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+from kouxing.shared.phones.events import EndOfSound, Phone, Progress, SoundEvent, SpeechChange
+
+Faps: TypeAlias = NDArray[np.float64]  # (68,)
+Frame: TypeAlias = tuple[float, NDArray[np.float32]]  # media time in seconds, FAPs (68,)
+
+MAX_DELAY_S = 1.5  # at most 0.3 live; a viseme further ahead has no visible weight
+REST_S = 0.3  # duration of the frames that lead to rest after the end of the sound
+_RECENT_S = 2.0  # events that a new lip model receives
+_WARM_UP_FRAMES = 10  # frames of a new lip model before it is shown
+_REHEARSAL_S = 0.8  # frames of a resumed face before it is shown
+_MOUTH_TRANSITION_S, _TRANSITION_S = 0.14, 0.6  # of mouth FAPs, of other FAPs
+_BIND_S = 0.04  # after this part of a transition, lips close fully for speech
+_SPEECH_LEAD_S = 0.04  # speech that starts within this time counts as started
+_ROUNDING = 0.01  # tolerance of media times, in frames
+
+_MOUTH = np.array(MOUTH_FAPS) - 1
+_TRANSITIONS_S = np.full(NUM_FAPS, _TRANSITION_S)
+_TRANSITIONS_S[_MOUTH] = _MOUTH_TRANSITION_S
+_ZERO = np.zeros(NUM_FAPS)
+_NO_TRANSITION = Transition(FapState(_ZERO, _ZERO), _TRANSITIONS_S)
+
+
+class FaceAnimator:
+    """Turns the sound events of a session, in order, into FAP frames.
+
+    Parameters
+    ----------
+    lip_model
+        Moves the mouth.
+    frame_rate_hz
+        10 to 240; frame ``k`` is at media time ``k / frame_rate_hz``.
+    delay_s
+        0 to 1.5, how much later than its audio a frame is made. At 1.5 the visemes of a recording
+        are blended as if all were known.
+    idle_motion_seed
+        Seed of blinks, gaze, brows and head motion; with 0 only the mouth moves.
+    expressiveness
+        0.5 to 2, size of mouth movements; 1 leaves the lip model's movements unchanged.
+
+    Raises
+    ------
+    UserError
+        If a value is out of range.
+    """
+
+    def __init__(
+        self,
+        lip_model: LipModel,
+        *,
+        frame_rate_hz: float,
+        delay_s: float,
+        idle_motion_seed: int = 0,
+        expressiveness: float = 1.0,
+    ) -> None:
+        if not 0.0 <= delay_s <= MAX_DELAY_S:
+            raise UserError(f"delay_s is {delay_s:g}; give 0 to {MAX_DELAY_S:g} seconds")
+        if not 10.0 <= frame_rate_hz <= 240.0:
+            raise UserError(f"frame_rate_hz is {frame_rate_hz:g}; give 10 to 240")
+        self._lip_model = lip_model
+        self._frame_rate_hz = frame_rate_hz
+        self._delay_s = delay_s
+        self._expressiveness = Expressiveness(expressiveness)
+        self._expression = Expression()
+        self._idle_motion = SpeechIdleMotion(idle_motion_seed) if idle_motion_seed else None
+        self._num_frames = 0  # including frames at rest
+        self._first_shown = 0  # earlier frames are rehearsals
+        self._goal: Faps | None = None  # the last frame without its transition
+        self._shown: Faps | None = None  # the last shown frame
+        self._previously_shown: Faps = _ZERO  # the shown frame before that
+        self._is_resuming = False  # only the replaced face has been shown so far
+        self._transition, self._transition_s = _NO_TRANSITION, 0.0  # and its age
+        self._event_s = 0.0  # time of the last event
+        self._start_at(0)
+
+    def _start_at(self, number: int) -> None:
+        """Start at rest with a frame number."""
+        self._next_frame = number
+        self._time_s = number / self._frame_rate_hz  # of the last frame
+        self._known_s = -math.inf  # the sound is known up to here
+        self._phones = PhoneNumbers()
+        self._is_speaking = False  # at the last frame
+        self._changes: deque[SpeechChange] = deque()  # that concern future frames
+        self._levels: list[tuple[float, float]] = []  # since the last frame
+        self._pitches: list[tuple[float, float]] = []  # since the last frame
+        self._recent: deque[SoundEvent] = deque()
+        self._lip_stream = self._lip_model.stream(
+            self._time_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s
+        )
+        self._modifiers: list[Modifier] = [  # in order of application
+            Amplitude(),
+            self._expressiveness,
+            self._expression,
+        ]
+        if self._idle_motion is not None:
+            self._modifiers.append(self._idle_motion)
+
+    def process(self, event: SoundEvent) -> list[Frame]:
+        """Process an event; return the frames that are now due.
+
+        After a gap of more than ``MAX_GAP_S`` the face starts again after the gap. The end of the
+        sound returns all remaining frames and those that lead to rest.
+        """
+        return list(self.iter_frames(event))
+
+    def iter_frames(self, event: SoundEvent) -> Iterator[Frame]:
+        """Yield the frames of ``process`` one by one; exhaust this before the next event."""
+        time_s = _time_of(event)
+        if time_s - self._event_s > MAX_GAP_S:
+            self._start_at(self._frame_number(max(0.0, time_s - self._delay_s)))
+        self._event_s = time_s
+        if isinstance(event, EndOfSound):
+            self._add_event(SpeechChange(active=False, time_s=time_s))
+            yield from self._frames_until(time_s + self._delay_s + REST_S)
+            return
+        self._add_event(event)
+        if isinstance(event, Progress):
+            yield from self._frames_until(time_s)
+
+    def change_recognizer(self) -> None:
+        """Continue with the events of another recognizer; phones that were not final are void.
+
+        The new recognizer numbers phones from 0 and may repeat known events.
+        """
+        self._phones.restart()
+
+    def resume(
+        self, time_s: float, num_frames: int, shown: NDArray[np.float32] | None = None
+    ) -> None:
+        """Replace the face of another process, before this face has made any frames.
+
+        Events of the last seconds may be repeated; their last frames are made but not shown.
+
+        Parameters
+        ----------
+        time_s
+            Media time of the other face's newest frame.
+        num_frames
+            Number of frames that it has made.
+        shown
+            FAPs (68,) of its newest frame; None if unknown.
+        """
+        self._first_shown = self._frame_number(time_s) + 1
+        num_rehearsed = min(
+            num_frames, self._first_shown, round(_REHEARSAL_S * self._frame_rate_hz)
+        )
+        self._num_frames = num_frames - num_rehearsed
+        self._event_s = time_s
+        self._start_at(self._first_shown - num_rehearsed)
+        self._is_resuming = shown is not None
+        self._shown = None if shown is None else shown.astype(np.float64)
+
+    def relax(self, num_frames: int) -> list[Frame]:
+        """Return frames that lead to rest while no sound arrives.
+
+        Their media time is that of the last frame. The face continues from its pose when sound
+        arrives again.
+        """
+        step_s = 1.0 / self._frame_rate_hz
+        self._update_speaking(math.inf)
+        self._withdraw_phones()
+        return [self._make_frame(self._lip_stream.relax(step_s)) for _ in range(num_frames)]
+
+    def flush(self) -> None:
+        """Drop the known events (an interruption); the next frames lead to rest."""
+        self._recent.clear()
+        self._lip_stream.flush()
+
+    def set_expressions(self, strengths: Mapping[str, float], hold_s: float) -> None:
+        """Show expressions, strengths 0 to 1 by name, for a time; they replace earlier ones."""
+        self._expression.show(strengths, hold_s)
+
+    def set_expressiveness(self, amount: float) -> None:
+        """Set the size of mouth movements, 0.5 to 2; 1 leaves the lip model unchanged."""
+        self._expressiveness.amount = amount
+
+    def set_lip_model(self, lip_model: LipModel) -> None:
+        """Change the lip model with a continuous transition."""
+        if lip_model is self._lip_model:
+            return
+        step_s = 1.0 / self._frame_rate_hz
+        start_s = self._time_s - _WARM_UP_FRAMES * step_s
+        stream = lip_model.stream(start_s, frame_rate_hz=self._frame_rate_hz, delay_s=self._delay_s)
+        for event in self._recent:
+            stream.add_event(event)
+        mouths = [
+            stream.frame_at(start_s + number * step_s) for number in range(1, _WARM_UP_FRAMES + 1)
+        ]
+        self._lip_model, self._lip_stream = lip_model, stream
+        if self._shown is None or self._is_resuming:
+            return
+        before, self._goal = (self._pose(mouth).astype(np.float64) for mouth in mouths[-2:])
+        steps = (self._shown - self._previously_shown) - (self._goal - before)
+        velocity = np.zeros(NUM_FAPS)  # FAPs outside the mouth move as before
+        velocity[_MOUTH] = steps[_MOUTH] / step_s
+        self._start_transition(FapState(self._shown - self._goal, velocity))
+
+    def _start_transition(self, difference: FapState) -> None:
+        """Add a difference to the next frames that fades to zero."""
+        self._transition, self._transition_s = Transition(difference, _TRANSITIONS_S), 0.0
+
+    def _add_event(self, event: SoundEvent) -> None:
+        if isinstance(event, Progress):
+            if event.time_s <= self._known_s:  # repeated by another recognizer
+                return
+            self._known_s = event.time_s
+        elif isinstance(event, Phone):
+            event = self._phones.renumber(event)
+        self._pass_to_lips(event)
+        if isinstance(event, SpeechChange):
+            self._changes.append(event)
+        elif isinstance(event, Progress):
+            self._levels.append((event.time_s, event.level_db))
+            if event.pitch_hz > 0.0:
+                self._pitches.append((event.time_s, event.pitch_hz))
+
+    def _pass_to_lips(self, event: SoundEvent) -> None:
+        self._lip_stream.add_event(event)
+        self._recent.append(event)
+        while _time_of(self._recent[0]) < self._event_s - _RECENT_S:
+            self._recent.popleft()
+
+    def _withdraw_phones(self) -> None:
+        """Withdraw the phones of a lost recognizer that the new one has not confirmed."""
+        for phone in self._phones.take_withdrawn():
+            self._pass_to_lips(phone)
+
+    def _frame_number(self, time_s: float) -> int:
+        """Return the number of the frame at or after a media time."""
+        return math.ceil(time_s * self._frame_rate_hz - _ROUNDING)
+
+    def _frames_until(self, time_s: float) -> Iterator[Frame]:
+        """Yield new frames that are due when the sound is known up to ``time_s``."""
+        last = math.floor((time_s - self._delay_s) * self._frame_rate_hz + _ROUNDING)
+        if last >= self._next_frame:
+            self._withdraw_phones()
+        while self._next_frame <= last:
+            number = self._next_frame
+            self._next_frame += 1
+            self._time_s = number / self._frame_rate_hz
+            self._update_speaking(self._time_s)
+            mouth = self._lip_stream.frame_at(self._time_s)
+            if number >= self._first_shown:
+                yield self._make_frame(mouth)
+            else:
+                self._make_goal(mouth)
+
+    def _update_speaking(self, time_s: float) -> None:
+        while self._changes and self._changes[0].time_s <= time_s:
+            change = self._changes.popleft()
+            self._is_speaking = change.active
+            if change.active:  # levels before speech are noise
+                self._levels = [level for level in self._levels if level[0] >= change.time_s]
+
+    def _speech_starts_soon(self) -> bool:
+        soon_s = self._time_s + _SPEECH_LEAD_S
+        return any(change.active and change.time_s <= soon_s for change in self._changes)
+
+    def _make_frame(self, mouth: MouthFrame) -> Frame:
+        rehearsed = self._goal
+        faps = self._make_goal(mouth)
+        if self._is_resuming and self._shown is not None:
+            self._is_resuming = False
+            goal = faps if rehearsed is None else rehearsed
+            self._start_transition(FapState(self._shown - goal, _ZERO))
+        self._transition_s += 1.0 / self._frame_rate_hz
+        difference = self._transition.at(self._transition_s).value
+        if difference.any():
+            free = max(self._expression.free, 1.0 - self._transition_s / _BIND_S)
+            jaw = faps[JAW] + difference[JAW]  # the jaw does not open the lips
+            mix(faps, difference.astype(np.float32), free)
+            faps[JAW] = max(jaw, 0.0)
+        shown = faps.astype(np.float64)
+        self._previously_shown = shown if self._shown is None else self._shown
+        self._shown = shown
+        return self._time_s, faps
+
+    def _make_goal(self, mouth: MouthFrame) -> NDArray[np.float32]:
+        """Return the next frame, FAPs (68,), without the transition."""
+        levels, self._levels = self._levels, []
+        pitches, self._pitches = self._pitches, []
+        self._num_frames += 1
+        faps = self._pose(mouth, 1.0 / self._frame_rate_hz, levels, pitches)
+        self._goal = faps.astype(np.float64)
+        return faps
+
+    def _pose(
+        self,
+        mouth: MouthFrame,
+        step_s: float = 0.0,
+        levels: Sequence[tuple[float, float]] = (),
+        pitches: Sequence[tuple[float, float]] = (),
+    ) -> NDArray[np.float32]:
+        """Return the FAPs (68,) of a mouth after all modifiers."""
+        faps = np.zeros(NUM_FAPS, dtype=np.float32)
+        faps[_MOUTH] = mouth.faps
+        context = FrameContext(
+            time_s=self._time_s,
+            known_s=self._time_s + self._delay_s,
+            elapsed_s=(self._num_frames - 1) / self._frame_rate_hz,
+            step_s=step_s,
+            is_speaking=self._is_speaking or self._speech_starts_soon(),
+            levels=levels,
+            pitches=pitches,
+            articulation=mouth.articulation,
+            amplitude_applies=self._lip_model.amplitude_applies,
+        )
+        for modifier in self._modifiers:
+            modifier.apply(faps, context)
+        return faps
+
+
+def _time_of(event: SoundEvent) -> float:
+    return event.onset_s if isinstance(event, Phone) else event.time_s

@@ -1,0 +1,106 @@
+"""The opening of the mouth over time, and its key frames from timed phones.
+
+Source: Zhang et al. 2021, sections 4 and 5, eq. 6. Each initial and final has an opening R, 0 (closed)
+to 5. The mouth has this opening when the phone starts; in between, R is linear. Before and after
+speech the mouth is closed, and it starts moving shortly before the first sound. As an option, R is a
+smooth curve: a piecewise cubic without overshoot (PCHIP, Fritsch and Butland, "A method for
+constructing local monotone piecewise cubic interpolants", 1984).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+
+from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, PhoneTable
+from kouxing.shared.phones.events import Phone
+
+Array = NDArray[np.float64]
+
+OPENING_TIME_S = 0.12  # from a closed mouth to the first phone
+PAUSE_S = 0.2  # the mouth stays open in shorter gaps between phones
+_MIN_STEP_S = 1e-3  # between key frames
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyFrames:
+    """The openings R(t) of a mouth; constant before the first and after the last key frame.
+
+    Parameters
+    ----------
+    times_s : array (num_key_frames,)
+        Seconds, strictly rising; at least one.
+    openings : array (num_key_frames,)
+        R at these times, 0 to ``MAX_OPENING``.
+
+    Raises
+    ------
+    ValueError
+        If there are no key frames, the times do not rise, or an opening is out of range.
+    """
+
+    times_s: Array
+    openings: Array
+
+    def __post_init__(self) -> None:
+        if self.times_s.ndim != 1 or self.times_s.shape != self.openings.shape:
+            raise ValueError(
+                f"expected times_s and openings of one shape (num_key_frames,), got "
+                f"{self.times_s.shape} and {self.openings.shape}"
+            )
+        if not len(self.times_s) or not (np.diff(self.times_s) > 0.0).all():
+            raise ValueError("times_s must rise strictly, with at least one key frame")
+        if not ((self.openings >= 0.0) & (self.openings <= MAX_OPENING)).all():
+            raise ValueError(f"openings must be between 0 and {MAX_OPENING:g}")
+
+    def openings_at(self, times_s: ArrayLike, *, smooth: bool = False) -> Array:
+        """Return R (n,) at times (n,); with ``smooth``, its velocity is continuous."""
+        times = np.asarray(times_s, dtype=np.float64)
+        if not smooth or len(self.times_s) == 1:
+            linear: Array = np.interp(times, self.times_s, self.openings)  # Zhang 2021, eq. 6
+            return linear
+        within = np.clip(times, self.times_s[0], self.times_s[-1])
+        curve: Array = PchipInterpolator(self.times_s, self.openings)(within)
+        return np.clip(curve, 0.0, MAX_OPENING)
+
+
+def anchors_of(phones: Sequence[Phone], silence: str) -> list[tuple[float, str]]:
+    """Return rising times at which the mouth has the opening of a phone.
+
+    Parameters
+    ----------
+    phones
+        In order of time; gaps and ``silence`` are pauses.
+    silence
+        The phone of a closed mouth.
+    """
+    spoken = [phone for phone in phones if phone.symbol != silence]
+    anchors: list[tuple[float, str]] = []
+    end_s = -np.inf
+    for phone in spoken:
+        if phone.onset_s - end_s > PAUSE_S:
+            if anchors:
+                anchors.append((end_s, silence))
+            anchors.append((phone.onset_s - OPENING_TIME_S, silence))
+        anchors.append((phone.onset_s, phone.symbol))
+        end_s = phone.onset_s + phone.duration_s
+    if spoken:
+        anchors.append((end_s, silence))
+    rising: list[tuple[float, str]] = []
+    for time_s, symbol in anchors:
+        if not rising or time_s >= rising[-1][0] + _MIN_STEP_S:
+            rising.append((time_s, symbol))
+    return rising
+
+
+def key_frames_of(phones: Sequence[Phone], table: PhoneTable, silence: str) -> KeyFrames:
+    """Return the key frames of phones, see ``anchors_of``; without phones the mouth is closed."""
+    anchors = anchors_of(phones, silence) or [(0.0, silence)]
+    return KeyFrames(
+        np.array([time_s for time_s, _ in anchors]),
+        np.array([table.opening[symbol] for _, symbol in anchors]),
+    )

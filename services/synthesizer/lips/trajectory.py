@@ -1,0 +1,70 @@
+"""Position and velocity of FAPs, and continuous transitions between trajectories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kouxing.shared.face.faps import NUM_MOUTH_FAPS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class FapState:
+    """Value and velocity of FAPs at one time."""
+
+    value: Array  # FAP units
+    velocity: Array  # FAP units per second
+
+    def __add__(self, other: FapState) -> FapState:
+        return FapState(self.value + other.value, self.velocity + other.velocity)
+
+    def __sub__(self, other: FapState) -> FapState:
+        return FapState(self.value - other.value, self.velocity - other.velocity)
+
+
+def still(value: Array) -> FapState:
+    """Return FAPs (num_mouth_faps,) that do not move."""
+    return FapState(value, np.zeros(NUM_MOUTH_FAPS))
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """Leads the difference between two trajectories to zero along cubics, one duration per FAP.
+
+    The sum of new trajectory and transition is continuous in position and velocity.
+    """
+
+    difference: FapState
+    duration_s: Array
+
+    def at(self, elapsed_s: float) -> FapState:
+        """Return the remaining difference after ``elapsed_s``."""
+        u = np.minimum(elapsed_s / self.duration_s, 1.0)
+        start, duration_s = self.difference, self.duration_s
+        # cubic Hermite spline from (value, velocity) to (0, 0)
+        value = (1.0 - u) ** 2 * ((1.0 + 2.0 * u) * start.value + u * duration_s * start.velocity)
+        velocity = (1.0 - u) * (
+            -6.0 * u * start.value / duration_s + (1.0 - 3.0 * u) * start.velocity
+        )
+        return FapState(value, velocity)
+
+
+NO_TRANSITION = Transition(still(np.zeros(NUM_MOUTH_FAPS)), np.ones(NUM_MOUTH_FAPS))
+
+
+class RestTransition:
+    """Leads the mouth to rest while media time stands still."""
+
+    def __init__(self, mouth: FapState, neutral: Array, duration_s: float) -> None:
+        self._neutral = still(neutral)
+        self._transition = Transition(mouth - self._neutral, np.full(NUM_MOUTH_FAPS, duration_s))
+        self._elapsed_s = 0.0
+
+    def step(self, step_s: float) -> FapState:
+        """Advance by a step; return the mouth."""
+        self._elapsed_s += step_s
+        return self._neutral + self._transition.at(self._elapsed_s)
