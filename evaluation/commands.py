@@ -12,7 +12,6 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_message, write_json
 
 if TYPE_CHECKING:
@@ -174,9 +173,7 @@ def schemes(
         Path | None, typer.Option(help="Folder of tracked lips with sound: these sentences.")
     ] = None,
     acoustic: Acoustic = None,
-    lips: Annotated[
-        list[LipModelName] | None, typer.Option(help="Lip model; repeatable; else all.")
-    ] = None,
+    lips: Annotated[list[str] | None, typer.Option(help="Lip model; repeatable; else all.")] = None,
     paper_rule: Annotated[
         bool, typer.Option("--paper-rule", help="Phones as in the paper: N = 3, never corrected.")
     ] = False,
@@ -202,6 +199,7 @@ def schemes(
     from kouxing.evaluation.lips.scheme_report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import evaluate
     from kouxing.services.recognizer.acoustic.load import load_live_model
+    from kouxing.services.synthesizer.lips.registry import lip_models
     from kouxing.shared.errors import UserError
 
     check_output(json_file)
@@ -215,16 +213,16 @@ def schemes(
     else:
         chosen = sentences.of_samples(model, SENTENCE.parent)
     listeners = listeners_of(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
-    lip_models = lips or list(LipModelName)
+    names = lips or list(lip_models())
     heard = hear_all(model, listeners, chosen)
-    outcome = evaluate(heard, listeners, lip_models)
+    outcome = evaluate(heard, listeners, names)
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))
     if videos:
         written = film_all(
             heard,
             listeners,
-            lip_models,
+            names,
             videos,
             has_anchor=anchor,
             sound_at_once=sound_at_once,

@@ -16,7 +16,7 @@ from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.recognizer import Recognizer
 from kouxing.services.recognizer.stream import SpeechStream
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.phones.events import SoundEvent, Waveform
@@ -90,7 +90,7 @@ class LiveChain:
             lips=lips_from_sound or lip_predictor_for(model),
             face_delay_s=synthesizer.delay_ms / 1e3,
         )
-        self._face = Face(
+        self._face = FaceAnimator(
             lips,
             frame_rate_hz=synthesizer.frame_rate_hz,
             delay_s=synthesizer.delay_ms / 1e3,
@@ -117,7 +117,7 @@ class LiveChain:
     def _animate(self) -> list[Frame]:
         events = _decode(self._recognizer, self._stream)
         self.events += events
-        return [frame for event in events for frame in self._face.accept(event)]
+        return [frame for event in events for frame in self._face.process(event)]
 
 
 def _decode(recognizer: Recognizer, stream: SpeechStream) -> list[SoundEvent]:

@@ -29,7 +29,7 @@ from kouxing.services.recognizer.speech_scorer import (
     score_recording,
 )
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face import MAX_DELAY_S, REST_S, Face, Frame
+from kouxing.services.synthesizer.face_animator import MAX_DELAY_S, REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learnt.closures import ClosureRule
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.lip_model import LipModel
@@ -106,7 +106,7 @@ def animate_recording(
     """Return all frames of a recording, until the face is at rest. ``delay_ms`` is ignored."""
     if isinstance(lips, LearntLips):
         lips = replace(lips, closures=_KNOWN_TEXT if recording.is_text_known else _RECOGNIZED)
-    face = Face(
+    face = FaceAnimator(
         lips,
         frame_rate_hz=config.frame_rate_hz,
         delay_s=MAX_DELAY_S,
@@ -117,7 +117,7 @@ def animate_recording(
     frames = [
         frame
         for event in [*sorted(recording.events, key=_time_of), end]
-        for frame in face.accept(event)
+        for frame in face.process(event)
     ]
     return [frame for frame in frames if frame[0] <= recording.duration_s + REST_S]
 

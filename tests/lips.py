@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.services.synthesizer.config import DELAYS_MS
-from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
     DynamicVisemes,
     VisemeArticulation,
@@ -15,23 +14,23 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.lip_model import Articulation
-from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.services.synthesizer.lips.registry import lip_model_info
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import load_inventory
 
 INVENTORY = load_inventory()
 LIPS = DynamicVisemes(load_parameters(), INVENTORY)
-DELAY_S = DELAYS_MS[LipModelName.DYNAMIC_VISEMES] / 1e3
+DELAY_S = lip_model_info("dynamic-visemes").delay_ms / 1e3
 SILENT_DB = -120.0
 JAW, LOWER_LIP, WIDTH = (MOUTH_FAPS.index(fap) for fap in (3, 5, 6))
 
 
 def make_face(
     *, delay_s: float = DELAY_S, frame_rate_hz: float = 50.0, idle_motion_seed: int = 0
-) -> Face:
-    return Face(
+) -> FaceAnimator:
+    return FaceAnimator(
         LIPS, frame_rate_hz=frame_rate_hz, delay_s=delay_s, idle_motion_seed=idle_motion_seed
     )
 
@@ -49,9 +48,9 @@ def phone(
     )
 
 
-def advance(face: Face, time_s: float) -> list[Frame]:
+def advance(face: FaceAnimator, time_s: float) -> list[Frame]:
     """Let a silent sound go on up to a time; return the frames that are due."""
-    return face.accept(Progress(time_s=time_s, level_db=SILENT_DB))
+    return face.process(Progress(time_s=time_s, level_db=SILENT_DB))
 
 
 def moment(
@@ -59,9 +58,9 @@ def moment(
     articulation: Articulation | None = None,
     levels: Sequence[tuple[float, float]] = (),
     step_s: float = 0.02,
-) -> Moment:
+) -> FrameContext:
     """What modifiers are told while somebody speaks, by default nothing that is known."""
-    return Moment(
+    return FrameContext(
         time_s=time_s,
         known_s=time_s,
         elapsed_s=time_s,

@@ -19,10 +19,9 @@ from kouxing.services.live_chain import sound_events
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import lip_models, load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 
 _FACE_PX = (480, 360)
 _IMAGES_PER_S = 25.0
@@ -43,14 +42,14 @@ def film_clip(folder: Path, name: str, output: Path) -> None:
         raise UserError(f"there is no clip {name} in {folder}")
     model = load_live_model()
     faces = []
-    for lips in LipModelName:
+    for lips in lip_models():
         delay_s = SynthesizerConfig(lips=lips).delay_ms / 1e3
         events = sound_events(model, clip.samples, lip_predictor_for(model), delay_s)
         faces.append(live_frames(load_lip_model(name=lips), events, delay_s, FRAME_RATE_HZ))
     times_s = np.arange(len(faces[0])) / FRAME_RATE_HZ
     faces.append(tracked_frames(clip, times_s))
     frames = list(zip(times_s, np.stack(faces, axis=1).astype(np.float32), strict=True))
-    captions = [*(f"lips: {lips}" for lips in LipModelName), "tracked lips"]
+    captions = [*(f"lips: {lips}" for lips in lip_models()), "tracked lips"]
     head = scene.load_head()
     camera = scene.camera(head, Framing.MOUTH)
     renderer = SideBySide(Renderer(head, *_FACE_PX, camera=camera), captions)

@@ -41,13 +41,11 @@ from kouxing.services.recognizer.alignment import align_phones, spoken
 from kouxing.services.recognizer.front_end.pcm import progress_of
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recognizer.offline import recognize
-from kouxing.services.synthesizer.config import DELAYS_MS
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING, KeyFrames
-from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
-from kouxing.services.synthesizer.lips.ferguson.table import load_table
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
-from kouxing.services.synthesizer.lips.load import LIP_MODELS, load_lip_model
+from kouxing.services.synthesizer.lips.registry import lip_model_info, lip_models, load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
@@ -199,7 +197,7 @@ def _methods(
     by_endpoints = time_text(progress_of(samples), syllables, table)
     for name, timed in (("text by endpoints", by_endpoints), ("text by alignment", phones)):
         yield name, _curves_of(key_frames_of(timed, table, inventory.silence))
-    delays_s = {name: DELAYS_MS[name] / 1e3 for name in LIP_MODELS}
+    delays_s = {name: lip_model_info(name).delay_ms / 1e3 for name in lip_models()}
     events = live_events(model, samples, lip_predictor_for(model), sorted(set(delays_s.values())))
     for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)

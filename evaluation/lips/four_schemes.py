@@ -37,17 +37,16 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import LipFrameModel
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
-from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
-from kouxing.services.synthesizer.face import Face, Frame
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.lips.registry import lip_model_info, lip_models, load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import SoundEvent
 
 SCHEMES = (1, 2, 3, 4)
 BOUND, RECOGNISED, NEXT_PHONE = 1, 2, 4
-_DELAYS_S = sorted({delay_ms / 1e3 for delay_ms in DELAYS_MS.values()})
+_DELAYS_S = sorted({info.delay_ms / 1e3 for info in lip_models().values()})
 _VIDEO_PX = (640, 640)
 _IMAGES_PER_S = 25.0
 
@@ -57,7 +56,7 @@ class Condition:
     """One way to drive a face."""
 
     scheme: int
-    lips: LipModelName
+    lips: str
     recognizer: str  # empty for scheme 1
 
     @property
@@ -76,9 +75,9 @@ class Listener:
     config: RecognizerConfig
     has_paper_rule: bool  # it emits phones as in the paper, and they are never corrected
 
-    def can_drive(self, lips: LipModelName) -> bool:
+    def can_drive(self, lips: str) -> bool:
         """Whether a lip model gets what it needs; learnt lips need the network's lip frames."""
-        return lips != LipModelName.LEARNT or self.lips is not None
+        return lips != "learnt" or self.lips is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +116,7 @@ def listeners_of(names: Sequence[str], *, has_paper_rule: bool = False) -> list[
     return found
 
 
-def conditions_of(listeners: Sequence[Listener], lips: Sequence[LipModelName]) -> list[Condition]:
+def conditions_of(listeners: Sequence[Listener], lips: Sequence[str]) -> list[Condition]:
     """All conditions, those of a lip model together."""
     return [
         condition
@@ -172,7 +171,7 @@ def face_of(
     hearing = heard.hearings[condition.recognizer]
     if condition.scheme == RECOGNISED:
         return animate_recording(hearing.recognised, lips, config)
-    face = Face(
+    face = FaceAnimator(
         lips,
         frame_rate_hz=config.frame_rate_hz,
         delay_s=config.delay_ms / 1e3,
@@ -184,7 +183,7 @@ def face_of(
 
 def events_told(condition: Condition, hearing: Hearing) -> Sequence[SoundEvent]:
     """Return what the face of a live condition is told, in order."""
-    events = hearing.live[DELAYS_MS[condition.lips] / 1e3]
+    events = hearing.live[lip_model_info(condition.lips).delay_ms / 1e3]
     if hearing.has_paper_rule:
         rule = once_the_next_is_emitted if condition.scheme == NEXT_PHONE else as_emitted
         return rule(events)
@@ -194,7 +193,7 @@ def events_told(condition: Condition, hearing: Hearing) -> Sequence[SoundEvent]:
 def film_all(
     heard: Sequence[HeardSentence],
     listeners: Sequence[Listener],
-    lips: Sequence[LipModelName],
+    lips: Sequence[str],
     folder: Path,
     *,
     has_anchor: bool = False,
@@ -252,7 +251,7 @@ def film_all(
 def _films(
     heard: Sequence[HeardSentence],
     listeners: Sequence[Listener],
-    lips: Sequence[LipModelName],
+    lips: Sequence[str],
     *,
     has_anchor: bool,
     sound_at_once: bool,
@@ -284,7 +283,7 @@ def _frames(condition: Condition, heard: HeardSentence) -> list[Frame]:
 
 
 def _frames_as_made(condition: Condition, heard: HeardSentence) -> list[Frame]:
-    delay_s = DELAYS_MS[condition.lips] / 1e3
+    delay_s = lip_model_info(condition.lips).delay_ms / 1e3
     return [(time_s + delay_s, faps) for time_s, faps in _frames(condition, heard)]
 
 

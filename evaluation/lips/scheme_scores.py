@@ -41,10 +41,10 @@ from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme
 from kouxing.evaluation.lips.scores import LipScore, pool
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.alignment import spoken
-from kouxing.services.synthesizer.config import DELAYS_MS, SynthesizerConfig
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.registry import lip_model_info
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent
 from kouxing.shared.phones.inventory import PhoneInventory
 
@@ -91,7 +91,7 @@ class Outcome:
 
 
 def evaluate(
-    heard: Sequence[HeardSentence], listeners: Sequence[Listener], lips: Sequence[LipModelName]
+    heard: Sequence[HeardSentence], listeners: Sequence[Listener], lips: Sequence[str]
 ) -> Outcome:
     """Measure all conditions.
 
@@ -187,7 +187,7 @@ def _pooled(
         lips=condition.lips,
         recognizer=condition.recognizer,
         num_sentences=len(mouths),
-        face_delay_ms=DELAYS_MS[condition.lips] if is_live else None,
+        face_delay_ms=lip_model_info(condition.lips).delay_ms if is_live else None,
         phone_delay_p50_ms=p50,
         phone_delay_p95_ms=p95,
         jerk=rms_jerk([MEASURES["opening"](mouth) for mouth in mouths], FRAME_RATE_HZ),
@@ -236,7 +236,7 @@ def _orders(
     reference: str,
     scores: Scores,
     listeners: Sequence[Listener],
-    lips: Sequence[LipModelName],
+    lips: Sequence[str],
 ) -> Iterator[Order]:
     for name in lips:
         for listener in listeners:

@@ -32,7 +32,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import LipFrameModel, LipFrameStream, delay_for
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.services.synthesizer.offline import synthesize
@@ -194,13 +194,13 @@ def live_frames(
     lips: LipModel, events: Sequence[SoundEvent], delay_s: float, frame_rate_hz: float
 ) -> Array:
     """Frames (num_frames, 68) that the live chain makes of sound events, without idle motion."""
-    face = Face(lips, frame_rate_hz=frame_rate_hz, delay_s=delay_s)
+    face = FaceAnimator(lips, frame_rate_hz=frame_rate_hz, delay_s=delay_s)
     return np.array([faps for _, faps in animate_live(face, events)], dtype=float)
 
 
-def animate_live(face: Face, events: Sequence[SoundEvent]) -> list[Frame]:
+def animate_live(face: FaceAnimator, events: Sequence[SoundEvent]) -> list[Frame]:
     """All frames that a face makes of sound events."""
-    return [frame for event in events for frame in face.accept(event)]
+    return [frame for event in events for frame in face.process(event)]
 
 
 def once_the_next_begins(events: Sequence[SoundEvent]) -> list[SoundEvent]:

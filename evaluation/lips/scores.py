@@ -60,7 +60,7 @@ from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
-from kouxing.services.synthesizer.lips.load import LIP_MODELS
+from kouxing.services.synthesizer.lips.registry import lip_models
 from kouxing.shared.errors import UserError
 
 
@@ -290,7 +290,7 @@ def main(
     model = load_live_model()
     lips = lip_predictor_for(model)
     visemes = DynamicVisemes(load_parameters(parameters), model.inventory)
-    models = {name: make(model.inventory) for name, make in LIP_MODELS.items()}
+    models = {name: make(model.inventory) for name, make in lip_models().items()}
     schemes = all_schemes(visemes, models | {"dynamic-visemes": visemes})
     clips = clips_to_score(folder, parameters, sources=sources)
     scores = []

@@ -21,11 +21,10 @@ from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predicto
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, SoundEvent
 from kouxing.shared.terminal import print_message
 
@@ -62,7 +61,7 @@ def read_motion(source: Path, sound: Path | None) -> Motion:
 
 def animate(
     source: Path,
-    lips: Sequence[LipModelName],
+    lips: Sequence[str],
     progress: Progress,
     *,
     live: bool,
@@ -122,7 +121,7 @@ def animate(
     )
 
 
-def _synthesizer_settings(lips: LipModelName, expressiveness: float | None) -> SynthesizerConfig:
+def _synthesizer_settings(lips: str, expressiveness: float | None) -> SynthesizerConfig:
     if expressiveness is None:
         return SynthesizerConfig(lips=lips)
     return SynthesizerConfig(lips=lips, expressiveness=expressiveness)

@@ -26,8 +26,11 @@ from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.transcriber import SherpaTranscriber
 from kouxing.services.synthesizer.lips.ferguson import drawing
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour
-from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
-from kouxing.services.synthesizer.lips.ferguson.openings import anchors_of, key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.key_frames import (
+    KeyFrames,
+    anchors_of,
+    key_frames_of,
+)
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
 from kouxing.shared.clock import MEDIA_RATE_HZ
@@ -188,7 +191,7 @@ def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.Moment]:
     syllables = {onset_s: label for onset_s, _, label in labels}
     anchors = anchors_of(mouth.phones, mouth.silence) or [(0.0, mouth.silence)]
     return [
-        drawing.Moment(
+        drawing.LabeledMouth(
             time_s,
             float(opening),
             "" if phone == mouth.silence else phone,

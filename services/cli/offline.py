@@ -18,7 +18,7 @@ from kouxing.services.cli.options import (
 )
 from kouxing.services.driver.config import Framing
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.terminal import CONSOLE, print_message, write_output
 
 Audio = Annotated[Path, typer.Argument(help="Audio or video file.")]
@@ -60,8 +60,13 @@ def render(
         ),
     ],
     lips: Annotated[
-        list[LipModelName] | None,
-        typer.Option(help="Lip model for a sound. Repeat it to see faces side by side."),
+        list[str] | None,
+        typer.Option(
+        typer.Option(
+            help="Lip model for a sound, such as learnt or dynamic-visemes. Repeat it to see faces"
+            " side by side."
+        ),
+        ),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Show what a viewer of the live stream would see.")

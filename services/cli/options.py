@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from kouxing.services.driver.config import DriverConfig, Framing
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.face.shape_names import ShapeSetName
 
 DEFAULT_HEAD = DriverConfig().head
@@ -68,7 +68,7 @@ class Timing(StrEnum):
 class ExportOptions:
     """How ``kouxing render`` shows and writes a face. The defaults are those of its options."""
 
-    lips: tuple[LipModelName, ...] = (DEFAULT_LIP_MODEL,)
+    lips: tuple[str, ...] = (DEFAULT_LIP_MODEL,)
     form: CurveForm = CurveForm.FAPS
     head: str = DEFAULT_HEAD
     size: str = "1280x720"

@@ -17,11 +17,12 @@ import numpy as np
 
 from kouxing.services.driver.config import DriverConfig
 from kouxing.services.driver.kind import KIND
-from kouxing.services.driver.poses import STALL_S, Poses
+from kouxing.services.driver.poses import Poses
 from kouxing.services.driver.recordings import Recordings
 from kouxing.services.driver.video.recording import Recording
 from kouxing.services.driver.view import View
 from kouxing.shared.clock import to_seconds
+from kouxing.shared.face.resting_face import STALL_S
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service

@@ -1,1 +1,1 @@
-"""Synthesizer: phones in, FAP frames out."""
+"""The synthesizer service: phones and lip frames in, FAP frames out."""

@@ -4,35 +4,41 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
-from kouxing.shared.config import BoundEndpoint, DefaultBy
+from kouxing.services.synthesizer.lips.registry import lip_model_info, lip_models
+from kouxing.shared.config import BoundEndpoint, DefaultBy, Form
+from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 
-# Default delay of each lip model.
-DELAYS_MS: dict[str, float] = {
-    LipModelName.LEARNT: 60.0,
-    LipModelName.DYNAMIC_VISEMES: 160.0,
-    LipModelName.FERGUSON: 160.0,
-}
+_DELAYS_MS = {name: info.delay_ms for name, info in lip_models().items()}
+
+
+def _check_lip_model(name: str) -> str:
+    try:
+        lip_model_info(name)
+    except UserError as error:
+        raise ValueError(str(error)) from None
+    return name
 
 
 class SynthesizerConfig(FaceConfig):
-    """The synthesizer's own keys."""
+    """The synthesizer's configuration keys."""
 
     phone_input: BoundEndpoint = "tcp://127.0.0.1:5570"
-    """Where the recognizer sends phones."""
+    """Endpoint for phones from the recognizer."""
     faps: BoundEndpoint = "tcp://127.0.0.1:5571"
-    """Where FAP frames are published."""
+    """Endpoint that publishes FAP frames."""
     frame_rate_hz: Annotated[float, Field(ge=10, le=240)] = 50.0
     """FAP frames per second."""
-    lips: LipModelName = DEFAULT_LIP_MODEL
-    """Lip model: of recognised phones (dynamic-visemes), of the sound itself (learnt), or of one
-    opening (ferguson)."""
+    lips: Annotated[str, AfterValidator(_check_lip_model), Form(" or ".join(lip_models()))] = (
+        DEFAULT_LIP_MODEL
+    )
+    """Lip model; a client can choose another one."""
     delay_ms: Annotated[float, Field(ge=0, le=300)] = Field(
-        default_factory=DefaultBy("lips", DELAYS_MS, DELAYS_MS[DEFAULT_LIP_MODEL])
+        default_factory=DefaultBy("lips", _DELAYS_MS, _DELAYS_MS[DEFAULT_LIP_MODEL])
     )
     """How much later than its audio a frame is made, in steps of 20 ms."""
     expressiveness: Annotated[float, Field(ge=0.5, le=2)] = 1.4
-    """How large the mouth's movements are; 1 for those of the lip model. Closures stay closed."""
+    """Size of the mouth movements; 1 leaves the lip model unchanged. Closures stay closed."""

@@ -1,7 +1,7 @@
 """The full model, offline: phones with their times in, all FAP frames out.
 
 Source: Wang & Cai 2003, eq. 6: every frame blends all visemes and silences. Li et al. 2011, 3.2,
-schemes 1 (phones of a forced alignment) and 2 (recognised phones with their times).
+schemes 1 (phones of a forced alignment) and 2 (recognized phones with their times).
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
 )
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import Timeline, build_timeline
 from kouxing.services.synthesizer.modifiers.amplitude import Amplitude
-from kouxing.services.synthesizer.modifiers.modifier import Moment
+from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import Phone
 
 _BLOCK_S = 2.0
-# Further away a viseme weighs less than a face can show, whatever its parameters.
-_REACH_S = 1.5
+_REACH_S = 1.5  # visemes further away have no visible weight
 
 
 def synthesize(
@@ -35,23 +34,20 @@ def synthesize(
     frame_rate_hz: float = 50.0,
     levels: Sequence[tuple[float, float]] = (),
 ) -> NDArray[np.float32]:
-    """FAP frames of an utterance.
+    """Return the FAP frames (num_frames, 68) of an utterance.
 
     Parameters
     ----------
-    lips : DynamicVisemes
-    phones : sequence of Phone
-        With their true times; holes between them and silences are pauses.
-    num_frames : int
+    lips
+        The lip model.
+    phones
+        Phones with their true times; gaps and silences are pauses.
+    num_frames
         Frame ``k`` is at ``k / frame_rate_hz`` seconds.
-    frame_rate_hz : float
-    levels : sequence of (time in seconds, level in dB of full scale)
-        Of the sound, if it is known.
-
-    Returns
-    -------
-    array (num_frames, 68)
-        FAP units.
+    frame_rate_hz
+        Frames per second.
+    levels
+        Times in seconds and levels in dB of full scale, if known.
     """
     parameters = lips.parameters
     timeline = build_timeline(phones, lips.inventory)
@@ -65,7 +61,7 @@ def synthesize(
     amplitude = Amplitude()
     articulation = VisemeArticulation(timeline, parameters.level_db)
     for number, (frame_s, faps_now) in enumerate(zip(time_s, faps, strict=True)):
-        moment = Moment(
+        context = FrameContext(
             time_s=float(frame_s),
             known_s=np.inf,
             elapsed_s=float(frame_s),
@@ -74,7 +70,7 @@ def synthesize(
             levels=levels if number == 0 else (),
             articulation=articulation,
         )
-        amplitude.apply(faps_now, moment)
+        amplitude.apply(faps_now, context)
     return faps
 
 

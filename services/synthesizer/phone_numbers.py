@@ -45,7 +45,7 @@ class PhoneNumbers:
         return renumbered
 
     def take_withdrawn(self) -> list[Phone]:
-        """Return the void phones that were not found again, as withdrawn phones, and forget them."""
+        """Return and forget the void phones that were not found again, as withdrawn phones."""
         withdrawn = [replace(phone, duration_s=0.0, final=True) for phone in self._void.values()]
         self._void.clear()
         return withdrawn

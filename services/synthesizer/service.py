@@ -1,12 +1,12 @@
-"""The synthesizer as a service: phones and lips in, FAP frames out.
+"""The synthesizer service: phones and lip frames in, FAP frames out.
 
 Reacts to: phone, lips, speech, progress, resume-face (recognizer), start-session, stop-session,
 flush-session, set-face (control).
 Emits: fap-frame, end-of-faps (followers), acknowledge-phones (recognizer).
 
-Frames are clocked by the audio that was processed, so a system under load is late, never wrong, and
-audio faster than real time gives the same frames. Only when a live stream stalls does the wall
-clock take over, to lead the face to rest.
+Processed audio clocks the frames. A system under load is late but makes the same frames, and so
+does audio faster than real time. Only while a live stream is stalled, the wall clock leads the face
+to rest.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face import REST_S, Face, Frame
+from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
-from kouxing.services.synthesizer.lips.load import LIP_MODELS, load_lip_model
+from kouxing.services.synthesizer.lips.registry import lip_models, load_lip_model
 from kouxing.shared.bus import PHONES, Socket
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of
@@ -53,58 +53,58 @@ from kouxing.shared.wire.speech import (
     ResumeFace,
 )
 
-LOST_S = 20.0  # without a word from a recognizer, which would tell that its client is silent
-AGAIN_S = 3.0  # for which followers of a session that has moved here may still be on their way
-MAX_AT_ONCE_S = 0.06  # of frames of a session: those of a gap must not hold others up
-MAX_WAITING = 200  # messages while they are made; the recognizer sends the next ones again
-MADE_UP_S = 0.2  # of frames without sound, when they are late
+RECOGNIZER_TIMEOUT_S = 20.0  # a recognizer also reports silent clients, so silence means it is lost
+REPUBLISH_S = 3.0  # followers of a session that has moved here may still be connecting
+MAX_BURST_S = 0.06  # frames of one session per loop iteration; a gap must not delay other sessions
+MAX_QUEUED = 200  # events of a session; the recognizer resends later ones
+MAX_CATCH_UP_S = 0.2  # late frames without sound that are still made
 EXPRESSIONS = frozenset(ExpressionName)
-LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # FAP 1 and 2 are not used; the others all are
+LOW_LEVEL_FAPS = range(2, NUM_FAPS)  # all but FAP 1 and 2
 MASK = sum(1 << index for index in LOW_LEVEL_FAPS).to_bytes(MASK_BYTES, "little")
 
 
 class _Session:
-    """One session: its face, and its place among messages."""
+    """A session: its face, and its position in the streams of messages."""
 
-    def __init__(self, start: StartSession, face: Face, input_socket: Socket) -> None:
+    def __init__(self, start: StartSession, face: FaceAnimator, input_socket: Socket) -> None:
         self.start = start
         self.face = face
         self.receiver = ReliableReceiver(input_socket, start.session, self._acknowledge)
-        self.epoch_in = 0  # of the newest message from the recognizer; 0: there is none
-        self.relaxes_s = time.monotonic() + LOST_S  # from when on frames come without sound
+        self.epoch_in = 0  # epoch of the newest message from the recognizer; 0 before the first
+        self.relax_at_s = time.monotonic() + RECOGNIZER_TIMEOUT_S  # start of frames without sound
         self.sequence_out = 0
-        self.shown: FapFrame | None = None  # the newest frame
+        self.newest: FapFrame | None = None
         self.final = FinalTime()
-        self.waiting: deque[SoundEvent] = deque()  # while frames are made of the first
-        self.frames: Iterator[Frame] | None = None  # of that, not made yet
+        self.queue: deque[SoundEvent] = deque()  # frames are made for the first event
+        self.frames: Iterator[Frame] | None = None  # remaining frames of the first event
         self.finished = False
-        self._resumed_s = -math.inf  # when it took another synthesizer's place
-        self.shapes: list[str] = []  # sets that are published
-        self.since_then: list[FapFrame | EndOfFaps] = []  # published of late
+        self._resumed_s = -math.inf  # when this session replaced one of another synthesizer
+        self.shapes: list[str] = []  # shape sets to publish
+        self.recently_published: list[FapFrame | EndOfFaps] = []
 
-    def resume(self, media_time: int, frame: int, faps: NDArray[np.float32] | None) -> None:
-        """Go on behind the newest frame of another synthesizer."""
+    def resume(self, media_time: int, num_frames: int, faps: NDArray[np.float32] | None) -> None:
+        """Continue after the newest frame of another synthesizer."""
         self._resumed_s = time.monotonic()
-        self.sequence_out = frame
-        self.face.resume(to_seconds(media_time), frame, faps)
+        self.sequence_out = num_frames
+        self.face.resume(to_seconds(media_time), num_frames, faps)
 
     @property
     def just_resumed(self) -> bool:
-        """Whether its followers may still be on their way here."""
-        return time.monotonic() < self._resumed_s + AGAIN_S
+        """Whether followers may still be connecting to this synthesizer."""
+        return time.monotonic() < self._resumed_s + REPUBLISH_S
 
     @property
     def media_time(self) -> int:
         """Media time of the newest frame, samples at 16 kHz."""
-        return self.shown.media_time if self.shown is not None else 0
+        return self.newest.media_time if self.newest is not None else 0
 
     def _acknowledge(self) -> AcknowledgePhones:
-        if self.shown is None:
+        if self.newest is None:
             return AcknowledgePhones()
         frame = NewestFrame(
-            sequence=self.shown.sequence,
-            media_time=self.shown.media_time,
-            values=self.shown.values,
+            sequence=self.newest.sequence,
+            media_time=self.newest.media_time,
+            values=self.newest.values,
         )
         return AcknowledgePhones(newest_frame=frame)
 
@@ -122,8 +122,8 @@ class SynthesizerService(Service):
             frame_rate_hz=config.frame_rate_hz, delay_ms=config.delay_ms, lips=config.lips
         )
         self._sessions: dict[str, _Session] = {}
-        self._turn = 0  # of sessions with many frames to make
-        self._dropped_s = 0.0  # when frames were dropped that nobody takes
+        self._turn = 0  # round robin of sessions with queued events
+        self._dropped_s = 0.0  # last removal of frames for stopped subscribers
         self._input = self.bus.bind_router(
             config.phone_input, "synthesizer.phone_input", PHONES, role="service"
         )
@@ -132,7 +132,7 @@ class SynthesizerService(Service):
             "phone_input": config.reachable(self._input.endpoint),
             "faps": config.reachable(self._faps.endpoint),
         }
-        load_lip_model(name=config.lips)  # the first session waits for nothing
+        load_lip_model(name=config.lips)  # no delay for the first session
         self.register(self._input, dict.fromkeys(LINK_MESSAGES, self._on_input))
         self.register(self._faps, {})
 
@@ -141,7 +141,7 @@ class SynthesizerService(Service):
         return super().control_handlers() | {SetFace: self._on_set_face}
 
     def start_session(self, start: StartSession) -> bool:
-        """Make a face at rest; a session that moved here again keeps its own."""
+        """Create a face at rest; a session that returns to this synthesizer keeps its face."""
         session = self._sessions.get(start.session)
         if session is None or session.start.token != start.token:
             session = _Session(start, self._new_face(start), self._input)
@@ -151,9 +151,9 @@ class SynthesizerService(Service):
         self.session_started(start, to_samples(session.final.time_s))
         return False
 
-    def _new_face(self, start: StartSession) -> Face:
+    def _new_face(self, start: StartSession) -> FaceAnimator:
         settings = self._known_settings(start.session, start.face)
-        face = Face(
+        face = FaceAnimator(
             load_lip_model(
                 start.facts.language or DEFAULT_LANGUAGE, settings.lips or self._config.lips
             ),
@@ -163,45 +163,46 @@ class SynthesizerService(Service):
             expressiveness=settings.expressiveness or self._config.expressiveness,
         )
         if settings.expressions:
-            face.express(settings.expressions, settings.hold_s)
+            face.set_expressions(settings.expressions, settings.hold_s)
         return face
 
     def stop_session(self, session: str) -> None:
-        """Forget a session."""
-        found = self._sessions.pop(session, None)
-        if found is not None and not found.finished and not self.should_exit:
-            self._end(found)
+        """Remove a session."""
+        stopped = self._sessions.pop(session, None)
+        # a stopping synthesizer leaves the session to another one
+        if stopped is not None and not stopped.finished and not self.should_exit:
+            self._end(stopped)
 
     def flush_session(self, session: str) -> None:
-        """Drop what is queued; the frames to come lead to rest."""
-        found = self._sessions.get(session)
-        if found is not None:
-            found.waiting = deque(
-                event for event in found.waiting if not isinstance(event, Phone | LipFrame)
+        """Drop queued phones and lip frames; the next frames lead to rest."""
+        flushed = self._sessions.get(session)
+        if flushed is not None:
+            flushed.queue = deque(
+                event for event in flushed.queue if not isinstance(event, Phone | LipFrame)
             )
-            found.face.flush()
+            flushed.face.flush()
 
     def _on_set_face(self, message: SetFace, _sender: Peer) -> None:
-        """Change how a face moves, from where it is."""
+        """Change the settings of a face; it moves continuously."""
         session = self._sessions.get(message.session)
         if session is None:
             return
         settings = self._known_settings(message.session, message.face)
         if settings.lips is not None:
             language = session.start.facts.language or DEFAULT_LANGUAGE
-            session.face.use_lips(load_lip_model(language, settings.lips))
+            session.face.set_lip_model(load_lip_model(language, settings.lips))
         if settings.expressiveness is not None:
-            session.face.choose_expressiveness(settings.expressiveness)
+            session.face.set_expressiveness(settings.expressiveness)
         if settings.expressions is not None:
-            session.face.express(settings.expressions, settings.hold_s)
+            session.face.set_expressions(settings.expressions, settings.hold_s)
         session.shapes = list(dict.fromkeys([*session.shapes, *(settings.shapes or ())]))
 
     def _known_settings(self, session: str, settings: FaceSettings) -> FaceSettings:
-        """Return settings without the names that are unknown here, and report these."""
+        """Return the settings without unknown names; report unknown names."""
         strengths = (settings.expressions or {}).items()
         known = replace(
             settings,
-            lips=settings.lips if settings.lips in LIP_MODELS else None,
+            lips=settings.lips if settings.lips in lip_models() else None,
             expressions=settings.expressions
             and {name: strength for name, strength in strengths if name in EXPRESSIONS},
             shapes=settings.shapes and [name for name in settings.shapes if name in SHAPE_SETS],
@@ -213,29 +214,29 @@ class SynthesizerService(Service):
         return known
 
     def on_tick(self, now_s: float) -> None:
-        """Acknowledge, lead faces to rest whose live stream has stalled, drop what grows old."""
+        """Acknowledge, lead faces of stalled live streams to rest, drop old frames."""
         if now_s > self._dropped_s + 1.0:
             self._dropped_s = now_s
             live = [name for name, session in self._sessions.items() if session.start.paced]
             self._faps.disconnect_stalled((FapFrame,), live)
         for session in self._sessions.values():
             session.receiver.tick()
-            if session.start.paced and not session.finished and not session.waiting:
+            if session.start.paced and not session.finished and not session.queue:
                 self._relax(session, now_s)
-        owing = [session for session in self._sessions.values() if session.waiting]
-        if owing:  # one after the other gets its turn
+        busy = [session for session in self._sessions.values() if session.queue]
+        if busy:
             self._turn += 1
-            self._make_frames(owing[self._turn % len(owing)])
+            self._make_frames(busy[self._turn % len(busy)])
 
     def session_inputs(self) -> dict[str, SessionInput]:
-        """Return up to where the phones of each session are final."""
+        """Return the time up to which the phones of each session are final."""
         return {
             name: SessionInput(media_time=to_samples(session.final.time_s))
             for name, session in self._sessions.items()
         }
 
     def on_drain(self) -> bool:
-        """Let others take the sessions; lead the faces that nobody takes to rest, and end them."""
+        """Wait until other synthesizers have taken the sessions; end the remaining ones."""
         unfinished = [session for session in self._sessions.values() if not session.finished]
         if unfinished and self.is_handing_over:
             return False
@@ -245,12 +246,12 @@ class SynthesizerService(Service):
         return True
 
     def _relax(self, session: _Session, now_s: float) -> None:
-        # a process that stood still does not make up for it
-        session.relaxes_s = max(session.relaxes_s, now_s - MADE_UP_S)
-        num_frames = int((now_s - session.relaxes_s) * self.frame_rate_hz)
+        # a stalled process does not make all missed frames
+        session.relax_at_s = max(session.relax_at_s, now_s - MAX_CATCH_UP_S)
+        num_frames = int((now_s - session.relax_at_s) * self.frame_rate_hz)
         if num_frames > 0:
-            session.relaxes_s += num_frames / self.frame_rate_hz
-            # Media time stands still with the audio; the sequence number goes on.
+            session.relax_at_s += num_frames / self.frame_rate_hz
+            # media time stands still with the audio; the sequence number continues
             self._publish(session, session.face.relax(num_frames))
             session.receiver.acknowledge()
 
@@ -262,36 +263,34 @@ class SynthesizerService(Service):
             return
         now_s = time.monotonic()
         has_stalled = isinstance(message, Progress) and message.state == AudioState.STALLED
-        session.relaxes_s = now_s if has_stalled else now_s + LOST_S
+        session.relax_at_s = now_s if has_stalled else now_s + RECOGNIZER_TIMEOUT_S
         if message.epoch != session.epoch_in:
             self._enter_epoch(session, message)
         if not has_stalled and not isinstance(message, ResumeFace):
-            self._accept(session, message)
+            self._queue_event(session, message)
 
     def _enter_epoch(self, session: _Session, message: LinkMessage) -> None:
-        """Let a face go on: with another recognizer, or where another synthesizer's face was."""
+        """Continue a face with another recognizer, or after another synthesizer's frames."""
         if session.epoch_in:
-            session.face.restart()
+            session.face.change_recognizer()
         elif isinstance(message, ResumeFace):
             frame = message.newest_frame
             session.resume(frame.media_time, frame.sequence, np.frombuffer(frame.values, "<f4"))
-        elif message.epoch > 1:  # both were lost, and nobody knows how far the other face came
+        elif message.epoch > 1:  # both workers were lost, so the other face's frame is unknown
             time_s = to_seconds(message.media_time)
             session.resume(message.media_time, int(time_s * self.frame_rate_hz), None)
         session.epoch_in = message.epoch
 
     def _admit(self, message: LinkMessage, sender: Peer) -> _Session | None:
-        """Return the session of a message if that is its recognizer's next one."""
+        """Return the session of a message if it is the next message of its recognizer."""
         session = self._sessions.get(message.session)
         if session is None:
             self.warn("unknown-session", "phones of an unknown session", message.session)
         elif sender.key != key_of(session.start.endpoints.get("phones", "")):
-            self.warn(
-                "foreign", "phones from another than the session's recognizer", message.session
-            )
-        elif message.epoch != session.start.epoch:  # sent again until control has told both ends
+            self.warn("foreign", "phones from a different recognizer", message.session)
+        elif message.epoch != session.start.epoch:  # resent until both ends have the epoch
             self.metrics.count("other_epoch")
-        elif len(session.waiting) >= MAX_WAITING:
+        elif len(session.queue) >= MAX_QUEUED:
             self.metrics.count("too_early")
         elif not session.receiver.receive(message, sender):
             self.metrics.count("repeated")
@@ -299,25 +298,25 @@ class SynthesizerService(Service):
             return session
         return None
 
-    def _accept(self, session: _Session, message: SpeechMessage) -> None:
+    def _queue_event(self, session: _Session, message: SpeechMessage) -> None:
         event = event_of(message)
         language = session.start.facts.language or DEFAULT_LANGUAGE
         if isinstance(event, Phone) and event.symbol not in load_inventory(language).index:
-            text = f"{event.symbol!r} is no phone of {language}"
+            text = f"{event.symbol!r} is not a phone of {language}"
             self.warn("unknown-phone", text, message.session)
             return
         session.final.update(event)
-        session.waiting.append(event)
-        if len(session.waiting) == 1:
+        session.queue.append(event)
+        if len(session.queue) == 1:
             self._make_frames(session)
 
     def _make_frames(self, session: _Session) -> None:
-        """Publish frames of what came for a session, but not too many at a time."""
-        num_left = max(1, round(MAX_AT_ONCE_S * self.frame_rate_hz))
-        while session.waiting:
-            event = session.waiting[0]
+        """Publish the frames of queued events, up to ``MAX_BURST_S``."""
+        num_left = max(1, round(MAX_BURST_S * self.frame_rate_hz))
+        while session.queue:
+            event = session.queue[0]
             if session.frames is None:
-                session.frames = session.face.frames_of(event)
+                session.frames = session.face.iter_frames(event)
             started_s = time.perf_counter()
             frames = list(itertools.islice(session.frames, num_left))
             self._publish(session, frames)
@@ -327,7 +326,7 @@ class SynthesizerService(Service):
             if num_left == 0:
                 return
             session.frames = None
-            session.waiting.popleft()
+            session.queue.popleft()
             if isinstance(event, EndOfSound):
                 self._end(session)
 
@@ -351,7 +350,7 @@ class SynthesizerService(Service):
         self.metrics.count("out_fap_frame", len(frames))
         for time_s, faps in frames:
             session.sequence_out += 1
-            session.shown = FapFrame(
+            session.newest = FapFrame(
                 session=session.start.session,
                 epoch=session.start.epoch,
                 sequence=session.sequence_out,
@@ -363,18 +362,18 @@ class SynthesizerService(Service):
                     for name in session.shapes
                 },
             )
-            self._send(session, session.shown)
+            self._send(session, session.newest)
 
     def _send(self, session: _Session, message: FapFrame | EndOfFaps) -> None:
         self._faps.send(message)
         if session.just_resumed:
-            session.since_then.append(message)
+            session.recently_published.append(message)
         else:
-            session.since_then.clear()
+            session.recently_published.clear()
 
     def _on_joined(self, session: str) -> None:
-        """Publish again what came before the followers of a moved session were here."""
-        found = self._sessions.get(session)
-        if found is not None and found.just_resumed:
-            for message in found.since_then:
+        """Publish recent frames again for a follower that joins a moved session."""
+        joined = self._sessions.get(session)
+        if joined is not None and joined.just_resumed:
+            for message in joined.recently_published:
                 self._faps.send(message)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
-Value = TypeVar("Value", float, Any)  # a number or an array
+import numpy as np
+from numpy.typing import NDArray
+
+Value = TypeVar("Value", float, NDArray[np.float32])
 
 
 def smoothing_share(elapsed_s: float, time_constant_s: float) -> float:

@@ -20,10 +20,9 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import delay_for
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import LipFrame, Phone
 from kouxing.shared.wire.events import message_of
 from kouxing.shared.wire.speech import Lips
@@ -90,7 +89,7 @@ def test_services_send_the_frames_of_the_chain(
 
 @pytest.mark.parametrize(("lips", "rate_hz"), [("learnt", 48000), ("dynamic-visemes", 16000)])
 def test_services_send_the_frames_of_the_chain_with_chosen_lips(
-    tmp_path: Path, lips: LipModelName, rate_hz: int
+    tmp_path: Path, lips: str, rate_hz: int
 ) -> None:
     samples = at_rate(samples_of_file(VOWELS_FILE), rate_hz)
     services = ("control", "recognizer", "synthesizer")
@@ -181,7 +180,7 @@ def test_lips_are_switched_while_a_session_runs(tmp_path: Path) -> None:
     frames = chain.accept_waveform(samples) + chain.input_finished()
     settings = {
         "KOUXING_SYNTHESIZER_LIPS": "dynamic-visemes",
-        "KOUXING_SYNTHESIZER_DELAY_MS": str(SynthesizerConfig(lips=LipModelName.LEARNT).delay_ms),
+        "KOUXING_SYNTHESIZER_DELAY_MS": str(SynthesizerConfig(lips="learnt").delay_ms),
     }
     with (
         System(("control", "synthesizer"), tmp_path, settings=settings) as running,

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
-from kouxing.services.synthesizer.config import DELAYS_MS
-from kouxing.services.synthesizer.face import Face, Frame
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
+from kouxing.services.synthesizer.lips.registry import lip_model_info, load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange, Waveform
 from tests.live_streams import recognize_live
@@ -41,20 +40,20 @@ def events() -> tuple[SoundEvent, ...]:
     return tuple(each for each in outputs if not isinstance(each, Waveform))
 
 
-def make_face(lips: str) -> Face:
-    face = Face(
+def make_face(lips: str) -> FaceAnimator:
+    face = FaceAnimator(
         load_lip_model(name=lips),
         frame_rate_hz=RATE_HZ,
-        delay_s=DELAYS_MS[lips] / 1e3,
+        delay_s=lip_model_info(lips).delay_ms / 1e3,
         idle_motion_seed=1,
         expressiveness=1.4,
     )
-    face.express({"joy": 0.7}, hold_s=3600.0)
+    face.set_expressions({"joy": 0.7}, hold_s=3600.0)
     return face
 
 
-def tell(face: Face, told: Sequence[SoundEvent]) -> list[Frame]:
-    return [frame for event in told for frame in face.accept(event)]
+def tell(face: FaceAnimator, told: Sequence[SoundEvent]) -> list[Frame]:
+    return [frame for event in told for frame in face.process(event)]
 
 
 @lru_cache
@@ -87,7 +86,7 @@ def with_another_recognizer(lips: str, cut: int) -> list[Frame]:
     final_s = max(map(final_until, before))
     again = [each for each in events() if middle_of(each) > final_s]
     first = min((each.index for each in again if isinstance(each, Phone)), default=0)
-    face.restart()
+    face.change_recognizer()
     return frames + tell(
         face,
         [
@@ -168,7 +167,7 @@ def test_a_face_goes_on_amid_its_largest_movement(
 ) -> None:
     plain = undisturbed("learnt")
     shown_s = plain[int(steps(plain)[20:, fap - 1].argmax()) + 20][0]
-    known_s = shown_s + DELAYS_MS["learnt"] / 1e3
+    known_s = shown_s + lip_model_info("learnt").delay_ms / 1e3
     cut = next(
         number
         for number, event in enumerate(events())

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.ferguson.contour import LINES, contour, lip_lines
-from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames
 
 pytestmark = pytest.mark.property
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.blending import blend, log_weights, softmax
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import EDGE_S, build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
@@ -130,7 +130,7 @@ def test_live_closes_the_lips_when_recognised_before_the_apex(
     face = make_face(delay_s=delay_s)
     frames = []
     for time_s, event in sorted(events, key=lambda item: item[0]):
-        frames += advance(face, time_s) + face.accept(event)
+        frames += advance(face, time_s) + face.process(event)
     frames += advance(face, phones[-1].onset_s + 2.0 + delay_s)
     faps = np.array([faps for _, faps in frames])
     times = np.array([time_s for time_s, _ in frames])
@@ -166,7 +166,7 @@ def revised_utterances(draw: st.DrawFn) -> list[tuple[float, Phone | SpeechChang
 
 def run(
     emitted: Sequence[tuple[float, Phone | SpeechChange]],
-    face: Face,
+    face: FaceAnimator,
     cuts: Sequence[float] = (),
 ) -> NDArray[np.float32]:
     """Frames of a session, ``advance`` being called at ``cuts`` too."""
@@ -175,7 +175,7 @@ def run(
     for time_s, item in stops:
         frames += advance(face, time_s)
         if item is not None:
-            face.accept(item)
+            face.process(item)
     frames += advance(face, stops[-1][0] + 3.0)
     return np.array([faps for _, faps in frames])
 
@@ -242,7 +242,7 @@ def test_flush_is_at_rest_within_150_ms(
         if time_s <= flush_s + delay_s:
             advance(face, time_s)
             if isinstance(item, Phone):
-                face.accept(item)
+                face.process(item)
     advance(face, flush_s + delay_s)
     face.flush()
     after = advance(face, flush_s + delay_s + 0.5)
@@ -307,8 +307,8 @@ def sound(seed: int) -> list[SoundEvent]:
 @few_examples
 @given(st.integers(0, 1000), st.sampled_from([0.0, 0.02, 0.1]))
 def test_learnt_lips_have_neither_jumps_nor_corners(seed: int, delay_s: float) -> None:
-    face = Face(LearntLips(LIPS), frame_rate_hz=FINE_RATE_HZ, delay_s=delay_s)
-    faps = np.array([faps for event in sound(seed) for _, faps in face.accept(event)])
+    face = FaceAnimator(LearntLips(LIPS), frame_rate_hz=FINE_RATE_HZ, delay_s=delay_s)
+    faps = np.array([faps for event in sound(seed) for _, faps in face.process(event)])
     faps = faps[:, [fap - 1 for fap in MOUTH_FAPS if fap not in (14, 44, 45, 46, 47)]]
     assert np.isfinite(faps).all()
     if len(faps) > 2:

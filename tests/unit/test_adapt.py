@@ -23,10 +23,9 @@ from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, l
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from tests.e2e.following import samples_of_file
 from tests.heads import load
 from tests.system import DEMO
@@ -76,7 +75,7 @@ def test_tracks_the_lips_in_a_video(tmp_path: Path) -> None:
 def test_tracks_the_lips_of_a_rendered_head(tmp_path: Path) -> None:
     """The head turns and nods while it speaks; the FAPs that move it are known."""
     samples = samples_of_file(DEMO / "hello-female.wav")[: 3 * 16_000]
-    visemes = LipModelName.DYNAMIC_VISEMES
+    visemes = "dynamic-visemes"
     settings = SynthesizerConfig(lips=visemes)
     chain = LiveChain(load_model(), load_lip_model(name=visemes), synthesizer=settings)
     frames = chain.accept_waveform(samples)

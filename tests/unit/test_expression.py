@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import VISEME_INDEX
 from kouxing.services.synthesizer.modifiers.expression import EXPRESSION_FAPS, mix
 from kouxing.shared.errors import UserError
@@ -25,7 +25,7 @@ SHUT = 20.0  # FAP units between lips
 FRAME_S = 0.02
 
 
-def shown(face: Face, until_s: float) -> NDArray[np.float32]:
+def shown(face: FaceAnimator, until_s: float) -> NDArray[np.float32]:
     return np.array([faps for _, faps in advance(face, until_s)])
 
 
@@ -38,7 +38,7 @@ def gaps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
 def test_every_expression_eases_in_stays_and_fades(name: ExpressionName) -> None:
     face = make_face()
     advance(face, 1.0)
-    face.express({name: 1.0}, 2.0)
+    face.set_expressions({name: 1.0}, 2.0)
     faps = shown(face, 5.0)
     moved = int(np.abs(faps).max(axis=0).argmax())
     curve = np.abs(faps[:, moved])
@@ -53,11 +53,11 @@ def test_every_expression_eases_in_stays_and_fades(name: ExpressionName) -> None
 
 def test_strengths_add_up_and_the_newest_wish_counts() -> None:
     face = make_face()
-    face.express({"joy": 0.4, "brow_up": 1.0}, 10.0)
+    face.set_expressions({"joy": 0.4, "brow_up": 1.0}, 10.0)
     both = shown(face, 2.0)[-1]
-    face.express({"joy": 0.4}, 10.0)
+    face.set_expressions({"joy": 0.4}, 10.0)
     joy = shown(face, 6.0)[-1]
-    face.express({}, 10.0)
+    face.set_expressions({}, 10.0)
     none = shown(face, 10.0)[-1]
     assert both[BROW] > 40.0 > abs(joy[BROW])
     assert joy[CORNER] == pytest.approx(0.4 * 353.2, rel=0.01)
@@ -67,9 +67,9 @@ def test_strengths_add_up_and_the_newest_wish_counts() -> None:
 
 def test_surprise_opens_a_mouth_at_rest_but_not_one_that_is_about_to_speak() -> None:
     face = make_face()
-    face.express({"surprise": 1.0}, 60.0)
+    face.set_expressions({"surprise": 1.0}, 60.0)
     assert gaps(shown(face, 3.0)[-1]).max() > 300.0
-    face.accept(SpeechChange(active=True, time_s=3.0))
+    face.process(SpeechChange(active=True, time_s=3.0))
     closing = shown(face, 3.3)
     assert gaps(closing[-1]).max() <= SHUT
     assert closing[-1][JAW] < 5.0
@@ -90,7 +90,7 @@ def test_no_expression_opens_lips_that_speech_has_shut(
     """What is shut without an expression is as shut with it, from the sound's beginning on."""
     plain, expressive = make_face(), make_face()
     for face in (plain, expressive):
-        face.accept(SpeechChange(active=True, time_s=0.2))
+        face.process(SpeechChange(active=True, time_s=0.2))
         for index, symbol in enumerate(symbols):
             onset_s = 0.4 + 0.12 * index
             phone = Phone(
@@ -101,10 +101,10 @@ def test_no_expression_opens_lips_that_speech_has_shut(
                 confidence=1.0,
                 final=True,
             )
-            face.accept(phone)
+            face.process(phone)
     frames = shown(plain, 2.0)
     begun = shown(expressive, from_s)
-    expressive.express(wanted, 60.0)
+    expressive.set_expressions(wanted, 60.0)
     mixed = np.concatenate([begun.reshape(-1, NUM_FAPS), shown(expressive, 2.0)])
     from_sound = slice(round(0.3 / FRAME_S), None)
     shut = gaps(frames)[from_sound] <= SHUT
@@ -127,7 +127,7 @@ def test_surprise_on_an_open_vowel_drops_no_jaw() -> None:
 @given(wanted=strengths)
 def test_the_lower_lip_of_f_does_not_leave_the_teeth(wanted: dict[str, float]) -> None:
     face = make_face()
-    face.express(wanted, 60.0)
+    face.set_expressions(wanted, 60.0)
     expression = shown(face, 2.0)[-1]
     teeth = np.zeros(NUM_FAPS, np.float32)
     teeth[np.array(MOUTH_FAPS) - 1] = LIPS.parameters.target[VISEME_INDEX["f"]]
@@ -139,7 +139,7 @@ def test_the_lower_lip_of_f_does_not_leave_the_teeth(wanted: dict[str, float]) -
 def test_a_blink_shuts_the_eyes_of_every_expression_as_it_shuts_those_at_rest() -> None:
     upper, lower = FAP_NUMBER["close_t_l_eyelid"] - 1, FAP_NUMBER["close_b_l_eyelid"] - 1
     faces = make_face(idle_motion_seed=3), make_face(idle_motion_seed=3)
-    faces[1].express({"joy": 1.0, "squint": 1.0}, 60.0)
+    faces[1].set_expressions({"joy": 1.0, "squint": 1.0}, 60.0)
     plain, squinting = (shown(face, 9.0)[100:] for face in faces)
     blink = int(plain[:, upper].argmax())
     closed = plain[blink, upper] + plain[blink, lower]

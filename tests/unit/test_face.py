@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.face import REST_S, Face, Frame
-from kouxing.services.synthesizer.lips.dynamic_visemes.known_phones import KnownPhones
+from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import LIP_HEIGHT_FAPS
+from kouxing.services.synthesizer.lips.known_phones import KnownPhones
 from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -26,12 +26,12 @@ def values(frames: list[Frame]) -> NDArray[np.float32]:
     return np.array([faps for _, faps in frames])
 
 
-def speak(face: Face, until_s: float = 0.74) -> list[Frame]:
+def speak(face: FaceAnimator, until_s: float = 0.74) -> list[Frame]:
     """Say "da" from 0.3 s on, up to a frame in the middle of the open vowel."""
     frames = advance(face, 0.35)
-    face.accept(SpeechChange(active=True, time_s=0.3))
-    face.accept(phone(0, "d", 0.3, 0.1))
-    face.accept(phone(1, "a", 0.4, 0.6, final=False))
+    face.process(SpeechChange(active=True, time_s=0.3))
+    face.process(phone(0, "d", 0.3, 0.1))
+    face.process(phone(1, "a", 0.4, 0.6, final=False))
     return frames + advance(face, until_s + DELAY_S)
 
 
@@ -53,8 +53,8 @@ def test_speech_opens_the_mouth_and_its_end_closes_it() -> None:
     face = make_face()
     frames = speak(face)
     assert frames[-1][1][JAW] > 100.0
-    face.accept(phone(1, "a", 0.4, 0.45))
-    face.accept(SpeechChange(active=False, time_s=0.85))
+    face.process(phone(1, "a", 0.4, 0.45))
+    face.process(SpeechChange(active=False, time_s=0.85))
     closing = values(advance(face, 1.5))
     assert not closing[-1].round(1).any()
 
@@ -68,7 +68,7 @@ def test_a_phone_whose_end_is_never_heard_fades() -> None:
 def test_an_end_of_speech_told_too_early_still_ends_it() -> None:
     face = make_face()
     speak(face)
-    face.accept(SpeechChange(active=False, time_s=0.35))
+    face.process(SpeechChange(active=False, time_s=0.35))
     assert not advance(face, 1.2)[-1][1].round(1).any()
 
 
@@ -76,7 +76,7 @@ def test_flush_returns_to_rest_within_150_ms() -> None:
     face = make_face()
     before = speak(face)[-1][0]
     face.flush()
-    face.accept(phone(1, "a", 0.4, 0.9))  # a late revision of what was dropped
+    face.process(phone(1, "a", 0.4, 0.9))  # a late revision of what was dropped
     after = advance(face, 2.0)
     assert all(not faps.round(3).any() for time_s, faps in after if time_s > before + 0.15)
     assert after[0][1][JAW] > 0.5 * 100.0  # and it does not jump there
@@ -100,9 +100,9 @@ def test_flush_then_stall_is_at_rest_in_time_too() -> None:
 @pytest.mark.parametrize("delay_s", [0.06, 0.16])
 def test_a_long_vowel_stays_open_while_no_news_comes(delay_s: float) -> None:
     face = make_face(delay_s=delay_s)
-    face.accept(SpeechChange(active=True, time_s=0.3))
+    face.process(SpeechChange(active=True, time_s=0.3))
     before = advance(face, 0.41)  # a recognizer needs a tenth of a second
-    face.accept(phone(0, "a", 0.3, 0.15, final=False))
+    face.process(phone(0, "a", 0.3, 0.15, final=False))
     jaw = values(before + advance(face, 1.6))[:72, JAW]
     assert jaw[21:].min() > 0.4 * jaw.max() > 100.0
     # it hardly falls back on the way, and then holds still
@@ -114,7 +114,7 @@ def test_the_mouth_sets_out_before_the_next_phone_is_known() -> None:
     jaws = []
     for duration_s in (0.06, 0.3):
         face = make_face()
-        face.accept(phone(0, "j", 0.3, duration_s, final=False))
+        face.process(phone(0, "j", 0.3, duration_s, final=False))
         jaws.append(values(advance(face, 0.4 + DELAY_S))[-1, JAW])
     assert jaws[0] > jaws[1] + 20.0  # a vowel is due after the short one
 
@@ -124,7 +124,7 @@ def test_a_phone_after_a_flush_is_spoken() -> None:
     speak(face)
     face.flush()
     advance(face, 1.2)
-    face.accept(phone(2, "a", 1.2, 0.3))
+    face.process(phone(2, "a", 1.2, 0.3))
     assert values(advance(face, 1.5))[-1, JAW] > 100.0
 
 
@@ -134,7 +134,7 @@ def test_relax_leads_to_rest_and_back_without_a_jump() -> None:
     rest = face.relax(10) + face.relax(10)
     assert {time_s for time_s, _ in rest} == {spoken[-1][0]}
     assert not rest[-1][1].round(3).any()
-    face.accept(phone(1, "a", 0.4, 0.9))
+    face.process(phone(1, "a", 0.4, 0.9))
     faps = values(spoken[-2:] + rest + advance(face, 1.2))
     assert faps[-1, JAW] > 100.0
     assert np.abs(np.diff(faps[:, JAW])).max() < 200.0
@@ -143,8 +143,8 @@ def test_relax_leads_to_rest_and_back_without_a_jump() -> None:
 def test_no_jump_when_a_guess_is_replaced() -> None:
     face = make_face()
     speak(face, 0.6)
-    face.accept(phone(1, "i", 0.4, 0.3))
-    face.accept(phone(2, "u", 0.6, 0.2, final=False))
+    face.process(phone(1, "i", 0.4, 0.3))
+    face.process(phone(2, "u", 0.6, 0.2, final=False))
     faps = values(advance(face, 0.74 + DELAY_S))
     assert np.abs(np.diff(faps, axis=0)).max() < 300.0
 
@@ -153,7 +153,7 @@ def test_value_and_slope_are_continuous_where_the_trajectory_changes() -> None:
     # at 240 frames a second differences are close to derivatives
     face = make_face(frame_rate_hz=240.0)
     frames = speak(face, 0.43)  # the jaw is moving
-    face.accept(phone(1, "i", 0.4, 0.2))
+    face.process(phone(1, "i", 0.4, 0.2))
     faps = values(frames[-3:] + advance(face, 0.54 + DELAY_S))[:, JAW]
     steps = np.diff(faps)
     assert abs(steps[1]) > 0.5
@@ -165,11 +165,11 @@ def test_value_and_slope_are_continuous_where_the_trajectory_changes() -> None:
 def test_every_phone_moves_the_face_or_is_silence(symbol: str) -> None:
     face = make_face()
     if symbol in INVENTORY.vowels:
-        face.accept(phone(0, symbol, 0.3, 0.2))
+        face.process(phone(0, symbol, 0.3, 0.2))
     else:  # closed lips show between open ones
-        face.accept(phone(0, "a", 0.1, 0.2))
-        face.accept(phone(1, symbol, 0.3, 0.2))
-        face.accept(phone(2, "a", 0.5, 0.2))
+        face.process(phone(0, "a", 0.1, 0.2))
+        face.process(phone(1, symbol, 0.3, 0.2))
+        face.process(phone(2, "a", 0.5, 0.2))
     frames = values(advance(face, 1.0))
     faps = frames[20]  # at 0.4 s
     if symbol == "sil":
@@ -185,67 +185,67 @@ def test_every_phone_moves_the_face_or_is_silence(symbol: str) -> None:
 @pytest.mark.parametrize("late_s", [0.0, 0.03, 0.05])
 def test_lips_meet_even_when_recognised_late(symbol: str, late_s: float) -> None:
     face = make_face()
-    face.accept(phone(0, "a", 0.1, 0.4))
+    face.process(phone(0, "a", 0.1, 0.4))
     frames = advance(face, 0.5 + 0.03 + DELAY_S + late_s)  # the frame of the apex has been made
-    face.accept(phone(1, symbol, 0.5, 0.06))
-    face.accept(phone(2, "a", 0.56, 0.3))
+    face.process(phone(1, symbol, 0.5, 0.06))
+    face.process(phone(2, "a", 0.56, 0.3))
     faps = values(frames + advance(face, 1.0))[:, np.array(LIP_HEIGHT_FAPS) - 1][25:34]
     assert np.abs(faps[:, :6]).max(axis=1).min() < 12.0
 
 
 def test_nonsense_is_dropped() -> None:
     known = KnownPhones(INVENTORY)
-    assert not known.accept_phone(phone(0, "a", math.nan, 0.1))
-    assert not known.accept_phone(phone(1, "a", 0.1, math.inf))
-    assert not known.accept_phone(phone(2, "q2", 0.1, 0.1))
+    assert not known.add_phone(phone(0, "a", math.nan, 0.1))
+    assert not known.add_phone(phone(1, "a", 0.1, math.inf))
+    assert not known.add_phone(phone(2, "q2", 0.1, 0.1))
     assert not len(known)
     face = make_face()
-    face.accept(phone(5, "a", 0.3, 0.0))
-    face.accept(phone(4, "b", 0.29, -1.0))
-    face.accept(phone(3, "sil", 0.1, 0.0))
+    face.process(phone(5, "a", 0.3, 0.0))
+    face.process(phone(4, "b", 0.29, -1.0))
+    face.process(phone(3, "sil", 0.1, 0.0))
     assert np.isfinite(values(advance(face, 1.0))).all()
 
 
 def test_what_was_flushed_and_estimates_overtaken_are_dropped() -> None:
     known = KnownPhones(INVENTORY)
-    assert known.accept_phone(phone(0, "a", 0.3, 0.1, final=False))
-    assert known.accept_phone(phone(0, "a", 0.3, 0.2))
-    assert not known.accept_phone(phone(0, "a", 0.3, 0.3, final=False))
+    assert known.add_phone(phone(0, "a", 0.3, 0.1, final=False))
+    assert known.add_phone(phone(0, "a", 0.3, 0.2))
+    assert not known.add_phone(phone(0, "a", 0.3, 0.3, final=False))
     known.flush()
-    assert not known.accept_phone(phone(0, "a", 0.3, 0.4))
-    assert known.accept_phone(phone(1, "a", 0.6, 0.4))
+    assert not known.add_phone(phone(0, "a", 0.3, 0.4))
+    assert known.add_phone(phone(1, "a", 0.6, 0.4))
 
 
 def test_a_phone_that_is_withdrawn_does_not_move_the_face() -> None:
     face, other = make_face(), make_face()
     for each in (face, other):
-        each.accept(phone(0, "a", 0.3, 0.2))
-    face.accept(phone(1, "b", 0.5, 0.1, final=False))
-    face.accept(phone(1, "sil", 0.5, 0.0))
+        each.process(phone(0, "a", 0.3, 0.2))
+    face.process(phone(1, "b", 0.5, 0.1, final=False))
+    face.process(phone(1, "sil", 0.5, 0.0))
     np.testing.assert_array_equal(values(advance(face, 1.0)), values(advance(other, 1.0)))
 
 
 def test_an_overtaken_estimate_is_dropped() -> None:
     face, other = make_face(), make_face()
     for each in (face, other):
-        each.accept(phone(0, "a", 0.3, 0.2))
-    face.accept(phone(0, "u", 0.3, 0.3, final=False))
+        each.process(phone(0, "a", 0.3, 0.2))
+    face.process(phone(0, "u", 0.3, 0.3, final=False))
     np.testing.assert_array_equal(values(advance(face, 1.0)), values(advance(other, 1.0)))
 
 
 def test_another_recognizer_that_tells_the_same_changes_nothing() -> None:
     face, plain = make_face(), make_face()
     frames, expected = speak(face), speak(plain)
-    face.restart()
-    face.accept(SpeechChange(active=True, time_s=0.3))
+    face.change_recognizer()
+    face.process(SpeechChange(active=True, time_s=0.3))
     frames += advance(face, 0.6)  # known already
-    face.accept(phone(0, "a", 0.42, 0.6, final=False))  # was number 1
+    face.process(phone(0, "a", 0.42, 0.6, final=False))  # was number 1
     for each in (face, plain):
         (frames if each is face else expected).extend(advance(each, 1.2))
     assert [time_s for time_s, _ in frames] == [time_s for time_s, _ in expected]
     np.testing.assert_allclose(values(frames)[:, JAW], values(expected)[:, JAW], atol=30.0)
-    face.accept(phone(0, "a", 0.42, 0.85))
-    face.accept(phone(1, "i", 1.27, 0.1))
+    face.process(phone(0, "a", 0.42, 0.85))
+    face.process(phone(1, "i", 1.27, 0.1))
     assert values(advance(face, 1.5))[:, JAW].max() > 100.0
 
 
@@ -253,9 +253,9 @@ def test_a_phone_that_another_recognizer_does_not_confirm_is_withdrawn() -> None
     face, plain = make_face(), make_face()
     for each in (face, plain):
         speak(each)
-    face.restart()
-    face.accept(phone(0, "i", 0.4, 0.8))
-    plain.accept(phone(1, "i", 0.4, 0.8))
+    face.change_recognizer()
+    face.process(phone(0, "i", 0.4, 0.8))
+    plain.process(phone(1, "i", 0.4, 0.8))
     after, revised = (values(advance(each, 1.0)) for each in (face, plain))
     np.testing.assert_allclose(after, revised, atol=1.0)
 
@@ -292,7 +292,7 @@ def test_a_long_gap_is_not_filled_with_frames() -> None:
 def test_the_end_of_the_sound_brings_the_frames_owed_and_leads_to_rest() -> None:
     face = make_face()
     frames = speak(face)
-    frames += face.accept(EndOfSound(time_s=0.95))
+    frames += face.process(EndOfSound(time_s=0.95))
     np.testing.assert_allclose([time_s for time_s, _ in frames], np.arange(len(frames)) * FRAME_S)
     assert frames[-1][0] == pytest.approx(0.95 + REST_S, abs=FRAME_S)
     assert not frames[-1][1].round(1).any()
@@ -317,8 +317,8 @@ def test_a_longer_delay_comes_nearer_to_the_full_model() -> None:
         frames = []
         for each in spoken:
             frames += advance(face, each.onset_s + 0.05)
-            face.accept(each)
-        face.accept(SpeechChange(active=False, time_s=1.5))
+            face.process(each)
+        face.process(SpeechChange(active=False, time_s=1.5))
         frames += advance(face, 2.2)
         errors.append(float(np.sqrt(np.mean((values(frames)[:90] - whole) ** 2))))
     assert errors[0] > errors[1] > errors[2]
@@ -331,10 +331,10 @@ def test_loud_speech_opens_the_mouth_further_but_never_a_closure() -> None:
     for level_db in (-36.0, -26.0, -16.0):
         face = make_face()
         for each in spoken:
-            face.accept(each)
+            face.process(each)
         frames = []
         for step in range(140):
-            frames += face.accept(Progress(time_s=step * 0.01, level_db=level_db))
+            frames += face.process(Progress(time_s=step * 0.01, level_db=level_db))
         faps.append(values(frames))
     jaws = [each[18:24, JAW].mean() for each in faps]
     assert jaws[0] < 0.95 * jaws[1] < 0.9 * jaws[2]

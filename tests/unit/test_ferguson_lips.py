@@ -13,14 +13,13 @@ from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.resample import to_16_khz
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from kouxing.shared.phones.inventory import load_inventory
 from tests.lips import phone
@@ -28,7 +27,7 @@ from tests.system import DEMO
 
 pytestmark = pytest.mark.unit
 
-LIPS = load_lip_model(name=LipModelName.FERGUSON)
+LIPS = load_lip_model(name="ferguson")
 TABLE = load_table(load_inventory())
 LOWER_LIP = 4  # column of FAP 5
 WIDEST = float(faps_of([5.0])[0, MOUTH_FAPS.index(5)])
@@ -42,10 +41,10 @@ def progress(start_s: float, end_s: float, *, loud: bool) -> list[SoundEvent]:
     ]
 
 
-def openings(events: Sequence[SoundEvent], face: Face | None = None) -> NDArray[np.float64]:
+def openings(events: Sequence[SoundEvent], face: FaceAnimator | None = None) -> NDArray[np.float64]:
     """R of each frame, at 50 Hz."""
-    face = face or Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
-    frames = [faps for event in events for _, faps in face.accept(event)]
+    face = face or FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    frames = [faps for event in events for _, faps in face.process(event)]
     return 5.0 * np.array(frames, dtype=np.float64)[:, LOWER_LIP] / WIDEST
 
 
@@ -98,7 +97,7 @@ def test_revisions_and_interruptions_leave_no_jump() -> None:
     ]
     made = openings([*SAID[:-60], *(event for event in revised if isinstance(event, Phone))])
     assert np.abs(np.diff(made)).max() < 2.0
-    face = Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
     before = openings(SAID[:42], face)
     assert before[-1] > 2.0
     face.flush()
@@ -108,7 +107,7 @@ def test_revisions_and_interruptions_leave_no_jump() -> None:
 
 
 def test_lips_at_rest_while_no_sound_comes() -> None:
-    face = Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
+    face = FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S)
     openings(SAID[:42], face)
     frames = np.array([faps for _, faps in face.relax(12)])
     assert np.abs(frames[-1]).max() < 1e-6
@@ -117,7 +116,7 @@ def test_lips_at_rest_while_no_sound_comes() -> None:
 def test_speech_moves_all_lips_within_their_travel_whatever_the_chunks() -> None:
     samples, rate_hz = read_audio(DEMO / "hello-female.wav")
     samples = to_16_khz(samples, rate_hz)[:32_000]
-    settings = SynthesizerConfig(lips=LipModelName.FERGUSON, idle_motion_seed=0, expressiveness=1.0)
+    settings = SynthesizerConfig(lips="ferguson", idle_motion_seed=0, expressiveness=1.0)
     assert settings.delay_ms == 160.0
     made = []
     for chunk in (32_000, 333):

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.front_end.pcm import progress_of, zero_crossing_rate
-from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableCutter, pieces_of
-from kouxing.services.synthesizer.lips.ferguson.motion import KeyFrames
-from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.endpoints import SyllableSegmenter, segment_speech
+from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import format_table, load_table, parse_table
 from kouxing.services.synthesizer.lips.ferguson.timing import MAX_SYLLABLES, time_text
 from kouxing.shared.audio_file import read_audio
@@ -55,7 +54,7 @@ def test_zero_crossings_of_a_tone_are_twice_its_frequency() -> None:
 
 def test_pieces_end_at_pauses_at_dips_and_before_hisses() -> None:
     parts = [("-", 0.4), ("v", 0.2), ("-", 0.2), ("v", 0.2), ("n", 0.08), ("v", 0.2)]
-    pieces = pieces_of(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
+    pieces = segment_speech(progress_of(speech([*parts, ("s", 0.1), ("v", 0.2), ("-", 0.4)])))
     starts = [piece.start_s for piece in pieces]
     np.testing.assert_allclose(starts, [0.4, 0.8, 1.0, 1.28], atol=0.045)
     assert pieces[0].end_s == pytest.approx(0.6, abs=0.045)
@@ -67,7 +66,7 @@ def test_the_thresholds_follow_the_noise() -> None:
     parts = [("-", 1.0), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 0.5)]
     noise = 0.01 * np.random.default_rng(1).standard_normal(round(2.2 * RATE_HZ))
     quiet, noisy = (
-        pieces_of(progress_of(sound.astype(np.float32)))
+        segment_speech(progress_of(sound.astype(np.float32)))
         for sound in (0.1 * speech(parts), speech(parts) + noise)
     )
     assert len(quiet) == len(noisy) == 2
@@ -79,10 +78,10 @@ def test_pieces_are_found_in_loud_noise_and_again_after_it_has_begun() -> None:
     parts = [("-", 0.8), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 4.0), ("v", 0.2), ("-", 0.5)]
     sound = 0.3 * speech(parts)
     noise = 0.03 * np.random.default_rng(1).standard_normal(len(sound))  # 3 dB below the vowels
-    starts = [piece.start_s for piece in pieces_of(progress_of((sound + noise).astype(np.float32)))]
+    starts = [piece.start_s for piece in segment_speech(progress_of((sound + noise).astype(np.float32)))]
     np.testing.assert_allclose(starts, [0.8, 1.3, 5.5], atol=0.045)
     noise[: 2 * RATE_HZ] = 0.0
-    pieces = pieces_of(progress_of((sound + noise).astype(np.float32)))
+    pieces = segment_speech(progress_of((sound + noise).astype(np.float32)))
     assert pieces[2].end_s - pieces[2].start_s == pytest.approx(3.0, abs=0.2)  # noise, until known
     assert pieces[3].start_s == pytest.approx(5.5, abs=0.045)
     assert pieces[3].end_s == pytest.approx(5.7, abs=0.045)
@@ -91,22 +90,22 @@ def test_pieces_are_found_in_loud_noise_and_again_after_it_has_begun() -> None:
 @pytest.mark.parametrize("chunk", [113, 4000])
 def test_pieces_of_a_stream_are_those_of_the_whole(chunk: int) -> None:
     samples = read_audio(DEMO / "hello-female.wav")[0].mean(axis=1)[: 2 * RATE_HZ]
-    cutter = SyllableCutter()
+    cutter = SyllableSegmenter()
     pieces = []
     for output in LiveStream(load_model()).feed(samples, chunk=chunk):
         if isinstance(output, Progress):
-            pieces += cutter.accept(output)
+            pieces += cutter.add_slice(output)
     pieces += cutter.finish()
-    assert pieces == pieces_of(progress_of(samples))
+    assert pieces == segment_speech(progress_of(samples))
     assert len(pieces) > 3
 
 
 def test_a_hole_in_time_ends_a_piece() -> None:
-    cutter = SyllableCutter()
+    cutter = SyllableSegmenter()
     slices = progress_of(speech([("-", 0.3), ("v", 0.3)]))
-    assert not [piece for one in slices for piece in cutter.accept(one)]
+    assert not [piece for one in slices for piece in cutter.add_slice(one)]
     later = Progress(time_s=5.0, level_db=-20.0)
-    assert [piece.end_s for piece in cutter.accept(later)] == [0.6]
+    assert [piece.end_s for piece in cutter.add_slice(later)] == [0.6]
 
 
 def test_syllables_begin_with_their_pieces_and_finals_by_the_influence_factor() -> None:
@@ -135,7 +134,7 @@ def test_more_and_fewer_pieces_than_syllables() -> None:
 
 def test_what_cannot_be_timed_is_refused() -> None:
     silent = progress_of(speech([("-", 1.0)]))
-    with pytest.raises(UserError, match="no speech was found"):
+    with pytest.raises(UserError, match="found no speech"):
         time_text(silent, [("a",)], TABLE)
     with pytest.raises(UserError, match="the text is empty"):
         time_text(silent, [], TABLE)

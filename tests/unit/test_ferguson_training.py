@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
-from kouxing.services.synthesizer.lips.ferguson.openings import key_frames_of
+from kouxing.services.synthesizer.lips.ferguson.key_frames import key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS

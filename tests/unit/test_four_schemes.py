@@ -22,10 +22,9 @@ from kouxing.evaluation.lips.sentences import choose
 from kouxing.evaluation.mos.commands import app as mos
 from kouxing.services.driver.video import film
 from kouxing.services.recording_chain import AnalyzedRecording
-from kouxing.services.synthesizer.config import DELAYS_MS
-from kouxing.services.synthesizer.face import Frame
+from kouxing.services.synthesizer.face_animator import Frame
+from kouxing.services.synthesizer.lips.registry import lip_model_info
 from kouxing.shared.face.faps import MOUTH_FAPS
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.media_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange
 from tests.lips import phone
@@ -143,13 +142,13 @@ def test_the_papers_rule_is_three_frames_of_any_confidence() -> None:
 
 
 def test_live_schemes_are_told_by_the_listeners_rule() -> None:
-    lips = LipModelName.DYNAMIC_VISEMES
+    lips = "dynamic-visemes"
     nothing = AnalyzedRecording(duration_s=0.0, events=[], is_text_known=False)
     for has_paper_rule, live, next_phone in (
         (True, as_emitted(LIVE), once_the_next_is_emitted(LIVE)),
         (False, LIVE, once_the_next_begins(LIVE)),
     ):
-        hearing = Hearing(nothing, {DELAYS_MS[lips] / 1e3: LIVE}, has_paper_rule)
+        hearing = Hearing(nothing, {lip_model_info(lips).delay_ms / 1e3: LIVE}, has_paper_rule)
         assert events_told(Condition(3, lips, "gmm"), hearing) == live
         assert events_told(Condition(4, lips, "gmm"), hearing) == next_phone
 
@@ -255,7 +254,7 @@ def test_videos_of_clips_make_a_listening_test(
     )
     assert made.exit_code == 0, made.output
 
-    delay_s = DELAYS_MS[LipModelName.LEARNT] / 1e3
+    delay_s = lip_model_info("learnt").delay_ms / 1e3
     for in_time, as_made in zip(live, late, strict=True):
         shown_s = [time_s for time_s, _ in drawn[as_made]]
         assert shown_s == pytest.approx([time_s + delay_s for time_s, _ in drawn[in_time]])

@@ -318,8 +318,14 @@ def test_broken_descriptions(
         (struct.pack("<4sII", b"glTF", 1, 20) + b"\0" * 8, "version 1"),
         (struct.pack("<4sII", b"glTF", 2, 99) + b"\0" * 8, "99 of 20 bytes"),
         (struct.pack("<4sIII4s", b"glTF", 2, 20, 50, b"JSON"), "cut off"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]", "glTF description is damaged"),
-        (struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x", "glTF description is damaged"),
+        (
+            struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"[]",
+            "glTF description is damaged",
+        ),
+        (
+            struct.pack("<4sIII4s", b"glTF", 2, 22, 2, b"JSON") + b"{x",
+            "glTF description is damaged",
+        ),
     ],
 )
 def test_broken_bytes(tmp_path: Path, data: bytes, said: str) -> None:

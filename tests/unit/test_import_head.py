@@ -51,7 +51,9 @@ def imported(own: Head, tmp_path_factory: pytest.TempPathFactory) -> Head:
     write_glb(folder / "face.glb", parts)
     (folder / "points.tsv").write_text(lines(own, place), encoding="utf-8")
     remarks = import_head(folder / "face.glb", folder / "points.tsv", folder / "face.npz")
-    assert remarks == ["no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"]
+    assert remarks == [
+        "no points for these FAPs, so they have no effect: dilate_l_pupil, dilate_r_pupil"
+    ]
     return Head.load(folder / "face.npz")
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.face import Face, Frame
+from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learnt.closures import ClosingPhones, ClosureRule, shut_share
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.learnt.track import LipTrack
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
@@ -55,12 +55,12 @@ def phone(symbol: str, onset_s: float, confidence: float = 0.95, index: int = 0)
     )
 
 
-def make_face(frame_rate_hz: float = 50.0, delay_s: float = DELAY_S) -> Face:
-    return Face(LearntLips(LIPS), frame_rate_hz=frame_rate_hz, delay_s=delay_s)
+def make_face(frame_rate_hz: float = 50.0, delay_s: float = DELAY_S) -> FaceAnimator:
+    return FaceAnimator(LearntLips(LIPS), frame_rate_hz=frame_rate_hz, delay_s=delay_s)
 
 
 def run(
-    face: Face,
+    face: FaceAnimator,
     begin_s: float,
     end_s: float,
     make: Callable[[float], LipFrame | None],
@@ -72,16 +72,16 @@ def run(
         now_s = number * 0.02
         for due_s, each in phones:
             if now_s - 0.02 < due_s <= now_s:
-                face.accept(each)
+                face.process(each)
         lips = make(now_s - 0.005 - LIPS_DELAY_S)
         if lips is not None:
-            frames += face.accept(lips)
-        frames += face.accept(Progress(time_s=now_s, level_db=-20.0))
+            frames += face.process(lips)
+        frames += face.process(Progress(time_s=now_s, level_db=-20.0))
     return frames
 
 
-def speak(face: Face, begin_s: float = 0.0) -> None:
-    face.accept(SpeechChange(active=True, time_s=begin_s))
+def speak(face: FaceAnimator, begin_s: float = 0.0) -> None:
+    face.process(SpeechChange(active=True, time_s=begin_s))
 
 
 def values(frames: Sequence[Frame], column: int) -> NDArray[np.float64]:
@@ -123,7 +123,7 @@ def test_position_and_velocity_are_continuous(delay_s: float) -> None:
     frames = run(face, 0.0, 0.3, nothing)
     speak(face, 0.3)
     frames += run(face, 0.3, 2.0, make)
-    face.accept(SpeechChange(active=False, time_s=2.0))
+    face.process(SpeechChange(active=False, time_s=2.0))
     frames += run(face, 2.0, 2.5, nothing)
     jaw = values(frames, JAW)
     steps = np.diff(jaw)
@@ -139,7 +139,7 @@ def test_silence_shuts_the_mouth_within_150_ms_and_nothing_twitches() -> None:
     frames = run(face, 0.0, 1.0, lip_frame)
     assert at(frames, 0.8)[JAW] > 250.0
     last_s = 1.0 - 0.005 - LIPS_DELAY_S  # the newest lip frame
-    face.accept(SpeechChange(active=False, time_s=1.0))
+    face.process(SpeechChange(active=False, time_s=1.0))
     frames += run(face, 1.0, 3.0, nothing)
     jaw = values([each for each in frames if each[0] >= last_s], JAW)
     assert (np.diff(jaw) <= 1e-4).all()
@@ -264,13 +264,13 @@ def test_closing_is_no_jerk() -> None:
 
 
 def test_the_tongue_comes_from_the_visemes_and_the_lips_do_not() -> None:
-    def tongue_of(face: Face) -> list[Frame]:
+    def tongue_of(face: FaceAnimator) -> list[Frame]:
         speak(face)
         phones = [(0.4, phone("d", 0.35, index=0)), (0.5, phone("a", 0.42, index=1))]
         return run(face, 0.0, 1.0, lambda time_s: lip_frame(time_s, opening=0.0), phones)
 
     learnt = tongue_of(make_face())
-    visemes = tongue_of(Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S))
+    visemes = tongue_of(FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S))
     tongue = values(learnt, TONGUE)
     np.testing.assert_array_equal(tongue, values(visemes, TONGUE))
     assert np.abs(tongue).max() > 50.0
@@ -285,8 +285,8 @@ def test_the_level_does_not_scale_what_already_follows_the_sound() -> None:
         speak(face)
         frames = []
         for number in range(1, 60):
-            face.accept(lip_frame(number * 0.02 - 0.005 - LIPS_DELAY_S))
-            frames += face.accept(Progress(time_s=number * 0.02, level_db=level_db))
+            face.process(lip_frame(number * 0.02 - 0.005 - LIPS_DELAY_S))
+            frames += face.process(Progress(time_s=number * 0.02, level_db=level_db))
         jaws.append(values(frames, JAW))
     np.testing.assert_array_equal(jaws[0], jaws[1])
 
@@ -301,7 +301,7 @@ def test_flush_returns_to_rest_within_150_ms_and_ignores_what_was_on_its_way() -
     assert late
     assert not np.array(late).round(3).any()
     assert after[0][1][JAW] > 150.0  # and it does not jump there
-    face.accept(SpeechChange(active=False, time_s=1.3))
+    face.process(SpeechChange(active=False, time_s=1.3))
     speak(face, 1.3)
     assert values(run(face, 1.3, 1.7, lip_frame), JAW)[-1] > 250.0
 
@@ -328,14 +328,14 @@ def test_nonsense_is_dropped() -> None:
         lip_frame(0.42, closure=np.nan),
         lip_frame(0.1, opening=-5.0),  # older than what is known
     ):
-        face.accept(bad)
+        face.process(bad)
     frames += run(face, 0.5, 1.0, lip_frame)
     assert np.isfinite(np.array([faps for _, faps in frames])).all()
     assert np.abs(values(frames[15:40], JAW) - 300.0).max() < 1.0
 
 
 def test_without_any_lip_frame_the_visemes_move_the_mouth() -> None:
-    faces = (make_face(), Face(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S))
+    faces = (make_face(), FaceAnimator(LIPS, frame_rate_hz=50.0, delay_s=DELAY_S))
     jaws = []
     for face in faces:
         speak(face)
@@ -359,7 +359,9 @@ def test_a_track_passes_through_its_frames_without_a_corner() -> None:
     step = 1e-6
     for time_s in np.linspace(0.9, 1.4, 101) + step / 3.0:  # at each frame, too, and beyond
         before, here, after = (track.at(float(time_s + k * step)) for k in (-1, 0, 1))
-        np.testing.assert_allclose(here.slope, (after.value - before.value) / (2 * step), atol=1e-2)
+        np.testing.assert_allclose(
+            here.velocity, (after.value - before.value) / (2 * step), atol=1e-2
+        )
     assert not track.at(0.94).value.any()
     assert not track.at(1.28).value.any()
 
@@ -402,21 +404,21 @@ def test_lips_do_not_pass_through_each_other() -> None:
 def test_phones_are_no_evidence_against_a_closure() -> None:
     phones = ClosingPhones(LIPS.inventory, "b", ClosureRule(phone=3.0))
     log_odds = [phones.log_odds(0.5)]
-    phones.accept(phone("t", 0.46), 0.4)
+    phones.add(phone("t", 0.46), 0.4)
     log_odds.append(phones.log_odds(0.5))
     assert log_odds == [0.0, 0.0]
-    phones.accept(phone("p", 0.46, index=1), 0.4)
+    phones.add(phone("p", 0.46, index=1), 0.4)
     assert phones.log_odds(0.5) > 2.0
     assert [shut_share(odds, 1.0) for odds in (-1.0, 0.0, 1.0)] == [0.0, 0.5, 1.0]
 
 
 def test_of_recordings_other_phones_are_evidence_against_a_closure() -> None:
     phones = ClosingPhones(LIPS.inventory, "b", ClosureRule(phone=3.0, other=2.0))
-    phones.accept(phone("t", 0.46), 0.0)
-    phones.accept(phone("sil", 0.7, index=1), 0.0)
+    phones.add(phone("t", 0.46), 0.0)
+    phones.add(phone("sil", 0.7, index=1), 0.0)
     assert phones.log_odds(0.5) == -2.0
     assert phones.log_odds(0.72) == 0.0
-    phones.accept(phone("p", 0.48, index=2), 0.0)
+    phones.add(phone("p", 0.48, index=2), 0.0)
     assert phones.log_odds(0.5) > 2.0
 
 
@@ -442,7 +444,7 @@ def test_another_lip_model_goes_on_from_where_the_mouth_is(to_learnt: bool) -> N
     first, second = models if to_learnt else models[::-1]
     frames = []
     for changes in (True, False):
-        face = Face(first if changes else second, frame_rate_hz=240.0, delay_s=DELAY_S)
+        face = FaceAnimator(first if changes else second, frame_rate_hz=240.0, delay_s=DELAY_S)
         speak(face)
         phones = [
             (0.02 + 0.1 * index, phone(symbol, 0.1 * index, index=index))
@@ -450,8 +452,8 @@ def test_another_lip_model_goes_on_from_where_the_mouth_is(to_learnt: bool) -> N
         ]
         shown = run(face, 0.0, 0.6, wave, phones[:6])
         if changes:
-            face.use_lips(second)
-            face.use_lips(second)
+            face.set_lip_model(second)
+            face.set_lip_model(second)
         frames.append(shown + run(face, 0.6, 1.2, wave, phones[6:]))
     changed = values(frames[0], JAW)
     steps = np.diff(changed)
@@ -463,5 +465,5 @@ def test_another_lip_model_goes_on_from_where_the_mouth_is(to_learnt: bool) -> N
 
 
 def test_an_unknown_lip_model_is_refused_by_name() -> None:
-    with pytest.raises(UserError, match="no lip model 'muscles'; choose one of"):
+    with pytest.raises(UserError, match="unknown lip model 'muscles'; use one of"):
         load_lip_model(name="muscles")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from kouxing.services.synthesizer.face import Face
+from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
 from kouxing.shared.face.idle_motion import IdleMotion, State
 from kouxing.shared.phones.events import Progress, SpeechChange
@@ -29,11 +29,11 @@ def levels(*parts: tuple[float, float]) -> list[float]:
 
 
 def show(
-    face: Face, levels_db: Sequence[float], step: int = 1, pitch_hz: Sequence[float] = ()
+    face: FaceAnimator, levels_db: Sequence[float], step: int = 1, pitch_hz: Sequence[float] = ()
 ) -> NDArray[np.float32]:
     """Frames of a sound with these levels and pitches, which arrives in so many at a time."""
     pitch_hz = pitch_hz or [0.0] * len(levels_db)
-    frames = face.accept(SpeechChange(active=True, time_s=0.0))
+    frames = face.process(SpeechChange(active=True, time_s=0.0))
     for first in range(0, len(levels_db), step):
         for number in range(first, min(first + step, len(levels_db))):
             progress = Progress(
@@ -41,7 +41,7 @@ def show(
                 level_db=levels_db[number],
                 pitch_hz=pitch_hz[number],
             )
-            frames += face.accept(progress)
+            frames += face.process(progress)
     return np.array([faps for _, faps in frames])
 
 
@@ -110,7 +110,7 @@ def test_noise_without_speech_moves_no_brow() -> None:
     frames = [
         faps
         for number, level_db in enumerate(STRESSED)
-        for _, faps in face.accept(Progress(time_s=(number + 1) * FRAME_S, level_db=level_db))
+        for _, faps in face.process(Progress(time_s=(number + 1) * FRAME_S, level_db=level_db))
     ]
     assert not np.array(frames)[:, BROW].any()
 
@@ -132,7 +132,7 @@ def test_eyes_leave_the_viewer_more_often_in_thought() -> None:
 def test_the_head_moves_on_after_a_gap() -> None:
     face = make_face(idle_motion_seed=5)
     before = show(face, levels((2.0, QUIET_DB)))[-1]
-    after = np.array([faps for _, faps in face.accept(Progress(time_s=20.0, level_db=SILENT_DB))])
+    after = np.array([faps for _, faps in face.process(Progress(time_s=20.0, level_db=SILENT_DB))])
     assert np.abs(after[0, [PITCH, YAW]] - before[[PITCH, YAW]]).max() < 300.0  # 0.2 degrees
 
 

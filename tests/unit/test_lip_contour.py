@@ -50,10 +50,10 @@ def test_feature_points_travel_as_measured(opening: float) -> None:
         ("\t52\t-513.1", "\t52\tfar", "could not convert"),
         ("\t52\t-513.1", "\t52\t-5131", "8.2 is out of range"),
         ("\t52\t-513.1", "\t52\tnan", "8.2 is out of range"),
-        ("\t52\t-513.1", "\t51\t-513.1", "FAP 51 moves 8.2"),
+        ("\t52\t-513.1", "\t51\t-513.1", "FAP 51 does not move 8.2"),
         ("\t52\t-513.1", "\t\t", "the outer lower line needs"),
         ("8.2\t0.500", "8.2\t0.900", "the outer lower line needs"),
-        ("8.2\t0.500", "8.20\t0.500", "FAP 52 moves 8.20"),
+        ("8.2\t0.500", "8.20\t0.500", "FAP 52 does not move 8.20"),
     ],
 )
 def test_a_damaged_table_of_points_is_refused(right: str, wrong: str, message: str) -> None:
@@ -100,14 +100,14 @@ def test_openings_out_of_range_are_refused(opening: float) -> None:
 
 
 def test_drawing_is_the_same_in_svg_and_picture() -> None:
-    moments = [drawing.Moment(0.1 * number, 2.5 * number, "a<", "ba") for number in range(3)]
-    strip = drawing.strip(moments, mouths_a_row=2, mouth_px=60.0)
+    moments = [drawing.LabeledMouth(0.1 * number, 2.5 * number, "a<", "ba") for number in range(3)]
+    strip = drawing.strip(moments, max_columns=2, mouth_px=60.0)
     root = ElementTree.fromstring(drawing.svg(strip))  # noqa: S314 - our own
     assert [element.text for element in root if element.tag.endswith("text")].count("a<") == 3
     picture = drawing.rasterize(strip)
     assert picture.shape == (strip.height_px, strip.width_px, 3)
 
-    def dark_rows(moment: drawing.Moment) -> int:
+    def dark_rows(moment: drawing.LabeledMouth) -> int:
         """Rows of the middle column that show the inside of the mouth."""
         column = drawing.rasterize(drawing.image(moment, 320, 240))[:200, 160].astype(int)
         return int((column.sum(axis=1) < 200).sum())

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.services.synthesizer.offline import synthesize
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import load_inventory
@@ -45,7 +44,7 @@ def phone_classes() -> dict[str, str]:
 @cache
 def frames_of(*symbols: str) -> Values:
     """Return the FAPs of phones of one length, from one to the other."""
-    lips = load_lip_model(name=LipModelName.DYNAMIC_VISEMES)
+    lips = load_lip_model(name="dynamic-visemes")
     assert isinstance(lips, DynamicVisemes)
     phones = [
         Phone(

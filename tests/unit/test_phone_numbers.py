@@ -14,26 +14,26 @@ pytestmark = pytest.mark.unit
 def numbers() -> PhoneNumbers:
     """A recognizer has told two phones, one of them final, and is lost."""
     numbers = PhoneNumbers()
-    assert numbers.place(phone(0, "d", 1.0)).index == 0
-    assert numbers.place(phone(1, "a", 1.1, final=False)).index == 1
+    assert numbers.renumber(phone(0, "d", 1.0)).index == 0
+    assert numbers.renumber(phone(1, "a", 1.1, final=False)).index == 1
     numbers.restart()
     return numbers
 
 
 def test_the_next_recognizer_counts_on(numbers: PhoneNumbers) -> None:
-    assert [numbers.place(phone(index, "i", 2.0 + index)).index for index in (0, 1)] == [2, 3]
-    assert numbers.place(phone(0, "u", 2.0)).index == 2, "a revision"
+    assert [numbers.renumber(phone(index, "i", 2.0 + index)).index for index in (0, 1)] == [2, 3]
+    assert numbers.renumber(phone(0, "u", 2.0)).index == 2, "a revision"
 
 
 def test_what_was_not_final_and_comes_again_keeps_its_place(numbers: PhoneNumbers) -> None:
-    assert numbers.place(phone(0, "a", 1.13, final=False)).index == 1
-    assert numbers.place(phone(0, "ai", 1.2)).index == 1, "and so do its revisions"
-    assert numbers.place(phone(1, "i", 1.3)).index == 3
+    assert numbers.renumber(phone(0, "a", 1.13, final=False)).index == 1
+    assert numbers.renumber(phone(0, "ai", 1.2)).index == 1, "and so do its revisions"
+    assert numbers.renumber(phone(1, "i", 1.3)).index == 3
     assert numbers.take_withdrawn() == []
 
 
 def test_what_does_not_come_again_is_withdrawn_once(numbers: PhoneNumbers) -> None:
-    assert numbers.place(phone(0, "a", 1.2)).index == 2, "another a"
+    assert numbers.renumber(phone(0, "a", 1.2)).index == 2, "another a"
     (withdrawn,) = numbers.take_withdrawn()
     assert (withdrawn.index, withdrawn.is_withdrawn) == (1, True)
     assert numbers.take_withdrawn() == []
@@ -41,4 +41,4 @@ def test_what_does_not_come_again_is_withdrawn_once(numbers: PhoneNumbers) -> No
 
 def test_phones_stay_void_over_two_losses(numbers: PhoneNumbers) -> None:
     numbers.restart()
-    assert numbers.place(phone(5, "a", 1.1)).index == 1
+    assert numbers.renumber(phone(5, "a", 1.1)).index == 1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.service import MAX_AT_ONCE_S, MAX_WAITING, SynthesizerService
+from kouxing.services.synthesizer.service import MAX_BURST_S, MAX_QUEUED, SynthesizerService
 from kouxing.shared.clock import to_samples
 from kouxing.shared.keys import Peer
 from kouxing.shared.wire.control import StartSession
@@ -68,7 +68,7 @@ def service() -> Iterator[Watched]:
 
 def test_frames_of_a_gap_do_not_hold_others_up(service: Watched) -> None:
     service.take("gap", 1, 9.9)
-    assert len(service.frames("gap")) == round(MAX_AT_ONCE_S * RATE_HZ)
+    assert len(service.frames("gap")) == round(MAX_BURST_S * RATE_HZ)
     service.take("other", 1, 0.02 + SynthesizerConfig().delay_ms / 1e3)
     assert len(service.frames("other")) == 2
     service.take("gap", 2, 9.92)
@@ -79,7 +79,7 @@ def test_frames_of_a_gap_do_not_hold_others_up(service: Watched) -> None:
         before = len(service.frames("gap"))
         service.on_tick(0.0)
         num_ticks += 1
-        assert len(service.frames("gap")) <= before + round(MAX_AT_ONCE_S * RATE_HZ)
+        assert len(service.frames("gap")) <= before + round(MAX_BURST_S * RATE_HZ)
     times = [frame.media_time for frame in service.frames("gap")]
     assert times == list(range(0, times[-1] + 1, to_samples(1 / RATE_HZ)))
     assert times[-1] >= to_samples(9.92)
@@ -92,7 +92,7 @@ def test_two_with_gaps_take_turns_and_show_what_others_would(service: Watched) -
     for _ in range(10):
         service.on_tick(0.0)
     numbers = [len(service.frames(name)) for name in ("gap", "other")]
-    assert abs(numbers[0] - numbers[1]) <= round(MAX_AT_ONCE_S * RATE_HZ)
+    assert abs(numbers[0] - numbers[1]) <= round(MAX_BURST_S * RATE_HZ)
     for _ in range(200):
         service.on_tick(0.0)
     gap, other = (
@@ -104,14 +104,14 @@ def test_two_with_gaps_take_turns_and_show_what_others_would(service: Watched) -
 
 
 def test_what_comes_too_early_is_left_to_be_sent_again(service: Watched) -> None:
-    for sequence in range(1, MAX_WAITING + 10):
+    for sequence in range(1, MAX_QUEUED + 10):
         service.take("gap", sequence, 5.0 + sequence * 0.02)
-    assert len(service._sessions["gap"].waiting) == MAX_WAITING
+    assert len(service._sessions["gap"].queue) == MAX_QUEUED
     for _ in range(300):
         service.on_tick(0.0)
-    assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_WAITING * 0.02 + 0.02)
-    service.take("gap", MAX_WAITING + 1, 5.0 + (MAX_WAITING + 1) * 0.02)
+    assert service.frames("gap")[-1].media_time < to_samples(5.0 + MAX_QUEUED * 0.02 + 0.02)
+    service.take("gap", MAX_QUEUED + 1, 5.0 + (MAX_QUEUED + 1) * 0.02)
     assert service.frames("gap")[-1].media_time == to_samples(
-        5.0 + (MAX_WAITING + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
+        5.0 + (MAX_QUEUED + 1) * 0.02 - SynthesizerConfig().delay_ms / 1e3
     )
-    assert not service._sessions["gap"].waiting
+    assert not service._sessions["gap"].queue

@@ -33,11 +33,10 @@ from kouxing.services.recognizer.front_end.vtln import PitchedLogMel, VocalTract
 from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.speech_scorer import frame_time_s
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.face import Face
-from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.services.synthesizer.face_animator import FaceAnimator
+from kouxing.services.synthesizer.lips.registry import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import LipModelName
 from kouxing.shared.phones.events import Phone, Progress
 from kouxing.shared.phones.inventory import PhoneInventory, load_inventory
 from tests.languages import flat_language, install_language
@@ -155,7 +154,7 @@ def test_text_is_aligned(toy: PhoneInventory, tmp_path: Path) -> None:
 
 
 def test_its_sound_opens_the_mouth(toy: PhoneInventory, tmp_path: Path) -> None:
-    visemes = LipModelName.DYNAMIC_VISEMES
+    visemes = "dynamic-visemes"
     chain = LiveChain(
         loaded(toy, tmp_path),
         load_lip_model("toy", visemes),
@@ -171,11 +170,11 @@ def test_its_sound_opens_the_mouth(toy: PhoneInventory, tmp_path: Path) -> None:
 
 
 def test_its_lips_close_for_m_and_it_has_a_diphthong(toy: PhoneInventory) -> None:
-    face = Face(load_lip_model("toy"), frame_rate_hz=50.0, delay_s=0.1)
+    face = FaceAnimator(load_lip_model("toy"), frame_rate_hz=50.0, delay_s=0.1)
     for index, (symbol, onset_s, duration_s) in enumerate(
         [("a", 0.1, 0.4), ("m", 0.5, 0.1), ("a", 0.6, 0.3), ("y", 0.9, 0.3)]
     ):
-        face.accept(
+        face.process(
             Phone(
                 index=index,
                 symbol=symbol,
@@ -185,7 +184,7 @@ def test_its_lips_close_for_m_and_it_has_a_diphthong(toy: PhoneInventory) -> Non
                 final=True,
             )
         )
-    frames = face.accept(Progress(time_s=1.5, level_db=-20.0))
+    frames = face.process(Progress(time_s=1.5, level_db=-20.0))
     _, upper_lip, lower_lip, width = np.array([faps[2:6] for _, faps in frames]).T  # FAPs 3 to 6
     assert lower_lip[15] < -400  # open at 0.3 s
     assert max(abs(upper_lip[27]), abs(lower_lip[27])) < 12  # closed at 0.54 s

@@ -3,20 +3,15 @@
 import numpy as np
 import pytest
 
-from kouxing.services.synthesizer.lips.dynamic_visemes.trajectory import (
-    Motion,
-    Rest,
-    TargetTrajectory,
-    Transition,
-    motionless,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.target_trajectory import TargetTrajectory
+from kouxing.services.synthesizer.lips.trajectory import FapState, RestTransition, Transition, still
 from kouxing.shared.face.faps import MOUTH_FAPS
 from tests.lips import LIPS, articulation_of, utterance
 
 pytestmark = pytest.mark.unit
 
 NUM = len(MOUTH_FAPS)
-DIFFERENCE = Motion(np.linspace(-100.0, 100.0, NUM), np.linspace(500.0, -500.0, NUM))
+DIFFERENCE = FapState(np.linspace(-100.0, 100.0, NUM), np.linspace(500.0, -500.0, NUM))
 DURATION_S = np.linspace(0.02, 0.14, NUM)
 
 
@@ -24,9 +19,9 @@ def test_a_transition_leads_value_and_slope_to_zero() -> None:
     transition = Transition(DIFFERENCE, DURATION_S)
     begin, end = transition.at(0.0), transition.at(0.14)
     np.testing.assert_allclose(begin.value, DIFFERENCE.value)
-    np.testing.assert_allclose(begin.slope, DIFFERENCE.slope)
+    np.testing.assert_allclose(begin.velocity, DIFFERENCE.velocity)
     assert not end.value.any()
-    assert not end.slope.any()
+    assert not end.velocity.any()
     done = transition.at(0.05)
     assert ((done.value == 0.0) == (DURATION_S <= 0.05)).all()
 
@@ -36,14 +31,14 @@ def test_the_slope_is_the_value_s_derivative(time_s: float) -> None:
     transition, step_s = Transition(DIFFERENCE, DURATION_S), 1e-7
     before, after = transition.at(time_s - step_s), transition.at(time_s + step_s)
     slope = (after.value - before.value) / (2.0 * step_s)
-    np.testing.assert_allclose(transition.at(time_s).slope, slope, atol=0.05)
+    np.testing.assert_allclose(transition.at(time_s).velocity, slope, atol=0.05)
 
 
 def test_the_slope_of_a_target_trajectory_is_its_derivative() -> None:
     trajectory = TargetTrajectory(LIPS.parameters, articulation_of(utterance(2, 8)).timeline)
     times = np.arange(0.4, 0.9, 0.001)
     values = np.array([trajectory.at(time_s).value for time_s in times])
-    slopes = np.array([trajectory.at(time_s).slope for time_s in times])
+    slopes = np.array([trajectory.at(time_s).velocity for time_s in times])
     assert np.abs(slopes).max() > 100.0
     inside = slice(1, -1)
     np.testing.assert_allclose(
@@ -53,8 +48,8 @@ def test_the_slope_of_a_target_trajectory_is_its_derivative() -> None:
 
 def test_rest_ends_at_the_neutral_mouth() -> None:
     neutral = np.full(NUM, 7.0)
-    rest = Rest(motionless(neutral) + DIFFERENCE, neutral, duration_s=0.3)
+    rest = RestTransition(still(neutral) + DIFFERENCE, neutral, duration_s=0.3)
     mouths = [rest.step(0.02) for _ in range(16)]
     assert np.abs(mouths[0].value - neutral - DIFFERENCE.value).max() < 15.0
     np.testing.assert_allclose(mouths[-1].value, neutral)
-    assert not mouths[-1].slope.any()
+    assert not mouths[-1].velocity.any()

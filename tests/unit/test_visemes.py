@@ -47,7 +47,7 @@ def test_a_language_with_other_visemes_is_refused() -> None:
         {"visemes": {**INVENTORY.visemes, "a": (("th", 1.0),)}},
         {"before_rounded": {"d": "th"}},
     ):
-        with pytest.raises(UserError, match="visemes th; known: rest, b"):
+        with pytest.raises(UserError, match="visemes th; use rest, b"):
             check_visemes(replace(INVENTORY, **change))
 
 

@@ -18,8 +18,8 @@ from scipy.optimize import lsq_linear
 from kouxing.corpora.lip_clips import LipClip
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import columns
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST
-from kouxing.services.synthesizer.lips.ferguson.motion import MAX_OPENING
-from kouxing.services.synthesizer.lips.ferguson.openings import anchors_of
+from kouxing.services.synthesizer.lips.ferguson.key_frames import anchors_of
+from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory

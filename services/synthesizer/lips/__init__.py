@@ -1,1 +1,1 @@
-"""Lip models: mouth FAPs from what the recognizer tells."""
+"""Lip models: mouth FAPs from sound events."""

@@ -1,1 +1,1 @@
-"""What changes a face after its lip model: amplitude, expression, idle motion."""
+"""Modifiers of the face after the lip model: amplitude, expressiveness, expression, idle motion."""

@@ -1,15 +1,15 @@
 """Scales mouth openings with the level of the voice and the rate of speech.
 
-Louder speech opens jaw and lips further (Lombard speech; Schulman 1989), fast speech less. Zhang 2021
-names both as open questions. Only openings are scaled, so closures stay closed.
+Louder speech opens jaw and lips further (Lombard speech; Schulman 1989), fast speech less. Zhang
+2021 names both as open questions. Only openings are scaled, so closures stay closed.
 
 The level is compared with the usual level of the current viseme, because open vowels are naturally
 louder than closed ones, and with the speaker's mean, so that microphone gain has no effect. Levels
-are known at once, phones about 0.1 s later. With a short delay, a level above that of the known phone
-therefore predicts the next vowel.
+are known at once, phones about 0.1 s later. With a short delay, a level above that of the known
+phone therefore predicts the next vowel.
 
-The rate acts twice. Blending makes fast visemes miss their targets, which explains about half of the
-reduction in real lips; `_PER_RATE` is the other half (see docs/visemes.md).
+The rate acts twice. Blending makes fast visemes miss their targets, which explains about half of
+the reduction in real lips; `_PER_RATE` is the other half (see docs/visemes.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Scales mouth movements, like a caricature.
 
-Differences from the usual mouth of speech grow: open lips open further, narrow lips become narrower,
-spread lips wider, and protruding lips protrude further.
+Differences from the usual mouth of speech grow: open lips open further, narrow lips become
+narrower, spread lips wider, and protruding lips protrude further.
 
 ======  ==============================================  ========  =====
 symbol  meaning                                         unit      shape
@@ -15,10 +15,10 @@ d       difference from the usual width or protrusion   FAP       (1,)
     x' = x + (e - 1) * max(x - 20, 0)                                       for e < 1
     d' = d + 2 * (e - 1) * d
 
-Closures are preserved. A lip within ``SHUT`` of its closed position does not move. Lips with a gap up
-to ``SHUT`` keep their gap, and so do lips whose lower lip touches the teeth (f). Very wide openings
-do not grow, so that the jaw does not drop too far. Horizontal movements are small but equally
-visible, so they count twice.
+Closures are preserved. A lip within ``SHUT`` of its closed position does not move. Lips with a gap
+up to ``SHUT`` keep their gap, and so do lips whose lower lip touches the teeth (f). Very wide
+openings do not grow, so that the jaw does not drop too far. Horizontal movements are small but
+equally visible, so they count twice.
 """
 
 from __future__ import annotations

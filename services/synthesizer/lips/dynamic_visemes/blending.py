@@ -3,8 +3,9 @@
 Source: Wang & Cai 2003, eq. 6 (all visemes and silences); Li et al. 2011, eq. 9-11 (the pair of
 visemes around a time, which is sufficient for a live synthesizer).
 
-Both are the same quotient over different sets of visemes, so one function blends and another selects.
-A softmax over log weights replaces the quotient, because the silences' weights would overflow.
+Both are the same quotient over different sets of visemes, so one function blends and another
+selects. A softmax over log weights replaces the quotient, because the silences' weights would
+overflow.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ def blend(
 
 
 def active_visemes(timeline: Timeline, time_s: float, reach_s: float) -> NDArray[np.bool_]:
-    """Return which visemes act at a time, as a mask: the pair around it, and all within ``reach_s``.
+    """Return a mask of the visemes that act at a time: the pair around it, and within ``reach_s``.
 
     With ``reach_s`` 0 this is the pair of Li 2011, eq. 11, from apex to apex. A longer reach is
     closer to the full model.

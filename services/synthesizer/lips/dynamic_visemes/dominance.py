@@ -13,10 +13,10 @@ theta   decay before (minus) and after (plus) the apex          s**-c    (...)
 c       exponent, the same for all, above 1 for smooth curves   1        ()
 ======  ======================================================  =======  =========
 
-Deviations: All values are logarithms, because silences grow without bound away from speech. A softmax
-over log weights equals the papers' quotient. A short pause weakens its silence (`log_pause`); this
-expresses the rule that the silence between touching phones vanishes. The closure rule is geometric
-instead of arithmetic (`log_closure`).
+Deviations: All values are logarithms, because silences grow without bound away from speech. A
+softmax over log weights equals the papers' quotient. A short pause weakens its silence
+(`log_pause`); this expresses the rule that the silence between touching phones vanishes. The
+closure rule is geometric instead of arithmetic (`log_closure`).
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def log_pause(log_right: Array, log_left: Array, pause_s: Array) -> Array:
     """Return the log dominance of the silence between two words.
 
     Wang & Cai 2003, section 3 say in words: the silence between neighbors is where the two models
-    intersect, it is stronger in longer pauses, and it vanishes when the neighbors touch. The formula
-    is half the harmonic mean of both models (a smooth minimum) times ``1 - exp(-pause / scale)``. A
-    model at an infinite distance has no effect.
+    intersect, it is stronger in longer pauses, and it vanishes when the neighbors touch. The
+    formula is half the harmonic mean of both models (a smooth minimum) times ``1 - exp(-pause /
+    scale)``. A model at an infinite distance has no effect.
     """
     strength: Array = np.log(-np.expm1(-pause_s / _PAUSE_SCALE_S))
     both: Array = np.logaddexp(-log_right, -log_left)
@@ -67,8 +67,8 @@ def log_closure(
     """Return the log dominance of a closing lip, which outweighs all others at its apex.
 
     Wang & Cai 2003, eq. 7 interpolates linearly from the viseme's own dominance at ``reach_s`` to
-    ``closure_ratio`` times the sum of all others at the apex. Its corners would be visible as jerks.
-    This function uses a smooth step between the same ends in the log domain.
+    ``closure_ratio`` times the sum of all others at the apex. Its corners would be visible as
+    jerks. This function uses a smooth step between the same ends in the log domain.
 
     Parameters
     ----------

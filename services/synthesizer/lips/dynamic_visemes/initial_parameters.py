@@ -1,8 +1,8 @@
 """Initial parameters of the dynamic visemes, set by hand; training starts from them.
 
 Static targets are published values (``targets.tsv``). Dominances and decays are estimates. The
-feature that defines a consonant dominates (closed lips for labials, closed teeth for sibilants). Its
-other features yield to the vowel, more for consonants that are articulated further back.
+feature that defines a consonant dominates (closed lips for labials, closed teeth for sibilants).
+Its other features yield to the vowel, more for consonants that are articulated further back.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import (
     VISEMES,
     static_targets,
 )
-
 from kouxing.shared.face.faps import NUM_MOUTH_FAPS
 
 _JAW_FAPS = (3, 14)

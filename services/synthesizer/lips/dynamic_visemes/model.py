@@ -8,13 +8,13 @@ The known phones define the *target trajectory*. Each revision by the live recog
 continuous in position and velocity. It is shorter if a lip must close earlier.
 
 A frame is made when the audio is known up to ``delay_s`` after it, with all phones known at that
-time. Visemes within that reach act in addition to the pair of eq. 11, so a longer delay is closer to
-the full model (Wang & Cai 2003, eq. 6).
+time. Visemes within that reach act in addition to the pair of eq. 11, so a longer delay is closer
+to the full model (Wang & Cai 2003, eq. 6).
 
-Lips move before the sound, but a phone is recognized about 0.1 s after its onset. Therefore the mouth
-starts moving towards an expected viseme after the last phone (`timeline`). While no phone follows,
-the expected viseme stays just ahead of the time up to which a phone would have been recognized. This
-halves the lag of the lips at short delays.
+Lips move before the sound, but a phone is recognized about 0.1 s after its onset. Therefore the
+mouth starts moving towards an expected viseme after the last phone (`timeline`). While no phone
+follows, the expected viseme stays just ahead of the time up to which a phone would have been
+recognized. This halves the lag of the lips at short delays.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Parameters of the dynamic visemes, and their file format.
 
-Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta_plus, t_o and T, for
-closures C and T; per FAP the silence models; one exponent c.
+Source: Wang & Cai 2003, section 4: per viseme and FAP alpha, theta_minus, theta_plus, t_o and T,
+for closures C and T; per FAP the silence models; one exponent c.
 """
 
 from __future__ import annotations

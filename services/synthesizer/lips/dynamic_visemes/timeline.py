@@ -3,11 +3,11 @@
 Source: Li et al. 2011, 2.3.1 (compound finals become several visemes), Wang & Cai 2003, section 3
 (positions of the silence models).
 
-The *apex* of a viseme is the time of its maximum effect (the papers' center). Deviations: The apex of
-a viseme longer than twice ``EDGE_S`` is an interval, so that a long vowel is held instead of fading
-from its middle. Eq. 5 then uses the distance to the nearer end. Live, an expected viseme follows the
-last known phone, because a vowel follows every initial and an initial follows most vowels. The mouth
-thus starts in time for a phone that will be recognized late.
+The *apex* of a viseme is the time of its maximum effect (the papers' center). Deviations: The apex
+of a viseme longer than twice ``EDGE_S`` is an interval, so that a long vowel is held instead of
+fading from its middle. Eq. 5 then uses the distance to the nearer end. Live, an expected viseme
+follows the last known phone, because a vowel follows every initial and an initial follows most
+vowels. The mouth thus starts in time for a phone that will be recognized late.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Timeline:
     open_phone: OpenPhone | None = None
 
     def select(self, selected: NDArray[np.bool_] | NDArray[np.intp]) -> Timeline:
-        """Return a timeline with the selected visemes (mask or rows), all silences and syllables."""
+        """Return a timeline with selected visemes (mask or rows), all silences and syllables."""
         return replace(
             self,
             viseme=self.viseme[selected],

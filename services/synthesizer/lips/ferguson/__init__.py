@@ -1,1 +1,18 @@
-"""Lips of one opening R over time, drawn as Ferguson curves: Zhang et al. 2021."""
+"""Lips with a single opening R, drawn as Ferguson curves: Zhang et al. 2021."""
+
+from kouxing.services.synthesizer.lips.lip_model import LipModel, LipModelInfo
+from kouxing.shared.phones.inventory import PhoneInventory
+
+
+def _load(inventory: PhoneInventory) -> LipModel:
+    from kouxing.services.synthesizer.lips.ferguson.model import FergusonLips
+    from kouxing.services.synthesizer.lips.ferguson.table import load_table
+
+    return FergusonLips(load_table(inventory), inventory)
+
+
+LIP_MODEL = LipModelInfo(
+    delay_ms=160.0,
+    titles={"en": "from one opening (Ferguson)", "zh": "由单一开口（Ferguson）"},
+    load=_load,
+)

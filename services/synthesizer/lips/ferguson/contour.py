@@ -1,9 +1,9 @@
 """The lip contour and the FAPs at an opening R.
 
 Source: Zhang et al. 2021, section 3. Four lines of five MPEG-4 feature points with shared corners
-have 16 points. The upward travel of each point was measured once. A Ferguson curve, a piecewise cubic
-with two continuous derivatives, passes through a line's points ``(x_j, dy_j)`` and gives the travel
-at any ``x``, so a contour may have any number of points:
+have 16 points. The upward travel of each point was measured once. A Ferguson curve, a piecewise
+cubic with two continuous derivatives, passes through a line's points ``(x_j, dy_j)`` and gives the
+travel at any ``x``, so a contour may have any number of points:
 
     l(x) = y(x) + R dy(x)                                                          (eq. 4)
 
@@ -80,7 +80,7 @@ class LipLine:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """x of both corners, mouth widths."""
+        """X of both corners, mouth widths."""
         return float(self.travel.x[0]), float(self.travel.x[-1])
 
     def heights(self, x: ArrayLike, openings: ArrayLike) -> Array:

@@ -1,7 +1,7 @@
 """Draws the mouth in two dimensions, as SVG text or pictures.
 
-A drawing is a list of outlines and labels, in pixels, y downwards. ``svg`` and ``rasterize`` convert
-it to the text of a file and to a picture.
+A drawing is a list of outlines and labels, in pixels, y downwards. ``svg`` and ``rasterize``
+convert it to the text of a file and to a picture.
 """
 
 from __future__ import annotations
@@ -242,7 +242,9 @@ def _font(text: str, size_px: float) -> ImageFont.FreeTypeFont | ImageFont.Image
 
 def rasterize(drawing: Drawing) -> UInt8:
     """Return a drawing as a picture (height_px, width_px, 3), sRGB."""
-    fine = Image.new("RGB", (drawing.width_px * _SUPERSAMPLING, drawing.height_px * _SUPERSAMPLING), PAPER)
+    fine = Image.new(
+        "RGB", (drawing.width_px * _SUPERSAMPLING, drawing.height_px * _SUPERSAMPLING), PAPER
+    )
     pen = ImageDraw.Draw(fine)
     for outline in drawing.outlines:
         points = [(x * _SUPERSAMPLING, y * _SUPERSAMPLING) for x, y in outline.points.tolist()]

@@ -1,7 +1,7 @@
 """Syllable endpoints by energy and zero crossings.
 
-Source: Zhang et al. 2021, section 2.2: short-time energy and zero-crossing rate, with two thresholds
-each. The states, for slices of 20 ms:
+Source: Zhang et al. 2021, section 2.2: short-time energy and zero-crossing rate, with two
+thresholds each. The states, for slices of 20 ms:
 
     silence --loud or hissing--> speech --quiet for HANGOVER_S--> silence
                                   |    ^
@@ -15,12 +15,13 @@ Q_n      short-time energy, as the level in dB of full scale              ``leve
 Z_n      zero crossings as a share of the samples, 0 to 1                 ``zero_crossing_rate``
 ======== ================================================================ =====================
 
-Deviations: The paper detects short gaps between words. Real syllables seldom have gaps, so a segment
-also ends at a dip of the *sonority*, which is the level minus a penalty for zero crossings above their
-low threshold. Unvoiced consonants therefore also are dips. The level thresholds are above the noise
-floor, which is the quietest slice of the last 3 s (as in minimum statistics: Martin, "Noise power
-spectral density estimation based on optimal smoothing and minimum statistics", 2001). They are
-proportional to the range of recent levels, because speech rises less above the floor in noise.
+Deviations: The paper detects short gaps between words. Real syllables seldom have gaps, so a
+segment also ends at a dip of the *sonority*, which is the level minus a penalty for zero crossings
+above their low threshold. Unvoiced consonants therefore also are dips. The level thresholds are
+above the noise floor, which is the quietest slice of the last 3 s (as in minimum statistics:
+Martin, "Noise power spectral density estimation based on optimal smoothing and minimum statistics",
+2001). They are proportional to the range of recent levels, because speech rises less above the
+floor in noise.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ from kouxing.shared.phones.events import Progress
 
 SLICE_S = 0.02
 
-# Chosen on recordings of the training split, by boundaries found within 50 ms; no value is critical.
+# Chosen on recordings of the training split, by boundaries found within 50 ms; no value is
+# critical.
 HIGH_SHARE = 0.4  # high threshold, relative to the range of recent levels
 MIN_HIGH_DB = 4.0  # more than the variation of steady noise
 LOW_SHARE = 0.5  # low threshold, relative to the high threshold

@@ -1,9 +1,9 @@
 """The opening of the mouth over time, and its key frames from timed phones.
 
-Source: Zhang et al. 2021, sections 4 and 5, eq. 6. Each initial and final has an opening R, 0 (closed)
-to 5. The mouth has this opening when the phone starts; in between, R is linear. Before and after
-speech the mouth is closed, and it starts moving shortly before the first sound. As an option, R is a
-smooth curve: a piecewise cubic without overshoot (PCHIP, Fritsch and Butland, "A method for
+Source: Zhang et al. 2021, sections 4 and 5, eq. 6. Each initial and final has an opening R, 0
+(closed) to 5. The mouth has this opening when the phone starts; in between, R is linear. Before and
+after speech the mouth is closed, and it starts moving shortly before the first sound. As an option,
+R is a smooth curve: a piecewise cubic without overshoot (PCHIP, Fritsch and Butland, "A method for
 constructing local monotone piecewise cubic interpolants", 1984).
 """
 

@@ -249,8 +249,8 @@ class FergusonStream:
     ) -> list[tuple[float, float]]:
         """Return the key frames of an average phone after the last one, or of a new segment.
 
-        They replace the closing of the mouth after the last phone, which is removed from ``frames``.
-        The mouth closes if no phone follows.
+        They replace the closing of the mouth after the last phone, which is removed from
+        ``frames``. The mouth closes if no phone follows.
         """
         averages = self._model.averages
         start_s = self._segmenter.start_s

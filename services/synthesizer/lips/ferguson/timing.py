@@ -6,9 +6,9 @@ higher level overlap more of the preceding consonant.
 
 The paper has one segment per syllable. Energy and zero crossings do not find exactly these, so
 syllables are first assigned to segments. A segment may contain several syllables, several segments
-may form one syllable, and a segment may be a breath or noise. Dynamic programming finds the cheapest
-assignment. Costs depend on the syllables' typical durations, at the rate of the whole recording, and
-on whether zero crossings match the first consonant of each syllable.
+may form one syllable, and a segment may be a breath or noise. Dynamic programming finds the
+cheapest assignment. Costs depend on the syllables' typical durations, at the rate of the whole
+recording, and on whether zero crossings match the first consonant of each syllable.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def phone_onsets(
 ) -> list[float]:
     """Return the onsets of the phones of a syllable, seconds (eq. 5).
 
-    The final follows its initial by its influence factor. A third phone (r-coloring) gets its typical
-    share of the remaining time.
+    The final follows its initial by its influence factor. A third phone (r-coloring) gets its
+    typical share of the remaining time.
     """
     onsets_s = [start_s]
     rest = list(syllable)
@@ -119,7 +119,9 @@ def syllable_times(
     if not segments:
         raise UserError("found no speech; check that text and recording belong together")
     text = _Text(
-        duration_s=np.array([sum(table.duration_s[phone] for phone in phones) for phones in syllables]),
+        duration_s=np.array(
+            [sum(table.duration_s[phone] for phone in phones) for phones in syllables]
+        ),
         crossings=np.array([table.crossings[phones[0]] for phones in syllables]),
     )
     times_s = np.zeros((len(syllables), 2))

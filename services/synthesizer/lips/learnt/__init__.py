@@ -1,1 +1,19 @@
-"""Lips as the sound itself tells them, with the closures and the tongue of recognised phones."""
+"""Learnt lips: predicted from the audio, with closures and tongue from recognized phones."""
+
+from kouxing.services.synthesizer.lips.lip_model import LipModel, LipModelInfo
+from kouxing.shared.phones.inventory import PhoneInventory
+
+
+def _load(inventory: PhoneInventory) -> LipModel:
+    from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
+    from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
+    from kouxing.services.synthesizer.lips.learnt.model import LearntLips
+
+    return LearntLips(DynamicVisemes(load_parameters(), inventory))
+
+
+LIP_MODEL = LipModelInfo(
+    delay_ms=60.0,
+    titles={"en": "from the sound (learnt)", "zh": "由声音（学得）"},
+    load=_load,
+)

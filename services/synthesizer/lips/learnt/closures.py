@@ -1,14 +1,15 @@
 """Decides about closures from predicted lips and recognized phones together.
 
-Both sources have errors: phone recognition confuses p with t, and the lip predictor smooths closures.
-Their evidence is added as log odds. A recognized b, p or m raises the odds of a closure; a high
-predicted probability needs no phone. Without a phone, the odds decrease with the predicted opening, so
-that lips open in time, and with rounding, because lips nearly meet in u and w. Phones are no evidence
-against a closure, so a p recognized as t cannot open closed lips. A phone on its own cannot close lips
-that are predicted to be wide open. In a complete recording phones are more reliable: other phones
-open the lips, and so does the middle of a vowel between two closing phones.
+Both sources have errors: phone recognition confuses p with t, and the lip predictor smooths
+closures. Their evidence is added as log odds. A recognized b, p or m raises the odds of a closure;
+a high predicted probability needs no phone. Without a phone, the odds decrease with the predicted
+opening, so that lips open in time, and with rounding, because lips nearly meet in u and w. Phones
+are no evidence against a closure, so a p recognized as t cannot open closed lips. A phone on its
+own cannot close lips that are predicted to be wide open. In a complete recording phones are more
+reliable: other phones open the lips, and so does the middle of a vowel between two closing phones.
 
-Phones alone decide about lower lip to upper teeth (f), which the lip predictor does not predict well.
+Phones alone decide about lower lip to upper teeth (f), which the lip predictor does not predict
+well.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@
 
 The recognizer predicts lip frames from the audio (``LipFrame``), 50 per second during speech. Small
 changes are reduced, because they are jitter. Recognized phones take part in the decision about
-closures (`closures`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which cameras
-do not track, come from the dynamic visemes. The lip frames already contain the effect of loudness, so
-the amplitude modifier is off.
+closures (`closures`). Each closure lasts at least two lip frames. Tongue and jaw thrust, which
+cameras do not track, come from the dynamic visemes. The lip frames already contain the effect of
+loudness, so the amplitude modifier is off.
 
 A lip frame is processed once, when its FAP frame is due, without waiting for the next lip frame. If
 lip frames are late, a *transition* keeps the mouth continuous in position and velocity. After the
