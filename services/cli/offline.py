@@ -62,10 +62,8 @@ def render(
     lips: Annotated[
         list[str] | None,
         typer.Option(
-        typer.Option(
             help="Lip model for a sound, such as learnt or dynamic-visemes. Repeat it to see faces"
             " side by side."
-        ),
         ),
     ] = None,
     live: Annotated[
