@@ -20,7 +20,7 @@ from kouxing.shared.face.expressions import (
     check_expressions,
     check_expressiveness,
 )
-from kouxing.shared.face.lip_models import MAX_MOUTH_PROFILE_BYTES, LipModelName
+from kouxing.shared.face.lip_models import LIP_MODEL_NAME, MAX_MOUTH_PROFILE_BYTES
 from kouxing.shared.wire.face import FaceSettings
 
 _HEADER = struct.Struct("<B3xId")
@@ -122,7 +122,7 @@ def parse_command(message: str) -> MicrophoneCommand:
 
 def _parse_lips(fields: Mapping[str, object]) -> str:
     lips = fields.get("lips", "")
-    if not isinstance(lips, str):
+    if not isinstance(lips, str) or (lips and not LIP_MODEL_NAME.fullmatch(lips)):
         raise UserError("lips must be the name of a lip model")
     return lips
 

@@ -1,4 +1,7 @@
 """Values about lips that services and clients share."""
 
+import re
+
 DEFAULT_LIP_MODEL = "learnt"
+LIP_MODEL_NAME = re.compile("[a-z0-9-]{1,64}")
 MAX_MOUTH_PROFILE_BYTES = 64 * 1024

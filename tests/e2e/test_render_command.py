@@ -100,13 +100,13 @@ def test_bad_fap_files_are_refused_with_line_and_reason(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "options", "said"),
     [
-        ("a.png", {"at": 9.0, "size": "64x48"}, "lasts from 0 to 0.45 s"),
+        ("a.png", {"at": 9.0, "size": "64x48"}, "give 0 to 0.45 seconds"),
         ("a.mp4", {"sound": Path("absent.wav")}, "no such file"),
         ("a.mp4", {"lips": ["learnt"]}, "--lips is for a sound"),
         ("a.mp4", {"mouth": Path("me.mouth")}, "--mouth is for a sound"),
         ("a.mp4", {"live": True}, "--live is for a sound"),
         ("a.csv", {"text": "你好"}, "--text is for a sound"),
-        ("no/a.png", {"size": "64x48"}, "cannot be written"),
+        ("no/a.png", {"size": "64x48"}, "cannot write"),
     ],
 )
 def test_what_does_not_fit_is_named(

@@ -85,7 +85,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("a.glb", {"form": CurveForm.OCULUS}, "holds faps or arkit; for oculus, write .csv"),
         ("a.csv", {"lips": ["dynamic-visemes", "learnt"]}, "curves are of one face"),
         ("no/a.csv", {}, "cannot be written"),
-        ("no/a.mp4", {}, "cannot be written"),
+        ("no/a.mp4", {}, "cannot write"),
         ("a.mp4", {"form": CurveForm.ARKIT}, "--as arkit is for curves"),
         ("a.mp4", {"background": "transparent"}, "MP4 has no transparency"),
         ("a.mp4", {"background": "mud"}, "write studio, transparent"),
@@ -93,7 +93,7 @@ def test_a_format_is_rejected_if_its_suffix_is_unknown(tmp_path: Path) -> None:
         ("a.mp4", {"size": "huge"}, "WIDTHxHEIGHT"),
         ("a.mp4", {"size": "161x120"}, "even for a video"),
         ("a.mp4", {"size": "99999x2"}, "7680"),
-        ("a.png", {"head": "nobody"}, "there is no head 'nobody'"),
+        ("a.png", {"head": "nobody"}, "unknown head 'nobody'"),
     ],
 )
 def test_options_are_checked_before_the_work(

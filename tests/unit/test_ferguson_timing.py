@@ -78,7 +78,9 @@ def test_pieces_are_found_in_loud_noise_and_again_after_it_has_begun() -> None:
     parts = [("-", 0.8), ("v", 0.2), ("-", 0.3), ("v", 0.2), ("-", 4.0), ("v", 0.2), ("-", 0.5)]
     sound = 0.3 * speech(parts)
     noise = 0.03 * np.random.default_rng(1).standard_normal(len(sound))  # 3 dB below the vowels
-    starts = [piece.start_s for piece in segment_speech(progress_of((sound + noise).astype(np.float32)))]
+    starts = [
+        piece.start_s for piece in segment_speech(progress_of((sound + noise).astype(np.float32)))
+    ]
     np.testing.assert_allclose(starts, [0.8, 1.3, 5.5], atol=0.045)
     noise[: 2 * RATE_HZ] = 0.0
     pieces = segment_speech(progress_of((sound + noise).astype(np.float32)))

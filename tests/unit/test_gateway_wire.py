@@ -66,7 +66,7 @@ def test_parses_microphone_commands() -> None:
 @pytest.mark.parametrize(
     ("fields", "error"),
     [
-        *(({"lips": lips}, "lips must be one of") for lips in ("muscles", 1, None, ["learnt"])),
+        *(({"lips": lips}, "lips must be the name") for lips in ("no name", 1, None, ["learnt"])),
         *(
             ({"skip": skip}, "skip must be a whole number")
             for skip in (-1, 1.5, True, "1", wire.MAX_SKIPPED + 1)
@@ -90,11 +90,11 @@ def test_parses_face_settings() -> None:
     ("fields", "error"),
     [
         ({"express": {"glee": 0.5}}, "glee"),
-        ({"express": {"joy": 2}}, "joy is 2"),
+        ({"express": {"joy": 2}}, "joy: strength 2"),
         ({"express": {"joy": 1}, "hold_s": "long"}, "hold_s is long"),
         ({"express": "joy"}, "strengths by name"),
         ({"expressiveness": 3}, "expressiveness is 3"),
-        ({"lips": "muscles"}, "lips must be one of"),
+        ({"lips": "no name"}, "lips must be the name"),
     ],
 )
 def test_rejects_bad_face_settings(fields: dict[str, object], error: str) -> None:
