@@ -198,8 +198,8 @@ def schemes(
     from kouxing.evaluation.lips.four_schemes import film_all, hear_all, listeners_of
     from kouxing.evaluation.lips.scheme_report import print_outcome
     from kouxing.evaluation.lips.scheme_scores import evaluate
+    from kouxing.services.lip_models import lip_models
     from kouxing.services.recognizer.acoustic.load import load_live_model
-    from kouxing.services.synthesizer.lips.registry import lip_models
     from kouxing.shared.errors import UserError
 
     check_output(json_file)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
+from kouxing.services.lip_models import lip_model_info
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
     DynamicVisemes,
@@ -14,7 +15,6 @@ from kouxing.services.synthesizer.lips.dynamic_visemes.model import (
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.lip_model import Articulation
-from kouxing.services.synthesizer.lips.registry import lip_model_info
 from kouxing.services.synthesizer.modifiers.modifier import FrameContext
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress

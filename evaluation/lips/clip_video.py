@@ -15,11 +15,12 @@ from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.render.side_by_side import SideBySide
 from kouxing.services.driver.video import film
 from kouxing.services.driver.video.writer import check_name
+from kouxing.services.lip_models import lip_models
 from kouxing.services.live_chain import sound_events
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.registry import lip_models, load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 

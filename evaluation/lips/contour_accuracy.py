@@ -35,6 +35,7 @@ from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
 from kouxing.evaluation.recognizer.disturbances import faster
+from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.alignment import align_phones, spoken
@@ -45,7 +46,7 @@ from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.key_frames import KeyFrames, key_frames_of
 from kouxing.services.synthesizer.lips.ferguson.table import MAX_OPENING, load_table
 from kouxing.services.synthesizer.lips.ferguson.timing import time_text
-from kouxing.services.synthesizer.lips.registry import lip_model_info, lip_models, load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.phones.events import Phone

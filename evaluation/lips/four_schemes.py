@@ -31,6 +31,7 @@ from kouxing.services.driver.config import Framing
 from kouxing.services.driver.render import scene
 from kouxing.services.driver.render.renderer import Renderer
 from kouxing.services.driver.video import film
+from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.config import RecognizerConfig
@@ -39,7 +40,7 @@ from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
-from kouxing.services.synthesizer.lips.registry import lip_model_info, lip_models, load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 from kouxing.shared.phones.events import SoundEvent

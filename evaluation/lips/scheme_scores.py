@@ -39,10 +39,10 @@ from kouxing.evaluation.lips.four_schemes import (
 from kouxing.evaluation.lips.measures import rms_jerk
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, HeardClip, Scheme
 from kouxing.evaluation.lips.scores import LipScore, pool
+from kouxing.services.lip_models import lip_model_info
 from kouxing.services.mouth_profiles.lip_tracks import level_track
 from kouxing.services.recognizer.alignment import spoken
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.registry import lip_model_info
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent

@@ -56,11 +56,11 @@ from kouxing.evaluation.lips.clip_scores import (
 )
 from kouxing.evaluation.lips.measures import Hits, best_lag
 from kouxing.evaluation.lips.schemes import all_schemes, hear
+from kouxing.services.lip_models import lip_models
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
 from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import clips_seen, load_parameters
-from kouxing.services.synthesizer.lips.registry import lip_models
 from kouxing.shared.errors import UserError
 
 

@@ -21,7 +21,7 @@ from kouxing.services.recognizer.lip_predictor import LipPredictor, lip_predicto
 from kouxing.services.recognizer.mouth_profile import read_mouth_profile
 from kouxing.services.recording_chain import analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import read_fap

@@ -186,7 +186,7 @@ def _labels(mouth: _Mouth, *, are_pixels: bool) -> list[Span]:
     ]
 
 
-def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.Moment]:
+def _key_moments(mouth: _Mouth, labels: Sequence[Span]) -> list[drawing.LabeledMouth]:
     """Return the mouth at each key frame. Closed mouths before and after speech have no phone."""
     syllables = {onset_s: label for onset_s, _, label in labels}
     anchors = anchors_of(mouth.phones, mouth.silence) or [(0.0, mouth.silence)]
@@ -231,7 +231,7 @@ def _write_video(output: Path, mouth: _Mouth) -> str:
     ):
         writer.write_sound(mouth.samples)
         for time_s, opening in progress.track(frames, description="drawing"):
-            moment = drawing.Moment(
+            moment = drawing.LabeledMouth(
                 time_s, opening, _label_at(time_s, symbols), _label_at(time_s, labels)
             )
             writer.write_image(drawing.rasterize(drawing.image(moment, *_VIDEO_SIZE_PX)))

@@ -15,7 +15,8 @@ from aiohttp import WSCloseCode, web
 import kouxing.shared.face
 from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.connection_quota import ConnectionQuota
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LipModelName
+from kouxing.services.lip_models import lip_models
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
 from kouxing.shared.logs import LOG
 from kouxing.shared.page_heads import page_heads_folder
 
@@ -163,9 +164,10 @@ def _modules_folder() -> Path | None:
 
 
 async def _serve_offers(_request: web.Request) -> web.StreamResponse:
-    """Answer with the names of the heads and lip models that the page's settings offer."""
+    """Answer with the heads' names and the lip models' titles that the page's settings offer."""
     heads = sorted(path.stem.removeprefix("head-") for path in PAGE.glob("head-*.webp"))
-    lips = sorted(LipModelName, key=lambda name: name != DEFAULT_LIP_MODEL)
+    names = sorted(lip_models(), key=lambda name: name != DEFAULT_LIP_MODEL)
+    lips = {name: dict(lip_models()[name].titles) for name in names}
     return web.json_response({"heads": heads, "lips": lips})
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from kouxing.services.synthesizer.lips.registry import lip_model_info, lip_models
+from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.shared.config import BoundEndpoint, DefaultBy, Form
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig

@@ -21,10 +21,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from kouxing.services.lip_models import lip_models
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import REST_S, FaceAnimator, Frame
 from kouxing.services.synthesizer.kind import KIND
-from kouxing.services.synthesizer.lips.registry import lip_models, load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.bus import PHONES, Socket
 from kouxing.shared.clock import to_samples, to_seconds
 from kouxing.shared.endpoints import key_of

@@ -20,7 +20,7 @@ from kouxing.services.recognizer.config import RecognizerConfig
 from kouxing.services.recognizer.lip_frames import delay_for
 from kouxing.services.recognizer.service import RecognizerService
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.clock import to_samples
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone

@@ -28,7 +28,7 @@ from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.recognizer.mouth_profile import MouthProfile
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.fap_file import FapAnimation, read_fap, write_fap

@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
-from kouxing.services.synthesizer.lips.registry import lip_model_info, load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange, Waveform
 from tests.live_streams import recognize_live

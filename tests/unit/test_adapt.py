@@ -23,7 +23,7 @@ from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, l
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.lip_predictor import load_lip_predictor
 from kouxing.services.synthesizer.config import SynthesizerConfig
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import FAP_NUMBER, MOUTH_FAPS
 from tests.e2e.following import samples_of_file

@@ -16,7 +16,7 @@ from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.services.synthesizer.lips.ferguson.table import load_table
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS

@@ -21,9 +21,9 @@ from kouxing.evaluation.lips.schemes import once_the_next_begins
 from kouxing.evaluation.lips.sentences import choose
 from kouxing.evaluation.mos.commands import app as mos
 from kouxing.services.driver.video import film
+from kouxing.services.lip_models import lip_model_info
 from kouxing.services.recording_chain import AnalyzedRecording
 from kouxing.services.synthesizer.face_animator import Frame
-from kouxing.services.synthesizer.lips.registry import lip_model_info
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.media_file import check_video
 from kouxing.shared.phones.events import Phone, Progress, SoundEvent, SpeechChange

@@ -12,8 +12,7 @@ from kouxing.services.synthesizer.face_animator import FaceAnimator, Frame
 from kouxing.services.synthesizer.lips.learnt.closures import ClosingPhones, ClosureRule, shut_share
 from kouxing.services.synthesizer.lips.learnt.model import LearntLips
 from kouxing.services.synthesizer.lips.learnt.track import LipTrack
-from kouxing.services.synthesizer.lips.registry import load_lip_model
-from kouxing.shared.errors import UserError
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import LipFrame, Phone, Progress, SpeechChange
 from tests.lips import LIPS
@@ -462,8 +461,3 @@ def test_another_lip_model_goes_on_from_where_the_mouth_is(to_learnt: bool) -> N
     # a while later it is as if it had been used from the beginning
     np.testing.assert_allclose(changed[-60:], values(frames[1], JAW)[-60:], atol=20.0)
     assert np.abs(changed[:here] - values(frames[1], JAW)[:here]).max() > 50.0
-
-
-def test_an_unknown_lip_model_is_refused_by_name() -> None:
-    with pytest.raises(UserError, match="unknown lip model 'muscles'; use one of"):
-        load_lip_model(name="muscles")

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.face.shapes import SHAPE_SETS
 from kouxing.shared.phones.events import Phone

@@ -17,7 +17,7 @@ from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.services.recording_chain import AnalyzedRecording, analyze_recording, animate_recording
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.services.synthesizer.offline import synthesize
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.phones.events import Phone, SpeechChange

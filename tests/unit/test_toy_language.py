@@ -34,7 +34,7 @@ from kouxing.services.recognizer.offline import recognize
 from kouxing.services.recognizer.speech_scorer import frame_time_s
 from kouxing.services.synthesizer.config import SynthesizerConfig
 from kouxing.services.synthesizer.face_animator import FaceAnimator
-from kouxing.services.synthesizer.lips.registry import load_lip_model
+from kouxing.services.synthesizer.lips.load import load_lip_model
 from kouxing.shared.audio_file import read_audio
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, Progress

@@ -2,6 +2,7 @@
 
 import { element } from "./elements.js";
 import { languageFor, say, setLanguage } from "./language.js";
+import { TEXTS } from "./texts.js";
 
 const STRENGTH = 0.8; // of an expression
 const EXPRESSIONS = ["smile", "joy", "surprise", "sadness", "anger", "fear", "disgust"];
@@ -12,13 +13,14 @@ export class Settings {
 
   /**
    * @param preferences Preferences
-   * @param offers { heads, lips }: names that the gateway offers
+   * @param offers { heads: names, lips: { name: title by language } } of the gateway
    * @param handlers { heads(name), lips(name), expressiveness(amount), express(strengths by name) },
    *   called when the user changes a setting
    */
   constructor(preferences, offers, handlers) {
     this.#preferences = preferences;
     this.#offers = offers;
+    for (const [name, title] of Object.entries(offers.lips)) TEXTS[`lips.${name}`] = title;
     this.#applyLanguage();
     this.#bind("heads", handlers.heads);
     this.#bind("lips", handlers.lips);
@@ -55,7 +57,7 @@ export class Settings {
     element("language").value = name;
     fill("heads", "option", "head", ["", ...this.#offers.heads]);
     showPictures(this.#offers.heads);
-    fill("lips", "option", "lips", this.#offers.lips);
+    fill("lips", "option", "lips", Object.keys(this.#offers.lips));
     fill("expressions", "button", "expression", EXPRESSIONS);
   }
 }

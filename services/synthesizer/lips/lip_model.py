@@ -2,12 +2,11 @@
 
 A lip model is loaded once and shared by all sessions; each session has its own stream. To add a lip
 model, add a package like ``dynamic_visemes`` whose ``__init__`` defines ``LIP_MODEL``, see
-``registry``.
+``services.lip_models``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -15,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.shared.phones.events import SoundEvent
-from kouxing.shared.phones.inventory import PhoneInventory
 
 
 class Articulation(Protocol):
@@ -76,22 +74,3 @@ class LipModel(Protocol):
         delay_s
             How much audio after a frame is known when the frame is made.
         """
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LipModelInfo:
-    """Description of a lip model, available without loading it.
-
-    Attributes
-    ----------
-    delay_ms
-        Default delay: how much later than its audio a frame is made.
-    titles
-        Name for users by language, "en" and "zh".
-    load
-        Loads the lip model for a language; imports its modules only when called.
-    """
-
-    delay_ms: float
-    titles: Mapping[str, str]
-    load: Callable[[PhoneInventory], LipModel]

@@ -1,6 +1,7 @@
 """Dynamic visemes (Wang & Cai 2003; Li et al. 2011): lips from recognized phones."""
 
-from kouxing.services.synthesizer.lips.lip_model import LipModel, LipModelInfo
+from kouxing.services.lip_models import LipModelInfo
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.phones.inventory import PhoneInventory
 
 

@@ -1,6 +1,7 @@
 """Lips with a single opening R, drawn as Ferguson curves: Zhang et al. 2021."""
 
-from kouxing.services.synthesizer.lips.lip_model import LipModel, LipModelInfo
+from kouxing.services.lip_models import LipModelInfo
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.phones.inventory import PhoneInventory
 
 

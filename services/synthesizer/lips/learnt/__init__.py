@@ -1,6 +1,7 @@
 """Learnt lips: predicted from the audio, with closures and tongue from recognized phones."""
 
-from kouxing.services.synthesizer.lips.lip_model import LipModel, LipModelInfo
+from kouxing.services.lip_models import LipModelInfo
+from kouxing.services.synthesizer.lips.lip_model import LipModel
 from kouxing.shared.phones.inventory import PhoneInventory
 
 
@@ -14,6 +15,6 @@ def _load(inventory: PhoneInventory) -> LipModel:
 
 LIP_MODEL = LipModelInfo(
     delay_ms=60.0,
-    titles={"en": "from the sound (learnt)", "zh": "由声音（学得）"},
+    titles={"en": "from the sound (learned)", "zh": "由声音（学得）"},
     load=_load,
 )

@@ -1,24 +1,46 @@
 """The installed lip models.
 
 Each lip model is a package whose ``__init__`` defines ``LIP_MODEL``, a ``LipModelInfo``. Packages
-next to this module are built in. Other distributions add lip models by entry points of the group
-``kouxing.lip_models``: the entry point's name is that of the lip model, its value is the package.
+in the synthesizer's folder ``lips`` are built in. Other distributions add lip models by entry
+points of the group ``kouxing.lip_models``: the entry point's name is that of the lip model, its
+value is the package.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
-from kouxing.services.synthesizer.lips.lip_model import LipModel, LipModelInfo
 from kouxing.shared.errors import UserError
-from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL
-from kouxing.shared.phones.inventory import DEFAULT_LANGUAGE, load_inventory
+from kouxing.shared.phones.inventory import PhoneInventory
 
 ENTRY_POINTS = "kouxing.lip_models"
+_BUILT_IN = "synthesizer", "lips"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LipModelInfo:
+    """Description of a lip model, available without loading it.
+
+    Attributes
+    ----------
+    delay_ms
+        Default delay: how much later than its audio a frame is made.
+    titles
+        Name for users by language, "en" and "zh".
+    load
+        Loads the lip model, a ``LipModel``, for a language. Only this imports its modules.
+    """
+
+    delay_ms: float
+    titles: Mapping[str, str]
+    load: Callable[[PhoneInventory], Any]
 
 
 @lru_cache
@@ -30,9 +52,10 @@ def lip_models() -> dict[str, LipModelInfo]:
     UserError
         If an installed lip model cannot be imported.
     """
+    folder = Path(__file__).parent.joinpath(*_BUILT_IN)
     packages = {
-        module.name.replace("_", "-"): f"{__package__}.{module.name}"
-        for module in pkgutil.iter_modules([str(Path(__file__).parent)])
+        module.name.replace("_", "-"): ".".join((__package__, *_BUILT_IN, module.name))
+        for module in pkgutil.iter_modules([str(folder)])
         if module.ispkg
     }
     packages |= {entry.name: entry.value for entry in entry_points(group=ENTRY_POINTS)}
@@ -47,7 +70,7 @@ def lip_models() -> dict[str, LipModelInfo]:
 
 
 def lip_model_info(name: str) -> LipModelInfo:
-    """Return an installed lip model's description.
+    """Return the description of an installed lip model.
 
     Raises
     ------
@@ -57,15 +80,3 @@ def lip_model_info(name: str) -> LipModelInfo:
     if name not in lip_models():
         raise UserError(f"unknown lip model {name!r}; use one of {', '.join(lip_models())}")
     return lip_models()[name]
-
-
-@lru_cache
-def load_lip_model(language: str = DEFAULT_LANGUAGE, name: str = DEFAULT_LIP_MODEL) -> LipModel:
-    """Load a lip model for the phones of a language.
-
-    Raises
-    ------
-    UserError
-        If the lip model or the language is not installed, or the lip model does not support it.
-    """
-    return lip_model_info(name).load(load_inventory(language))

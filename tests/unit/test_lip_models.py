@@ -1,0 +1,61 @@
+"""Discovery of lip models: built-in packages and entry points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from kouxing.services.lip_models import lip_models
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.lips.load import load_lip_model
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.lip_models import DEFAULT_LIP_MODEL, LIP_MODEL_NAME
+
+pytestmark = pytest.mark.unit
+
+PACKAGE = """
+from kouxing.services.lip_models import LipModelInfo
+
+LIP_MODEL = LipModelInfo(
+    delay_ms=40.0,
+    titles={"en": "toy", "zh": "toy"},
+    load=lambda inventory: ("toy", inventory.language),
+)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _fresh_registry() -> Iterator[None]:
+    lip_models.cache_clear()
+    yield
+    lip_models.cache_clear()
+    load_lip_model.cache_clear()
+
+
+def test_built_in_lip_models() -> None:
+    assert lip_models().keys() >= {"dynamic-visemes", "ferguson", "learnt"}
+    assert DEFAULT_LIP_MODEL in lip_models()
+    for name, info in lip_models().items():
+        assert LIP_MODEL_NAME.fullmatch(name)
+        assert info.titles.keys() == {"en", "zh"}
+        assert SynthesizerConfig(lips=name).delay_ms == info.delay_ms
+
+
+def test_a_package_adds_a_lip_model_by_entry_point(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "toy_lips.py").write_text(PACKAGE)
+    metadata = tmp_path / "toy_lips-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-lips\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text("[kouxing.lip_models]\ntoy = toy_lips\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert lip_models()["toy"].delay_ms == 40.0
+    assert load_lip_model(name="toy") == ("toy", "mandarin")
+
+
+def test_an_unknown_lip_model_is_an_error() -> None:
+    with pytest.raises(UserError, match="unknown lip model 'muscles'; use one of dynamic-visemes"):
+        load_lip_model(name="muscles")
