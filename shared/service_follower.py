@@ -43,12 +43,13 @@ class ServiceFollower(Follower):
             _ServiceTransport(service),
             session,
             handlers.keys(),
-            lambda message: handlers[type(message)](message),
+            self._handle,
             live=live,
             on_complete=on_complete,
             on_new_epoch=on_new_epoch,
         )
         self._service = service
+        self._handlers = handlers
         self._counted = {"frames_missed": 0, "dropped_old_epoch": 0}
 
     def start(self, epoch: int, endpoints: Mapping[str, str]) -> None:
@@ -57,18 +58,23 @@ class ServiceFollower(Follower):
         self._service.tick_callbacks.add(self.tick)
 
     def tick(self) -> None:
-        """Do what is due, and count."""
+        """Do what is due, as ``Follower.tick``."""
         super().tick()
-        counts = {"frames_missed": self.num_missed, "dropped_old_epoch": self.num_outdated}
-        for name, count in counts.items():
-            if count > self._counted[name]:
-                self._service.metrics.count(name, count - self._counted[name])
-        self._counted = counts
+        if self.is_settled:
+            self._service.tick_callbacks.discard(self.tick)
 
     def close(self) -> None:
         """Unsubscribe, as ``Follower.close``."""
         super().close()
         self._service.tick_callbacks.discard(self.tick)
+
+    def _handle(self, message: Any) -> None:
+        counts = {"frames_missed": self.num_missed, "dropped_old_epoch": self.num_outdated}
+        if counts != self._counted:
+            for name, count in counts.items():
+                self._service.metrics.count(name, count - self._counted[name])
+            self._counted = counts
+        self._handlers[type(message)](message)
 
 
 class _ServiceTransport:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import zmq
-from kouxing_client import Client, Refused, Session, Sound
+from kouxing_client import Client, KouxingError, Refused, Session, Sound
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.bus import Bus, Socket
@@ -72,10 +72,13 @@ def test_a_bad_mouth_profile_is_refused_and_the_session_goes_on(
         client.open_session(mouth_profile=bytes(70_000))
 
 
-def test_half_a_sample_is_refused(client: Client, witness: Session) -> None:
+def test_half_a_sample_is_refused(client: Client, bus: Bus, witness: Session) -> None:
     session = client.open_session(encoding="s16le", num_channels=2)
-    session.push(b"\0" * 6)
-    error = first_error(session)
+    with pytest.raises(KouxingError, match="not whole samples"):
+        session.push(b"\0" * 6)
+    audio, token = bus.connect_dealer(session.info["audio"]), session.info["token"]
+    audio.send(AudioChunk(session=session.name, token=token, sequence=1, pcm=b"\0" * 6))
+    error = next(answers(audio))
     assert error.code == "bad-audio"
     assert "2 channels" in error.text
     session.close()
