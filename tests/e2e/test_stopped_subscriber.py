@@ -27,9 +27,9 @@ FOLLOWER = """
 import sys
 from kouxing_client import Client, FapFrame
 
-control, session = sys.argv[1:]
+control, session, paced = sys.argv[1:]
 with Client(control) as client:
-    frames = client.follow(session).results(FapFrame, keep_all=True)
+    frames = client.follow(session, paced=paced == "True").results(FapFrame, keep_all=True)
     print(0, flush=True)
     for frame in frames:
         print(frame.sequence, flush=True)
@@ -49,8 +49,8 @@ class Other:
 
 
 @contextmanager
-def another(control: str, session: Session) -> Iterator[Other]:
-    command = [sys.executable, "-c", FOLLOWER, control, session.name]
+def another(control: str, session: Session, *, paced: bool) -> Iterator[Other]:
+    command = [sys.executable, "-c", FOLLOWER, control, session.name, str(paced)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         other = Other(process, process.stdout)
@@ -84,7 +84,7 @@ def test_of_a_live_face_few_old_frames_come(system: System) -> None:
         session = client.open_session(encoding="f32le")
         output = session.results(FapFrame, keep_all=True)
         session.push(np.zeros(320, np.float32))  # then frames of rest go on and on
-        with another(system.control, session) as other:
+        with another(system.control, session, paced=True) as other:
             until(lambda: len(other.numbers) > RATE_HZ, "no frames come")
             os.kill(other.process.pid, signal.SIGSTOP)
             time.sleep(STOPPED_S)
@@ -102,7 +102,7 @@ def test_of_a_recording_every_frame_comes(system: System) -> None:
     samples = np.tile(samples_of_file(DEMO / "hello-female.wav")[:48000], 4)
     with Client(system.control) as client:
         session = client.open_session(encoding="f32le", paced=False)
-        with another(system.control, session) as other:
+        with another(system.control, session, paced=False) as other:
             os.kill(other.process.pid, signal.SIGSTOP)
             for chunk in np.split(samples, len(samples) // 3200):
                 session.push(chunk)

@@ -85,6 +85,7 @@ def test_flushed_audio_is_not_sent_but_the_end_is() -> None:
     stream.add({}, CHUNK, 0.3)
     stream.flush()
     assert sent(stream) == []
+    assert stream.num_unacknowledged == 0
     stream.add({"last": True}, 0, 0.4)
     stream.flush()
     stream.move(2, 0.5)

@@ -285,7 +285,7 @@ def test_a_session_that_control_closes_ends_after_its_last_results() -> None:
 @pytest.mark.parametrize("is_there", [True, False])
 def test_asks_where_a_silent_session_of_another_program_is(is_there: bool) -> None:
     scene = Scene()
-    following = scene.core.follow("other")
+    following = scene.core.follow("other", is_live=True)
     endpoints = {"audio": "a", "phones": "phones 1", "faps": "faps 1"}
     state = {**STATE, "session": "other", "endpoints": endpoints}
     scene.answer("status-report", services=[CONTROL_STATE], sessions=[state])

@@ -79,9 +79,9 @@ class AsyncClient(BaseClient):
         opened = self._thread.submit(lambda core: core.open_session(fields))
         return AsyncSession(self._thread, await asyncio.wrap_future(opened), fields)
 
-    async def follow(self, name: str = "") -> AsyncSession:
+    async def follow(self, name: str = "", *, paced: bool = True) -> AsyncSession:
         """Follow another program's session, as ``Client.follow``."""
-        followed = self._thread.submit(lambda core: core.follow(name))
+        followed = self._thread.submit(lambda core: core.follow(name, is_live=paced))
         return AsyncSession(self._thread, await asyncio.wrap_future(followed), None)
 
     async def status(self, session: str = "") -> Status:

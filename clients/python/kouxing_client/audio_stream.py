@@ -53,6 +53,11 @@ class AudioStream:
         """Media time of the next chunk, samples at 16 kHz."""
         return self._num_frames * MEDIA_RATE_HZ // self._sample_rate_hz
 
+    @property
+    def num_unacknowledged(self) -> int:
+        """Number of messages that the recognizer must still acknowledge; any thread may ask."""
+        return min(self.sequence - self.acknowledged, len(self._kept))
+
     def connect_ms(self, default: int) -> int:
         """Return the time limit for a new connection.
 
@@ -105,7 +110,7 @@ class AudioStream:
     def is_stuck(self, now_s: float) -> bool:
         """Return whether acknowledgements have stopped, so the connection may be dead."""
         # A recognizer that never acknowledges is an older one.
-        is_behind = 0 < self.acknowledged < self.sequence
+        is_behind = self.acknowledged > 0 and self.num_unacknowledged > 0
         return is_behind and now_s - self._progress_s > self._answer_s
 
     def resend(self, now_s: float) -> None:

@@ -256,7 +256,10 @@ class BaseSession:
 
     def _num_unacknowledged(self) -> int:
         stream = self._core.stream
-        return 0 if stream is None else self._num_added - stream.acknowledged
+        if stream is None:
+            return 0
+        num_new = self._num_added - stream.sequence  # the thread has not taken them yet
+        return num_new + stream.num_unacknowledged
 
 
 class BaseResults:

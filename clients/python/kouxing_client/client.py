@@ -93,9 +93,18 @@ class Client(BaseClient):
         core = self._thread.submit(lambda core: core.open_session(fields)).result()
         return Session(self._thread, core, fields)
 
-    def follow(self, name: str = "") -> Session:
-        """Follow a session that another program opened; if the name is empty, the newest."""
-        core = self._thread.submit(lambda core: core.follow(name)).result()
+    def follow(self, name: str = "", *, paced: bool = True) -> Session:
+        """Follow a session that another program opened.
+
+        Parameters
+        ----------
+        name
+            Session name. If empty, the newest session.
+        paced
+            Whether old frames are dropped after this process was suspended, as is right for a face
+            that is shown live. If false, no result is dropped, however late it is.
+        """
+        core = self._thread.submit(lambda core: core.follow(name, is_live=paced)).result()
         return Session(self._thread, core, None)
 
     def status(self, session: str = "") -> Status:

@@ -115,14 +115,19 @@ class ClientCore:
 
     def open_session(self, options: Fields) -> Future[SessionCore]:
         """Open a session; the options are the fields of ``open-session``."""
+        is_live = bool(options.get("paced", True))
         return then(
-            self.request("open-session", **options), lambda opened: self._add(opened, options)
+            self.request("open-session", **options),
+            lambda opened: self._add(opened, options, is_live=is_live),
         )
 
-    def follow(self, name: str) -> Future[SessionCore]:
+    def follow(self, name: str, *, is_live: bool) -> Future[SessionCore]:
         """Follow a session that another program opened; if the name is empty, the newest."""
-        # Only the status of the whole system has the endpoint of control's events.
-        return then(self.status(""), lambda status: self._add(newest_session(status, name), None))
+
+        def add(status: Status) -> SessionCore:
+            return self._add(newest_session(status, name), None, is_live=is_live)
+
+        return then(self.status(""), add)  # with the endpoint of control's events
 
     def add_inbox(self, session: str, inbox: Inbox) -> None:
         """Pass a session's events to an inbox, even after the session has ended."""
@@ -188,8 +193,9 @@ class ClientCore:
             " it; otherwise run there 'kouxing keys add NAME --role client' and copy the file here"
         )
 
-    def _add(self, opened: Fields, options: Fields | None) -> SessionCore:
-        session = SessionCore(self._sockets, opened, options, self._make_signal())
+    def _add(self, opened: Fields, options: Fields | None, *, is_live: bool) -> SessionCore:
+        signal = self._make_signal()
+        session = SessionCore(self._sockets, opened, options, signal, is_live=is_live)
         if self._events is None:
             self._events = self._sockets.connect_events(opened["events"], self._on_event)
         self.sessions.append(session)

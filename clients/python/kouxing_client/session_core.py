@@ -152,17 +152,25 @@ class SessionCore:
         Fields of ``open-session``; None if another program opened the session.
     signal
         Notified of changes.
+    is_live
+        Whether results are worthless when they are late.
     """
 
     def __init__(
-        self, sockets: Sockets, opened: Fields, options: Fields | None, signal: Signal
+        self,
+        sockets: Sockets,
+        opened: Fields,
+        options: Fields | None,
+        signal: Signal,
+        *,
+        is_live: bool,
     ) -> None:
         self.sockets = sockets
         self.endpoints = opened
         self.name: str = opened["session"]
         self.epoch: int = opened["epoch"]
         self.token: str = opened.get("token", "")
-        self.is_live = options is None or bool(options.get("paced", True))
+        self.is_live = is_live
         self.stream: AudioStream | None = None
         if options is not None:
             self.stream = AudioStream(options["sample_rate_hz"], is_paced=self.is_live)
