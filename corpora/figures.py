@@ -1,4 +1,4 @@
-"""Pictures drawn with matplotlib, which only training and evaluation need."""
+"""Figures drawn with matplotlib, an optional dependency of training and evaluation."""
 
 from __future__ import annotations
 
@@ -11,13 +11,7 @@ _DOTS_PER_INCH = 80
 
 
 def new_figure(width_in: float, height_in: float) -> Any:
-    """Make an empty figure.
-
-    Raises
-    ------
-    UserError
-        If matplotlib is missing.
-    """
+    """Create an empty figure; raises UserError if matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415 (optional)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -29,13 +23,7 @@ def new_figure(width_in: float, height_in: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure; the suffix of its file names the format.
-
-    Raises
-    ------
-    UserError
-        If it cannot be written.
-    """
+    """Write a figure in the format of the file's suffix; raises UserError if that fails."""
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Errors of recognised phones against a reference, and the hypotheses that are counted."""
+"""Alignment of recognized phones with a reference, and the hypotheses that are counted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kouxing.shared.phones.events import Phone
 
 @dataclass(slots=True, kw_only=True)
 class ErrorCounts:
-    """Errors of recognised phones against the reference."""
+    """Errors of recognized phones against the reference."""
 
     insertions: int = 0
     deletions: int = 0
@@ -40,10 +40,13 @@ def matched_pairs(
 ) -> list[tuple[int | None, int | None]]:
     """Align two strings with the fewest errors (Levenshtein 1966).
 
+    Of several best alignments, this one prefers substitutions from the end. rapidfuzz prefers
+    deletions, which would change published figures.
+
     Returns
     -------
     list of tuple
-        Pairs of positions; None in the first place is an insertion, in the second a deletion.
+        Pairs of indices. The first is None for an insertion, the second for a deletion.
 
     Examples
     --------
@@ -88,22 +91,22 @@ def count_errors(reference: Sequence[str], recognized: Sequence[str]) -> ErrorCo
 
 
 def is_emitted(phone: Phone, after: StreamOutput | None) -> bool:
-    """Tell whether the output rule emitted a phone, by the event that came after it.
+    """Whether the output rule emitted a phone; otherwise it is a correction or a passed-over phone.
 
-    The rule emits a phone after the revisions of all phones before it.
+    The rule emits a phone after the revisions of all phones before it, so the next event decides.
     """
     return not phone.final and not (isinstance(after, Phone) and after.index > phone.index)
 
 
 def first_hypothesis(events: Sequence[StreamOutput], known: set[int]) -> list[Phone]:
-    """Pick each phone as it was emitted first, by the rule or along with the next one.
+    """Return each phone as first emitted, by the rule or along with the next one.
 
     Parameters
     ----------
     events
-        A live recognizer's output, in order.
+        Output of a live recognizer.
     known
-        Indices of the phones emitted before; those of ``events`` are added.
+        Indices of the phones emitted before. Those of ``events`` are added.
     """
     first = []
     for event, after in zip_longest(events, events[1:]):
@@ -115,5 +118,5 @@ def first_hypothesis(events: Sequence[StreamOutput], known: set[int]) -> list[Ph
 
 
 def final_hypothesis(events: Iterable[StreamOutput]) -> list[Phone]:
-    """Pick the phones that will not change any more from a live recognizer's output."""
+    """Return the final phones in the output of a live recognizer."""
     return [event for event in events if isinstance(event, Phone) and event.final]

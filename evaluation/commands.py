@@ -16,39 +16,26 @@ from kouxing.shared.terminal import CONSOLE, JsonFile, check_output, print_messa
 
 if TYPE_CHECKING:
     from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
+    from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 
 
 class BenchGroup(TyperGroup):
-    """Takes ``kouxing bench my.wav`` for ``kouxing bench chain my.wav``."""
+    """Accepts ``kouxing bench my.wav`` for ``kouxing bench chain my.wav``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the command in front where there is none."""
+        """Insert the command if it is missing."""
         if args and args[0] not in {*self.commands, *self.get_help_option_names(ctx)}:
             args = ["chain", *args]
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure the models.")
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="Measure models and services.")
 plot_app = typer.Typer(no_args_is_help=True, add_completion=False)
 bench_app = typer.Typer(cls=BenchGroup, add_completion=False, help="Measure the running system.")
 
-Manifest = Annotated[Path, typer.Option(help="Manifest or corpus folder.")]
-Audio = Annotated[
-    Path | None,
-    typer.Option(help="Folder that the manifest's paths start from, instead of its own."),
-]
-Split = Annotated[str, typer.Option(help="Its split.")]
-Acoustic = Annotated[
-    list[str] | None, typer.Option(help="neural, blocks, gmm or a model file; repeatable.")
-]
-LookAhead = Annotated[
-    list[float] | None,
-    typer.Option("--look-ahead-ms", help="Look-ahead of models that have one; repeatable."),
-]
-
 
 class Part(StrEnum):
-    """What clips are for."""
+    """Purpose of clips."""
 
     CHOICE = "choice"  # choosing settings
     HELD = "held"  # scoring
@@ -56,23 +43,39 @@ class Part(StrEnum):
 
 SENTENCE = Path(__file__).parents[1] / "shared" / "demo" / "hello-female.wav"
 
+Manifest = Annotated[Path, typer.Option(help="Manifest, or folder of a corpus.")]
+AudioFolder = Annotated[
+    Path | None, typer.Option(help="Folder of the manifest's paths. Default: the manifest's own.")
+]
+Split = Annotated[str, typer.Option(help="Split of the corpus.")]
+Acoustic = Annotated[
+    list[str] | None, typer.Option(help="neural, blocks, gmm or a model file; repeatable.")
+]
+LookAhead = Annotated[
+    list[float] | None,
+    typer.Option("--look-ahead-ms", help="Look-ahead, for models that have one; repeatable."),
+]
+Clips = Annotated[Path, typer.Option(help="Folder of clips with tracked lips and sound.")]
+Parameters = Annotated[Path | None, typer.Option(help="File of viseme parameters (.json).")]
+AudioFile = Annotated[Path, typer.Argument(help="Audio file to stream.")]
+
 
 @app.command()
 def recognizer(
     manifest: Manifest,
-    audio: Audio = None,
+    audio: AudioFolder = None,
     split: Split = "test",
     acoustic: Acoustic = None,
     look_ahead: LookAhead = None,
     confusions: Annotated[
-        Path | None, typer.Option(help="Picture of the last model's confusions (.png).")
+        Path | None, typer.Option(help="Plot the confusions of the last model (.png).")
     ] = None,
     curve: Annotated[
-        Path | None, typer.Option(help="Picture of the errors over the delay (.png).")
+        Path | None, typer.Option(help="Plot the errors over the delay (.png).")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure phone and viseme errors, delays and cost of acoustic models, side by side."""
+    """Compare phone and viseme errors, delays and CPU cost of acoustic models."""
     from kouxing.evaluation.recognizer.confusions import draw_confusions
     from kouxing.evaluation.recognizer.delay_curve import draw_delay_curve
     from kouxing.evaluation.recognizer.error_rates import evaluate_recognizer
@@ -82,9 +85,9 @@ def recognizer(
     results = {
         title: {
             "acoustic": name,
-            **evaluate_recognizer(model, manifest, split, audio=audio, own_rule=rule),
+            **evaluate_recognizer(model, manifest, split, default_rule, audio=audio),
         }
-        for title, name, model, rule in _models(acoustic, look_ahead)
+        for title, name, model, default_rule in _models(acoustic, look_ahead)
     }
     print_figures(results, Console())
     write_json(json_file, results)
@@ -97,7 +100,7 @@ def recognizer(
 @app.command()
 def robustness(
     manifest: Manifest,
-    audio: Audio = None,
+    audio: AudioFolder = None,
     split: Split = "test",
     acoustic: Acoustic = None,
     look_ahead: LookAhead = None,
@@ -106,13 +109,13 @@ def robustness(
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure errors in disturbed speech, and phones recognised in sounds without speech."""
+    """Measure errors in disturbed speech, and phones recognized in sounds without speech."""
     from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
 
     check_output(json_file)
     results = {
         title: evaluate_robustness(
-            model, manifest, split, audio=audio, own_rule=rule, other_language=other_language
+            model, manifest, split, rule, audio=audio, other_language=other_language
         )
         for title, _, model, rule in _models(acoustic, look_ahead)
     }
@@ -122,42 +125,37 @@ def robustness(
 
 def _models(
     names: list[str] | None, look_aheads_ms: list[float] | None
-) -> Iterator[tuple[str, str, AcousticModel, tuple[int, float]]]:
-    """Load models, each with every look-ahead that is given, or else with the one that suits it.
-
-    Yields title, name, model, and the output rule that suits it.
-    """
+) -> Iterator[tuple[str, str, AcousticModel, OutputRuleConfig]]:
+    """Yield title, name, model and default output rule of each model and look-ahead."""
     from kouxing.services.recognizer.acoustic.load import DEFAULT_MODEL, load_live_model
     from kouxing.services.recognizer.config import RecognizerConfig
 
     for name in names or [DEFAULT_MODEL]:
-        suited = RecognizerConfig(acoustic=name)
-        rule = suited.num_stable_frames, suited.min_confidence
-        for look_ahead_ms in look_aheads_ms or [suited.look_ahead_ms]:
+        defaults = RecognizerConfig(acoustic=name)
+        for look_ahead_ms in look_aheads_ms or [defaults.look_ahead_ms]:
             model = load_live_model(name, look_ahead_ms=look_ahead_ms)
             title = f"{name}, {look_ahead_ms:g} ms look-ahead" if look_aheads_ms else name
-            yield title, name, model, rule
+            yield title, name, model, defaults.output_rule
 
 
 @app.command()
 def lips(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
-    parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
+    clips: Clips,
+    parameters: Parameters = None,
     source: Annotated[
-        list[str] | None,
-        typer.Option(help="Only clips whose names begin with this and _; repeatable."),
+        list[str] | None, typer.Option(help="Only clips named SOURCE_...; repeatable.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Compare every lip model with tracked lips, at several delays, on held-out clips.
 
-    The file has all figures by language, source and speaker, too.
+    The JSON file also has the figures by language, source and speaker.
     """
     from kouxing.evaluation.lips.report import print_scores
-    from kouxing.evaluation.lips.scores import main
+    from kouxing.evaluation.lips.scores import score_lip_models
 
     check_output(json_file)
-    scores = main(clips, parameters, source or ())
+    scores = score_lip_models(clips, parameters, source or ())
     print_scores(scores, Console())
     write_json(json_file, [asdict(score) for score in scores])
 
@@ -165,85 +163,87 @@ def lips(
 @app.command()
 def schemes(
     manifest: Annotated[
-        Path | None, typer.Option(help="Manifest or corpus folder: 20 sentences of it.")
+        Path | None, typer.Option(help="Manifest or corpus; 20 sentences are used.")
     ] = None,
-    audio: Audio = None,
+    audio: AudioFolder = None,
     split: Split = "test",
     clips: Annotated[
-        Path | None, typer.Option(help="Folder of tracked lips with sound: these sentences.")
+        Path | None, typer.Option(help="Folder of clips with tracked lips, instead of a corpus.")
     ] = None,
     acoustic: Acoustic = None,
-    lips: Annotated[list[str] | None, typer.Option(help="Lip model; repeatable; else all.")] = None,
+    lips: Annotated[
+        list[str] | None, typer.Option(help="Lip model; repeatable. Default: all.")
+    ] = None,
     paper_rule: Annotated[
-        bool, typer.Option("--paper-rule", help="Phones as in the paper: N = 3, never corrected.")
+        bool, typer.Option("--paper-rule", help="Phones as in the paper: N = 3, no corrections.")
     ] = False,
     videos: Annotated[
-        Path | None, typer.Option(help="Write CONDITION/SENTENCE.mp4 there, unless they exist.")
+        Path | None, typer.Option(help="Folder for CONDITION/SENTENCE.mp4; existing ones stay.")
     ] = None,
     anchor: Annotated[
-        bool, typer.Option("--anchor", help="With --videos: a mouth at rest, bad on purpose.")
+        bool, typer.Option("--anchor", help="Also write videos with a mouth at rest.")
     ] = False,
     sound_at_once: Annotated[
-        bool,
-        typer.Option("--sound-at-once", help="With --videos: sound does not wait for live faces."),
+        bool, typer.Option("--sound-at-once", help="In videos of live faces, do not delay sound.")
     ] = False,
     json_file: JsonFile = None,
 ) -> None:
-    """Compare the four schemes of Li et al. 2011: aligned, recognised, live, next phone.
+    """Compare the four schemes of Li et al. 2011: aligned, recognized, live, next phone.
 
-    Without a corpus or clips the sentences are the samples that come with kouxing, without
-    --acoustic the recognizers blocks and gmm.
+    The default sentences are the samples of the package. The default recognizers are blocks and
+    gmm.
     """
     from kouxing.evaluation.lips import sentences
-    from kouxing.evaluation.lips.four_schemes import film_all, hear_all, listeners_of
+    from kouxing.evaluation.lips.four_schemes import load_recognizers, recognize_all
     from kouxing.evaluation.lips.scheme_report import print_outcome
-    from kouxing.evaluation.lips.scheme_scores import evaluate
+    from kouxing.evaluation.lips.scheme_scores import score_schemes
+    from kouxing.evaluation.lips.scheme_videos import write_videos
     from kouxing.services.lip_models import lip_models
     from kouxing.services.recognizer.acoustic.load import load_live_model
     from kouxing.shared.errors import UserError
 
     check_output(json_file)
     if manifest and clips:
-        raise UserError("--manifest and --clips both name sentences; give one of them")
+        raise UserError("use either --manifest or --clips, not both")
     model = load_live_model()
     if manifest:
-        chosen = sentences.of_corpus(model, manifest, split, audio)
+        chosen = sentences.corpus_sentences(model, manifest, split, audio)
     elif clips:
-        chosen = sentences.of_clips(model, clips)
+        chosen = sentences.clip_sentences(model, clips)
     else:
-        chosen = sentences.of_samples(model, SENTENCE.parent)
-    listeners = listeners_of(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
+        chosen = sentences.sample_sentences(model, SENTENCE.parent)
+    recognizers = load_recognizers(acoustic or ["blocks", "gmm"], has_paper_rule=paper_rule)
     names = lips or list(lip_models())
-    heard = hear_all(model, listeners, chosen)
-    outcome = evaluate(heard, listeners, names)
+    recognized = recognize_all(model, recognizers, chosen)
+    outcome = score_schemes(recognized, recognizers, names)
     print_outcome(outcome, Console())
     write_json(json_file, asdict(outcome))
     if videos:
-        written = film_all(
-            heard,
-            listeners,
+        written = write_videos(
+            recognized,
+            recognizers,
             names,
             videos,
             has_anchor=anchor,
             sound_at_once=sound_at_once,
         )
         print_message(f"wrote {len(written)} videos to {videos}")
-        if any(each.aligned is None for each in heard):
-            print_message("none of scheme 1: the text of some sentences is not known")
+        if any(sentence.aligned is None for sentence in recognized):
+            print_message("no videos of scheme 1: some sentences have no text")
 
 
 @app.command()
 def ferguson(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
-    part: Annotated[Part, typer.Option(help="Which clips.")] = Part.HELD,
+    clips: Clips,
+    part: Annotated[Part, typer.Option(help="Purpose of the clips.")] = Part.HELD,
     picture: Annotated[
-        Path | None, typer.Option(help="Picture of the accuracy over the rate (.png).")
+        Path | None, typer.Option(help="Plot the accuracy over the speaking rate (.png).")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Compare lips with real ones at several speaking rates, as Zhang et al. 2021 do."""
+    """Compare lips with tracked lips at several speaking rates, as Zhang et al. 2021 do."""
     from kouxing.corpora.figures import save_figure
-    from kouxing.evaluation.lips.contour_accuracy import print_rates, rates_figure, score_rates
+    from kouxing.evaluation.lips.speaking_rates import print_rates, rates_figure, score_rates
 
     check_output(picture, json_file)
     scores = score_rates(clips, part)
@@ -255,29 +255,41 @@ def ferguson(
 
 @app.command()
 def visemes(
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
-    parameters: Annotated[Path | None, typer.Option(help="Viseme parameters (.json).")] = None,
+    clips: Clips,
+    parameters: Parameters = None,
     picture: Annotated[
-        Path | None, typer.Option(help="Picture of measured and modelled curves (.png).")
+        Path | None, typer.Option(help="Plot measured and modeled curves (.png).")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Show how the visemes fit lips they were not trained on, and what training changed."""
-    from kouxing.evaluation.lips.viseme_fit import main
+    """Measure how well the visemes fit held-out lips, as Wang & Cai 2003 do."""
+    from kouxing.corpora.figures import save_figure
+    from kouxing.evaluation.lips.viseme_fit import (
+        fit_figure,
+        fit_folder,
+        print_errors,
+        viseme_errors,
+    )
 
     check_output(picture, json_file)
-    write_json(json_file, main(clips, parameters, picture))
+    fitted = fit_folder(clips, parameters)
+    errors = viseme_errors(fitted)
+    print_errors(errors, Console())
+    if picture is not None:
+        save_figure(fit_figure(fitted), picture)
+    names = [clip.clip.name for clip in fitted]
+    write_json(json_file, {"clips": names, "errors": [asdict(error) for error in errors]})
 
 
 @app.command()
 def attacks(
-    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
+    audio: AudioFile = SENTENCE,
     attack: Annotated[
-        list[str] | None, typer.Option(help="Only this one, by its name; repeatable.")
+        list[str] | None, typer.Option(help="Name of an attack; repeatable. Default: all.")
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure what hostile peers cost: memory of the services, and delay of others' faces."""
+    """Measure what attackers cost: memory of the services, and delay of other clients."""
     from kouxing.evaluation.system.attacks import measure, show
 
     check_output(json_file)
@@ -288,20 +300,21 @@ def attacks(
 
 @app.command()
 def faults(
-    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")] = SENTENCE,
+    audio: AudioFile = SENTENCE,
     fault: Annotated[
-        list[str] | None, typer.Option(help="Only this one, by its name; repeatable.")
+        list[str] | None, typer.Option(help="Name of a fault; repeatable. Default: all.")
     ] = None,
-    logs: Annotated[Path | None, typer.Option(help="Keep the services' logs there.")] = None,
+    logs: Annotated[Path | None, typer.Option(help="Folder for the services' logs.")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure what faults do to a live face: how long it stands, what is lost, how it jumps.
+    """Measure what faults do to a live face: how long it stops, what is lost, how far it jumps.
 
-    Faults: "none", "recognizer killed", "synthesizer killed", the same with "stopped" and "hangs"
-    in place of "killed", each of the six also with ", one more" of its kind behind it, "control
-    killed", "busy machine", "16 sessions", "a subscriber stopped", and between hosts of their own
-    "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut off for 2 s", "hosts,
-    recognizer gone for good, one more", "hosts, synthesizer gone for good, one more".
+    Faults on this machine: "none", "recognizer killed", "recognizer stopped", "recognizer hangs",
+    the same for "synthesizer", each of these also with ", one more" worker of the same kind,
+    "control killed", "busy machine", "16 sessions" and "a subscriber stopped".
+
+    Faults between hosts: "hosts, 0 ms, 0% lost" (also 20 and 50 ms, 1% and 3%), "hosts, client cut
+    off for 2 s", "hosts, recognizer gone for good, one more" and the same for "synthesizer".
     """
     from kouxing.evaluation.system.faults import TIMING, measure, show
 
@@ -313,8 +326,8 @@ def faults(
 
 @bench_app.command()
 def chain(
-    audio: Annotated[Path, typer.Argument(help="Audio file to stream.")],
-    repeats: Annotated[int, typer.Option(min=1, help="How often to stream it.")] = 3,
+    audio: AudioFile,
+    repeats: Annotated[int, typer.Option(min=1, help="How often to stream the file.")] = 3,
     json_file: JsonFile = None,
 ) -> None:
     """Measure latency, CPU and images per second of the whole chain on this machine.
@@ -325,39 +338,38 @@ def chain(
 
     delays = latency.measure(audio, repeats, CONSOLE)
     costs = sessions.measure(audio)
-    pictures = rendering.measure()
-    figures = page.measure(audio, CONSOLE) if chromium.is_installed() else None
-    out = Console()
-    latency.show(delays, out)
-    sessions.show(costs, out)
-    rendering.show(pictures, out)
-    if figures is not None:
-        page.show(figures, out)
+    images = rendering.measure()
+    drawings = page.measure(audio, CONSOLE) if chromium.is_installed() else {}
+    console = Console()
+    latency.show(delays, console)
+    sessions.show(costs, console)
+    rendering.show(images, console)
+    if drawings:
+        page.show(drawings, console)
+    page_figures = {"drawings": {name: asdict(drawing) for name, drawing in drawings.items()}}
     write_json(
         json_file,
-        asdict(delays)
-        | {"sessions": costs, "rendering": asdict(pictures)}
-        | {"page": {"drawings": {name: asdict(each) for name, each in (figures or {}).items()}}},
+        {**asdict(delays), "sessions": costs, "rendering": asdict(images), "page": page_figures},
     )
 
 
 @bench_app.command()
 def load(
     audio: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings to speak; else the samples.")
+        list[Path] | None, typer.Argument(help="Recordings to speak. Default: the samples.")
     ] = None,
     sessions: Annotated[
-        int, typer.Option(min=1, max=1000, help="As many live sessions at the end.")
+        int, typer.Option(min=1, max=1000, help="Number of sessions of the last step.")
     ] = 24,
     seconds: Annotated[
-        float, typer.Option(min=1.0, help="How long each of up to 9 numbers is measured.")
+        float, typer.Option(min=1.0, help="How long to measure each of up to 9 steps.")
     ] = 12.0,
-    picture: Annotated[Path | None, typer.Option(help="Picture of the curves (.png).")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Plot the figures (.png).")] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Measure how many live sessions control, a recognizer and a synthesizer carry here.
+    """Measure how many live sessions control, a recognizer and a synthesizer can serve here.
 
-    One process speaks into all of them, each with a voice of its own.
+    One process speaks in all of them, with different voices.
     """
     from kouxing.corpora.figures import save_figure
     from kouxing.evaluation.system.load import draw, measure, show
@@ -382,8 +394,8 @@ def plot_heads(
         Path | None, typer.Option(help="Folder for a small picture of every head.")
     ] = None,
 ) -> None:
-    """Draw every head, and the faces of every viseme, from the front and from 40 degrees."""
-    from kouxing.evaluation.system.head_pictures import draw_choices, draw_sheets
+    """Draw every head and every viseme, from the front and from 40 degrees."""
+    from kouxing.evaluation.head_pictures import draw_choices, draw_sheets
 
     for path in draw_sheets(folder) + (draw_choices(choices) if choices else []):
         print_message(f"wrote {path}")
@@ -393,9 +405,9 @@ def plot_heads(
 def plot_clip(
     name: Annotated[str, typer.Argument(help="Name of the clip.")],
     output: Annotated[Path, typer.Argument(help="Video to write (.mp4, .mov, .webm, .webp).")],
-    clips: Annotated[Path, typer.Option(help="Folder of tracked lips with sound.")],
+    clips: Clips,
 ) -> None:
-    """Make a video of every lip model beside the tracked lips of a clip."""
+    """Make a video of every lip model next to the tracked lips of a clip."""
     from kouxing.evaluation.lips.clip_video import film_clip
 
     film_clip(clips, name, output)

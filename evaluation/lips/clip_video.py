@@ -1,4 +1,4 @@
-"""A video of a tracked clip: the faces that lip models make of its sound, beside its real lips."""
+"""A video of a tracked clip: the face of each lip model, next to a face with the tracked lips."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
 
 _FACE_PX = (480, 360)
 _IMAGES_PER_S = 25.0
-_INNER_FAPS = dict(zip(range(51, 61), range(4, 14), strict=True))  # of the outer ones
+_INNER_FAPS = dict(zip(range(51, 61), range(4, 14), strict=True))  # by the FAP of the outer contour
 
 
 def film_clip(folder: Path, name: str, output: Path) -> None:
-    """Write a video, with sound, of every lip model by its default settings and the tracked lips.
+    """Write a video with sound of every lip model and of the tracked lips.
 
     Raises
     ------
     UserError
-        If there is no such clip, or the video cannot be written.
+        If the clip does not exist, or the video cannot be written.
     """
     check_name(output)
     clip = next((clip for clip in read_clips(folder, language=None) if clip.name == name), None)
     if clip is None:
-        raise UserError(f"there is no clip {name} in {folder}")
+        raise UserError(f"no clip is named {name} in {folder}")
     model = load_live_model()
     faces = []
     for lips in lip_models():
@@ -59,15 +59,15 @@ def film_clip(folder: Path, name: str, output: Path) -> None:
 
 
 def tracked_frames(clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the tracked mouth at some times, FAPs (n, 68).
+    """Return the tracked mouth at the given times, FAPs (n, 68).
 
-    Where the outer contour was not measured, it follows the inner one; all else is at rest then.
+    If the outer contour was not measured, it follows the inner one.
     """
     faps = np.zeros((len(times_s), NUM_FAPS))
-    for fap, track in zip(MOUTH_FAPS, clip.faps.T, strict=True):
-        seen = np.isfinite(track)
-        if seen.any():
-            faps[:, fap - 1] = np.interp(times_s, clip.time_s[seen], track[seen])
+    for fap, curve in zip(MOUTH_FAPS, clip.faps.T, strict=True):
+        is_known = np.isfinite(curve)
+        if is_known.any():
+            faps[:, fap - 1] = np.interp(times_s, clip.time_s[is_known], curve[is_known])
         elif fap in _INNER_FAPS:
             faps[:, fap - 1] = faps[:, _INNER_FAPS[fap] - 1]
     return faps

@@ -1,14 +1,13 @@
-"""What each lip model, and each baseline, makes of a clip.
+"""The lips that each lip model, and each baseline, makes for a clip.
 
-Schemes of Li et al. 2011, section 3.2:
+The schemes of Li et al. 2011, section 3.2:
 
-1. forced alignment of the transcript, full model (Mandarin clips with a transcript);
-2. recognised phones with their times, full model;
+1. phones from forced alignment of the transcript, all of them known (Mandarin clips only);
+2. recognized phones, all of them known;
 3. every lip model live, at several delays: the frames that the services would send;
-4. dynamic visemes live, but a phone counts only once the next one begins (at the default delay).
+4. dynamic visemes live, but a phone counts only once the next one starts.
 
-Two baselines need no phones: a mouth that opens with the loudness, at the same delays, and one
-that stands still at its mean.
+Two baselines need no phones: a mouth that opens with the loudness, and a still mouth.
 """
 
 from __future__ import annotations
@@ -44,63 +43,58 @@ Array = NDArray[np.float64]
 
 DEFAULT_DELAY_S = SynthesizerConfig().delay_ms / 1e3
 DELAYS_S = sorted({0.0, 0.05, 0.1, 0.16, 0.3, DEFAULT_DELAY_S})
-NEXT_PHONE_DELAY_S = DEFAULT_DELAY_S
 FRAME_RATE_HZ = 50.0
-_HOP_S = 1.0 / FRAME_RATE_HZ
 _LOUDNESS_RANGE_DB = 40.0
 _LOUDNESS_WINDOW = np.hanning(7)  # frames
 _SPEECH_RANGE_DB, _SPEECH_MARGIN_S = 30.0, 0.1
-_PAUSE_S = 0.5
-_QUIETEST_HOP_S = 0.01
-_MEAN_OPENING = 250.0  # FAP units; only closures see it, means are removed
+_MIN_PAUSE_S = 0.5
+_POWER_STEP_S = 0.01
+_STILL_OPENING = 250.0  # FAP units; it affects only closures, because means are removed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HeardClip:
-    """A clip with what the recognizer makes of its sound."""
+class RecognizedClip:
+    """A clip with the recognizer's output for its audio."""
 
     clip: LipClip
-    num_frames: int  # of synthesis
+    num_frames: int  # at FRAME_RATE_HZ
     levels: list[tuple[float, float]]  # seconds, dB of full scale
-    events: Mapping[float, Sequence[SoundEvent]]  # of the live recognizer, by the face's delay in s
-    inventory: PhoneInventory  # of the phones
-    recognised: list[Phone]  # by offline decoding
-    aligned: list[Phone] | None  # by the transcript
+    events: Mapping[float, Sequence[SoundEvent]]  # live output, by the face's delay in seconds
+    inventory: PhoneInventory
+    recognized: list[Phone]  # by offline decoding
+    aligned: list[Phone] | None  # by forced alignment of the transcript
 
 
 @dataclass(frozen=True, slots=True)
 class Scheme:
-    """A way to make frames (num_frames, 68) from a clip's sound; None: not from this clip."""
+    """A way to make frames (num_frames, 68) for a clip; None if it does not apply to the clip."""
 
     name: str
-    delay_s: float | None  # None: it knows the whole recording
-    frames: Callable[[HeardClip], Array | None]
+    delay_s: float | None  # None: it uses the whole recording
+    frames: Callable[[RecognizedClip], Array | None]
 
 
-def hear(
+def recognize_clip(
     model: AcousticModel,
     clip: LipClip,
     lips: LipFrameModel | None,
     delays_s: Sequence[float] = DELAYS_S,
-) -> HeardClip:
-    """Recognise a clip live and offline, and align it with its text where that is known.
-
-    Live, lip frames of the sound come in time for a face of each delay.
-    """
-    return HeardClip(
+) -> RecognizedClip:
+    """Recognize a clip live and offline, and align its transcript if there is one."""
+    return RecognizedClip(
         clip=clip,
         num_frames=int(len(clip.samples) / SAMPLE_RATE_HZ * FRAME_RATE_HZ) + 1,
         levels=level_track(clip.samples),
         events=live_events(model, clip.samples, lips, delays_s),
         inventory=model.inventory,
-        recognised=recognize(model, clip.samples, SAMPLE_RATE_HZ),
+        recognized=recognize(model, clip.samples, SAMPLE_RATE_HZ),
         aligned=aligned_phones(model, clip),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _SeveralDelays:
-    """A model of lips that makes frames for faces of several delays at once."""
+    """Makes lip frames for faces of several delays in one run."""
 
     lips: LipFrameModel
     delays_s: Sequence[float]
@@ -119,92 +113,83 @@ def live_events(
     delays_s: Sequence[float],
     config: RecognizerConfig | None = None,
 ) -> dict[float, list[SoundEvent]]:
-    """Return what ``sound_events`` returns for a face of each delay; the recognizer runs once."""
+    """Return the result of ``sound_events`` for several delays, with one run of the recognizer."""
     if lips is None:
         return dict.fromkeys(delays_s, sound_events(model, samples, config=config))
-    chosen = {delay_s: delay_for(lips.delays_s, delay_s) for delay_s in delays_s}
-    several = _SeveralDelays(lips, sorted(set(chosen.values())))
+    lip_delays_s = {delay_s: delay_for(lips.delays_s, delay_s) for delay_s in delays_s}
+    several = _SeveralDelays(lips, sorted(set(lip_delays_s.values())))
     events = sound_events(model, samples, several, config=config)
     return {
         delay_s: [
             event
             for event in events
-            if not isinstance(event, LipFrame) or math.isclose(event.delay_s, own, abs_tol=1e-4)
+            if not isinstance(event, LipFrame)
+            or math.isclose(event.delay_s, lip_delay_s, abs_tol=1e-4)
         ]
-        for delay_s, own in chosen.items()
+        for delay_s, lip_delay_s in lip_delays_s.items()
     }
 
 
 def all_schemes(visemes: DynamicVisemes, lip_models: Mapping[str, LipModel]) -> list[Scheme]:
-    """Return the schemes of some lip models by name, those of the visemes, and the baselines."""
+    """Return all schemes and baselines."""
     return [
-        Scheme("aligned phones", None, lambda heard: full_frames(visemes, heard, heard.aligned)),
-        Scheme(
-            "recognised phones", None, lambda heard: full_frames(visemes, heard, heard.recognised)
-        ),
-        *(
-            live_scheme(name, lips, delay)
-            for name, lips in lip_models.items()
-            for delay in DELAYS_S
-        ),
+        Scheme("aligned phones", None, lambda clip: full_frames(visemes, clip, clip.aligned)),
+        Scheme("recognized phones", None, lambda clip: full_frames(visemes, clip, clip.recognized)),
+        *(live_scheme(name, lips, d) for name, lips in lip_models.items() for d in DELAYS_S),
         next_phone_scheme(visemes),
         *(loudness_scheme(delay_s) for delay_s in DELAYS_S),
-        Scheme("mean mouth", None, mean_mouth),
+        Scheme("mean mouth", None, still_mouth),
     ]
 
 
 def live_scheme(name: str, lips: LipModel, delay_s: float) -> Scheme:
-    """Return what the live chain makes with a lip model and a delay."""
-    return Scheme(
-        name,
-        delay_s,
-        lambda heard: live_frames(lips, heard.events[delay_s], delay_s, FRAME_RATE_HZ),
-    )
+    """Return scheme 3 with a lip model and a delay."""
+
+    def frames(clip: RecognizedClip) -> Array:
+        return live_frames(lips, clip.events[delay_s], delay_s, FRAME_RATE_HZ)
+
+    return Scheme(name, delay_s, frames)
 
 
 def next_phone_scheme(visemes: DynamicVisemes) -> Scheme:
-    """Return scheme 4."""
-    return Scheme(
-        "next phone",
-        NEXT_PHONE_DELAY_S,
-        lambda heard: live_frames(
-            visemes,
-            once_the_next_begins(heard.events[NEXT_PHONE_DELAY_S]),
-            NEXT_PHONE_DELAY_S,
-            FRAME_RATE_HZ,
-        ),
-    )
+    """Return scheme 4, at the default delay."""
+
+    def frames(clip: RecognizedClip) -> Array:
+        events = drop_first_hypotheses(clip.events[DEFAULT_DELAY_S])
+        return live_frames(visemes, events, DEFAULT_DELAY_S, FRAME_RATE_HZ)
+
+    return Scheme("next phone", DEFAULT_DELAY_S, frames)
 
 
 def loudness_scheme(delay_s: float) -> Scheme:
-    """Return the mouth that opens with the loudness."""
-    return Scheme("loudness", delay_s, lambda heard: loudness_frames(heard.clip.samples, delay_s))
+    """Return the baseline that opens the mouth with the loudness."""
+    return Scheme("loudness", delay_s, lambda clip: loudness_frames(clip.clip.samples, delay_s))
 
 
 def full_frames(
-    visemes: DynamicVisemes, heard: HeardClip, phones: Sequence[Phone] | None
+    visemes: DynamicVisemes, clip: RecognizedClip, phones: Sequence[Phone] | None
 ) -> Array | None:
-    """Frames (num_frames, 68) of the full model from phones, if they are known."""
+    """Return frames (num_frames, 68) of the full viseme model, if the phones are known."""
     if phones is None:
         return None
-    return synthesize(visemes, phones, heard.num_frames, FRAME_RATE_HZ, heard.levels).astype(float)
+    return synthesize(visemes, phones, clip.num_frames, FRAME_RATE_HZ, clip.levels).astype(float)
 
 
 def live_frames(
     lips: LipModel, events: Sequence[SoundEvent], delay_s: float, frame_rate_hz: float
 ) -> Array:
-    """Frames (num_frames, 68) that the live chain makes of sound events, without idle motion."""
+    """Return frames (num_frames, 68) of the live chain, without idle motion."""
     face = FaceAnimator(lips, frame_rate_hz=frame_rate_hz, delay_s=delay_s)
     return np.array([faps for _, faps in animate_live(face, events)], dtype=float)
 
 
 def animate_live(face: FaceAnimator, events: Sequence[SoundEvent]) -> list[Frame]:
-    """All frames that a face makes of sound events."""
+    """Return all frames that a face makes for sound events."""
     return [frame for event in events for frame in face.process(event)]
 
 
-def once_the_next_begins(events: Sequence[SoundEvent]) -> list[SoundEvent]:
-    """Leave out each phone's first hypothesis: what comes with the next phone remains."""
+def drop_first_hypotheses(events: Sequence[SoundEvent]) -> list[SoundEvent]:
+    """Remove each phone's first hypothesis. What arrives with the next phone remains."""
     return [
         event
         for event, after in zip_longest(events, events[1:])
@@ -216,12 +201,12 @@ def once_the_next_begins(events: Sequence[SoundEvent]) -> list[SoundEvent]:
 
 
 def loudness_frames(samples: NDArray[np.float32], delay_s: float) -> Array:
-    """Frames (num_frames, 68) of a mouth that opens with the level, 0 to 1 over 40 dB.
+    """Return frames (num_frames, 68) of a mouth that opens with the level, from 0 to 1 over 40 dB.
 
-    The level is smoothed over what is known a delay after the frame. How loud the loudest frames
-    of the recording are is known from the start, which flatters this baseline.
+    The level is smoothed over what is known ``delay_s`` after the frame. The level of the loudest
+    frames is known from the start, which favors this baseline.
     """
-    hop = round(SAMPLE_RATE_HZ * _HOP_S)
+    hop = round(SAMPLE_RATE_HZ / FRAME_RATE_HZ)
     num_frames = len(samples) // hop + 1
     padded = np.pad(samples.astype(float), (hop, 2 * hop))
     power = [np.mean(padded[k * hop : (k + 2) * hop] ** 2) for k in range(num_frames)]
@@ -229,86 +214,82 @@ def loudness_frames(samples: NDArray[np.float32], delay_s: float) -> Array:
     loudest_db = np.percentile(level_db, 95)
     level = np.clip((level_db - loudest_db) / _LOUDNESS_RANGE_DB + 1.0, 0.0, 1.0)
     reach = len(_LOUDNESS_WINDOW) // 2
-    known = np.arange(1 - reach, reach + 2) * _HOP_S <= delay_s + 1e-9  # ends of the levels' sound
-    window = np.where(known, _LOUDNESS_WINDOW, 0.0)
+    ends_s = np.arange(1 - reach, reach + 2) / FRAME_RATE_HZ  # of the audio behind each level
+    window = np.where(ends_s <= delay_s + 1e-9, _LOUDNESS_WINDOW, 0.0)
     level = np.correlate(np.pad(level, reach), window / window.sum(), mode="valid")
     faps = np.zeros((num_frames, NUM_FAPS))
     faps[:, 2], faps[:, 4] = 300.0 * level, -600.0 * level
     return faps
 
 
-def mean_mouth(heard: HeardClip) -> Array:
-    """Frames (num_frames, 68) of a mouth that stands still, half open."""
-    faps = np.zeros((heard.num_frames, NUM_FAPS))
-    faps[:, 4] = -_MEAN_OPENING
+def still_mouth(clip: RecognizedClip) -> Array:
+    """Return frames (num_frames, 68) of a half-open mouth that does not move."""
+    faps = np.zeros((clip.num_frames, NUM_FAPS))
+    faps[:, 4] = -_STILL_OPENING
     return faps
 
 
-def is_speech(heard: HeardClip, time_s: Array) -> NDArray[np.bool_]:
-    """Tell of some times whether somebody speaks then.
+def is_speech(clip: RecognizedClip, time_s: Array) -> NDArray[np.bool_]:
+    """Whether somebody speaks at the given times.
 
-    That is while the recognizer's voice activity is on, within 0.1 s of sound that is less than
-    30 dB below the loudest. Voice activity alone spans pauses of half a second, the level alone
-    takes noise for speech.
+    The recognizer's voice activity is on, and a sound less than 30 dB below the loudest is within
+    0.1 s. Voice activity alone spans pauses of half a second; the level alone takes noise for
+    speech.
     """
-    speech: NDArray[np.bool_] = _is_active(heard, time_s) & is_near(
-        time_s, _loud_s(heard), _SPEECH_MARGIN_S
+    speech: NDArray[np.bool_] = _is_active(clip, time_s) & is_near(
+        time_s, _loud_s(clip), _SPEECH_MARGIN_S
     )
     return speech
 
 
-def pauses(heard: HeardClip) -> Array:
-    """Where half a second and more is silent after speech, seconds, shape (num_pauses, 2).
+def pauses(clip: RecognizedClip) -> Array:
+    """Return the starts and ends of pauses after speech, seconds, shape (num_pauses, 2).
 
-    A pause goes from the last sound that is less than 30 dB below the loudest, while the
-    recognizer's voice activity is on, to the next such sound or the end of the clip.
+    A pause lasts at least half a second, from the last loud sound, while voice activity is on, to
+    the next one or to the end of the clip.
     """
-    loud_s = _loud_s(heard)
-    spoken_s = loud_s[_is_active(heard, loud_s)]
-    edges_s = np.append(spoken_s, len(heard.clip.samples) / SAMPLE_RATE_HZ)
-    is_pause = np.diff(edges_s) >= _PAUSE_S
+    loud_s = _loud_s(clip)
+    speech_s = loud_s[_is_active(clip, loud_s)]
+    edges_s = np.append(speech_s, len(clip.clip.samples) / SAMPLE_RATE_HZ)
+    is_pause = np.diff(edges_s) >= _MIN_PAUSE_S
     return np.stack([edges_s[:-1][is_pause], edges_s[1:][is_pause]], axis=1)
 
 
-def _is_active(heard: HeardClip, time_s: Array) -> NDArray[np.bool_]:
-    """Tell of some times whether the recognizer's voice activity is on."""
-    events = next(iter(heard.events.values()))  # voice activity is the same for all delays
+def _is_active(clip: RecognizedClip, time_s: Array) -> NDArray[np.bool_]:
+    events = next(iter(clip.events.values()))  # voice activity is the same for all delays
     changes = [event for event in events if isinstance(event, SpeechChange)]
     after = np.searchsorted([change.time_s for change in changes], time_s, side="right")
     return np.array([False, *(change.active for change in changes)])[after]
 
 
-def _loud_s(heard: HeardClip) -> Array:
-    """When the sound is less than 30 dB below the loudest, seconds."""
-    if not heard.levels:
+def _loud_s(clip: RecognizedClip) -> Array:
+    """Return when the sound is less than 30 dB below the loudest, seconds."""
+    if not clip.levels:
         return np.zeros(0)
-    end_s, level_db = np.array(heard.levels).T
+    end_s, level_db = np.array(clip.levels).T
     is_loud = level_db > np.percentile(level_db, 95) - _SPEECH_RANGE_DB
     loud_s: Array = end_s[is_loud] - LEVEL_STEP_S / 2.0
     return loud_s
 
 
-def phones_shaped(heard: HeardClip, viseme: str) -> list[Phone]:
-    """Phones of a clip that begin with a viseme; none where the language is not the model's."""
-    if heard.clip.language != heard.inventory.code:
+def phones_with_viseme(clip: RecognizedClip, viseme: str) -> list[Phone]:
+    """Return the phones that start with a viseme; none for a clip in another language."""
+    if clip.clip.language != clip.inventory.code:
         return []
-    visemes = heard.inventory.visemes
-    return [
-        phone
-        for phone in heard.aligned or heard.recognised
-        if visemes[phone.symbol][0][0] == viseme
-    ]
+    visemes = clip.inventory.visemes
+    phones = clip.aligned or clip.recognized
+    return [phone for phone in phones if visemes[phone.symbol][0][0] == viseme]
 
 
 def quietest_moments(clip: LipClip, phones: Sequence[Phone]) -> Array:
-    """When some phones of a clip are quietest, seconds."""
-    hop = round(_QUIETEST_HOP_S * SAMPLE_RATE_HZ)
+    """Return when each phone of a clip is quietest, seconds."""
+    hop = round(_POWER_STEP_S * SAMPLE_RATE_HZ)
     power = np.square(clip.samples[: len(clip.samples) // hop * hop], dtype=float)
     level = power.reshape(-1, hop).mean(axis=1)
     moments = []
     for phone in phones:
-        first = round(phone.onset_s / _QUIETEST_HOP_S)
-        last = max(round((phone.onset_s + phone.duration_s) / _QUIETEST_HOP_S), first + 1)
+        first = round(phone.onset_s / _POWER_STEP_S)
+        last = max(round((phone.onset_s + phone.duration_s) / _POWER_STEP_S), first + 1)
         if first < len(level):
-            moments.append((first + int(np.argmin(level[first:last])) + 0.5) * _QUIETEST_HOP_S)
+            moments.append((first + int(np.argmin(level[first:last])) + 0.5) * _POWER_STEP_S)
     return np.array(moments)

@@ -1,35 +1,23 @@
-"""How well synthesized lips move like real ones.
+"""Score lip models on clips with tracked lips.
 
-The schemes (``schemes.py``) run the same chain as the product, end of speech included, on clips
-with tracked lips. Each figure is pooled over the frames of a group of clips: all, a language, a
-source, a speaker.
+The schemes (``schemes.py``) run the same code as the services, on held-out clips. Results are
+pooled over all frames of a group of clips: all, a language, a source, a speaker.
 
-- Correlation of opening (inner lips), width and jaw, each clip's own means removed, since a
-  tracked face at rest is never quite at 0: over everything; within speech only (voice activity and
-  level, ``is_speech``); over everything with drift under 1 Hz removed from both.
-- The lag at which correlation is best, above 0 where the synthesized lips are late; error in FAP
-  units.
-- Closures: recall, precision and F1 (``measures.py``), and within speech only: lips that shut at
-  the end of each word are nearly always right to. Lower lip to upper teeth: recall of the f
-  that the tracks show, precision of what looks like it. How many b p m close: the synthesized lips
-  meet within 40 ms of the phone's quietest moment. The phones f b p m, only of clips in the
-  recognizer's language, are those of the aligned text or, where that is unknown, of offline
-  decoding, which the scheme of recognised phones then meets by construction.
-- Turns: sign changes of the velocity a second, and those of the real lips, both at the frame rate
-  of the video; those at 50 Hz besides, since 25 images a second do not show all flicker. Tracked
-  lips tremble by errors of tracking: smooth ones (an animator's rig) are the stricter measure.
-- The time from a real opening to the synthesized one, in media time: a viewer waits for the delay
-  besides.
-- Pauses, half a second and more without speech (``schemes.pauses``): root mean square of the
-  opening's velocity at the video's frame rate, once the lips had 0.3 s to close, and that of the
-  real lips, whose tracking trembles; a mouth at rest has 0. The time from the last sound to lips
-  that are shut, synthesized and real, in media time, and in how many pauses they shut at all.
+- Correlation of opening, width and jaw, after removal of each clip's mean, because a tracked face
+  at rest is never exactly at 0. It is measured over everything, in speech only (``is_speech``), and
+  with drift below 1 Hz removed.
+- The lag with the highest correlation, positive if the made lips are late; the error in FAP units.
+- Closures: recall, precision and F1 (``measures.py``), also in speech only, because lips that close
+  after each word are nearly always right. Contacts of lower lip and upper teeth. How many b p m
+  close: the lips must close within 40 ms of the phone's quietest moment. The phones come from
+  forced alignment or, without a transcript, from offline decoding.
+- Turns: sign changes of the velocity per second, for made and real lips, at the video's frame rate
+  and at 50 Hz. Tracked lips tremble; smooth ones, of an animator's rig, are the stricter measure.
+- The time from a real opening to the made one. The face's delay comes on top.
+- Pauses of half a second and more: the RMS velocity of the opening, and the time from the last
+  sound to closed lips.
 
-Clips whose sound is not in sync with the picture count for no time: not for lags, closures,
-openings and pauses. The real lips of another speaker who says the same, a bound of what sound can
-tell, would need clips that share a sentence.
-
-Only clips that are held out are scored, and of them only those that the parameters have not seen.
+Clips that are out of sync count only for shapes, not for lags, events and pauses.
 """
 
 from __future__ import annotations
@@ -54,8 +42,8 @@ from kouxing.evaluation.lips.clip_scores import (
     is_measured,
     score_clip,
 )
-from kouxing.evaluation.lips.measures import Hits, best_lag
-from kouxing.evaluation.lips.schemes import all_schemes, hear
+from kouxing.evaluation.lips.measures import Detections, best_lag
+from kouxing.evaluation.lips.schemes import all_schemes, recognize_clip
 from kouxing.services.lip_models import lip_models
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.lip_predictor import lip_predictor_for
@@ -66,27 +54,27 @@ from kouxing.shared.errors import UserError
 
 @dataclass(slots=True, kw_only=True)
 class CurveScore:
-    """One measure of the mouth; None where nothing moves or nothing was measured."""
+    """One measure of the mouth; None if nothing moves or nothing was measured."""
 
     correlation: float | None
     correlation_in_speech: float | None
     correlation_without_drift: float | None
-    best_lag_ms: float | None  # above 0: late
+    best_lag_ms: float | None  # positive: late
     best_correlation: float | None
-    rmse: float | None  # FAP units, own means removed
-    turns_per_s: float | None  # at the video's frame rate, as the real lips'
-    turns_per_s_at_50_hz: float | None  # what a face shows
+    rmse: float | None  # FAP units, clip means removed
+    turns_per_s: float | None  # at the video's frame rate
+    turns_per_s_at_50_hz: float | None
     real_turns_per_s: float | None
 
 
 @dataclass(slots=True, kw_only=True)
 class HitScore:
-    """Real events that are met, and made ones that are true."""
+    """Detected events."""
 
     real: int
-    met: int
+    met: int  # real events that are reproduced
     made: int
-    true: int
+    true: int  # made events that are right
     recall: float | None
     precision: float | None
     f1: float | None
@@ -94,14 +82,14 @@ class HitScore:
 
 @dataclass(slots=True, kw_only=True)
 class PauseScore:
-    """The opening while nobody speaks; None where there is no pause."""
+    """The opening in pauses; None if there is no pause."""
 
     count: int
-    speed: float | None  # root mean square, FAP units a second, at the video's frame rate
+    speed: float | None  # RMS, FAP units per second, at the video's frame rate
     real_speed: float | None
-    shut: int  # pauses in which the lips shut
+    shut: int  # pauses in which the lips close
     real_shut: int
-    shut_after_p50_ms: float | None  # from the last sound
+    shut_after_p50_ms: float | None  # after the last sound
     shut_after_p95_ms: float | None
     real_shut_after_p50_ms: float | None
     real_shut_after_p95_ms: float | None
@@ -112,11 +100,11 @@ class LipScore:
     """One scheme on one group of clips."""
 
     scheme: str
-    delay_ms: float | None  # None: it knows the whole recording
-    kind: str  # of the group: "all", "language", "source" or "speaker"
+    delay_ms: float | None  # None: it uses the whole recording
+    kind: str  # of the group: all, language, source or speaker
     group: str
     num_clips: int
-    curves: dict[str, CurveScore]  # of opening, width, jaw, where measured
+    curves: dict[str, CurveScore]  # of opening, width and jaw
     closures: HitScore
     closures_in_speech: HitScore
     lip_to_teeth: HitScore
@@ -136,50 +124,44 @@ def clips_to_score(
     language: str | None = None,
     sources: Collection[str] = (),
 ) -> list[LipClip]:
-    """Held-out clips of a folder that some viseme parameters have not seen either.
+    """Read the held-out clips of a folder that the viseme parameters were not trained on.
 
     Parameters
     ----------
     folder
-        Of clips.
+        Folder of clips.
     parameters
-        Viseme parameters; None: those shipped.
+        Viseme parameters. If None, those of the package.
     language, sources
-        Only these clips; by default all.
+        Only these clips. By default all.
 
     Raises
     ------
     UserError
-        There are none.
+        If there are no such clips.
     """
-    clips = [
-        clip
-        for clip in read_clips(folder, language=language)
-        if not sources or clip.source in sources
-    ]
+    clips = read_clips(folder, language=language)
+    clips = [clip for clip in clips if not sources or clip.source in sources]
     if not clips:
-        raise UserError(f"{folder}: no clip is from {', '.join(sources)}; give other sources")
-    held = [clip for clip in clips if clip.part == "held"]
-    if not held:
-        raise UserError(f"{folder}: no clip is held out; name clips or speakers in held.txt")
+        raise UserError(f"{folder}: no clip is from {', '.join(sources)}; choose other sources")
+    clips = [clip for clip in clips if clip.part == "held"]
+    if not clips:
+        raise UserError(f"{folder}: no clip is held out; list clips or speakers in held.txt")
     seen = clips_seen(parameters)
-    unseen = [clip for clip in held if clip.name not in seen]
-    if not unseen:
-        raise UserError(
-            f"{folder}: the parameters were learnt from or chosen with every held clip; give other "
-            "clips"
-        )
-    measured = [clip for clip in unseen if any(is_measured(clip, name) for name in MEASURES)]
-    if not measured:
+    clips = [clip for clip in clips if clip.name not in seen]
+    if not clips:
+        raise UserError(f"{folder}: the parameters were trained on all clips; give others")
+    clips = [clip for clip in clips if any(is_measured(clip, name) for name in MEASURES)]
+    if not clips:
         raise UserError(
             f"{folder}: no clip measures lip opening (FAP 4 and 5), mouth width (FAP 6 and 7) or "
             "jaw (FAP 3); add such columns"
         )
-    return measured
+    return clips
 
 
 def groups_of(clip: LipClip) -> list[tuple[str, str]]:
-    """Kinds and names of the groups that a clip counts in."""
+    """Return the kinds and names of the groups that a clip belongs to."""
     return [
         ("all", "all"),
         ("language", clip.language),
@@ -195,13 +177,10 @@ def pool(scores: Sequence[ClipScore]) -> list[LipScore]:
         for score in scores:
             if (kind, name) in groups_of(score.clip):
                 members.setdefault((kind, name, score.scheme, score.delay_s), []).append(score)
-    return [
-        _pooled(kind, name, scheme, delay_s, group)
-        for (kind, name, scheme, delay_s), group in members.items()
-    ]
+    return [_pool(*key, group) for key, group in members.items()]
 
 
-def _pooled(
+def _pool(
     kind: str, name: str, scheme: str, delay_s: float | None, scores: Sequence[ClipScore]
 ) -> LipScore:
     curves = {
@@ -233,11 +212,11 @@ def _pooled(
 
 
 def _curve_score(sums: CurveSums) -> CurveScore:
-    best = best_lag(sums.lagged, LAGS_S)
+    best = best_lag(sums.lagged.moments, LAGS_S)
     return CurveScore(
         correlation=sums.everything.correlation,
         correlation_in_speech=sums.in_speech.correlation,
-        correlation_without_drift=sums.no_drift.correlation,
+        correlation_without_drift=sums.without_drift.correlation,
         best_lag_ms=None if best is None else round(1e3 * best[1]),
         best_correlation=None if best is None else best[0],
         rmse=sums.everything.rmse,
@@ -247,27 +226,27 @@ def _curve_score(sums: CurveSums) -> CurveScore:
     )
 
 
-def _hit_score(hits: Hits) -> HitScore:
+def _hit_score(events: Detections) -> HitScore:
     return HitScore(
-        real=hits.num_real,
-        met=hits.num_met,
-        made=hits.num_made,
-        true=hits.num_true,
-        recall=hits.recall,
-        precision=hits.precision,
-        f1=hits.f1,
+        real=events.num_real,
+        met=events.num_met,
+        made=events.num_made,
+        true=events.num_true,
+        recall=events.recall,
+        precision=events.precision,
+        f1=events.f1,
     )
 
 
 def _pause_score(sums: PauseSums) -> PauseScore:
-    p50, p95 = _percentiles_ms(sums.shut_after_s)
-    real_p50, real_p95 = _percentiles_ms(sums.real_shut_after_s)
+    p50, p95 = _percentiles_ms(sums.closed_after_s)
+    real_p50, real_p95 = _percentiles_ms(sums.real_closed_after_s)
     return PauseScore(
         count=sums.count,
         speed=sums.speed.rms,
         real_speed=sums.real_speed.rms,
-        shut=len(sums.shut_after_s),
-        real_shut=len(sums.real_shut_after_s),
+        shut=len(sums.closed_after_s),
+        real_shut=len(sums.real_closed_after_s),
         shut_after_p50_ms=p50,
         shut_after_p95_ms=p95,
         real_shut_after_p50_ms=real_p50,
@@ -276,26 +255,25 @@ def _pause_score(sums: PauseSums) -> PauseScore:
 
 
 def _percentiles_ms(times_s: Sequence[float]) -> tuple[float | None, float | None]:
-    """Return the median and the 95th percentile, ms; None without times."""
     if not times_s:
         return None, None
     p50, p95 = 1e3 * np.percentile(times_s, [50, 95])
     return float(p50), float(p95)
 
 
-def main(
+def score_lip_models(
     folder: Path, parameters: Path | None = None, sources: Collection[str] = ()
 ) -> list[LipScore]:
-    """Score every lip model on the held clips of a folder."""
+    """Score every lip model on the held-out clips of a folder."""
     model = load_live_model()
     lips = lip_predictor_for(model)
     visemes = DynamicVisemes(load_parameters(parameters), model.inventory)
     models = {name: make(model.inventory) for name, make in lip_models().items()}
     schemes = all_schemes(visemes, models | {"dynamic-visemes": visemes})
-    clips = clips_to_score(folder, parameters, sources=sources)
     scores = []
+    clips = clips_to_score(folder, parameters, sources=sources)
     for clip in track(clips, description="clips", transient=True):
-        heard = hear(model, clip, lips)
-        found = [score_clip(heard, scheme) for scheme in schemes]
-        scores += [score for score in found if score is not None]
+        recognized = recognize_clip(model, clip, lips)
+        clip_scores = [score_clip(recognized, scheme) for scheme in schemes]
+        scores += [score for score in clip_scores if score is not None]
     return pool(scores)

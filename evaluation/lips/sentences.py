@@ -1,4 +1,4 @@
-"""Test sentences: of a corpus, of clips of tracked lips, or the samples that come with kouxing."""
+"""Test sentences: from a corpus, from clips of tracked lips, or the samples of the package."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 
-NUM_SENTENCES = 20  # of Li et al. 2011, two of each speaker
-_USUAL_S = 4.0  # their mean length
+NUM_SENTENCES = 20  # as in Li et al. 2011
+_MEAN_S = 4.0  # mean length of the paper's sentences
 
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """What somebody says."""
+    """A recording, with its phones by forced alignment if its text is known."""
 
-    clip: LipClip  # without frames where the lips were not tracked
-    aligned: list[Phone] | None  # by its text; None where that is not known
+    clip: LipClip  # without frames if there are no tracked lips
+    aligned: list[Phone] | None
 
 
-def of_samples(model: AcousticModel, folder: Path) -> list[Sentence]:
-    """Sentences of a folder with ``transcripts.tsv``, columns ``file text voice``."""
+def sample_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
+    """Read a folder with ``transcripts.tsv``, which has the columns ``file text voice``."""
     with (folder / "transcripts.tsv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file, delimiter="\t"))
     clips = [
@@ -44,56 +44,46 @@ def of_samples(model: AcousticModel, folder: Path) -> list[Sentence]:
     return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
 
 
-def of_corpus(
+def corpus_sentences(
     model: AcousticModel, corpus: Path, split: str, audio: Path | None = None
 ) -> list[Sentence]:
-    """Twenty sentences of a split of a corpus, as :func:`choose` chooses them.
+    """Read twenty sentences of a split of a corpus.
 
     Raises
     ------
     UserError
-        If there is no such corpus, or no usable recording in the split.
+        If the corpus does not exist, or the split has no usable recording.
     """
     errors = RowErrors()
-    found = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
-    if not found:
+    utterances = read_corpus(corpus, errors, model.inventory, split=split, audio=audio)
+    if not utterances:
         raise errors.nothing_left(f"in the split {split!r} of {corpus}")
     sentences = []
-    for each in choose(found):
-        clip = _clip(model, each.path, each.utterance_id, each.speaker)
-        syllables = syllables_of(each, model.inventory)
-        sentences.append(
-            Sentence(clip, align_phones(model, clip.samples, SAMPLE_RATE_HZ, syllables))
-        )
+    for utterance in choose(utterances):
+        clip = _clip(model, utterance.path, utterance.utterance_id, utterance.speaker)
+        syllables = syllables_of(utterance, model.inventory)
+        phones = align_phones(model, clip.samples, SAMPLE_RATE_HZ, syllables)
+        sentences.append(Sentence(clip, phones))
     return sentences
 
 
 def choose(utterances: Sequence[Utterance], number: int = NUM_SENTENCES) -> list[Utterance]:
-    """Choose as many of each speaker as of any other, those that last nearly 4 s first."""
+    """Choose equally many utterances of each speaker, preferably about 4 s long."""
     by_speaker: dict[str, list[Utterance]] = defaultdict(list)
-    for each in sorted(utterances, key=lambda one: (abs(one.seconds - _USUAL_S), one.utterance_id)):
-        by_speaker[each.speaker].append(each)
+    for utterance in sorted(utterances, key=lambda u: (abs(u.seconds - _MEAN_S), u.utterance_id)):
+        by_speaker[utterance.speaker].append(utterance)
     rounds = zip_longest(*(by_speaker[speaker] for speaker in sorted(by_speaker)))
-    ranked = [each for one in rounds for each in one if each is not None]
-    return sorted(ranked[:number], key=lambda one: one.utterance_id)
+    ranked = [utterance for one in rounds for utterance in one if utterance is not None]
+    return sorted(ranked[:number], key=lambda utterance: utterance.utterance_id)
 
 
-def of_clips(model: AcousticModel, folder: Path) -> list[Sentence]:
-    """All clips of tracked lips that are held out, in the model's language.
-
-    Raises
-    ------
-    UserError
-        If there are none.
-    """
-    return [
-        Sentence(clip, aligned_phones(model, clip))
-        for clip in clips_to_score(folder, None, language=model.inventory.code)
-    ]
+def clip_sentences(model: AcousticModel, folder: Path) -> list[Sentence]:
+    """Read all held-out clips of tracked lips in the model's language; UserError if none."""
+    clips = clips_to_score(folder, None, language=model.inventory.code)
+    return [Sentence(clip, aligned_phones(model, clip)) for clip in clips]
 
 
 def _clip(model: AcousticModel, path: Path, name: str, speaker: str, text: str = "") -> LipClip:
-    """Return a recording as a clip without frames; UserError if it cannot be read."""
     try:
         samples = read_audio(path)
     except ValueError as error:

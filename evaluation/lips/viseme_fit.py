@@ -1,16 +1,16 @@
-"""How well the visemes fit lips that they were not learnt from, and what learning changed.
+"""How well the visemes fit lips that they were not trained on.
 
-Source: Wang & Cai 2003, section 4, whose fig. 4 shows measured against modelled curves of a single
-final and of a sentence. Here the full model runs over the phones of each clip (aligned where the
-text is known, else recognised), once with the learnt parameters and once with those set by hand
-(``initial_parameters.py``). The errors of a viseme are those of the frames nearest to it. The level
-of the voice is left out: this measures the parameters alone.
+Source: Wang & Cai 2003, section 4. Their figure 4 shows measured and modeled curves of a single
+final and of a sentence. Here the full model runs over the phones of each clip (aligned if the text
+is known, else recognized), with the learnt parameters and with the initial ones, which were set by
+hand. The errors of a viseme are those of the frames nearest to it. The level of the voice is not
+used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from kouxing.corpora.figures import new_figure, save_figure
+from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, label_clip
 from kouxing.evaluation.lips.clip_scores import MEASURES, real_faps
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ
@@ -29,49 +29,34 @@ from kouxing.evaluation.lips.scores import clips_to_score
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.synthesizer.lips.dynamic_visemes.initial_parameters import initial_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.model import DynamicVisemes
-from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import (
-    VisemeParameters,
-    load_parameters,
-)
+from kouxing.services.synthesizer.lips.dynamic_visemes.parameters import load_parameters
 from kouxing.services.synthesizer.lips.dynamic_visemes.timeline import build_timeline
 from kouxing.services.synthesizer.lips.dynamic_visemes.visemes import REST, VISEMES
 from kouxing.services.synthesizer.offline import synthesize
-from kouxing.shared.face.faps import MOUTH_FAPS
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 
 Array = NDArray[np.float64]
 
-_COMPARED_FAPS = {"jaw": 3, "lower lip": 5, "corner": 6}
 _SENTENCE_S = 6.0
-_LONG_VOWEL_S, _AROUND_S = 0.2, 0.4  # least duration of the vowel that is shown; what is around it
+_LONG_VOWEL_S, _CONTEXT_S = 0.2, 0.4
 
 
 @dataclass(slots=True, kw_only=True)
 class VisemeError:
-    """Root of the mean squared error over the frames of a viseme, FAP units."""
+    """RMS error over the frames of a viseme, FAP units."""
 
     viseme: str
     measure: str
     num_frames: int
     extent: float  # standard deviation of the measured values in these frames
     learnt: float
-    guessed: float
-
-
-@dataclass(slots=True, kw_only=True)
-class Change:
-    """What learning made of the parameters of a viseme and a FAP."""
-
-    viseme: str
-    fap: int
-    guessed: dict[str, float]
-    learnt: dict[str, float]
+    guessed: float  # with the initial parameters
 
 
 @dataclass(frozen=True, slots=True)
 class FittedClip:
-    """A clip with its phones and modelled curves, frames as the clip's."""
+    """A clip with its phones and modeled curves, at the clip's frames."""
 
     clip: LipClip
     phones: list[Phone]
@@ -79,11 +64,34 @@ class FittedClip:
     learnt: Array  # (num_frames, 68)
     guessed: Array  # (num_frames, 68)
 
+    def curves(self, measure: str) -> tuple[Array, Array, Array]:
+        """Return measured, learnt and guessed values, (num_frames,), without the clip's means."""
+        real = MEASURES[measure](real_faps(self.clip))
+        is_known = ~np.isnan(real)
+        learnt, guessed = MEASURES[measure](self.learnt), MEASURES[measure](self.guessed)
+        if is_known.any():
+            real, learnt, guessed = (v - v[is_known].mean() for v in (real, learnt, guessed))
+        return real, learnt, guessed
+
+
+def fit_folder(folder: Path, parameters: Path | None) -> list[FittedClip]:
+    """Model all clips of a folder that the parameters were not trained on."""
+    model = load_model()
+    learnt, guessed = (
+        DynamicVisemes(each, model.inventory)
+        for each in (load_parameters(parameters), initial_parameters())
+    )
+    clips = clips_to_score(folder, parameters, language=model.inventory.code)
+    return [
+        fit_clip(clip, label_clip(model, clip), learnt, guessed)
+        for clip in track(clips, description="clips", transient=True)
+    ]
+
 
 def fit_clip(
     clip: LipClip, phones: list[Phone], learnt: DynamicVisemes, guessed: DynamicVisemes
 ) -> FittedClip:
-    """Model a clip's lips with learnt and with guessed parameters."""
+    """Model a clip's lips with learnt and with initial parameters."""
 
     def curves(lips: DynamicVisemes) -> Array:
         num_frames = int(max(clip.time_s[-1], 0.0) * FRAME_RATE_HZ) + 2
@@ -97,15 +105,13 @@ def fit_clip(
     return FittedClip(clip, phones, learnt.inventory, curves(learnt), curves(guessed))
 
 
-def errors_of_visemes(fitted: Sequence[FittedClip]) -> list[VisemeError]:
-    """Errors of each viseme and of all together, for every measure."""
-    viseme = np.concatenate([_nearest_visemes(each) for each in fitted])
+def viseme_errors(fitted: Sequence[FittedClip]) -> list[VisemeError]:
+    """Return the errors of each viseme, and of all together, for every measure."""
+    viseme = np.concatenate([_nearest_visemes(clip) for clip in fitted])
     errors = []
     for measure in MEASURES:
-        real, learnt, guessed = (
-            np.concatenate(values)
-            for values in zip(*(_centred(each, measure) for each in fitted), strict=True)
-        )
+        curves = zip(*(clip.curves(measure) for clip in fitted), strict=True)
+        real, learnt, guessed = (np.concatenate(values) for values in curves)
         for name in ("all", *VISEMES):
             rows = ~np.isnan(real)
             if name != "all":
@@ -124,135 +130,62 @@ def errors_of_visemes(fitted: Sequence[FittedClip]) -> list[VisemeError]:
     return errors
 
 
-def _centred(each: FittedClip, measure: str) -> tuple[Array, Array, Array]:
-    """Measured, learnt and guessed values, the clip's own means removed."""
-    real = MEASURES[measure](real_faps(each.clip))
-    known = ~np.isnan(real)
-    values = (real, MEASURES[measure](each.learnt), MEASURES[measure](each.guessed))
-    if known.any():
-        real, learnt, guessed = (value - value[known].mean() for value in values)
-    else:
-        _, learnt, guessed = values
-    return real, learnt, guessed
-
-
-def _nearest_visemes(each: FittedClip) -> NDArray[np.intp]:
-    """Viseme nearest to each frame; ``rest`` where nothing is said."""
-    timeline = build_timeline(each.phones, each.inventory)
-    time_s = each.clip.time_s[:, None]
-    quiet = ((time_s > timeline.silence_start_s) & (time_s < timeline.silence_end_s)).any(axis=1)
+def _nearest_visemes(fitted: FittedClip) -> NDArray[np.intp]:
+    """Return the viseme nearest to each frame, or rest in silence."""
+    timeline = build_timeline(fitted.phones, fitted.inventory)
+    time_s = fitted.clip.time_s[:, None]
+    is_quiet = ((time_s > timeline.silence_start_s) & (time_s < timeline.silence_end_s)).any(axis=1)
     rest = VISEMES.index(REST)
     if not len(timeline.viseme):
         return np.full(len(time_s), rest)
     distance = np.maximum(timeline.apex_start_s - time_s, time_s - timeline.apex_end_s)
-    return np.where(quiet, rest, timeline.viseme[np.argmin(distance, axis=1)])
+    return np.where(is_quiet, rest, timeline.viseme[np.argmin(distance, axis=1)])
 
 
 def _rms(error: Array) -> float:
     return float(np.sqrt(np.mean(error**2)))
 
 
-def changes(learnt: VisemeParameters, guessed: VisemeParameters) -> list[Change]:
-    """Compare parameters, for one FAP of jaw, lips and mouth width each."""
-    names = ("target", "alpha", "theta_minus", "theta_plus", "offset_s")
-    return [
-        Change(
-            viseme=viseme,
-            fap=fap,
-            guessed={n: float(getattr(guessed, n)[row, MOUTH_FAPS.index(fap)]) for n in names},
-            learnt={n: float(getattr(learnt, n)[row, MOUTH_FAPS.index(fap)]) for n in names},
-        )
-        for fap in _COMPARED_FAPS.values()
-        for row, viseme in enumerate(VISEMES)
-        if viseme != REST
-    ]
-
-
-def main(folder: Path, parameters: Path | None, picture: Path | None) -> dict[str, Any]:
-    """Fit all clips that were not learnt from, print tables and return the figures."""
-    model = load_model()
-    learnt, guessed = load_parameters(parameters), initial_parameters()
-    lips = [DynamicVisemes(each, model.inventory) for each in (learnt, guessed)]
-    clips = clips_to_score(folder, parameters, language=model.inventory.code)
-    fitted = [
-        fit_clip(clip, label_clip(model, clip), *lips)
-        for clip in track(clips, description="clips", transient=True)
-    ]
-    errors, changed = errors_of_visemes(fitted), changes(learnt, guessed)
-    console = Console()
-    _print_errors(errors, console)
-    _print_changes(changed, console)
-    if picture is not None:
-        save_figure(fit_figure(fitted), picture)
-    return {
-        "clips": [each.clip.name for each in fitted],
-        "errors": [asdict(error) for error in errors],
-        "changes": [asdict(change) for change in changed],
-    }
-
-
-def _print_errors(errors: Sequence[VisemeError], console: Console) -> None:
-    table = Table(title="error in FAP units: learnt (guessed); extent of what was measured")
-    table.add_column("viseme")
-    table.add_column("frames")
-    for measure in MEASURES:
-        table.add_column(measure)
+def print_errors(errors: Sequence[VisemeError], console: Console) -> None:
+    """Print the errors, one row per viseme."""
+    title = "error in FAP units: learnt (initial); standard deviation of the measured values"
+    table = Table("viseme", "frames", *MEASURES, title=title)
     for viseme in dict.fromkeys(error.viseme for error in errors):
-        rows = [error for error in errors if error.viseme == viseme]
+        rows = {error.measure: error for error in errors if error.viseme == viseme}
         cells = {
-            error.measure: f"{error.learnt:.0f} ({error.guessed:.0f}); {error.extent:.0f}"
-            for error in rows
+            measure: f"{error.learnt:.0f} ({error.guessed:.0f}); {error.extent:.0f}"
+            for measure, error in rows.items()
         }
-        num_frames = max(error.num_frames for error in rows)
+        num_frames = max(error.num_frames for error in rows.values())
         table.add_row(viseme, str(num_frames), *(cells.get(m, "") for m in MEASURES))
     console.print(table)
 
 
-def _print_changes(changed: Sequence[Change], console: Console) -> None:
-    for name, fap in _COMPARED_FAPS.items():
-        table = Table(title=f"{name} (FAP {fap}): guessed -> learnt")
-        for column in ("viseme", "T", "alpha", "theta-", "theta+", "t_o ms"):
-            table.add_column(column)
-        for change in changed:
-            if change.fap == fap:
-                old, new = change.guessed, change.learnt
-                table.add_row(
-                    change.viseme,
-                    f"{old['target']:.0f} -> {new['target']:.0f}",
-                    f"{old['alpha']:.2f} -> {new['alpha']:.2f}",
-                    f"{old['theta_minus']:.0f} -> {new['theta_minus']:.0f}",
-                    f"{old['theta_plus']:.0f} -> {new['theta_plus']:.0f}",
-                    f"{1e3 * old['offset_s']:.0f} -> {1e3 * new['offset_s']:.0f}",
-                )
-        console.print(table)
-
-
 def fit_figure(fitted: Sequence[FittedClip]) -> Any:
-    """Measured against modelled curves: a long vowel with what is around it, and a sentence."""
+    """Plot measured and modeled curves: of a long vowel, and of a sentence."""
     figure = new_figure(14.0, 6.0)
-    num_rows = 1 + len(MEASURES)
     axes = figure.subplots(
-        num_rows, 2, sharex="col", sharey="row", width_ratios=(1.0, 2.2), squeeze=False
+        1 + len(MEASURES), 2, sharex="col", sharey="row", width_ratios=(1.0, 2.2), squeeze=False
     )
-    shown = max(fitted, key=lambda each: _surest_vowel(each)[2])
-    start_s, length_s, _ = _surest_vowel(shown)
-    _draw_fit(axes[:, 0], shown, start_s - _AROUND_S, start_s + length_s + _AROUND_S)
-    shown = max(fitted, key=lambda each: _busiest(each)[1])
-    start_s, _ = _busiest(shown)
-    _draw_fit(axes[:, 1], shown, start_s, start_s + _SENTENCE_S)
+    clip = max(fitted, key=lambda each: _long_vowel(each)[2])
+    start_s, length_s, _ = _long_vowel(clip)
+    _draw_fit(axes[:, 0], clip, start_s - _CONTEXT_S, start_s + length_s + _CONTEXT_S)
+    clip = max(fitted, key=lambda each: _busiest_stretch(each)[1])
+    start_s, _ = _busiest_stretch(clip)
+    _draw_fit(axes[:, 1], clip, start_s, start_s + _SENTENCE_S)
     for axis, measure in zip(axes[1:, 0], MEASURES, strict=True):
         axis.set_ylabel(f"{measure}, FAP units", fontsize=8)
     axes[1, 1].legend(fontsize=8, loc="upper right")
     return figure
 
 
-def _surest_vowel(each: FittedClip) -> tuple[float, float, float]:
-    """Onset, duration and confidence of the surest long vowel of one viseme before a pause."""
-    inventory = each.inventory
+def _long_vowel(fitted: FittedClip) -> tuple[float, float, float]:
+    """Return onset, duration and confidence of the best long vowel before a pause."""
+    inventory = fitted.inventory
     return max(
         (
             (phone.onset_s, phone.duration_s, phone.confidence)
-            for phone, after in pairwise(each.phones)
+            for phone, after in pairwise(fitted.phones)
             if phone.symbol in inventory.vowels
             and len(inventory.visemes[phone.symbol]) == 1
             and phone.duration_s > _LONG_VOWEL_S
@@ -263,10 +196,10 @@ def _surest_vowel(each: FittedClip) -> tuple[float, float, float]:
     )
 
 
-def _busiest(each: FittedClip) -> tuple[float, int]:
-    """Onset of the stretch of a sentence's length with the most phones, and how many."""
-    silence = each.inventory.silence
-    onsets_s = np.array([phone.onset_s for phone in each.phones if phone.symbol != silence])
+def _busiest_stretch(fitted: FittedClip) -> tuple[float, int]:
+    """Return the start of the 6 s with the most phones, and their number."""
+    silence = fitted.inventory.silence
+    onsets_s = np.array([phone.onset_s for phone in fitted.phones if phone.symbol != silence])
     if not onsets_s.size:
         return 0.0, 0
     until = np.searchsorted(onsets_s, onsets_s + _SENTENCE_S)
@@ -275,39 +208,31 @@ def _busiest(each: FittedClip) -> tuple[float, int]:
     return max(float(onsets_s[best]) - 0.1, 0.0), int(count[best])
 
 
-def _draw_fit(axes: Any, each: FittedClip, start_s: float, end_s: float) -> None:
+def _draw_fit(axes: Any, fitted: FittedClip, start_s: float, end_s: float) -> None:
     first, last = (round(max(time_s, 0.0) * SAMPLE_RATE_HZ) for time_s in (start_s, end_s))
-    inside = [phone for phone in each.phones if start_s <= phone.onset_s < end_s]
-    samples = each.clip.samples[first:last]
-    _draw_sound(axes[0], samples, inside, each.inventory.silence, first / SAMPLE_RATE_HZ)
-    axes[0].set_title(each.clip.name, fontsize=9)
-    shown = (each.clip.time_s >= start_s) & (each.clip.time_s <= end_s)
-    time_s = each.clip.time_s[shown]
-    for axis, measure in zip(axes[1:], MEASURES, strict=True):
-        real, learnt, guessed = _centred(each, measure)
-        axis.plot(time_s, guessed[shown], color="C1", linewidth=0.8, label="guessed")
-        axis.plot(time_s, real[shown], color="0.6", linewidth=2.5, label="measured")
-        axis.plot(time_s, learnt[shown], color="black", linewidth=1.2, label="learnt")
-        for phone in inside:
+    phones = [phone for phone in fitted.phones if start_s <= phone.onset_s < end_s]
+    _draw_waveform(axes[0], fitted.clip.samples[first:last], first / SAMPLE_RATE_HZ)
+    top = axes[0].get_ylim()[1]
+    for number, phone in enumerate(phones):
+        for axis in axes:
             axis.axvline(phone.onset_s, color="0.92", zorder=0)
+        if phone.symbol != fitted.inventory.silence:
+            # two heights, so that labels of short phones do not overlap
+            axes[0].text(phone.onset_s, top * (0.7 + 0.15 * (number % 2)), phone.symbol, fontsize=8)
+    axes[0].set_title(fitted.clip.name, fontsize=9)
+    is_shown = (fitted.clip.time_s >= start_s) & (fitted.clip.time_s <= end_s)
+    time_s = fitted.clip.time_s[is_shown]
+    for axis, measure in zip(axes[1:], MEASURES, strict=True):
+        real, learnt, guessed = (curve[is_shown] for curve in fitted.curves(measure))
+        axis.plot(time_s, guessed, color="C1", linewidth=0.8, label="initial parameters")
+        axis.plot(time_s, real, color="0.6", linewidth=2.5, label="measured")
+        axis.plot(time_s, learnt, color="black", linewidth=1.2, label="learnt parameters")
     axes[-1].set_xlabel("s")
 
 
-def _draw_sound(
-    axis: Any,
-    samples: NDArray[np.float32],
-    phones: Sequence[Phone],
-    silence: str,
-    start_s: float = 0.0,
-) -> None:
-    """Draw a waveform that begins at ``start_s``, with its phones above."""
+def _draw_waveform(axis: Any, samples: NDArray[np.float32], start_s: float) -> None:
     time_s = start_s + np.arange(len(samples)) / SAMPLE_RATE_HZ
     axis.plot(time_s, samples, color="0.6", linewidth=0.3)
     top = 1.1 * float(np.abs(samples).max(initial=1e-3))
-    for number, phone in enumerate(phones):
-        axis.axvline(phone.onset_s, color="0.9", zorder=0)
-        if phone.symbol != silence:
-            # two heights, so that short phones do not overlap
-            axis.text(phone.onset_s, top * (1.0 + 0.25 * (number % 2)), phone.symbol, fontsize=8)
     axis.set_ylim(-top, 1.5 * top)
     axis.set_yticks([])

@@ -1,4 +1,4 @@
-"""The recognizer's errors over its delay: a picture of what a longer look-ahead brings."""
+"""Plot the recognizer's errors over its delay."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any
 
 from kouxing.corpora.figures import new_figure, save_figure
 
-_STYLES = {"": ("o-", "first"), "final_": ("s--", "final")}  # by prefix of the rates' names
+_STYLES = {"": ("o-", "first"), "final_": ("s--", "final")}  # by prefix of the keys
 
 
-def draw_delay_curve(figures: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw phone and viseme errors of both hypotheses over the median delay of the first.
+def draw_delay_curve(results: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Plot the errors of both hypotheses over the median delay of the first.
 
     Parameters
     ----------
-    figures
-        Those of :func:`evaluation.recognizer.error_rates.evaluate_recognizer` with the name of the
-        model as ``acoustic``; those of one model, at several look-aheads, follow each other.
+    results
+        Results of ``evaluate_recognizer``, with the model's name as ``acoustic``. Those of one
+        model, with several look-aheads, are adjacent.
     path
-        The picture.
+        File of the picture.
 
     Raises
     ------
@@ -30,11 +30,11 @@ def draw_delay_curve(figures: Sequence[Mapping[str, Any]], path: Path) -> None:
     """
     figure = new_figure(11.0, 4.5)
     for axes, kind in zip(figure.subplots(1, 2), ("phone", "viseme"), strict=True):
-        by_model = groupby(figures, key=lambda each: each["acoustic"])
+        by_model = groupby(results, key=lambda result: result["acoustic"])
         for number, (name, group) in enumerate(by_model):
-            own = [each["scores"][-1] for each in group]
-            recognized = [score for score in own if "delay_ms" in score]  # any phone
-            scores = sorted(recognized, key=lambda score: score["delay_ms"]["p50"])
+            defaults = [result["scores"][-1] for result in group]
+            scores = [score for score in defaults if "delay_ms" in score]
+            scores.sort(key=lambda score: score["delay_ms"]["p50"])
             delays_ms = [score["delay_ms"]["p50"] for score in scores]
             for prefix, (style, hypothesis) in _STYLES.items():
                 rates = [100 * score[f"{prefix}{kind}_error_rate"] for score in scores]

@@ -1,23 +1,23 @@
 """Disturbances of speech on its way to a microphone, and sounds without speech.
 
-Everything is drawn with fixed seeds, so that figures can be reproduced.
+All random numbers have fixed seeds, so that figures can be reproduced.
 
-==================== ===========================================================================
-noise at so many dB  pink noise (power falling by 3 dB an octave), relative to the speech's level
-babble               six stretches of the recordings at once, likewise
-room                 echoes that fall by 60 dB in 0.5 s (noise with an exponential envelope, Polack
-                     1988), together as loud as the direct sound
-telephone band       300 to 3400 Hz, Butterworth of order 8
-MP3, Opus            coded with 16 and 9 kbit/s, and decoded
-clipped              at a fifth of the peak
-half, double level   samples times 0.5 and 2, clipped at full scale
-speech at 0.8x, 1.3x overlap-add of the most similar 20 ms pieces, the pitch stays (Verhelst and
-                     Roelands 1993, "WSOLA")
-music                chords of plucked strings, four a second, with a bass drum
-noise                pink noise whose level wanders
-keyboard             strokes of 2 to 6 a second, each two clicks of some milliseconds
-breathing            noise between 300 and 3000 Hz, in and out every four seconds
-==================== ===========================================================================
+====================  ==========================================================================
+noise N dB below      pink noise (power falling by 3 dB per octave), relative to the speech level
+babble                six parts of the recordings at once, likewise
+room                  echoes that fall by 60 dB in 0.5 s (noise with an exponential envelope, Polack
+                      1988), together as loud as the direct sound
+limit_to_telephone_band band        300 to 3400 Hz, Butterworth of order 8
+MP3, Opus             encoded with 16 and 9 kbit/s, and decoded
+clipped               at a fifth of the peak
+half, double level    samples times 0.5 and 2, clipped at full scale
+0.8, 1.3 times the    overlap-add of the most similar 20 ms segments at constant pitch (WSOLA,
+speed                 Verhelst and Roelands 1993)
+music                 chords of plucked strings, four per second, with a bass drum
+noise                 pink noise with a varying level
+keyboard              2 to 6 strokes per second, each with two clicks of some milliseconds
+breathing             noise between 300 and 3000 Hz, in and out every four seconds
+====================  ==========================================================================
 """
 
 from __future__ import annotations
@@ -34,116 +34,116 @@ from kouxing.services.recognizer.front_end.features import SAMPLE_RATE_HZ
 
 Samples = NDArray[np.float32]  # (n,), 16 kHz, in [-1, 1]
 _TWELFTH = 2 ** (1 / 12)
-_REVERBERATION_S = 0.5  # in which a room's echoes fall by 60 dB
-_NUM_BABBLING = 6
+_REVERBERATION_S = 0.5  # time in which echoes fall by 60 dB
+_NUM_VOICES = 6
 _MP3 = {"format": "MP3", "subtype": "MPEG_LAYER_III", "bitrate_mode": "CONSTANT"}
 _OPUS = {"format": "OGG", "subtype": "OPUS"}
 
 
 def pink_noise(num_samples: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Noise of equal power in every octave, of root mean square 1."""
+    """Return noise with equal power in every octave and an RMS of 1."""
     spectrum = np.fft.rfft(rng.normal(size=num_samples))
     frequency = np.maximum(np.fft.rfftfreq(num_samples), 20 / SAMPLE_RATE_HZ)
     noise = np.fft.irfft(spectrum / np.sqrt(frequency), num_samples)
     return np.asarray(noise / np.sqrt(np.mean(noise**2)))
 
 
-def with_noise(samples: Samples, below_db: float) -> Samples:
+def add_noise(samples: Samples, below_db: float) -> Samples:
     """Add pink noise ``below_db`` decibels below the speech's level."""
     noise = pink_noise(len(samples), np.random.default_rng(len(samples)))
-    return _mixed(samples, noise, below_db)
+    return _mix(samples, noise, below_db)
 
 
 def babble(voices: Sequence[Samples]) -> Samples:
-    """Lay six stretches of the recordings on each other, each recording equally loud."""
+    """Mix six parts of the recordings. Each recording has the same level."""
     speech = np.concatenate([voice / max(1e-9, np.sqrt(np.mean(voice**2))) for voice in voices])
-    starts = np.arange(_NUM_BABBLING) * len(speech) // _NUM_BABBLING
+    starts = np.arange(_NUM_VOICES) * len(speech) // _NUM_VOICES
     together: Samples = np.sum([np.roll(speech, start) for start in starts], axis=0)
     return together
 
 
-def with_sound(samples: Samples, sound: Samples, below_db: float) -> Samples:
-    """Add a stretch of a sound, repeated if need be, ``below_db`` below the speech's level."""
+def add_sound(samples: Samples, sound: Samples, below_db: float) -> Samples:
+    """Add a part of a sound, repeated if necessary, ``below_db`` below the speech's level."""
     start = np.random.default_rng(len(samples)).integers(len(sound))
-    return _mixed(samples, np.resize(np.roll(sound, -start), len(samples)), below_db)
+    return _mix(samples, np.resize(np.roll(sound, -start), len(samples)), below_db)
 
 
-def in_a_room(samples: Samples) -> Samples:
+def add_echoes(samples: Samples) -> Samples:
     """Add echoes that are together as loud as the direct sound."""
     num_samples = round(_REVERBERATION_S * SAMPLE_RATE_HZ)
     decay = 10 ** (-3 * np.arange(num_samples) / num_samples)  # by 60 dB
     echoes = np.random.default_rng(5).normal(size=num_samples) * decay
     heard = fftconvolve(samples, echoes / np.sqrt(np.sum(echoes**2)))[: len(samples)]
-    return _clipped((samples + heard) / np.sqrt(2))
+    return _clip_to_full_scale((samples + heard) / np.sqrt(2))
 
 
-def coded(samples: Samples, codec: dict[str, str], compression_level: float) -> Samples:
-    """Code speech and decode it; libsndfile turns its level, 0 to 1, into a bit rate."""
+def encode_and_decode(samples: Samples, codec: dict[str, str], compression_level: float) -> Samples:
+    """Encode and decode speech. libsndfile derives the bit rate from the level, 0 to 1."""
     file = BytesIO()
     soundfile.write(file, samples, SAMPLE_RATE_HZ, compression_level=compression_level, **codec)
     file.seek(0)
     decoded, _ = soundfile.read(file, dtype="float32")
-    return _clipped(decoded)
+    return _clip_to_full_scale(decoded)
 
 
-def telephone(samples: Samples) -> Samples:
-    """Keep 300 to 3400 Hz."""
+def limit_to_telephone_band(samples: Samples) -> Samples:
+    """Keep only 300 to 3400 Hz."""
     band = butter(8, [300, 3400], "bandpass", fs=SAMPLE_RATE_HZ, output="sos")
-    return _clipped(sosfilt(band, samples))
+    return _clip_to_full_scale(sosfilt(band, samples))
 
 
-def clipped_at(samples: Samples, fraction: float) -> Samples:
+def clip(samples: Samples, fraction: float) -> Samples:
     """Clip the samples at a fraction of their peak."""
     limit = fraction * np.abs(samples).max()
     clipped: Samples = np.clip(samples, -limit, limit)
     return clipped
 
 
-def louder(samples: Samples, factor: float) -> Samples:
+def change_level(samples: Samples, factor: float) -> Samples:
     """Multiply the samples and clip them at full scale."""
-    return _clipped(samples * factor)
+    return _clip_to_full_scale(samples * factor)
 
 
-def faster(samples: Samples, factor: float) -> Samples:
-    """Change the speed of speech and keep its pitch."""
-    hop, search = 160, 120  # 10 and 7.5 ms; pieces are two hops long
+def change_speed(samples: Samples, factor: float) -> Samples:
+    """Change the speed of speech at constant pitch."""
+    hop, search = 160, 120  # 10 and 7.5 ms; segments are two hops long
     window = np.hanning(2 * hop + 1)[: 2 * hop]
     padded = np.pad(samples.astype(np.float64), (search, 3 * hop + 2 * search))
-    num_pieces = int(len(samples) / (hop * factor))
-    out = np.zeros((num_pieces + 1) * hop)
-    taken = 0  # where the last piece was taken from
-    for number in range(num_pieces):
+    num_segments = int(len(samples) / (hop * factor))
+    out = np.zeros((num_segments + 1) * hop)
+    source = 0  # start of the last segment
+    for number in range(num_segments):
         at = round(number * hop * factor)
         if number:
-            wanted = padded[taken + hop : taken + 3 * hop]  # the continuation without a cut
+            continuation = padded[source + hop : source + 3 * hop]  # the natural continuation
             near = padded[at : at + 2 * search + 2 * hop]
             energy = np.convolve(near**2, np.ones(2 * hop), "valid")
-            similarity = np.correlate(near, wanted, "valid") / np.sqrt(energy + 1e-9)
+            similarity = np.correlate(near, continuation, "valid") / np.sqrt(energy + 1e-9)
             at += int(similarity.argmax())
-        taken = at
+        source = at
         out[number * hop : (number + 2) * hop] += window * padded[at : at + 2 * hop]
-    return _clipped(out[hop:])
+    return _clip_to_full_scale(out[hop:])
 
 
 SPEECH_CONDITIONS: dict[str, Callable[[Samples], Samples]] = {
     "as recorded": lambda samples: samples,
-    "noise 20 dB below": lambda samples: with_noise(samples, 20),
-    "noise 10 dB below": lambda samples: with_noise(samples, 10),
-    "noise 5 dB below": lambda samples: with_noise(samples, 5),
-    "room": in_a_room,
-    "telephone band": telephone,
-    "MP3, 16 kbit/s": lambda samples: coded(samples, _MP3, 0.95),
-    "Opus, 9 kbit/s": lambda samples: coded(samples, _OPUS, 0.99),
-    "clipped at a fifth": lambda samples: clipped_at(samples, 0.2),
-    "half level": lambda samples: louder(samples, 0.5),
-    "double level": lambda samples: louder(samples, 2.0),
-    "0.8 times the speed": lambda samples: faster(samples, 0.8),
-    "1.3 times the speed": lambda samples: faster(samples, 1.3),
+    "noise 20 dB below": lambda samples: add_noise(samples, 20),
+    "noise 10 dB below": lambda samples: add_noise(samples, 10),
+    "noise 5 dB below": lambda samples: add_noise(samples, 5),
+    "room": add_echoes,
+    "telephone band": limit_to_telephone_band,
+    "MP3, 16 kbit/s": lambda samples: encode_and_decode(samples, _MP3, 0.95),
+    "Opus, 9 kbit/s": lambda samples: encode_and_decode(samples, _OPUS, 0.99),
+    "clipped at a fifth": lambda samples: clip(samples, 0.2),
+    "half level": lambda samples: change_level(samples, 0.5),
+    "double level": lambda samples: change_level(samples, 2.0),
+    "0.8 times the speed": lambda samples: change_speed(samples, 0.8),
+    "1.3 times the speed": lambda samples: change_speed(samples, 1.3),
 }
 
 
 def music(seconds: float) -> Samples:
-    """Chords of plucked strings over a drum."""
+    """Return chords of plucked strings with a drum."""
     rng = np.random.default_rng(1)
     out = np.zeros(round((seconds + 2) * SAMPLE_RATE_HZ))
     time_s = np.arange(SAMPLE_RATE_HZ) / SAMPLE_RATE_HZ
@@ -160,20 +160,20 @@ def music(seconds: float) -> Samples:
         if beat % 2 == 0:
             drum = np.sin(2 * np.pi * 60 * time_s) * np.exp(-20 * time_s)
             out[start : start + len(time_s)] += 3 * drum
-    return _at_level(out[: round(seconds * SAMPLE_RATE_HZ)])
+    return _normalize(out[: round(seconds * SAMPLE_RATE_HZ)])
 
 
-def wandering_noise(seconds: float) -> Samples:
-    """Pink noise whose level wanders by some decibels."""
+def varying_noise(seconds: float) -> Samples:
+    """Return pink noise whose level varies by some decibels."""
     rng = np.random.default_rng(2)
     noise = pink_noise(round(seconds * SAMPLE_RATE_HZ), rng)
     knots = rng.normal(0, 0.5, max(2, round(seconds)))
     gain = np.exp(np.interp(np.linspace(0, 1, len(noise)), np.linspace(0, 1, len(knots)), knots))
-    return _at_level(gain * noise)
+    return _normalize(gain * noise)
 
 
 def keyboard(seconds: float) -> Samples:
-    """Strokes on a keyboard: a click down and a weaker one up."""
+    """Return strokes on a keyboard: a click down and a weaker one up."""
     rng = np.random.default_rng(3)
     out = np.zeros(round((seconds + 1) * SAMPLE_RATE_HZ))
     at_s = 0.2
@@ -184,38 +184,38 @@ def keyboard(seconds: float) -> Samples:
             start = round((at_s + offset_s) * SAMPLE_RATE_HZ)
             out[start : start + length] += click
         at_s += float(rng.uniform(0.15, 0.5))
-    return _at_level(out[: round(seconds * SAMPLE_RATE_HZ)])
+    return _normalize(out[: round(seconds * SAMPLE_RATE_HZ)])
 
 
 def breathing(seconds: float) -> Samples:
-    """Breathing in and out near the microphone."""
+    """Return breathing in and out near the microphone."""
     rng = np.random.default_rng(4)
     num_samples = round(seconds * SAMPLE_RATE_HZ)
     band = butter(2, [300, 3000], "bandpass", fs=SAMPLE_RATE_HZ, output="sos")
     noise = sosfiltfilt(band, rng.normal(size=num_samples))
     phase = 2 * np.pi * np.arange(num_samples) / (4 * SAMPLE_RATE_HZ)
     strength = np.maximum(0, np.sin(phase)) + 0.6 * np.maximum(0, -np.sin(phase)) ** 2
-    return _at_level(noise * strength)
+    return _normalize(noise * strength)
 
 
 SOUNDS: dict[str, Callable[[float], Samples]] = {
     "music": music,
-    "noise": wandering_noise,
+    "noise": varying_noise,
     "keyboard": keyboard,
     "breathing": breathing,
 }
 
 
-def _mixed(samples: Samples, sound: NDArray[np.floating], below_db: float) -> Samples:
+def _mix(samples: Samples, sound: NDArray[np.floating], below_db: float) -> Samples:
     gain = np.sqrt(np.mean(samples.astype(np.float64) ** 2) / np.mean(sound**2))
-    return _clipped(samples + gain * 10 ** (-below_db / 20) * sound)
+    return _clip_to_full_scale(samples + gain * 10 ** (-below_db / 20) * sound)
 
 
-def _at_level(sound: NDArray[np.float64]) -> Samples:
-    """Scale to -26 dB of full scale, the level of speech near a microphone."""
-    return _clipped(sound / np.sqrt(np.mean(sound**2)) * 0.05)
+def _normalize(sound: NDArray[np.float64]) -> Samples:
+    """Scale to -26 dB full scale, the level of speech near a microphone."""
+    return _clip_to_full_scale(sound / np.sqrt(np.mean(sound**2)) * 0.05)
 
 
-def _clipped(sound: NDArray[np.floating]) -> Samples:
+def _clip_to_full_scale(sound: NDArray[np.floating]) -> Samples:
     clipped: Samples = np.clip(sound, -1.0, 1.0).astype(np.float32)
     return clipped

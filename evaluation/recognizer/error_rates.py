@@ -1,20 +1,18 @@
-"""Error rates, delays, confusions and cost of the recognizer.
+"""Error rates, delays, confusions and CPU cost of the recognizer.
 
-Measured for offline decoding (full traceback) and for the live output rule (Li et al. 2011, eq. 4)
-with several N and confidences:
+Measured for offline decoding and for the live output rule (Li et al. 2011, eq. 4) with several
+parameters:
 
-- phone error rate (insertions + deletions + substitutions per reference phone, silence not
-  counted), by speaker, with a bootstrap interval over speakers;
-- viseme error rate: phones as mouth shapes (Li 2011, table 1), compound vowels split, equal
-  neighbours counted once because the mouth does not move between them;
-- emission delay: media time when a phone is first emitted, minus its true onset by forced
-  alignment;
-- CPU seconds per second of sound, by stage.
+- phone error rate: insertions, deletions and substitutions per reference phone, without silence, by
+  speaker, with a bootstrap interval over speakers;
+- viseme error rate: the same for mouth shapes (Li 2011, table 1). Compound vowels are split. Equal
+  neighbors count once, because the mouth does not move between them;
+- emission delay: media time when a phone is first emitted, minus its onset by forced alignment;
+- CPU seconds per second of audio, by stage.
 
-A live recognizer has two hypotheses. The first hypothesis holds each phone as it was first emitted:
-by the rule or, unlike in the paper, along with the next phone. The final hypothesis holds the
-corrected phones. Every recording is a session of its own, so the live mean starts from the prior
-each time.
+A live recognizer has two hypotheses. The first hypothesis holds each phone as first emitted, by the
+rule or, unlike in the paper, along with the next phone. The final hypothesis holds the corrected
+phones. Every recording is a separate session, so the live mean starts from the prior each time.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from kouxing.corpora.scoring import (
     first_hypothesis,
     matched_pairs,
 )
-from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus
+from kouxing.corpora.speech_corpus import RowErrors, Utterance, read_corpus, syllables_of
 from kouxing.evaluation.recognizer.confusions import Confusions
 from kouxing.evaluation.recognizer.cost import CHUNK_SAMPLES, cpu_by_stage
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
@@ -50,25 +48,27 @@ from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone
 from kouxing.shared.phones.inventory import PhoneInventory
 
-Rule = tuple[int, float]  # N, and the confidence that a frame needs
-# The paper's rule, and confident frames only.
-RULES: tuple[Rule, ...] = ((1, 0.0), (3, 0.0), (5, 0.0), (3, 0.95), (3, 0.99), (1, 0.98))
+# The paper's rule, and rules that use only confident frames.
+RULES = tuple(
+    OutputRuleConfig(*parameters)
+    for parameters in ((1, 0.0), (3, 0.0), (5, 0.0), (3, 0.95), (3, 0.99), (1, 0.98))
+)
 _NUM_RESAMPLES = 2000
 
 
 @dataclass(slots=True, kw_only=True)
 class Score:
-    """Errors and delays of one output on all recordings; live, of its first hypothesis."""
+    """Errors and delays of one output on all recordings. Counts are by speaker."""
 
     name: str
-    phones: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
-    visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # by speaker
-    final_phones: dict[str, ErrorCounts] = field(default_factory=dict)  # of the final hypothesis
-    final_visemes: dict[str, ErrorCounts] = field(default_factory=dict)  # likewise
+    phones: dict[str, ErrorCounts] = field(default_factory=dict)  # live: of the first hypothesis
+    visemes: dict[str, ErrorCounts] = field(default_factory=dict)
+    final_phones: dict[str, ErrorCounts] = field(default_factory=dict)
+    final_visemes: dict[str, ErrorCounts] = field(default_factory=dict)
     delays_s: list[float] = field(default_factory=list)
 
     def summary(self, rng: np.random.Generator) -> dict[str, object]:
-        """Rates, intervals and delay percentiles, for a JSON file."""
+        """Return rates, intervals and delay percentiles for a JSON file."""
         out: dict[str, object] = {"output": self.name}
         measures = {
             "phone": self.phones,
@@ -94,7 +94,7 @@ class Score:
 
 
 def mouth_shapes(phones: Iterable[str], inventory: PhoneInventory) -> list[str]:
-    """Shapes that the mouth goes through (Li 2011, table 1), equal neighbours once."""
+    """Return the shapes that the mouth goes through (Li 2011, table 1), equal neighbors once."""
     shapes = [
         viseme
         for phone in phones
@@ -107,9 +107,9 @@ def mouth_shapes(phones: Iterable[str], inventory: PhoneInventory) -> list[str]:
 def bootstrap_interval(
     by_speaker: Sequence[ErrorCounts], rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """95 % interval of the error rate when speakers are resampled (Efron 1979).
+    """Return the 95 % interval of the error rate over resampled speakers (Efron 1979).
 
-    None for a single speaker, who tells nothing about others.
+    None for a single speaker.
     """
     if len(by_speaker) < 2:
         return None
@@ -125,10 +125,10 @@ def evaluate_recognizer(
     model: AcousticModel,
     corpus: Path,
     split: str,
+    default_rule: OutputRuleConfig,
     *,
     audio: Path | None = None,
-    rules: Sequence[Rule] = RULES,
-    own_rule: Rule,
+    rules: Sequence[OutputRuleConfig] = RULES,
 ) -> dict[str, object]:
     """Measure a model on one split of a corpus.
 
@@ -137,48 +137,48 @@ def evaluate_recognizer(
     model
         The acoustic model.
     corpus, audio
-        A corpus folder, or a manifest and the folder of its recordings, in the model's language,
-        as :func:`kouxing.corpora.speech_corpus.read_corpus` reads them.
+        A corpus folder, or a manifest and the folder of its recordings, in the model's language
+        (:func:`kouxing.corpora.speech_corpus.read_corpus`).
     split
-        Its split, such as ``dev`` or ``test``.
+        Split of the corpus, such as ``dev`` or ``test``.
+    default_rule
+        The recognizer's default output rule with this model. Its score is the last one.
     rules
-        Output rules to try.
-    own_rule
-        The one that the recognizer has with this model; it comes last.
+        Other output rules to try.
 
     Returns
     -------
     dict
-        Figures for a JSON file. ``confusions`` counts reference phones (rows) against recognised
-        phones (columns) of offline decoding, in the order of ``phones``; the row of ``silence``
-        counts insertions, its column deletions. ``labials`` has the consonants made at the lips by
-        output. Rows that could not be used are in ``bad_rows``.
+        Figures for a JSON file. ``confusions`` counts reference phones (rows) against phones of
+        offline decoding (columns), in the order of ``phones``. ``labials`` has the consonants made
+        with the lips. ``bad_rows`` lists rows that could not be used.
 
     Raises
     ------
     UserError
-        If there is no such corpus, or no usable recording in the split.
+        If the corpus does not exist, or the split has no usable recording.
     """
     inventory = model.inventory
     errors = RowErrors()
     utterances = read_corpus(corpus, errors, inventory, split=split, audio=audio)
-    rules = [*(rule for rule in rules if rule != own_rule), own_rule]
-    offline = Score(name="full traceback")
+    rules = [*(rule for rule in rules if rule != default_rule), default_rule]
+    offline = Score(name="offline decoding")
     live = [Score(name=_rule_name(rule)) for rule in rules]
     confusions = {output: Confusions(inventory) for output in ("offline", "first", "final")}
     used: list[Utterance] = []
     seconds = 0.0
-    for utterance in track(utterances, description=f"recognising {split}"):
+    for utterance in track(utterances, description=f"recognizing {split}"):
         try:
             samples = read_audio(utterance.path)
-            truth = _align(model, utterance, samples)
+            syllables = syllables_of(utterance, inventory)
+            truth = spoken(align_phones(model, samples, SAMPLE_RATE_HZ, syllables), inventory)
         except (UserError, ValueError) as error:
             errors.add(utterance.utterance_id, str(error))
             continue
         used.append(utterance)
         seconds += len(samples) / SAMPLE_RATE_HZ
         reference = _Reference(truth, utterance.speaker, inventory)
-        scored = _scores(model, samples)
+        scored = _score(model, samples)
         decoded = decode_offline(model, (event for _, events in scored for event in events))
         recognized = spoken(decoded, inventory)
         reference.count(recognized, offline.phones, offline.visemes)
@@ -189,13 +189,12 @@ def evaluate_recognizer(
             reference.count(output.first, score.phones, score.visemes)
             reference.count(output.final, score.final_phones, score.final_visemes)
             score.delays_s += reference.delays_s(output)
-        for name, hypothesis in (
-            ("offline", recognized), ("first", output.first), ("final", output.final)
-        ):  # fmt: skip
-            confusions[name].add(reference.phones, [phone.symbol for phone in hypothesis])
+        hypotheses = {"offline": recognized, "first": output.first, "final": output.final}
+        for name, phones in hypotheses.items():
+            confusions[name].add(reference.phones, [phone.symbol for phone in phones])
     if not used:
         raise UserError(
-            f"{corpus} has no usable recordings in the split {split!r}; name another split"
+            f"{corpus} has no usable recordings in the split {split!r}; choose another split"
             + "".join(f"\n{message}" for message in errors.messages[:5])
         )
     rng = np.random.default_rng(0)
@@ -208,7 +207,7 @@ def evaluate_recognizer(
         "bad_rows": errors.messages,
         "scores": [score.summary(rng) for score in (offline, *live)],
         "most_confused": confusions["offline"].most_frequent(),
-        "labials": {output: counted.at_lips() for output, counted in confusions.items()},
+        "labials": {output: counted.labials() for output, counted in confusions.items()},
         "phones": list(inventory.phones),
         "silence": inventory.silence,
         "confusions": confusions["offline"].counts.tolist(),
@@ -216,22 +215,15 @@ def evaluate_recognizer(
     }
 
 
-def _rule_name(rule: tuple[int, float]) -> str:
-    num_stable_frames, min_confidence = rule
-    return f"N = {num_stable_frames}" + (f", conf. {min_confidence}" if min_confidence else "")
+def _rule_name(rule: OutputRuleConfig) -> str:
+    confidence = f", conf. {rule.min_confidence}" if rule.min_confidence else ""
+    return f"N = {rule.num_stable_frames}{confidence}"
 
 
-def _align(model: AcousticModel, utterance: Utterance, samples: NDArray[np.float32]) -> list[Phone]:
-    """Find the true onsets of the utterance's phones."""
-    phones = iter(model.inventory.phones[phone] for phone in utterance.phones)
-    syllables = [tuple(next(phones) for _ in range(length)) for length in utterance.syllables]
-    return spoken(align_phones(model, samples, SAMPLE_RATE_HZ, syllables), model.inventory)
-
-
-def _scores(
+def _score(
     model: AcousticModel, samples: NDArray[np.float32]
 ) -> list[tuple[float, list[ScoreEvent]]]:
-    """Score a recording as it arrives: media time in seconds, and the new events by then."""
+    """Score a recording live; return media time in seconds and the new events, by chunk."""
     scorer = SpeechScorer(model)
     scored = []
     for start in range(0, len(samples), CHUNK_SAMPLES):
@@ -246,25 +238,25 @@ def _scores(
 
 @dataclass(slots=True)
 class _LiveOutput:
-    """Output of a live recognizer."""
-
     first: list[Phone] = field(default_factory=list)
-    emitted_s: list[float] = field(default_factory=list)  # media time, of each of ``first``
+    emitted_s: list[float] = field(default_factory=list)  # media time of each of ``first``
     final: list[Phone] = field(default_factory=list)
 
 
 def _decode_live(
-    model: AcousticModel, scored: Sequence[tuple[float, list[ScoreEvent]]], rule: Rule
+    model: AcousticModel,
+    scored: Sequence[tuple[float, list[ScoreEvent]]],
+    rule: OutputRuleConfig,
 ) -> _LiveOutput:
-    decoder = LiveDecoder(model.topology, OutputRuleConfig(*rule))
+    decoder = LiveDecoder(model.topology, rule)
     output = _LiveOutput()
     known: set[int] = set()
     for time_s, scores in scored:
         events = decoder.decode(scores)
         output.final += spoken(final_hypothesis(events), model.inventory)
-        new = spoken(first_hypothesis(events, known), model.inventory)
-        output.first += new
-        output.emitted_s += [time_s] * len(new)
+        first = spoken(first_hypothesis(events, known), model.inventory)
+        output.first += first
+        output.emitted_s += [time_s] * len(first)
     return output
 
 
@@ -284,7 +276,7 @@ class _Reference:
         phones: dict[str, ErrorCounts],
         visemes: dict[str, ErrorCounts],
     ) -> None:
-        """Add the errors of recognised phones to the speaker's counts."""
+        """Add the errors of recognized phones to the speaker's counts."""
         symbols = [phone.symbol for phone in recognized]
         shapes = mouth_shapes(symbols, self._inventory)
         for counts, new in (
@@ -294,7 +286,7 @@ class _Reference:
             counts[self._speaker] = counts.get(self._speaker, ErrorCounts()) + new
 
     def delays_s(self, output: _LiveOutput) -> list[float]:
-        """Emission delays of the phones that are correct in the first hypothesis."""
+        """Return the emission delays of phones that are right in the first hypothesis."""
         symbols = [phone.symbol for phone in output.first]
         return [
             output.emitted_s[j] - self._truth[i].onset_s

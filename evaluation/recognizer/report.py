@@ -1,4 +1,4 @@
-"""The recognizer's figures as tables."""
+"""Print the recognizer's figures as tables."""
 
 from __future__ import annotations
 
@@ -9,18 +9,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-Figures = Mapping[str, Any]  # of evaluation.recognizer.error_rates.evaluate_recognizer
+Figures = Mapping[str, Any]  # result of evaluate_recognizer
 
 
 def print_figures(results: Mapping[str, Figures], console: Console) -> None:
     """Print the tables of each model, then all models side by side, then bad rows.
 
-    Parameters
-    ----------
-    results
-        The figures by the model's name.
-    console
-        Where to print.
+    ``results`` has the figures by the name of the model.
     """
     for name, figures in results.items():
         console.rule(name)
@@ -30,7 +25,7 @@ def print_figures(results: Mapping[str, Figures], console: Console) -> None:
         console.print(_labials(figures))
         cost = figures["cpu_per_audio_second"]
         parts = ", ".join(f"{stage} {seconds:.4f}" for stage, seconds in cost.items())
-        console.print(f"CPU seconds per second of sound: {parts}; all {sum(cost.values()):.4f}")
+        console.print(f"CPU seconds per second of audio: {parts}; total {sum(cost.values()):.4f}")
     if len(results) > 1:
         console.print(_side_by_side(results))
     messages = dict.fromkeys(line for figures in results.values() for line in figures["bad_rows"])
@@ -86,7 +81,7 @@ def _speakers(figures: Figures) -> Table:
 
 
 def _labials(figures: Figures) -> Table:
-    columns = ("recall", "precision", "recognised as d t n g k h", "d t n g k h spoken")
+    columns = ("recall", "precision", "recognized as d t n g k h", "d t n g k h spoken")
     table = _table("p, b, m and f, %", ("output", *columns))
     for output, fractions in figures["labials"].items():
         table.add_row(output, *map(percent, fractions.values()))
@@ -94,7 +89,7 @@ def _labials(figures: Figures) -> Table:
 
 
 def _side_by_side(results: Mapping[str, Figures]) -> Table:
-    """Offline decoding, and both hypotheses of the recognizer's own output rule."""
+    """Compare offline decoding and both hypotheses of the default output rule."""
     columns = ("offline", "first hypothesis", "final hypothesis", "delay p50 / p95 ms")
     table = _table("phone / viseme error %", ("model", *columns))
     for name, figures in results.items():
@@ -111,7 +106,7 @@ def _table(title: str, columns: Iterable[str]) -> Table:
 
 
 def percent(rate: float | None) -> str:
-    """Write a rate as a table shows it; None is no rate."""
+    """Format a rate for a table."""
     return "-" if rate is None else f"{100 * rate:.1f}"
 
 

@@ -1,7 +1,4 @@
-"""Robustness: errors in disturbed speech, and phones recognised in sounds without speech.
-
-Both come from :mod:`kouxing.evaluation.recognizer.disturbances`.
-"""
+"""Robustness: errors in disturbed speech, and phones recognized in sounds without speech."""
 
 from __future__ import annotations
 
@@ -9,8 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -23,10 +18,10 @@ from kouxing.evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
     Samples,
+    add_sound,
     babble,
-    with_sound,
 )
-from kouxing.evaluation.recognizer.error_rates import Rule, mouth_shapes
+from kouxing.evaluation.recognizer.error_rates import mouth_shapes
 from kouxing.evaluation.recognizer.report import percent
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.alignment import spoken
@@ -38,9 +33,9 @@ from kouxing.services.recognizer.speech_scorer import score_recording
 from kouxing.shared.phones.inventory import PhoneInventory
 
 _SOUND_S = 60.0
-_OTHER_RECORDINGS = 40  # of another language
-_OUTPUTS = {  # key in the figures, column of the table
-    "offline": "full traceback",
+_MAX_OTHER_RECORDINGS = 40
+_OUTPUTS = {  # key of the figures: title of the column
+    "offline": "offline decoding",
     "first_hypothesis": "first hypothesis",
     "final_hypothesis": "final hypothesis",
 }
@@ -50,9 +45,9 @@ def evaluate_robustness(
     model: AcousticModel,
     corpus: Path,
     split: str,
+    rule: OutputRuleConfig,
     *,
     audio: Path | None = None,
-    own_rule: Rule,
     other_language: Path | None = None,
 ) -> dict[str, Any]:
     """Measure a model on disturbed speech and on sounds without its language.
@@ -62,27 +57,25 @@ def evaluate_robustness(
     model
         The acoustic model.
     corpus, audio
-        A corpus folder, or a manifest and the folder of its recordings, in the model's language,
-        as :func:`kouxing.corpora.speech_corpus.read_corpus` reads them.
+        A corpus folder, or a manifest and the folder of its recordings, in the model's language.
     split
-        Its split, such as ``dev`` or ``test``.
-    own_rule
-        Output rule that the recognizer has with this model.
+        Split of the corpus, such as ``dev`` or ``test``.
+    rule
+        The recognizer's output rule.
     other_language
         Folder of recordings in another language, of which forty are used.
 
     Returns
     -------
     dict
-        ``speech``: by condition and output (offline decoding with the full traceback, first and
-        final hypothesis) the phone and viseme error rates, and ``labials``
-        (:meth:`evaluation.recognizer.confusions.Confusions.at_lips`); ``sounds``: phones per minute
-        by sound.
+        ``speech``: phone and viseme error rates and ``labials``
+        (:meth:`kouxing.evaluation.recognizer.confusions.Confusions.labials`) by condition and
+        output. ``sounds``: phones per minute by sound.
 
     Raises
     ------
     UserError
-        If there is no such corpus, no usable recording in the split or in the other folder.
+        If a folder does not exist or has no usable recording.
     """
     phones = model.inventory.phones
     errors = RowErrors()
@@ -95,24 +88,24 @@ def evaluate_robustness(
     voices = babble([samples for _, samples in recordings])
     conditions: dict[str, Callable[[Samples], Samples]] = {
         **SPEECH_CONDITIONS,
-        "babble 10 dB below": lambda samples: with_sound(samples, voices, 10),
+        "babble 10 dB below": lambda samples: add_sound(samples, voices, 10),
     }
     speech = {}
-    for name, disturbed in track(conditions.items(), description="disturbed speech"):
+    for name, disturb in track(conditions.items(), description="disturbed speech"):
         tallies = {output: _Tally(model.inventory) for output in _OUTPUTS}
         for reference, samples in recordings:
-            for output, recognized in _outputs(model, disturbed(samples), own_rule).items():
+            for output, recognized in _recognize(model, disturb(samples), rule).items():
                 tallies[output].add(reference, recognized)
         speech[name] = {output: tally.rates() for output, tally in tallies.items()}
     sounds = {name: [make(_SOUND_S)] for name, make in SOUNDS.items()}
     if other_language is not None:
-        sounds["other language"] = recordings_in(other_language)
-    rates = {name: _phones_per_minute(model, each, own_rule) for name, each in sounds.items()}
+        sounds["other language"] = read_recordings(other_language)
+    rates = {name: _phones_per_minute(model, each, rule) for name, each in sounds.items()}
     return {"split": split, "recordings": len(recordings), "speech": speech, "sounds": rates}
 
 
 class _Tally:
-    """Errors of one output under one condition."""
+    """Errors of one output in one condition."""
 
     def __init__(self, inventory: PhoneInventory) -> None:
         self._inventory = inventory
@@ -122,7 +115,7 @@ class _Tally:
     def add(self, reference: Sequence[str], recognized: Sequence[str]) -> None:
         self._phones += count_errors(reference, recognized)
         self._visemes += count_errors(
-            *(mouth_shapes(phones, self._inventory) for phones in (reference, recognized))
+            mouth_shapes(reference, self._inventory), mouth_shapes(recognized, self._inventory)
         )
         self._confusions.add(reference, recognized)
 
@@ -130,12 +123,12 @@ class _Tally:
         return {
             "phone_error_rate": self._phones.rate,
             "viseme_error_rate": self._visemes.rate,
-            "labials": self._confusions.at_lips(),
+            "labials": self._confusions.labials(),
         }
 
 
 def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> None:
-    """Print the figures of several models as two tables."""
+    """Print two tables for each model."""
     for name, figures in results.items():
         title = f"{name}, {figures['split']}: phone / viseme error %"
         labials = "p, b, m, f in the final hypothesis, recall / precision %"
@@ -157,12 +150,12 @@ def print_robustness(results: dict[str, dict[str, Any]], console: Console) -> No
         console.print(table)
 
 
-def _outputs(
-    model: AcousticModel, samples: NDArray[np.float32], rule: Rule
+def _recognize(
+    model: AcousticModel, samples: Samples, rule: OutputRuleConfig
 ) -> dict[str, list[str]]:
-    """Recognise a recording offline and live; return the phones of each of ``_OUTPUTS``."""
+    """Return the phones of a recording in each of ``_OUTPUTS``."""
     scores = score_recording(model, samples, SAMPLE_RATE_HZ)
-    events = LiveDecoder(model.topology, OutputRuleConfig(*rule)).decode(scores)
+    events = LiveDecoder(model.topology, rule).decode(scores)
     outputs = {
         "offline": decode_offline(model, scores),
         "first_hypothesis": first_hypothesis(events, set()),
@@ -175,19 +168,19 @@ def _outputs(
 
 
 def _phones_per_minute(
-    model: AcousticModel, sounds: Sequence[NDArray[np.float32]], rule: Rule
+    model: AcousticModel, sounds: Sequence[Samples], rule: OutputRuleConfig
 ) -> float:
     minutes = sum(len(samples) for samples in sounds) / SAMPLE_RATE_HZ / 60
     num_phones = 0
     for samples in sounds:
         scores = score_recording(model, samples, SAMPLE_RATE_HZ)
-        events = LiveDecoder(model.topology, OutputRuleConfig(*rule)).decode(scores)
+        events = LiveDecoder(model.topology, rule).decode(scores)
         num_phones += len(spoken(final_hypothesis(events), model.inventory))
     return num_phones / minutes
 
 
-def recordings_in(folder: Path) -> list[NDArray[np.float32]]:
-    """Read some of the recordings in a folder, evenly spread; UserError if there is none."""
-    found = audio_files(folder)
-    step = max(1, len(found) // _OTHER_RECORDINGS)
-    return [read_audio(path) for path in found[::step][:_OTHER_RECORDINGS]]
+def read_recordings(folder: Path) -> list[Samples]:
+    """Read up to forty recordings of a folder, evenly spread; raises UserError if it has none."""
+    paths = audio_files(folder)
+    step = max(1, len(paths) // _MAX_OTHER_RECORDINGS)
+    return [read_audio(path) for path in paths[::step][:_MAX_OTHER_RECORDINGS]]

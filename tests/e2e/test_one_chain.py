@@ -13,7 +13,7 @@ import pytest
 from kouxing_client import Client
 from numpy.typing import NDArray
 
-from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, hear, live_scheme
+from kouxing.evaluation.lips.schemes import DEFAULT_DELAY_S, live_scheme, recognize_clip
 from kouxing.services.live_chain import LiveChain
 from kouxing.services.recognizer.acoustic.load import load_live_model
 from kouxing.services.recognizer.config import RecognizerConfig
@@ -205,7 +205,8 @@ def test_evaluation_scores_the_mouth_of_the_chain() -> None:
     chain = LiveChain(load_live_model(), LIPS, synthesizer=SynthesizerConfig(expressiveness=1.0))
     frames = chain.accept_waveform(samples) + chain.input_finished()
     clip = replace(clip_of(np.zeros(1), np.zeros((1, len(MOUTH_FAPS)))), samples=samples)
-    scored = live_scheme("lips", LIPS, DEFAULT_DELAY_S).frames(hear(load_live_model(), clip, None))
+    scheme = live_scheme("lips", LIPS, DEFAULT_DELAY_S)
+    scored = scheme.frames(recognize_clip(load_live_model(), clip, None))
     assert scored is not None
     np.testing.assert_array_equal(scored[:, MOUTH], np.array([faps[MOUTH] for _, faps in frames]))
     assert scored[:, MOUTH].any()

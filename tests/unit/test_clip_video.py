@@ -1,4 +1,4 @@
-"""A tracked clip as a video, beside what the lip models make of its sound."""
+"""A video of a tracked clip next to the lip models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.lips import JAW, WIDTH, clip_of
 pytestmark = pytest.mark.unit
 
 
-def test_tracked_lips_at_the_frames_of_the_face() -> None:
+def test_interpolates_tracked_lips() -> None:
     faps = np.full((3, len(MOUTH_FAPS)), np.nan)
     faps[:, JAW] = 0.0, np.nan, 100.0
     frames = tracked_frames(clip_of(np.array([0.0, 0.1, 0.2]), faps), np.array([0.05, 0.1, 0.9]))
@@ -30,7 +30,7 @@ def test_tracked_lips_at_the_frames_of_the_face() -> None:
     assert frames[0, [5, 52]].tolist() == [-50.0, -50.0], "outer lips follow the inner ones"
 
 
-def test_the_tracked_face_is_the_last_one(tmp_path: Path) -> None:
+def test_the_last_face_has_the_tracked_lips(tmp_path: Path) -> None:
     (tmp_path / "one.json").write_text(json.dumps({"language": "en", "licence": "MIT"}))
     (tmp_path / "one.csv").write_text("t,F3_open_jaw,F5_raise_b_midlip\n0,500,-900\n")
     soundfile.write(tmp_path / "one.flac", np.zeros(1600), 16_000)
@@ -42,5 +42,5 @@ def test_the_tracked_face_is_the_last_one(tmp_path: Path) -> None:
     assert np.abs(learnt - visemes).max() < 60, "both are silent"
     assert np.abs(learnt - ferguson).max() < 60, "both are silent"
     assert np.abs(learnt - tracked).max() > 120
-    with pytest.raises(UserError, match="there is no clip two"):
+    with pytest.raises(UserError, match="no clip is named two"):
         film_clip(tmp_path, "two", tmp_path / "two.mp4")

@@ -1,4 +1,4 @@
-"""The experiment of the paper: which sentences, what is measured, and one small run."""
+"""The four schemes of Li et al. 2011: sentences, measures and one small run."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ from typer.testing import CliRunner
 
 from kouxing.corpora.speech_corpus import Utterance
 from kouxing.evaluation.commands import app
-from kouxing.evaluation.lips.four_schemes import Condition, Hearing, events_told, listeners_of
+from kouxing.evaluation.lips.four_schemes import (
+    Condition,
+    RecognizerOutput,
+    face_input,
+    load_recognizers,
+)
 from kouxing.evaluation.lips.measures import rms_jerk
-from kouxing.evaluation.lips.paper_rule import as_emitted, once_the_next_is_emitted
-from kouxing.evaluation.lips.scheme_report import sentence
-from kouxing.evaluation.lips.scheme_scores import Order, falls, first_told
-from kouxing.evaluation.lips.schemes import once_the_next_begins
+from kouxing.evaluation.lips.paper_rule import delay_by_one_phone, without_corrections
+from kouxing.evaluation.lips.scheme_report import describe
+from kouxing.evaluation.lips.scheme_scores import Order, first_hypotheses, is_decreasing
+from kouxing.evaluation.lips.schemes import drop_first_hypotheses
 from kouxing.evaluation.lips.sentences import choose
 from kouxing.evaluation.mos.commands import app as mos
 from kouxing.services.driver.video import film
@@ -42,10 +47,10 @@ def test_jerk_is_the_third_derivative() -> None:
     assert rms_jerk([np.zeros(3)], 50.0) is None
 
 
-def test_an_order_holds_only_if_every_scheme_is_worse_than_the_one_before() -> None:
-    assert falls(np.array([1.0, 0.8, 0.7, 0.6]))
-    assert not falls(np.array([1.0, 0.8, 0.8, 0.6]))
-    assert not falls(np.array([1.0, 0.7, 0.8, 0.6]))
+def test_an_order_holds_if_every_scheme_is_worse_than_the_one_before() -> None:
+    assert is_decreasing(np.array([1.0, 0.8, 0.7, 0.6]))
+    assert not is_decreasing(np.array([1.0, 0.8, 0.8, 0.6]))
+    assert not is_decreasing(np.array([1.0, 0.7, 0.8, 0.6]))
     order = Order(
         lips="learnt",
         recognizer="blocks",
@@ -55,14 +60,14 @@ def test_an_order_holds_only_if_every_scheme_is_worse_than_the_one_before() -> N
         holds=False,
         num_holding=7,
     )
-    assert sentence(order) == (
+    assert describe(order) == (
         "learnt, blocks, opening against scheme 1 (1.00 0.90 0.75 0.80): 1 > 2 > 3 > 4 does not "
         "hold, in 7 of 20 sentences; live costs +0.25, waiting for the next phone -0.05"
     )
 
 
-def test_a_phone_is_told_when_it_comes_first() -> None:
-    told = first_told(
+def test_times_the_first_hypothesis_of_each_phone() -> None:
+    told = first_hypotheses(
         [
             Progress(time_s=0.02, level_db=-20.0),
             phone(0, "b", 0.0, final=False),
@@ -113,8 +118,8 @@ def told_phones(events: list[SoundEvent]) -> list[tuple[str, float, float]]:
     return [(event.symbol, event.onset_s, event.duration_s) for event in found]
 
 
-def test_by_the_papers_rule_nothing_is_corrected() -> None:
-    told = as_emitted(LIVE)
+def test_the_papers_rule_corrects_nothing() -> None:
+    told = without_corrections(LIVE)
     assert told_phones(told) == [
         ("b", 0.0, 0.1),
         ("a", 0.06, 0.13),
@@ -124,8 +129,8 @@ def test_by_the_papers_rule_nothing_is_corrected() -> None:
     assert told.index(Progress(time_s=0.12, level_db=-20.0)) == 5, "i comes after it"
 
 
-def test_by_the_papers_rule_a_phone_waits_for_the_next_and_has_its_duration() -> None:
-    told = once_the_next_is_emitted(LIVE)
+def test_scheme_4_delays_each_phone_by_one() -> None:
+    told = delay_by_one_phone(LIVE)
     assert told_phones(told) == [("b", 0.0, 0.06), ("d", 0.13, 0.07)]
     assert told[1:3] == [
         phone(0, "b", 0.0, 0.06, final=False),
@@ -134,23 +139,25 @@ def test_by_the_papers_rule_a_phone_waits_for_the_next_and_has_its_duration() ->
     assert isinstance(told[-1], SpeechChange)
 
 
-def test_the_papers_rule_is_three_frames_of_any_confidence() -> None:
-    (listener,) = listeners_of(["gmm"], has_paper_rule=True)
+def test_the_papers_rule_uses_three_frames_of_any_confidence() -> None:
+    (listener,) = load_recognizers(["gmm"], has_paper_rule=True)
     assert listener.name == "gmm-paper"
     config = listener.config
     assert (config.acoustic, config.num_stable_frames, config.min_confidence) == ("gmm", 3, 0.0)
 
 
-def test_live_schemes_are_told_by_the_listeners_rule() -> None:
+def test_live_schemes_use_the_recognizers_rule() -> None:
     lips = "dynamic-visemes"
     nothing = AnalyzedRecording(duration_s=0.0, events=[], is_text_known=False)
     for has_paper_rule, live, next_phone in (
-        (True, as_emitted(LIVE), once_the_next_is_emitted(LIVE)),
-        (False, LIVE, once_the_next_begins(LIVE)),
+        (True, without_corrections(LIVE), delay_by_one_phone(LIVE)),
+        (False, LIVE, drop_first_hypotheses(LIVE)),
     ):
-        hearing = Hearing(nothing, {lip_model_info(lips).delay_ms / 1e3: LIVE}, has_paper_rule)
-        assert events_told(Condition(3, lips, "gmm"), hearing) == live
-        assert events_told(Condition(4, lips, "gmm"), hearing) == next_phone
+        hearing = RecognizerOutput(
+            nothing, {lip_model_info(lips).delay_ms / 1e3: LIVE}, has_paper_rule
+        )
+        assert face_input(Condition(3, lips, "gmm"), output) == live
+        assert face_input(Condition(4, lips, "gmm"), output) == next_phone
 
 
 def utterance(name: str, speaker: str, seconds: float) -> Utterance:
@@ -167,7 +174,7 @@ def utterance(name: str, speaker: str, seconds: float) -> Utterance:
     )
 
 
-def test_sentences_are_of_all_speakers_and_near_4_s() -> None:
+def test_chooses_sentences_of_all_speakers_near_4_s() -> None:
     found = [
         utterance("a-long", "A", 9.0),
         utterance("a-usual", "A", 4.1),
@@ -179,7 +186,7 @@ def test_sentences_are_of_all_speakers_and_near_4_s() -> None:
     assert len(choose(found)) == 4
 
 
-def test_a_small_run_of_the_command(tmp_path: Path) -> None:
+def test_the_command_scores_and_films_a_sentence(tmp_path: Path) -> None:
     samples, rate_hz = soundfile.read(DEMO / "hello-female.wav", frames=11_200)
     soundfile.write(tmp_path / "hello.wav", samples, rate_hz)
     (tmp_path / "manifest.tsv").write_text(
@@ -224,7 +231,7 @@ def write_clip(folder: Path, name: str, transcript: str) -> None:
     (folder / f"{name}.csv").write_text("t,F4_lower_t_midlip,F5_raise_b_midlip\n" + rows)
 
 
-def test_videos_of_clips_make_a_listening_test(
+def test_videos_of_clips_form_a_listening_test(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clips, videos = tmp_path / "clips", tmp_path / "videos"

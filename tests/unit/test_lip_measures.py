@@ -1,23 +1,23 @@
-"""Figures of made-up curves whose answers are known."""
+"""Measures of curves with known results."""
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from kouxing.evaluation.lips.measures import (
-    Hits,
-    Likeness,
+    Detections,
+    Moments,
     best_lag,
     closures,
+    is_closed_at,
     is_near,
-    likeness,
     lip_to_teeth,
     lip_to_teeth_poses,
+    moments,
     offsets,
     openings,
+    real_closed,
     real_closures,
-    real_shut,
-    shut_at,
     turns,
     without_drift,
 )
@@ -35,42 +35,42 @@ def mouth(*closed: tuple[float, float], opening: float = 300.0) -> NDArray[np.fl
     return curve
 
 
-def test_likeness_of_known_curves_adds_up() -> None:
+def test_moments_add_up() -> None:
     real = np.array([0.0, 1.0, 2.0, 3.0])
-    assert likeness(2.0 * real + 7.0, real).correlation == pytest.approx(1.0)
-    assert likeness(-real, real).correlation == pytest.approx(-1.0)
-    assert likeness(np.ones(4), real).correlation is None
+    assert moments(2.0 * real + 7.0, real).correlation == pytest.approx(1.0)
+    assert moments(-real, real).correlation == pytest.approx(-1.0)
+    assert moments(np.ones(4), real).correlation is None
     # a constant offset is no error; the deviations -1.5 to 1.5 are doubled
-    assert likeness(2.0 * real + 7.0, real).rmse == pytest.approx(np.sqrt(1.25))
-    both = likeness(real, real) + likeness(-real, real)
+    assert moments(2.0 * real + 7.0, real).rmse == pytest.approx(np.sqrt(1.25))
+    both = moments(real, real) + moments(-real, real)
     assert both.num_frames == 8
     assert both.correlation == pytest.approx(0.0)
-    assert likeness(np.zeros(0), np.zeros(0)) == Likeness()
+    assert moments(np.zeros(0), np.zeros(0)) == Moments()
     rest = without_drift(np.full(len(TIME_S), -250.0), 50.0)  # all but zero
-    assert likeness(rest, np.sin(TIME_S)).correlation is None
-    assert Likeness().correlation is Likeness().rmse is None
+    assert moments(rest, np.sin(TIME_S)).correlation is None
+    assert Moments().correlation is Moments().rmse is None
 
 
-def test_drift_is_removed_and_speech_stays_in_place() -> None:
+def test_removes_drift_without_delay() -> None:
     drift = 500.0 * np.sin(2.0 * np.pi * 0.1 * TIME_S)
     syllables = np.sin(2.0 * np.pi * 4.0 * TIME_S)
-    found = without_drift(drift + syllables, 50.0)
+    filtered = without_drift(drift + syllables, 50.0)
     middle = slice(50, -50)
-    assert likeness(found[middle], syllables[middle]).correlation == pytest.approx(1.0, abs=0.01)
-    np.testing.assert_allclose(found[middle], syllables[middle], atol=0.15)
+    assert moments(filtered[middle], syllables[middle]).correlation == pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(filtered[middle], syllables[middle], atol=0.15)
     assert np.abs(without_drift(np.full(30, 5.0), 25.0)).max() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_best_lag_is_that_of_a_delayed_curve() -> None:
+def test_finds_the_lag_of_a_delayed_curve() -> None:
     real = np.sin(2.0 * np.pi * TIME_S)
     lags_s = np.arange(-5, 6) / 50.0
-    late = [likeness(np.sin(2.0 * np.pi * (TIME_S + lag_s - 0.06)), real) for lag_s in lags_s]
+    late = [moments(np.sin(2.0 * np.pi * (TIME_S + lag_s - 0.06)), real) for lag_s in lags_s]
     assert best_lag(late, lags_s) == pytest.approx((1.0, 0.06))
     assert best_lag(late[:8], lags_s[:8]) is None  # it may be better still beyond
-    assert best_lag([Likeness()] * len(lags_s), lags_s) is best_lag([], lags_s) is None
+    assert best_lag([Moments()] * len(lags_s), lags_s) is best_lag([], lags_s) is None
 
 
-def test_turns_count_changes_of_direction_but_no_trembling() -> None:
+def test_turns_ignore_trembling() -> None:
     wave = 100.0 * np.sin(2.0 * np.pi * 2.0 * TIME_S)
     assert turns(TIME_S, wave).count == 16  # two a period, four seconds
     assert turns(TIME_S, wave).per_second == pytest.approx(4.0, rel=0.01)
@@ -91,48 +91,48 @@ def test_real_closures_are_minima_near_an_opening() -> None:
     half_shut[50] = 150.0
     np.testing.assert_allclose(real_closures(TIME_S, half_shut), [3.2])
     assert not len(real_closures(TIME_S, np.full(len(TIME_S), np.nan)))
-    assert not len(real_shut(TIME_S, np.full(len(TIME_S), np.nan)))
+    assert not len(real_closed(TIME_S, np.full(len(TIME_S), np.nan)))
 
 
-def test_closures_that_are_missed_and_those_too_many_both_count() -> None:
+def test_counts_missed_and_false_closures() -> None:
     real_s = np.array([0.5, 1.5, 2.5])
     made = mouth((0.54, 0.56), (2.0, 2.1), (2.4, 2.46), (3.5, 3.5))
     hits = closures(real_s, real_s, TIME_S, made)
-    assert hits == Hits(num_real=3, num_met=2, num_made=4, num_true=2)
+    assert hits == Detections(num_real=3, num_met=2, num_made=4, num_true=2)
     assert hits.recall == pytest.approx(2 / 3)
     assert hits.precision == 0.5
     assert hits.f1 == pytest.approx(4 / 7)
-    np.testing.assert_array_equal(shut_at(real_s, TIME_S, made), [True, False, True])
+    np.testing.assert_array_equal(is_closed_at(real_s, TIME_S, made), [True, False, True])
     assert (hits + hits).f1 == hits.f1
-    assert hits + hits == Hits(6, 4, 8, 4)
+    assert hits + hits == Detections(6, 4, 8, 4)
 
 
-def test_a_mouth_that_rests_closes_nothing() -> None:
+def test_a_resting_mouth_has_no_closures() -> None:
     rests = mouth((0.0, 0.5), (1.0, 2.0))
 
-    def closures_at(moment_s: float, opening: NDArray[np.float64]) -> Hits:
+    def closures_at(moment_s: float, opening: NDArray[np.float64]) -> Detections:
         return closures(np.array([moment_s]), np.array([moment_s]), TIME_S, opening)
 
     # the rest at the start is no closure; the other is one, where it touches the open mouth
-    assert closures_at(1.5, rests) == Hits(1, 0, 1, 0)
-    assert closures_at(1.02, rests) == Hits(1, 1, 1, 1)
-    assert closures_at(0.25, np.zeros(len(TIME_S))) == Hits(1, 0, 0, 0)
+    assert closures_at(1.5, rests) == Detections(1, 0, 1, 0)
+    assert closures_at(1.02, rests) == Detections(1, 1, 1, 1)
+    assert closures_at(0.25, np.zeros(len(TIME_S))) == Detections(1, 0, 0, 0)
     never = closures(np.zeros(0), np.zeros(0), TIME_S, mouth())
     assert never.recall is never.precision is never.f1 is None
     # between 20 and 100 units lips neither meet nor open
     assert closures_at(1.0, np.minimum(mouth((1.0, 1.0)), 99.0)).num_made == 0
 
 
-def test_real_lips_close_as_they_do_themselves() -> None:
+def test_real_lips_agree_with_themselves() -> None:
     real = mouth((0.5, 0.52), (1.0, 1.6), (2.0, 2.0), (2.4, 3.6))
-    real_s, shut_s = real_closures(TIME_S, real), real_shut(TIME_S, real)
+    real_s, shut_s = real_closures(TIME_S, real), real_closed(TIME_S, real)
     assert len(shut_s) == 2 + 31 + 1 + 61
-    assert closures(real_s, shut_s, TIME_S, real) == Hits(4, 4, 4, 4)
+    assert closures(real_s, shut_s, TIME_S, real) == Detections(4, 4, 4, 4)
     late = np.interp(TIME_S - 0.2, TIME_S, real)  # too late but in the pauses, which last
-    assert closures(real_s, shut_s, TIME_S, late) == Hits(4, 0, 4, 2)
+    assert closures(real_s, shut_s, TIME_S, late) == Detections(4, 0, 4, 2)
 
 
-def test_the_lip_meets_the_teeth_where_the_upper_lip_is_raised() -> None:
+def test_finds_contacts_of_lip_and_teeth() -> None:
     upper, lower = np.full((2, len(TIME_S)), -60.0)
     lower[TIME_S < 3.9] = -240.0
     bite, shut = np.abs(TIME_S - 1.0) < 0.03, np.abs(TIME_S - 2.0) < 0.03
@@ -141,15 +141,17 @@ def test_the_lip_meets_the_teeth_where_the_upper_lip_is_raised() -> None:
     lower[TIME_S >= 3.9] = -240.0
     np.testing.assert_allclose(lip_to_teeth_poses(TIME_S, upper, lower), [1.0])
     contacts = lip_to_teeth(np.array([1.0]), np.array([1.0]), TIME_S, upper, lower)
-    assert contacts == Hits(1, 1, 1, 1)
-    # what looks so makes a contact true, but need not be met
-    assert lip_to_teeth(np.zeros(0), np.array([1.0]), TIME_S, upper, lower) == Hits(0, 0, 1, 1)
-    assert lip_to_teeth(np.array([2.0]), np.array([2.0]), TIME_S, upper, lower) == Hits(1, 0, 1, 0)
+    assert contacts == Detections(1, 1, 1, 1)
+    # a pose makes a contact true, but need not be reproduced
+    at_1_s, at_2_s = np.array([1.0]), np.array([2.0])
+    contacts = lip_to_teeth(np.zeros(0), at_1_s, TIME_S, upper, lower)
+    assert contacts == Detections(0, 0, 1, 1)
+    assert lip_to_teeth(at_2_s, at_2_s, TIME_S, upper, lower) == Detections(1, 0, 1, 0)
     nothing = np.full(len(TIME_S), np.nan)
     assert not len(lip_to_teeth_poses(TIME_S, nothing, nothing))
 
 
-def test_openings_are_found_whatever_the_range() -> None:
+def test_finds_openings_in_any_range() -> None:
     curve = mouth((0.5, 1.0), (2.0, 2.2))
     # three tenths of the way from the last shut frame to the first open one
     np.testing.assert_allclose(openings(TIME_S, curve), [1.006, 2.206])
@@ -160,7 +162,7 @@ def test_openings_are_found_whatever_the_range() -> None:
     np.testing.assert_allclose(openings(TIME_S, gap), [2.206])
 
 
-def test_offsets_are_those_of_the_nearest() -> None:
+def test_offsets_to_the_nearest_moment() -> None:
     moments_s = np.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose(
         offsets(moments_s, np.array([0.9, 1.2, 3.1]), 0.3), [-0.1, np.nan, 0.1]

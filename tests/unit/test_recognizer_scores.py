@@ -15,6 +15,7 @@ from kouxing.evaluation.recognizer.error_rates import (
 )
 from kouxing.evaluation.recognizer.report import print_figures
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 from kouxing.shared.phones.events import Phone, SpeechChange
 from tests.languages import MANDARIN
@@ -41,7 +42,7 @@ def test_errors(reference: str, recognized: str, errors: tuple[int, int, int]) -
     assert (counts.insertions, counts.deletions, counts.substitutions) == errors
 
 
-def test_the_first_hypothesis_leaves_out_revisions() -> None:
+def test_first_hypothesis_skips_corrections() -> None:
     def emit(index: int, symbol: str, final: bool = False) -> Phone:
         return Phone(
             index=index, symbol=symbol, onset_s=0.0, duration_s=0.1, confidence=1.0, final=final
@@ -66,7 +67,7 @@ def test_rate_and_sum() -> None:
     assert (one + ErrorCounts(reference=10)).rate == 0.3
 
 
-def test_fewest_errors_for_random_strings() -> None:
+def test_aligns_random_strings_with_the_fewest_errors() -> None:
     """Against the recursive definition (Levenshtein 1966)."""
     rng = np.random.default_rng(0)
 
@@ -82,13 +83,13 @@ def test_fewest_errors_for_random_strings() -> None:
         assert sum(i is None or j is None or a[i] != b[j] for i, j in pairs) == distance(a, b)
 
 
-def test_shapes_of_the_mouth() -> None:
+def test_mouth_shapes() -> None:
     assert mouth_shapes(["b", "iao"], MANDARIN) == ["b", "i", "ao"]
-    assert mouth_shapes(["sh", "iii"], MANDARIN) == ["zh"]  # the vowel holds the shape
+    assert mouth_shapes(["sh", "iii"], MANDARIN) == ["zh"]  # the vowel keeps the shape
     assert mouth_shapes(["p", "a", "sil", "m", "ang"], MANDARIN) == ["b", "a", "b", "a"]
 
 
-def test_interval_holds_the_rate_and_closes_for_equal_speakers() -> None:
+def test_bootstrap_interval() -> None:
     rng = np.random.default_rng(0)
     same = [ErrorCounts(substitutions=3, reference=10)] * 5
     assert bootstrap_interval(same, rng) == (0.3, 0.3)
@@ -97,10 +98,10 @@ def test_interval_holds_the_rate_and_closes_for_equal_speakers() -> None:
     assert bounds is not None
     low, high = bounds
     assert 0.2 < low < 0.45 < high < 0.7
-    assert bootstrap_interval(mixed[:1], rng) is None  # one speaker tells nothing about others
+    assert bootstrap_interval(mixed[:1], rng) is None  # one speaker gives no interval
 
 
-def test_confusions_are_ranked() -> None:
+def test_ranks_confusions() -> None:
     confusions = Confusions(MANDARIN)
     for _ in range(99):
         confusions.add(["a"], ["a"])
@@ -112,14 +113,14 @@ def test_confusions_are_ranked() -> None:
     assert second == {"reference": "sil", "recognized": "b", "count": 1}  # an insertion
 
 
-def test_consonants_at_the_lips_have_recall_and_precision() -> None:
+def test_recall_and_precision_of_labials() -> None:
     confusions = Confusions(MANDARIN)
     nothing = dict.fromkeys(("recall", "precision", "as_lingual", "for_lingual"))
-    assert confusions.at_lips() == nothing
+    assert confusions.labials() == nothing
     confusions.add(["p", "a", "m", "i", "f", "u"], ["t", "a", "b", "i", "f", "u"])
     confusions.add(["b", "a"], ["a"])
     confusions.add(["d", "a", "a"], ["b", "a", "m", "a"])
-    assert confusions.at_lips() == {
+    assert confusions.labials() == {
         "recall": 2 / 4,
         "precision": 2 / 4,
         "as_lingual": 1 / 4,  # t
@@ -128,7 +129,7 @@ def test_consonants_at_the_lips_have_recall_and_precision() -> None:
 
 
 @pytest.mark.slow
-def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
+def test_evaluates_a_corpus_with_bad_rows(tmp_path: Path) -> None:
     vowels = VOWELS_FILE
     (tmp_path / "noise.wav").write_bytes(b"no sound")
     rows = [
@@ -142,8 +143,8 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
     ]
     header = "utt_id\tpath\tspeaker\tsplit\tseconds\ttext\tpinyin"
     (tmp_path / "manifest.tsv").write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    rules = [(3, 0.0), (1, 0.7)]
-    results = evaluate_recognizer(load_model(), tmp_path, "test", rules=rules, own_rule=(1, 0.9))
+    default, *rules = (OutputRuleConfig(*each) for each in ((1, 0.9), (3, 0.0), (1, 0.7)))
+    results = evaluate_recognizer(load_model(), tmp_path, "test", default, rules=rules)
     assert results["recordings"] == 1
     assert results["num_bad_rows"] == 5
     json.dumps(results)  # everything is plain
@@ -165,9 +166,9 @@ def test_a_whole_evaluation_with_bad_rows(tmp_path: Path) -> None:
         "broken: cannot read",
         "5 rows skipped",
     )
-    for part in ("full traceback", "by speaker", "p, b, m and f", "CPU seconds", *reasons):
+    for part in ("offline decoding", "by speaker", "p, b, m and f", "CPU seconds", *reasons):
         assert part in text, part
     assert "first hypothesis  final hypothesis" in text  # side by side
     assert text.count("lying") == 1  # once, not once a model
     with pytest.raises(UserError, match="'nothing'"):
-        evaluate_recognizer(load_model(), tmp_path, "nothing", own_rule=(1, 0.9))
+        evaluate_recognizer(load_model(), tmp_path, "nothing", default)

@@ -1,4 +1,4 @@
-"""Disturbances have the stated amount, and the figures count what is recognised."""
+"""Disturbances have the stated amount, and the figures count recognized phones."""
 
 import io
 from pathlib import Path
@@ -11,18 +11,19 @@ from kouxing.evaluation.recognizer import robustness
 from kouxing.evaluation.recognizer.disturbances import (
     SOUNDS,
     SPEECH_CONDITIONS,
+    add_echoes,
+    add_noise,
+    add_sound,
     babble,
-    clipped_at,
-    faster,
-    in_a_room,
-    louder,
+    change_level,
+    change_speed,
+    clip,
+    limit_to_telephone_band,
     pink_noise,
-    telephone,
-    with_noise,
-    with_sound,
 )
 from kouxing.evaluation.recognizer.robustness import evaluate_robustness, print_robustness
 from kouxing.services.recognizer.acoustic.load import load_model
+from kouxing.services.recognizer.search.output_rule import OutputRuleConfig
 from kouxing.shared.errors import UserError
 
 pytestmark = pytest.mark.unit
@@ -41,9 +42,9 @@ def level(samples: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("below_db", [20.0, 10.0, 5.0])
-def test_noise_is_as_loud_as_asked(below_db: float) -> None:
+def test_noise_has_the_requested_level(below_db: float) -> None:
     speech = tone(440)
-    noise = with_noise(speech, below_db) - speech
+    noise = add_noise(speech, below_db) - speech
     assert 20 * np.log10(level(speech) / level(noise)) == pytest.approx(below_db, abs=0.2)
 
 
@@ -55,25 +56,25 @@ def test_pink_noise_has_equal_power_in_every_octave() -> None:
 
 
 @pytest.mark.parametrize(("frequency_hz", "passes"), [(1000, True), (100, False), (6000, False)])
-def test_a_telephone_lets_its_band_through(frequency_hz: float, passes: bool) -> None:
-    share = level(telephone(tone(frequency_hz))) / level(tone(frequency_hz))
+def test_telephone_band(frequency_hz: float, passes: bool) -> None:
+    share = level(limit_to_telephone_band(tone(frequency_hz))) / level(tone(frequency_hz))
     assert share == pytest.approx(1.0, abs=0.05) if passes else share < 0.03
 
 
-def test_babble_is_six_voices_as_loud_as_asked() -> None:
+def test_babble_mixes_six_voices() -> None:
     voices = [tone(frequency_hz) for frequency_hz in (200, 400, 600, 800, 1000, 1200)]
     together = babble([(number + 1) * voice for number, voice in enumerate(voices)])
     first_s = np.abs(np.fft.rfft(together[:RATE_HZ]))  # as each is one second long
     assert set(np.argsort(first_s)[-6:]) == {200, 400, 600, 800, 1000, 1200}
     speech = tone(440)
-    heard = with_sound(speech, together, 10.0) - speech
+    heard = add_sound(speech, together, 10.0) - speech
     assert 20 * np.log10(level(speech) / level(heard)) == pytest.approx(10, abs=0.5)
 
 
-def test_a_room_echoes_for_half_a_second() -> None:
+def test_echoes_last_half_a_second() -> None:
     click = np.zeros(RATE_HZ, np.float32)
     click[0] = 1
-    heard = in_a_room(click)
+    heard = add_echoes(click)
     assert heard[0] == pytest.approx(np.sqrt(1 / 2), rel=0.1)
     falls = level(heard[1:801]) / level(heard[4001:4801])
     assert 20 * np.log10(falls) == pytest.approx(30, abs=2)  # in a quarter of a second
@@ -81,7 +82,7 @@ def test_a_room_echoes_for_half_a_second() -> None:
 
 
 @pytest.mark.parametrize("name", ["MP3, 16 kbit/s", "Opus, 9 kbit/s"])
-def test_a_codec_keeps_length_and_speech(name: str) -> None:
+def test_codecs_keep_length_and_pitch(name: str) -> None:
     speech = tone(440)
     decoded = SPEECH_CONDITIONS[name](speech)
     assert len(decoded) == pytest.approx(len(speech), abs=2000)
@@ -90,17 +91,17 @@ def test_a_codec_keeps_length_and_speech(name: str) -> None:
 
 
 def test_clipping_is_relative_to_the_peak() -> None:
-    assert np.abs(clipped_at(tone(440), 0.2)).max() == pytest.approx(0.06, abs=1e-3)
+    assert np.abs(clip(tone(440), 0.2)).max() == pytest.approx(0.06, abs=1e-3)
 
 
 def test_double_level_clips() -> None:
-    assert louder(tone(440), 4.0).max() == 1.0
-    np.testing.assert_array_equal(louder(tone(440), 0.5), tone(440) / 2)
+    assert change_level(tone(440), 4.0).max() == 1.0
+    np.testing.assert_array_equal(change_level(tone(440), 0.5), tone(440) / 2)
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.0, 1.3])
-def test_speed_changes_and_pitch_stays(factor: float) -> None:
-    changed = faster(tone(200), factor)
+def test_speed_changes_at_constant_pitch(factor: float) -> None:
+    changed = change_speed(tone(200), factor)
     assert len(changed) == pytest.approx(RATE_HZ / factor, abs=200)
     middle = changed[2000:10_000]
     spectrum = np.abs(np.fft.rfft(middle * np.hanning(len(middle))))
@@ -108,7 +109,7 @@ def test_speed_changes_and_pitch_stays(factor: float) -> None:
 
 
 @pytest.mark.parametrize("name", SOUNDS)
-def test_sounds_are_the_same_every_time(name: str) -> None:
+def test_sounds_are_reproducible(name: str) -> None:
     sound = SOUNDS[name](1.5)
     assert sound.shape == (24_000,)
     assert 0.02 < level(sound) <= 0.06
@@ -116,7 +117,7 @@ def test_sounds_are_the_same_every_time(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evaluates_a_small_corpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = "utt_id\tpath\tspeaker\tsplit\tseconds\tpinyin\n"
     (tmp_path / "manifest.tsv").write_text(
         f"{rows}one\t{DEMO / 'hello-male.wav'}\tm\tdev\t3\tni3 hao3\n", encoding="utf-8"
@@ -125,7 +126,7 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robustness, "SPEECH_CONDITIONS", conditions)
     monkeypatch.setattr(robustness, "SOUNDS", {"noise": lambda _: np.zeros(16_000, np.float32)})
     figures = evaluate_robustness(
-        load_model(), tmp_path, "dev", own_rule=(1, 0.9), other_language=DEMO
+        load_model(), tmp_path, "dev", OutputRuleConfig(1, 0.9), other_language=DEMO
     )
     assert set(figures["speech"]) == {*conditions, "babble 10 dB below"}
     rates = figures["speech"]["as recorded"]["offline"]
@@ -137,9 +138,9 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     print_robustness({"a model": figures}, Console(file=output, width=120))
     assert "half level" in output.getvalue()
     with pytest.raises(UserError, match="no usable recordings in the split 'test'"):
-        evaluate_robustness(load_model(), tmp_path, "test", own_rule=(1, 0.9))
+        evaluate_robustness(load_model(), tmp_path, "test", OutputRuleConfig())
 
 
-def test_a_folder_without_sound(tmp_path: Path) -> None:
+def test_rejects_a_folder_without_recordings(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="holds no wav"):
-        robustness.recordings_in(tmp_path)
+        robustness.read_recordings(tmp_path)

@@ -1,24 +1,25 @@
-"""Accuracy of the lips against real ones, at several speaking rates.
+"""The experiment of Zhang et al. 2021, section 6: accuracy of the lips at several speaking rates.
 
-Source: Zhang et al. 2021, section 6, eq. 7 to 9 (*reconstructed*) and tables 3 and 4. With the
-displacements ``V`` of the lips' feature points from the closed mouth,
+With the displacements ``V`` of the lips' feature points from the closed mouth (eq. 7 to 9,
+*reconstructed*),
 
     accuracy = 1 - sum |V_made - V_real| / sum |V_real|
 
-over all vertical displacements of lip points. It is taken twice: over all frames, and over the mean
-mouths of the phones. The paper's ``V_real`` is the mean of several people who say the same;
-here no two clips share a sentence, but the phones return: the mean mouth of a phone is that of all
-moments at which it begins.
+over all vertical displacements of lip points, once over all frames, and once over the mean mouths
+of the phones (tables 3 and 4). In the paper, ``V_real`` is the mean of several people who say the
+same sentence. Our clips share no sentences, but phones repeat: the mean mouth of a phone is taken
+over all its onsets.
 
 Two deviations: each speaker's displacements are scaled so that the widest opening (98th percentile)
-is that of R = 5. And other rates are the same recording, time-scaled with its pitch kept, so that
-the real lips are known: they move as much faster.
+is that of R = 5. And the other rates are the same recording, time-scaled at constant pitch, so that
+the real lips are known.
 
-Where a clip's words are not known, its recognised syllables are the text, as in the paper.
+If a clip's transcript is not known, the recognized syllables serve as the text, as in the paper.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ from rich.table import Table
 from kouxing.corpora.figures import new_figure
 from kouxing.corpora.lip_clips import SAMPLE_RATE_HZ, LipClip, read_clips
 from kouxing.evaluation.lips.schemes import FRAME_RATE_HZ, live_events, live_frames
-from kouxing.evaluation.recognizer.disturbances import faster
+from kouxing.evaluation.recognizer.disturbances import change_speed
 from kouxing.services.lip_models import lip_model_info, lip_models
 from kouxing.services.recognizer.acoustic.acoustic_model import AcousticModel
 from kouxing.services.recognizer.acoustic.load import load_live_model
@@ -58,6 +59,7 @@ Samples = NDArray[np.float32]
 Curves = Callable[[Array], Array]  # times (n,), seconds -> mouth FAPs (n, num_mouth_faps)
 
 RATES = (0.8, 1.0, 1.5, 2.0)
+BEST_OPENING, STILL = "best R of each mouth", "still mouth"
 _FULL_PERCENTILE = 98.0
 _MIN_MOUTHS = 3
 _LIP_COLUMNS = [
@@ -67,18 +69,17 @@ _LIP_COLUMNS = [
     if fap != 3
 ]
 _MIDDLES = [MOUTH_FAPS.index(4), MOUTH_FAPS.index(5)]
-BEST_OPENING, STILL = "best R of each mouth", "still mouth"
-_LIMIT_STYLES = {BEST_OPENING: "--", STILL: ":"}
+_BOUND_STYLES = {BEST_OPENING: "--", STILL: ":"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RateScore:
-    """What every method scores at one speaking rate."""
+    """Accuracy of every method at one speaking rate."""
 
     rate: float  # relative to the recording
     syllables_per_s: float
-    of_frames: dict[str, float]  # accuracy by method
-    of_phones: dict[str, float]  # accuracy of the phones' mean mouths
+    of_frames: dict[str, float]  # accuracy over all frames, by method
+    of_phones: dict[str, float]  # accuracy over the mean mouths of phones, by method
 
 
 def accuracy_of(made: Array, real: Array) -> float:
@@ -89,7 +90,7 @@ def accuracy_of(made: Array, real: Array) -> float:
 
 
 def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list[RateScore]:
-    """Score all lip models on the clips of a part ("choice" or "held"), in sync, in Mandarin.
+    """Score all methods on the Mandarin clips of a part ("choice" or "held") that are in sync.
 
     Raises
     ------
@@ -99,7 +100,7 @@ def score_rates(folder: Path, part: str, rates: Sequence[float] = RATES) -> list
     clips = [clip for clip in read_clips(folder) if clip.part == part and clip.is_in_sync]
     if not clips:
         raise UserError(f"{folder} has no {part} clips in sync")
-    real = scaled([clip.speaker for clip in clips], [clip.faps for clip in clips])
+    real = scale_openings([clip.speaker for clip in clips], [clip.faps for clip in clips])
     model = load_live_model()
     return [_score_rate(model, clips, real, rate) for rate in rates]
 
@@ -112,16 +113,16 @@ def _score_rate(
     real_onsets: list[Array] = []
     frames: dict[str, list[Array]] = defaultdict(list)
     onsets: dict[str, list[Array]] = defaultdict(list)
-    shown = track(clips, description=f"{rate:g} times the rate")
-    for clip, faps in zip(shown, real, strict=True):
-        samples = clip.samples if rate == 1.0 else faster(clip.samples, rate)
+    progress = track(clips, description=f"{rate:g} times the rate")
+    for clip, faps in zip(progress, real, strict=True):
+        samples = clip.samples if rate == 1.0 else change_speed(clip.samples, rate)
         times_s = clip.time_s / rate
         syllables, phones = _text(model, clip, samples)
         num_syllables += len(syllables)
         seconds += sum(phone.duration_s for phone in phones)
         onsets_s = np.array([phone.onset_s for phone in phones])
         symbols += [phone.symbol for phone in phones]
-        real_onsets.append(_interpolated(onsets_s, times_s, faps))
+        real_onsets.append(_interpolate(onsets_s, times_s, faps))
         for name, curves in _methods(model, samples, syllables, phones):
             frames[name].append(curves(times_s))
             onsets[name].append(curves(onsets_s))
@@ -132,40 +133,39 @@ def _score_rate(
             {name: np.concatenate(mouths) for name, mouths in frames.items()}, np.concatenate(real)
         ),
         of_phones=_accuracies(
-            {name: mean_mouths(symbols, np.concatenate(each)) for name, each in onsets.items()},
+            {name: mean_mouths(symbols, np.concatenate(faps)) for name, faps in onsets.items()},
             mean_mouths(symbols, np.concatenate(real_onsets)),
         ),
     )
 
 
 def _accuracies(made: Mapping[str, Array], real: Array) -> dict[str, float]:
-    accuracy = {name: accuracy_of(mouths, real) for name, mouths in made.items()}
-    return accuracy | limits(real)
+    return {name: accuracy_of(mouths, real) for name, mouths in made.items()} | bounds(real)
 
 
 def mean_mouths(symbols: Sequence[str], mouths: Array) -> Array:
-    """Return the mean mouth of each phone, NaN where never measured.
+    """Return the mean mouth of each phone that occurs at least 3 times, NaN where never measured.
 
     Parameters
     ----------
     symbols
-        Of each mouth; those that come fewer than 3 times are left out.
+        The phone of each mouth.
     mouths
         FAPs (num_mouths, num_mouth_faps), NaN where not measured.
     """
     means = []
     for symbol in sorted(set(symbols)):
-        of_symbol = mouths[[one == symbol for one in symbols]]
-        if len(of_symbol) >= _MIN_MOUTHS:
-            num_measured = np.isfinite(of_symbol).sum(axis=0)
-            total = np.nansum(of_symbol, axis=0)
+        rows = mouths[[other == symbol for other in symbols]]
+        if len(rows) >= _MIN_MOUTHS:
+            num_measured = np.isfinite(rows).sum(axis=0)
+            total = np.nansum(rows, axis=0)
             means.append(np.where(num_measured, total / np.maximum(num_measured, 1), np.nan))
     return np.array(means).reshape(-1, mouths.shape[1])
 
 
-def scaled(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
-    """Scale FAPs (num_frames, num_mouth_faps): every speaker's widest opening is that of R = 5."""
-    whole = -float(faps_of([MAX_OPENING])[0, _MIDDLES].sum())
+def scale_openings(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
+    """Scale FAPs (num_frames, num_mouth_faps) so that every speaker's widest opening is R = 5."""
+    full = -float(faps_of([MAX_OPENING])[0, _MIDDLES].sum())
     openings: dict[str, list[Array]] = defaultdict(list)
     for speaker, faps in zip(speakers, mouths, strict=True):
         openings[speaker].append(-faps[:, _MIDDLES].sum(axis=1))
@@ -173,17 +173,18 @@ def scaled(speakers: Sequence[str], mouths: Sequence[Array]) -> list[Array]:
         speaker: max(float(np.nanpercentile(np.concatenate(group), _FULL_PERCENTILE)), 1.0)
         for speaker, group in openings.items()
     }
-    return [faps * whole / widest[speaker] for speaker, faps in zip(speakers, mouths, strict=True)]
+    return [faps * full / widest[speaker] for speaker, faps in zip(speakers, mouths, strict=True)]
 
 
 def _text(
     model: AcousticModel, clip: LipClip, samples: Samples
 ) -> tuple[list[Syllable], list[Phone]]:
-    """Return the syllables of a clip, known or recognised, and their phones with true times."""
+    """Return the syllables of a clip, known or recognized, and their phones with real times."""
     if clip.transcript:
-        syllables = model.inventory.pronounce(clip.transcript)
-        phones = align_phones(model, samples, SAMPLE_RATE_HZ, syllables)
-        return syllables, spoken(phones, model.inventory)
+        with contextlib.suppress(UserError):  # a transcript with words in another language
+            syllables = model.inventory.pronounce(clip.transcript)
+            phones = align_phones(model, samples, SAMPLE_RATE_HZ, syllables)
+            return syllables, spoken(phones, model.inventory)
     phones = spoken(recognize(model, samples, SAMPLE_RATE_HZ), model.inventory)
     groups = group_syllables(phones, model.inventory)
     return [tuple(phone.symbol for phone in group) for group in groups], phones
@@ -192,7 +193,7 @@ def _text(
 def _methods(
     model: AcousticModel, samples: Samples, syllables: Sequence[Syllable], phones: Sequence[Phone]
 ) -> Iterator[tuple[str, Curves]]:
-    """Yield each way to make lips, with what it makes of a sound."""
+    """Yield the name and the curves of each method."""
     inventory = model.inventory
     table = load_table(inventory)
     by_endpoints = time_text(progress_of(samples), syllables, table)
@@ -203,28 +204,26 @@ def _methods(
     for name, delay_s in delays_s.items():
         lips = load_lip_model(inventory.language, name)
         frames = live_frames(lips, events[delay_s], delay_s, FRAME_RATE_HZ)
-        yield f"{name}, live", _between(frames[:, np.array(MOUTH_FAPS) - 1])
+        yield f"{name}, live", _curves_between(frames[:, np.array(MOUTH_FAPS) - 1])
 
 
 def _curves_of(motion: KeyFrames) -> Curves:
     return lambda times_s: faps_of(motion.openings_at(times_s))
 
 
-def _between(mouth: Array) -> Curves:
-    """Interpolate between frames (num_frames, num_mouth_faps)."""
+def _curves_between(mouth: Array) -> Curves:
     frame_s = np.arange(len(mouth)) / FRAME_RATE_HZ
-    return lambda times_s: _interpolated(times_s, frame_s, mouth)
+    return lambda times_s: _interpolate(times_s, frame_s, mouth)
 
 
-def _interpolated(times_s: Array, frame_s: Array, mouths: Array) -> Array:
-    """Return FAPs (n, num_mouth_faps) at times (n,) from frames (num_frames, num_mouth_faps)."""
+def _interpolate(times_s: Array, frame_s: Array, mouths: Array) -> Array:
     return np.stack([np.interp(times_s, frame_s, column) for column in mouths.T], axis=1)
 
 
-def limits(real: Array) -> dict[str, float]:
-    """Score the best that one opening a frame can do, and a mouth that stands still."""
+def bounds(real: Array) -> dict[str, float]:
+    """Score the best opening R for each frame, and a mouth that does not move."""
     candidates = faps_of(np.linspace(0.0, MAX_OPENING, 51))
-    away = np.stack(
+    errors = np.stack(
         [np.nansum(np.abs(real - mouth)[:, _LIP_COLUMNS], axis=1) for mouth in candidates]
     )
     still = np.zeros_like(real)
@@ -232,35 +231,31 @@ def limits(real: Array) -> dict[str, float]:
         measured = real[np.isfinite(real[:, column]), column]
         still[:, column] = np.median(measured) if len(measured) else 0.0
     return {
-        BEST_OPENING: accuracy_of(candidates[away.argmin(axis=0)], real),
+        BEST_OPENING: accuracy_of(candidates[errors.argmin(axis=0)], real),
         STILL: accuracy_of(still, real),
     }
 
 
 def print_rates(scores: Sequence[RateScore], console: Console) -> None:
-    """Print accuracies by speaking rate as the paper's table 3, a row for each method."""
-    for title, accuracies in _MEASURES.items():
+    """Print accuracies by speaking rate as in the paper's table 3, one row per method."""
+    for title, accuracies in _TITLES.items():
         table = Table(title, *(f"{score.rate:g}" for score in scores))
-        table.add_row("syllables a second", *(f"{score.syllables_per_s:.1f}" for score in scores))
+        table.add_row("syllables per second", *(f"{score.syllables_per_s:.1f}" for score in scores))
         for name in accuracies(scores[0]):
             table.add_row(name, *(f"{100 * accuracies(score)[name]:.0f} %" for score in scores))
         console.print(table)
 
 
 def rates_figure(scores: Sequence[RateScore]) -> Any:
-    """Draw the accuracies over the speaking rate."""
+    """Plot the accuracies over the speaking rate."""
     figure = new_figure(11.0, 4.5)
     rates = [score.rate for score in scores]
     axes = figure.subplots(1, 2, sharey=True)
-    for axis, (title, accuracies) in zip(axes, _MEASURES.items(), strict=True):
+    for axis, (title, accuracies) in zip(axes, _TITLES.items(), strict=True):
         for name in accuracies(scores[0]):
-            axis.plot(
-                rates,
-                [100 * accuracies(score)[name] for score in scores],
-                _LIMIT_STYLES.get(name, "o-"),
-                color="0.6" if name in _LIMIT_STYLES else None,
-                label=name,
-            )
+            percents = [100 * accuracies(score)[name] for score in scores]
+            color = "0.6" if name in _BOUND_STYLES else None
+            axis.plot(rates, percents, _BOUND_STYLES.get(name, "o-"), color=color, label=name)
         axis.set_title(title)
         axis.set_xlabel("speaking rate, relative to the recording")
     axes[0].set_ylabel("accuracy, %")
@@ -268,7 +263,7 @@ def rates_figure(scores: Sequence[RateScore]) -> Any:
     return figure
 
 
-_MEASURES: dict[str, Callable[[RateScore], dict[str, float]]] = {
-    "accuracy of all frames": lambda score: score.of_frames,
-    "accuracy of the phones' mean mouths": lambda score: score.of_phones,
+_TITLES: dict[str, Callable[[RateScore], dict[str, float]]] = {
+    "accuracy over all frames": lambda score: score.of_frames,
+    "accuracy over the mean mouths of phones": lambda score: score.of_phones,
 }

@@ -1,17 +1,17 @@
-"""Accuracy of made lips against real ones (Zhang et al. 2021, section 6)."""
+"""Accuracy of made lips compared with real ones (Zhang et al. 2021, section 6)."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from kouxing.evaluation.lips.contour_accuracy import (
+from kouxing.evaluation.lips.speaking_rates import (
     BEST_OPENING,
     STILL,
     accuracy_of,
-    limits,
+    bounds,
     mean_mouths,
-    scaled,
+    scale_openings,
 )
 from kouxing.services.synthesizer.lips.ferguson.contour import faps_of
 from kouxing.shared.face.faps import MOUTH_FAPS
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.unit
 OPENINGS = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 3.0])
 
 
-def test_accuracy_is_one_less_the_share_of_the_error() -> None:
+def test_accuracy_is_one_minus_the_relative_error() -> None:
     real = faps_of(OPENINGS)
     assert accuracy_of(real, real) == pytest.approx(1.0)
     assert accuracy_of(0.75 * real, real) == pytest.approx(0.75)
@@ -29,7 +29,7 @@ def test_accuracy_is_one_less_the_share_of_the_error() -> None:
     assert accuracy_of(-real, real) == pytest.approx(-1.0)
 
 
-def test_unmeasured_points_and_other_faps_do_not_count() -> None:
+def test_accuracy_ignores_unmeasured_points_and_other_faps() -> None:
     real = faps_of(OPENINGS)
     made = 0.5 * real
     real[2] = np.nan
@@ -39,15 +39,15 @@ def test_unmeasured_points_and_other_faps_do_not_count() -> None:
     assert accuracy_of(made, real) == pytest.approx(0.5)
 
 
-def test_everyone_opens_as_wide() -> None:
+def test_scales_every_speaker_to_the_same_opening() -> None:
     real = faps_of(OPENINGS)
-    of_two = scaled(["a", "b", "a"], [3.0 * real, 0.2 * real, 1.5 * real])
-    assert np.nanmax(of_two[0][:, MOUTH_FAPS.index(52)]) == pytest.approx(0.0)
-    np.testing.assert_allclose(of_two[0], 2.0 * of_two[2])
-    assert of_two[1][4] == pytest.approx(real[4], rel=0.1)
+    scaled = scale_openings(["a", "b", "a"], [3.0 * real, 0.2 * real, 1.5 * real])
+    assert np.nanmax(scaled[0][:, MOUTH_FAPS.index(52)]) == pytest.approx(0.0)
+    np.testing.assert_allclose(scaled[0], 2.0 * scaled[2])
+    assert scaled[1][4] == pytest.approx(real[4], rel=0.1)
 
 
-def test_phones_have_the_mean_of_their_mouths_where_they_are_measured() -> None:
+def test_mean_mouths_ignore_unmeasured_values() -> None:
     mouths = np.array([[1.0, 2.0], [9.0, 9.0], [3.0, np.nan], [5.0, np.nan], [0.0, np.nan]])
     np.testing.assert_array_equal(mean_mouths(["a", "b", "a", "a", "i"], mouths), [[3.0, 2.0]])
     unmeasured = np.where([True, False], mouths, np.nan)
@@ -55,8 +55,8 @@ def test_phones_have_the_mean_of_their_mouths_where_they_are_measured() -> None:
     assert mean_mouths([], mouths[:0]).shape == (0, 2)
 
 
-def test_limits_of_one_opening_and_of_none() -> None:
+def test_bounds_of_one_opening_and_of_a_still_mouth() -> None:
     real = faps_of(OPENINGS)
-    found = limits(real)
-    assert found[BEST_OPENING] == pytest.approx(1.0)
-    assert found[STILL] < 0.6
+    scores = bounds(real)
+    assert scores[BEST_OPENING] == pytest.approx(1.0)
+    assert scores[STILL] < 0.6

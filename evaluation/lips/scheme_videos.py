@@ -1,0 +1,150 @@
+"""Videos of the four schemes, for a listening test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from kouxing.corpora.lip_clips import LipClip
+from kouxing.evaluation.lips.clip_video import tracked_frames
+from kouxing.evaluation.lips.four_schemes import (
+    ALIGNED,
+    RECOGNIZED,
+    Condition,
+    RecognizedSentence,
+    TestedRecognizer,
+    all_conditions,
+    make_frames,
+)
+from kouxing.services.driver.config import Framing
+from kouxing.services.driver.render import scene
+from kouxing.services.driver.render.renderer import Renderer
+from kouxing.services.driver.video import film
+from kouxing.services.lip_models import lip_model_info
+from kouxing.services.synthesizer.config import SynthesizerConfig
+from kouxing.services.synthesizer.face_animator import Frame
+from kouxing.shared.errors import UserError
+from kouxing.shared.face.faps import MOUTH_FAPS, NUM_FAPS
+
+_VIDEO_PX = (640, 640)
+_IMAGES_PER_S = 25.0
+MakeFrames = Callable[[RecognizedSentence], list[Frame]]
+
+
+def write_videos(
+    recognized: Sequence[RecognizedSentence],
+    recognizers: Sequence[TestedRecognizer],
+    lips: Sequence[str],
+    folder: Path,
+    *,
+    has_anchor: bool = False,
+    sound_at_once: bool = False,
+) -> list[Path]:
+    """Write ``CONDITION/SENTENCE.mp4`` for all conditions and sentences; keep existing videos.
+
+    A condition that is not possible for every sentence is left out, because a listening test needs
+    all sentences in all conditions.
+
+    Parameters
+    ----------
+    recognized, recognizers, lips
+        Sentences, recognizers and lip models.
+    folder
+        Folder of the videos.
+    has_anchor
+        Add a condition ``anchor``, with a mouth at rest.
+    sound_at_once
+        Show live frames when they are made, later than their sound.
+
+    Raises
+    ------
+    UserError
+        If a file or folder cannot be written.
+    """
+    conditions = _conditions(
+        recognized, recognizers, lips, has_anchor=has_anchor, sound_at_once=sound_at_once
+    )
+    missing = [
+        (make, sentence, path)
+        for name, make in conditions
+        for sentence in recognized
+        if not (path := folder / name / f"{sentence.sentence.clip.name}.mp4").exists()
+    ]
+    if not missing:
+        return []
+    head = scene.load_head()
+    renderer = Renderer(head, *_VIDEO_PX, camera=scene.camera(head, Framing.FACE))
+    for make, sentence, path in track(missing, description="rendering", transient=True):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{path.parent}: cannot be created: {error.strerror}") from error
+        samples = sentence.sentence.clip.samples
+        film.render_video(
+            make(sentence), path, renderer, frame_rate_hz=_IMAGES_PER_S, samples=samples
+        )
+    renderer.close()
+    return [path for _, _, path in missing]
+
+
+def _conditions(
+    recognized: Sequence[RecognizedSentence],
+    recognizers: Sequence[TestedRecognizer],
+    lips: Sequence[str],
+    *,
+    has_anchor: bool,
+    sound_at_once: bool,
+) -> Iterator[tuple[str, MakeFrames]]:
+    """Yield each condition's name, and the function that makes its frames."""
+    is_aligned = all(sentence.aligned is not None for sentence in recognized)
+    conditions = [
+        condition
+        for condition in all_conditions(recognizers, lips)
+        if condition.scheme != ALIGNED or is_aligned
+    ]
+    for condition in conditions:
+        if sound_at_once and condition.scheme > RECOGNIZED:
+            yield f"{condition.name}-sound-at-once", partial(_late_frames, condition)
+        else:
+            yield condition.name, partial(_frames, condition)
+    if not conditions:
+        return
+    if has_anchor:
+        yield "anchor", partial(_frames_with_mouth, conditions[0], _mouth_at_rest)
+    clips = [sentence.sentence.clip for sentence in recognized]
+    if all(len(clip.time_s) and clip.is_in_sync for clip in clips):
+        yield "tracked", partial(_frames_with_mouth, conditions[0], tracked_frames)
+
+
+def _frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
+    frames = make_frames(condition, sentence, SynthesizerConfig(lips=condition.lips))
+    assert frames is not None  # noqa: S101 - impossible conditions are left out
+    return frames
+
+
+def _late_frames(condition: Condition, sentence: RecognizedSentence) -> list[Frame]:
+    delay_s = lip_model_info(condition.lips).delay_ms / 1e3
+    return [(time_s + delay_s, faps) for time_s, faps in _frames(condition, sentence)]
+
+
+def _frames_with_mouth(
+    condition: Condition,
+    mouth_of: Callable[[LipClip, NDArray[np.float64]], NDArray[np.float64]],
+    sentence: RecognizedSentence,
+) -> list[Frame]:
+    """Replace the mouth of a condition's face; keep its blinks and head motion."""
+    frames = _frames(condition, sentence)
+    faps = np.array([faps for _, faps in frames])
+    times_s = np.array([time_s for time_s, _ in frames])
+    mouth = np.array(MOUTH_FAPS) - 1
+    faps[:, mouth] = mouth_of(sentence.sentence.clip, times_s)[:, mouth]
+    return [(time_s, row) for (time_s, _), row in zip(frames, faps, strict=True)]
+
+
+def _mouth_at_rest(_clip: LipClip, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.zeros((len(times_s), NUM_FAPS))
