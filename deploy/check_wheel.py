@@ -50,6 +50,9 @@ def main(wheel: Path) -> None:
         }
         environment |= dict.fromkeys(("HOME", "XDG_CACHE_HOME", "XDG_STATE_HOME"), name)
         environment["PATH"] = f"{python.parent}{os.pathsep}/usr/bin{os.pathsep}/bin"  # no npm
+        subprocess.run(
+            ["kouxing", "--help"], env=environment, stdout=subprocess.DEVNULL, check=True
+        )
         check_render(folder, environment)
         check_page(folder, environment)
     print("the wheel works")

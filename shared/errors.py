@@ -1,15 +1,18 @@
-"""Errors that name what is wrong and how to mend it."""
+"""Errors that say what is wrong and what to do."""
 
+import importlib.util
 import sys
 
 
 class UserError(Exception):
-    """A mistake in what the user gave; the text names the thing and the fix.
+    """A mistake in the user's input. The text names the cause and the remedy.
 
     The command line prints the text without a traceback and exits with status 2.
     """
 
 
 def install_command(package: str) -> str:
-    """Return what installs a package, or an extra such as ``kouxing[camera]``, beside kouxing."""
+    """Return the command that adds a package, or an extra such as ``kouxing[camera]``."""
+    if importlib.util.find_spec("pip") is None:  # an environment of uv
+        return f"uv pip install --python {sys.executable} '{package}'"
     return f"{sys.executable} -m pip install '{package}'"

@@ -11,7 +11,7 @@ import soundfile
 
 from kouxing.shared.audio_file import open_audio, raw_audio, read_audio
 from kouxing.shared.errors import UserError
-from tests.system import DEMO
+from tests.system import DEMO, VOWELS_FILE
 
 pytestmark = pytest.mark.unit
 
@@ -54,6 +54,28 @@ def test_an_hour_is_read_without_holding_it(tmp_path: Path) -> None:
     assert num_samples == 3600 * 8000
     assert source.duration_s == 3600
     assert peak_bytes < 5e6
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty"),
+        (b"this is no sound", "no audio"),
+        (VOWELS_FILE.read_bytes()[:44], "no samples"),
+        (VOWELS_FILE.read_bytes()[:20], "no audio"),
+    ],
+    ids=["empty", "text", "header only", "half a header"],
+)
+def test_rejects_a_file_without_samples(tmp_path: Path, content: bytes, message: str) -> None:
+    (tmp_path / "bad.wav").write_bytes(content)
+    with pytest.raises(UserError, match=rf"bad\.wav.*{message}"):
+        open_audio(tmp_path / "bad.wav")
+
+
+def test_rejects_a_sample_rate_below_8_khz(tmp_path: Path) -> None:
+    soundfile.write(tmp_path / "low.wav", np.zeros(4000, np.float32), 4000)
+    with pytest.raises(UserError, match="too low"):
+        open_audio(tmp_path / "low.wav")
 
 
 def test_nan_is_named_with_its_place(tmp_path: Path) -> None:
