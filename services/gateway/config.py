@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar
 from pydantic import AfterValidator
 
 from kouxing.services.gateway.connection_quota import ADDRESS_SHARE
-from kouxing.services.senders.protocols import parse_target
 from kouxing.shared.config import BoundHost, BoundPort, Form, Switch, Texts
 from kouxing.shared.errors import UserError
 from kouxing.shared.face.config import FaceConfig
@@ -23,6 +22,11 @@ def _check_origins(values: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _check_targets(values: tuple[str, ...]) -> tuple[str, ...]:
+    if not values:
+        return values
+    # every command loads this module, and senders import NumPy
+    from kouxing.services.senders.protocols import parse_target  # noqa: PLC0415
+
     try:
         for url in values:
             parse_target(url)

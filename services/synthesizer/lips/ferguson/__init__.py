@@ -1,8 +1,14 @@
 """Lips with a single opening R, drawn as Ferguson curves: Zhang et al. 2021."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from kouxing.services.lip_models import LipModelInfo
-from kouxing.services.synthesizer.lips.lip_model import LipModel
-from kouxing.shared.phones.inventory import PhoneInventory
+
+if TYPE_CHECKING:  # importing NumPy would slow down every command
+    from kouxing.services.synthesizer.lips.lip_model import LipModel
+    from kouxing.shared.phones.inventory import PhoneInventory
 
 
 def _load(inventory: PhoneInventory) -> LipModel:

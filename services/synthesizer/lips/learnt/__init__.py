@@ -1,8 +1,14 @@
 """Learnt lips: predicted from the audio, with closures and tongue from recognized phones."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from kouxing.services.lip_models import LipModelInfo
-from kouxing.services.synthesizer.lips.lip_model import LipModel
-from kouxing.shared.phones.inventory import PhoneInventory
+
+if TYPE_CHECKING:  # importing NumPy would slow down every command
+    from kouxing.services.synthesizer.lips.lip_model import LipModel
+    from kouxing.shared.phones.inventory import PhoneInventory
 
 
 def _load(inventory: PhoneInventory) -> LipModel:
