@@ -1,0 +1,40 @@
+"""The documents' links lead somewhere, and the commands that they name exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from kouxing.services.cli.main import app
+
+pytestmark = pytest.mark.contract
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = [
+    path
+    for pattern in ("*.md", "docs/**/*.md", "proto/*.md", "examples/*.md", "clients/*/*.md")
+    for path in ROOT.glob(pattern)
+    if "node_modules" not in path.parts
+]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_relative_link_has_a_target(document: Path) -> None:
+    links = re.findall(r"\]\((?!http)([^)#]*)(?:#([^)]+))?\)", document.read_text("utf-8"))
+    for link, heading in links:
+        target = document.parent / link if link else document
+        assert target.exists(), link
+        if heading:
+            titles = re.findall(r"^#+ (.*)$", target.read_text("utf-8"), re.MULTILINE)
+            anchors = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
+            assert heading in anchors, f"{link}#{heading}"
+
+
+def test_every_named_command_exists() -> None:
+    text = "\n".join(path.read_text("utf-8") for path in DOCUMENTS)
+    named = set(re.findall(r"(?:`|^    [^#\n]*?)kouxing ([a-z-]+)", text, re.MULTILINE))
+    assert len(named) > 10
+    assert named <= {*get_command(app).list_commands(None)}  # type: ignore[attr-defined]
