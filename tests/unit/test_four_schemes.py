@@ -153,9 +153,8 @@ def test_live_schemes_use_the_recognizers_rule() -> None:
         (True, without_corrections(LIVE), delay_by_one_phone(LIVE)),
         (False, LIVE, drop_first_hypotheses(LIVE)),
     ):
-        hearing = RecognizerOutput(
-            nothing, {lip_model_info(lips).delay_ms / 1e3: LIVE}, has_paper_rule
-        )
+        events = {lip_model_info(lips).delay_ms / 1e3: LIVE}
+        output = RecognizerOutput(nothing, events, has_paper_rule)
         assert face_input(Condition(3, lips, "gmm"), output) == live
         assert face_input(Condition(4, lips, "gmm"), output) == next_phone
 
