@@ -1,10 +1,10 @@
 """ZeroMQ sockets that carry messages.
 
-Services bind, clients connect. Every socket has explicit limits on message size, queue length and
-linger. Parts that are no message are returned as ``BadMessage``; nobody else notices them.
+Services bind, clients connect. Every socket has explicit limits of message size, queue length and
+linger. Undecodable messages are returned as ``BadMessage``.
 
-Connections are encrypted and both ends know each other's key (CURVE), unless the whole bus is
-plain. Where a socket is bound with a key, that follows its address: ``tcp://HOST:PORT KEY``.
+Connections are encrypted and both ends are authenticated (CURVE), unless the bus has no key. The
+endpoint of a bound socket with a key includes the public key: ``tcp://HOST:PORT KEY``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from kouxing.shared.connections import (
 )
 from kouxing.shared.endpoints import split_endpoint
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import NOBODY, Guest, Key, Peer, may_follow
+from kouxing.shared.keys import NO_PEER, Grant, Key, Peer, may_follow
 from kouxing.shared.wire.codec import BadMessage, decode, encode, topic
 from kouxing.shared.wire.message import (
     MAX_AUDIO_BYTES,
@@ -40,35 +40,35 @@ from kouxing.shared.wire.message import (
 from kouxing.shared.wire.session import Error, Joined
 from kouxing.shared.zap import Zap, answer_handshakes
 
-QUEUE_LENGTH = 20_000  # messages; 400 s of FAP frames of a recording for a subscriber that pauses
-LIVE_BUFFER = 65_536  # bytes of the kernel: some seconds of FAP frames, over any distance
-AUDIO_QUEUE_LENGTH = 500  # chunks; then a sender that is faster than the recognizer must wait
+QUEUE_LENGTH = 20_000  # messages: a subscriber to a recording may pause for 400 s
+LIVE_BUFFER = 65_536  # bytes in the kernel: a few seconds of FAP frames
+AUDIO_QUEUE_LENGTH = 500  # chunks; a sender that is faster than the recognizer then waits
 # Few answers to audio wait: not every client reads them.
 AUDIO = Limits(part_bytes=MAX_AUDIO_BYTES + KIB, queue_length=4, num_answers=100)
 COMMANDS = Limits(part_bytes=MAX_COMMAND_BYTES, queue_length=2, cost=1.0)
 PHONES = Limits(part_bytes=4 * KIB, queue_length=64)
 SUBSCRIPTIONS = Limits(part_bytes=512, queue_length=32, cost=1.0)  # most of it for the handshake
-ERROR_COST = 4.0  # of the sender's budget, for each message answered with an error
+ERROR_COST = 4.0  # of the sender's budget, for each message that is answered with an error
 ANSWER_COST = 0.25  # for each KiB of an answer: the longest status report has 15 MB
 MAX_PARTS = 4
-MAX_DROPPED = 20_000  # parts of a message of too many, before other sockets get their turn
-MAX_BATCH = 200  # messages taken from one socket before the others get their turn
-RECONNECT_MS = (20, 50)  # between attempts to connect, at first and later
-CONNECT_MS = 300  # for one; whoever is further away cannot be reached
+MAX_DROPPED = 20_000  # parts of one message, before other sockets get their turn
+MAX_BATCH = 200  # messages from one socket, before other sockets get their turn
+RECONNECT_MS = (20, 50)  # between attempts to connect, initial and maximum
+CONNECT_MS = 300  # for one attempt; limits the round-trip time
 HANDSHAKE_MS = 2000
 _SESSION = re.compile(r"^[A-Za-z0-9_-]{1,64}$")
 
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """One message, or why the parts were none, and its sender (ROUTER sockets only)."""
+    """A message or the reason why it is bad, and its sender (ROUTER sockets only)."""
 
     message: Message | BadMessage
-    sender: Peer = NOBODY
+    sender: Peer = NO_PEER
 
 
 class Socket:
-    """One ZeroMQ socket that sends and receives messages, never blocking."""
+    """A ZeroMQ socket that sends and receives messages without blocking."""
 
     def __init__(
         self,
@@ -89,23 +89,23 @@ class Socket:
         self._publishes = publishes
         self._on_joined = on_joined
         self._connection: Connection | None = None  # that the last message came through
-        self._sender = NOBODY  # of it
+        self._sender = NO_PEER  # of it
         self._has_rest = False  # parts of it that nobody wants
         self._rest_from: Connection | None = None  # whose they are
         self._name = secrets.token_hex(8)
 
     @property
     def endpoint(self) -> str:
-        """The endpoint that was bound, with its port."""
+        """The bound endpoint with its port."""
         return self._raw.getsockopt_string(zmq.LAST_ENDPOINT)
 
     @property
     def file_descriptor(self) -> int:
-        """Readable when something may have happened (edge-triggered)."""
+        """Becomes readable when the state may have changed (edge-triggered)."""
         return int(self._raw.getsockopt(zmq.FD))
 
-    def send(self, message: Message, *, to: Peer = NOBODY) -> bool:
-        """Send a message, on a ROUTER to one peer; return whether it could be queued.
+    def send(self, message: Message, *, to: Peer = NO_PEER) -> bool:
+        """Queue a message (on a ROUTER: to one peer). Return False if the queue is full.
 
         An answer to the message that is being handled reduces its sender's budget.
         """
@@ -124,23 +124,23 @@ class Socket:
         return True
 
     def subscribe(self, kind: type[Message], session: str | None) -> None:
-        """Subscribe to a kind of message, of one session or (None) of all."""
+        """Subscribe to a kind of message, of one session or of all (None)."""
         self._raw.setsockopt(zmq.SUBSCRIBE, _filter(kind, session))
 
     def subscribe_session(self, kinds: Iterable[type[Message]], session: str) -> None:
-        """Subscribe to kinds of message of one session, and ask for confirmation.
+        """Subscribe to kinds of message of one session, and request a confirmation.
 
-        Every publisher answers with one ``joined`` message once all of them are in effect there:
-        subscriptions keep their order, and the one to ``joined`` goes last.
+        Every publisher answers with one ``joined`` message when all of them are in effect:
+        subscriptions keep their order, and the one to ``joined`` is the last.
         """
         for kind in (*kinds, Joined):
             self.subscribe(kind, session)
 
     def receive(self) -> Iterator[Received]:
-        """Yield what has arrived, up to a fair batch.
+        """Yield the messages that have arrived, at most ``MAX_BATCH``.
 
-        On a publishing socket a new subscription to ``joined/<session>/`` is answered with a
-        ``joined`` message, so that subscribers know from when on they miss nothing.
+        A publishing socket answers a new subscription to ``joined/<session>/`` with a ``joined``
+        message. From then on, the subscriber misses nothing.
         """
         try:
             for _ in range(MAX_BATCH):
@@ -155,14 +155,14 @@ class Socket:
                     return
                 if self._connection is not None and self._connection.is_cut:
                     continue
-                guest = None if self._zap is None else self._zap.guests.get(key)
-                if self._zap is not None and guest is None:  # gone or revoked
+                grant = None if self._zap is None else self._zap.grants.get(key)
+                if self._zap is not None and grant is None:  # gone or revoked
                     continue
                 if self._publishes:
-                    self._on_subscription(parts, guest)
+                    self._on_subscription(parts, grant)
                     continue
                 number = self._connection.inode if self._connection is not None else 0
-                self._sender = Peer(parts.pop(0), key, number) if self._routes else NOBODY
+                self._sender = Peer(parts.pop(0), key, number) if self._routes else NO_PEER
                 try:
                     yield Received(decode(parts), self._sender)
                 except BadMessage as error:
@@ -195,31 +195,31 @@ class Socket:
             yield self._limited.ended.popleft()
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether something arrived within the time."""
+        """Wait for a message. Return False after the timeout."""
         return bool(self._raw.poll(int(timeout_s * 1000)))
 
     @property
     def can_send(self) -> bool:
-        """Whether a message would be queued.
+        """Whether ``send`` would queue a message.
 
-        A connected socket whose peer once answered the handshake with what no peer says takes no
-        more, as its queue is gone: libzmq never connects it again.
+        This stays False after a peer broke the protocol in the handshake: libzmq then gives up
+        the connection and its queue.
         """
         return bool(self._raw.poll(0, zmq.POLLOUT))
 
     def connect(self, endpoint: str) -> None:
-        """Connect to one more peer.
+        """Connect to another peer.
 
         Raises
         ------
         UserError
-            If the endpoint is malformed, or has a key where all is plain, or the other way round.
+            If the endpoint is malformed, or only one side uses encryption.
         """
         address, _, server_key = endpoint.partition(" ")
         split_endpoint(address, "endpoint")
         if bool(server_key) != (self._key is not None):
-            where = "here, but not there" if server_key else "there, but not here"
-            raise UserError(f"{address}: insecure = true is set {where}")
+            side = "this process" if server_key else f"the service at {address}"
+            raise UserError(f"only {side} has insecure = true; set it for both or for neither")
         try:
             if self._key is not None:
                 self._raw.setsockopt_string(zmq.CURVE_SERVERKEY, server_key)
@@ -231,16 +231,16 @@ class Socket:
             raise UserError(f"cannot connect to {endpoint}: {error.strerror}") from None
 
     def close(self, *, linger_s: float = 1.0) -> None:
-        """Close; queued messages have some time to leave, then they are dropped."""
+        """Close. Queued messages are dropped after ``linger_s``."""
         self._raw.close(linger=int(linger_s * 1000))
 
     @property
     def raw(self) -> zmq.Socket[bytes]:
-        """For the poller of this module only."""
+        """The socket, for this module's poller."""
         return self._raw
 
     def _take(self) -> tuple[list[bytes], str]:
-        """Return the parts of a message, of too many the first ones, and its sender's key.
+        """Return the first ``MAX_PARTS`` parts of a message, and its sender's key.
 
         Raises
         ------
@@ -263,24 +263,24 @@ class Socket:
         return parts, key
 
     def _drop_rest(self) -> None:
-        """Drop what is left of a message of too many parts, so much that nobody waits for long.
+        """Drop the remaining parts of a message, at most ``MAX_DROPPED`` at a time.
 
         Raises
         ------
         zmq.Again
-            If more is left for the next time.
+            If parts are left for the next call.
         """
         for _ in range(MAX_DROPPED):
             if not self._has_rest:
                 return
-            self._has_rest = self._raw.recv(zmq.DONTWAIT, False).more  # quicker than by keyword
+            self._has_rest = self._raw.recv(zmq.DONTWAIT, False).more  # positional: faster
         if self._has_rest:
             if self._rest_from is not None:
                 self._rest_from.budget.block(LONG_PENALTY_S)
             raise zmq.Again
 
-    def _on_subscription(self, parts: list[bytes], guest: Guest | None) -> None:
-        if len(parts) != 1:  # nobody publishes here
+    def _on_subscription(self, parts: list[bytes], grant: Grant | None) -> None:
+        if len(parts) != 1:  # not a subscription
             return
         verb, wanted = parts[0][:1], parts[0][1:]
         if self._connection is not None and self._limited is not None:
@@ -290,7 +290,7 @@ class Socket:
                 self._connection.topics.discard(wanted)
             if self._connection.is_cut:
                 return
-        may = guest is None or may_follow(guest, wanted)  # without keys everybody may
+        may = grant is None or may_follow(grant, wanted)  # everyone may without keys
         if verb == b"\x00":
             self._raw.setsockopt(zmq.UNSUBSCRIBE, wanted)
         elif verb == b"\x01" and may:
@@ -306,7 +306,7 @@ class Socket:
 
 
 def _descriptor(frame: zmq.Frame) -> int:
-    """Return the descriptor of the connection that a frame came through, -1 if it has ended."""
+    """Return the descriptor of a frame's connection, -1 if that has ended."""
     try:
         return int(frame.get(zmq.SRCFD))
     except zmq.ZMQError:
@@ -314,7 +314,7 @@ def _descriptor(frame: zmq.Frame) -> int:
 
 
 def _key(frame: zmq.Frame) -> str:
-    """Return the key of a frame's sender; empty at the end of a subscription whose peer is gone."""
+    """Return the key of a frame's sender, empty if the peer is gone."""
     try:
         return str(frame.get("User-Id"))
     except zmq.ZMQError:
@@ -331,17 +331,17 @@ class Bus:
     Parameters
     ----------
     key
-        Proves who this process is; its sockets accept only keys that are allowed. None: all is
-        plain, to anybody.
+        Key of this process; its sockets then accept only allowed keys. None disables encryption
+        and accepts every peer.
     extra_connections
         Number of connections that are allowed in addition to the usual limit.
 
     Attributes
     ----------
     zap
-        Who may connect; None on a plain bus.
+        The allowed keys; None without encryption.
     connect_ms
-        How long sockets that are opened from now on try to connect at a time.
+        Timeout of one attempt to connect, for sockets that are opened later.
 
     Raises
     ------
@@ -367,7 +367,7 @@ class Bus:
     def bind_router(
         self, endpoint: str, key: str, limits: Limits = AUDIO, *, role: str = ""
     ) -> Socket:
-        """Bind a socket that many peers send commands or data to.
+        """Bind a socket that receives from many peers.
 
         If a role is given, only keys with such a role (``service``: any service) may connect.
         """
@@ -380,19 +380,19 @@ class Bus:
     ) -> Socket:
         """Bind a socket that many peers subscribe to.
 
-        ``on_joined`` is called with the session when somebody's subscriptions are in effect.
+        ``on_joined`` is called with the session when the subscriptions of a peer are in effect.
         """
         return self._bind(zmq.XPUB, endpoint, key, SUBSCRIPTIONS, on_joined)
 
     def connect_dealer(self, endpoint: str, *, queue_length: int = QUEUE_LENGTH) -> Socket:
-        """Connect to a router; messages queue until it is there."""
+        """Connect to a router. Messages are queued until it is available."""
         return self._connect(zmq.DEALER, endpoint, queue_length=queue_length)
 
     def connect_subscriber(self, *endpoints: str, live: Iterable[str] = ()) -> Socket:
-        """Connect to publishers; nothing arrives before ``subscribe``.
+        """Connect to publishers. Call ``subscribe`` to receive messages.
 
-        From those in ``live`` the kernel takes few messages ahead, so that there is not much to
-        skip after this process was stopped.
+        For publishers in ``live`` the kernel buffers only a few messages, so that a stalled
+        process has little to skip.
         """
         socket = self._connect(zmq.SUB, *endpoints, queue_length=QUEUE_LENGTH)
         socket.raw.setsockopt(zmq.RCVBUF, LIVE_BUFFER)
@@ -401,10 +401,9 @@ class Bus:
         return socket
 
     def is_refused(self, endpoint: str) -> bool:
-        """Return whether somebody listens there who does not accept this key, or has another.
+        """Return whether a service at an endpoint rejects this key, or has another key itself.
 
-        Whoever refuses closes the connection, when the time for a handshake is over at the latest;
-        who only says nothing hangs.
+        A service that rejects the key closes the connection. A service that hangs does not.
         """
         probe = self._connect(zmq.DEALER, queue_length=1)
         probe.raw.setsockopt(zmq.HANDSHAKE_IVL, 3 * HANDSHAKE_MS)  # not closed from here first
@@ -424,7 +423,7 @@ class Bus:
         return Poller()
 
     def drop(self, socket: Socket, *, linger_s: float = 1.0) -> None:
-        """Close one socket early; see ``Socket.close``."""
+        """Close one socket (see ``Socket.close``)."""
         self._sockets.remove(socket)
         socket.close(linger_s=linger_s)
 
@@ -508,7 +507,7 @@ class Bus:
 
 
 class Poller:
-    """Waits on several sockets at once."""
+    """Waits for several sockets."""
 
     def __init__(self) -> None:
         self._poller = zmq.Poller()
@@ -525,7 +524,7 @@ class Poller:
         self._poller.unregister(socket.raw)
 
     def wait(self, timeout_s: float) -> list[Socket]:
-        """Return the sockets that have something, in the order they were added."""
+        """Return the readable sockets in the order in which they were added."""
         ready = dict(self._poller.poll(max(0, int(timeout_s * 1000))))
         for raw, socket in self._sockets.items():
             if raw not in ready:

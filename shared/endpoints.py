@@ -1,4 +1,4 @@
-"""Addresses: what an endpoint looks like, and who can reach it."""
+"""The form of an endpoint, and which hosts can reach it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import socket
 
 from kouxing.shared.errors import UserError
 
-WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - named to be recognised, not bound
+WILDCARDS = {"*", "0.0.0.0", "[::]"}  # noqa: S104 - compared, not bound
 _ENDPOINT = re.compile(
     r"tcp://(?P<host>\[[0-9a-fA-F:]{2,45}\]|\*|\w[\w.-]{0,189}):(?P<port>\d{1,5}|\*)", re.ASCII
 )
@@ -21,16 +21,16 @@ def split_endpoint(endpoint: str, key: str) -> tuple[str, str]:
     Raises
     ------
     UserError
-        Naming the configuration key, if the endpoint is not of that form.
+        If the endpoint has another form. The error names the configuration key.
     """
     match = _ENDPOINT.fullmatch(endpoint)
     if match is None or (match["port"] != "*" and int(match["port"]) > 65535):
-        raise UserError(f"{key}: {endpoint!r} is no endpoint; write tcp://HOST:PORT")
+        raise UserError(f"{key}: {endpoint!r} is not an endpoint; write tcp://HOST:PORT")
     return match["host"], match["port"]
 
 
 def is_address(host: str) -> bool:
-    """Return whether a host is given by its IP address, not by a name."""
+    """Return whether a host is an IP address rather than a name."""
     try:
         ipaddress.ip_address(host.strip("[]"))
     except ValueError:
@@ -39,7 +39,7 @@ def is_address(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host name or address can only be reached from this machine."""
+    """Return whether only this machine can reach a host name or address."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -47,7 +47,7 @@ def is_loopback(host: str) -> bool:
 
 
 def with_host(endpoint: str, host: str) -> str:
-    """Return an endpoint at another host, given by name or address."""
+    """Replace the host of an endpoint by another name or address."""
     _, port = split_endpoint(endpoint, "endpoint")
     if ":" in host and not host.startswith("["):
         host = f"[{host}]"
@@ -55,13 +55,13 @@ def with_host(endpoint: str, host: str) -> str:
 
 
 def own_address(towards: str = "192.0.2.1") -> str:
-    """Return the address of this host from which it would connect to another; nothing is sent.
+    """Return the local address for connections to another host, without sending anything.
 
     Parameters
     ----------
     towards
-        Name or address of the other host; by default one of no network of its own (RFC 5737).
-        Where no way leads there, the way to that one counts, then 127.0.0.1.
+        Name or address of the other host. If it cannot be reached, or by default, the address of
+        the default route is returned, or 127.0.0.1 without one.
     """
     for host in dict.fromkeys((towards, "192.0.2.1")):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -73,10 +73,10 @@ def own_address(towards: str = "192.0.2.1") -> str:
 
 
 def key_of(endpoint: str) -> str:
-    """Return the public key of whom is bound at an endpoint; empty where all is plain."""
+    """Return the public key in an endpoint, empty without encryption."""
     return endpoint.partition(" ")[2]
 
 
 def with_key(endpoint: str, public_key: str) -> str:
-    """Return an endpoint as sockets take it: with the key of whom is bound there, if it has one."""
+    """Append the public key of the bound socket, if any, to an endpoint."""
     return f"{endpoint} {public_key}" if public_key else endpoint

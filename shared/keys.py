@@ -1,16 +1,16 @@
-"""Who a process is, and who may talk to it: CURVE keys in a folder of the user's own.
+"""CURVE keys: the identity of each process, and the list of keys that may connect.
 
-The folder is ``$XDG_STATE_HOME/kouxing``, else ``~/.local/state/kouxing``, and belongs to one
-system. Whatever starts first makes it. It has
+The keys are in ``$XDG_STATE_HOME/kouxing`` or ``~/.local/state/kouxing``. The first process that
+starts creates the folder:
 
-- ``NAME.key``: a key pair of one service or client, with control's public key;
-- ``allowed``: who may connect, a line ``PUBLIC-KEY NAME ROLE...`` each.
+- ``NAME.key``: the key pair of a service or client, with control's public key;
+- ``allowed``: the keys that may connect, one line ``PUBLIC-KEY NAME ROLE...`` each.
 
-A file of the same name in ``$CREDENTIALS_DIRECTORY``, such as a container's secret or what systemd
-gives a unit, counts instead, and is only read.
+A file of the same name in ``$CREDENTIALS_DIRECTORY`` (a container secret or a systemd credential)
+takes precedence and is only read.
 
-Roles are ``client`` (opens sessions), ``operator`` (changes the faces of others' sessions),
-``service:KIND`` and ``subscriber:SESSION`` (or ``subscriber:*``); each may ask for the status.
+Roles are ``client`` (opens sessions), ``operator`` (changes the faces of other sessions),
+``service:KIND``, and ``subscriber:SESSION`` or ``subscriber:*``. Every role may request the status.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from kouxing.shared.errors import UserError
 
 CONTROL = "control"
 CLIENT = "client"
-CLIENT_ROLES = ("client", "operator")  # of whoever uses control's machine
-# What one message from control can tell the services.
-MAX_KEYS = 1000
+CLIENT_ROLES = ("client", "operator")  # of the user of control's machine
+MAX_KEYS = 1000  # with MAX_ROLES, what fits in one message from control
 MAX_ROLES = 16  # of a key
 _MAX_ALLOWED_BYTES = 768 * 1024
 _ALLOWED = "allowed"
@@ -44,7 +43,7 @@ _ROLE = re.compile(r"client|operator|service:[a-z-]{1,64}|subscriber:([A-Za-z0-9
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key pair, and the public key of control; Z85, 40 characters each."""
+    """A key pair and control's public key, each as 40 characters of Z85."""
 
     public: str
     secret: str
@@ -53,39 +52,39 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Who sent something to a ROUTER socket; the same peer may connect again."""
+    """The sender of a message to a ROUTER socket."""
 
-    address: bytes = b""  # what it calls itself, or a name made by the socket
-    key: str = ""  # its public key, proved; empty where all is plain
-    connection: int = field(default=0, compare=False)  # its number; 0: it has ended
-
-
-NOBODY = Peer()
+    address: bytes = b""  # ROUTING_ID
+    key: str = ""  # authenticated public key, empty without encryption
+    connection: int = field(default=0, compare=False)  # 0: it has ended
 
 
-class Guest(NamedTuple):
-    """Whose key it is, and what its owner may do."""
+NO_PEER = Peer()
+
+
+class Grant(NamedTuple):
+    """The name and the roles of a key."""
 
     name: str
     roles: tuple[str, ...]
 
 
-Guests = Mapping[str, Guest]  # by public key
+Grants = Mapping[str, Grant]  # by public key
 
 
 def key_folder() -> Path:
-    """Return where the keys are; it need not exist yet."""
+    """Return the folder of the keys. It may not exist yet."""
     state = os.environ.get("XDG_STATE_HOME")
     return (Path(state) if state else Path.home() / ".local" / "state") / "kouxing"
 
 
-def own_key(name: str, roles: Collection[str]) -> Key:
-    """Return a key of this machine; on control's, one that does not exist is made and allowed.
+def load_key(name: str, roles: Collection[str]) -> Key:
+    """Return a key of this machine. On control's machine, create and allow a missing key.
 
     Raises
     ------
     UserError
-        If the key cannot be read or made, or others could read it, too.
+        If the key cannot be read or created, or other users can read it.
     """
     if credential := _credential(f"{name}.key"):
         return read_key(credential)
@@ -95,8 +94,8 @@ def own_key(name: str, roles: Collection[str]) -> Key:
             if not (folder / "control.key").exists():
                 if any(folder.glob("*.key")):
                     raise UserError(
-                        f"{path} is missing, and control's key is not here to allow a new one; "
-                        f"on control's machine: {how_to_add(roles)}"
+                        f"{path} is missing, and a new key can be created only on control's"
+                        f" machine. Run there: {add_key_hint(roles)}"
                     )
                 _write(folder / "control.key", _new_key())
             if name != CONTROL:
@@ -105,142 +104,142 @@ def own_key(name: str, roles: Collection[str]) -> Key:
 
 
 def user_key() -> Key:
-    """Return the key of the user's own commands and clients; raises as ``own_key``."""
-    return own_key(CLIENT, CLIENT_ROLES)
+    """Return the key of the user's commands and clients. Raises the errors of ``load_key``."""
+    return load_key(CLIENT, CLIENT_ROLES)
 
 
 def control_endpoint(address: str, *, insecure: bool) -> str:
-    """Return where a client finds control: address and, unless all is plain, public key.
+    """Return control's endpoint with, unless ``insecure``, its public key.
 
     Raises
     ------
     UserError
-        As ``own_key``.
+        If the user's key cannot be read (see ``load_key``).
     """
     return with_key(address, "" if insecure else user_key().control)
 
 
-def refusal(control: str, name: str, roles: Collection[str]) -> str:
-    """Return what to say when control refuses a process of this machine, with its key or none."""
+def rejection_hint(control: str, name: str, roles: Collection[str]) -> str:
+    """Return an error text for a process of this machine that control rejects."""
     address, _, server_key = control.partition(" ")
     if not server_key:
         return (
-            f"control at {address} refuses this machine: insecure = true is set here, but not"
-            " there, or its log says why"
+            f"control at {address} rejects this machine: insecure = true is set only here,"
+            " or see control's log"
         )
     return (
-        f"control at {address} does not accept {key_folder() / name}.key; if it"
-        f" runs on this machine, start it again, else make a key there: {how_to_add(roles)}"
+        f"control at {address} does not accept {key_folder() / name}.key. If control runs on this"
+        f" machine, restart it. Otherwise create a key there: {add_key_hint(roles)}"
     )
 
 
 def key_text(key: Key) -> str:
-    """Return the content of a key's file."""
+    """Return the content of a key file."""
     return json.dumps(asdict(key), indent=1) + "\n"
 
 
-def how_to_add(roles: Collection[str]) -> str:
-    """Return what makes a key with some roles, for messages about a key that is missing."""
+def add_key_hint(roles: Collection[str]) -> str:
+    """Return the command that creates a key, for messages about a missing key."""
     options = "".join(f" --role {role}" for role in roles)
-    return f"kouxing keys add NAME{options}; then copy the file here"
+    return f"kouxing keys add NAME{options} (then copy the file here)"
 
 
-def read_guests() -> dict[str, Guest]:
-    """Return who may connect, by public key; nobody if that was never said.
+def read_grants() -> dict[str, Grant]:
+    """Return the allowed keys, by public key. The list may not exist yet.
 
     Raises
     ------
     UserError
-        If the list cannot be read, or others could change it.
+        If the list cannot be read, or other users can change it.
     """
     if credential := _credential(_ALLOWED):
-        return _read_guests(credential)
+        return _read_grants(credential)
     with _locked_folder() as folder:
-        return _read_guests(folder / _ALLOWED)
+        return _read_grants(folder / _ALLOWED)
 
 
-def guests_file() -> Path:
-    """Return the file that ``read_guests`` reads; a change puts another in its place."""
+def grants_file() -> Path:
+    """Return the file that ``read_grants`` reads. Every change replaces the file."""
     return _credential(_ALLOWED) or key_folder() / _ALLOWED
 
 
-def add_guest(name: str, roles: Collection[str], path: Path) -> None:
-    """Make a key with some roles, allow it, and write it to a file for another machine.
+def add_key(name: str, roles: Collection[str], path: Path) -> None:
+    """Create and allow a key, and write it to a file for another machine.
 
     Raises
     ------
     UserError
-        If the name is taken, a role is none, or this is not control's machine.
+        If the name is taken, a role is invalid, or this is not control's machine.
     """
-    own_key(CONTROL, ())
+    load_key(CONTROL, ())
     with _locked_folder() as folder:
         _add_key(folder, path, name, roles)
 
 
-def revoke_guest(name: str) -> None:
-    """Allow a key no longer.
+def revoke_key(name: str) -> None:
+    """Revoke a key.
 
     Raises
     ------
     UserError
-        If there is no key of that name.
+        If no key has this name.
     """
     with _locked_folder() as folder:
-        guests = _parse_guests(folder / _ALLOWED)  # of too many it may revoke some
-        kept = {public: guest for public, guest in guests.items() if guest.name != name}
-        if len(kept) == len(guests):
-            raise UserError(f"no key is called {name!r}; 'kouxing keys list' shows all")
+        grants = _parse_grants(folder / _ALLOWED)  # unchecked, so that it works with too many keys
+        kept = {public: grant for public, grant in grants.items() if grant.name != name}
+        if len(kept) == len(grants):
+            raise UserError(f"no key is named {name!r}; list them with 'kouxing keys list'")
         _write(folder / _ALLOWED, _lines(kept))
 
 
-def save_guests(guests: Guests) -> None:
-    """Keep what control has told, so that a service knows its guests when it starts again.
+def save_grants(grants: Grants) -> None:
+    """Save the list that control sent, so that it is available after a restart.
 
-    On control's own machine the list is there, and perhaps newer.
+    On control's machine this does nothing: the list there may be newer.
 
     Raises
     ------
     UserError
-        If it cannot be written.
+        If the list cannot be written.
     """
     with _locked_folder() as folder:
         is_controls = (folder / "control.key").exists()
-        if not is_controls and _read_guests(folder / _ALLOWED) != guests:
-            _write(folder / _ALLOWED, _lines(guests))
+        if not is_controls and _read_grants(folder / _ALLOWED) != grants:
+            _write(folder / _ALLOWED, _lines(grants))
 
 
-def may_follow(guest: Guest, topic: bytes) -> bool:
-    """Return whether somebody may subscribe to the messages whose topic begins so."""
-    if any(role == f"{_SUBSCRIBER}*" or not role.startswith(_SUBSCRIBER) for role in guest.roles):
+def may_follow(grant: Grant, topic: bytes) -> bool:
+    """Return whether a key may subscribe to a topic prefix."""
+    if any(role == f"{_SUBSCRIBER}*" or not role.startswith(_SUBSCRIBER) for role in grant.roles):
         return True
     _kind, *rest = topic.decode("ascii", "replace").split("/")
-    return len(rest) == 2 and f"{_SUBSCRIBER}{rest[0]}" in guest.roles
+    return len(rest) == 2 and f"{_SUBSCRIBER}{rest[0]}" in grant.roles
 
 
 def _new_key(control: str = "") -> str:
-    import zmq  # noqa: PLC0415 (commands that talk to nobody start without)
+    import zmq  # noqa: PLC0415 (slow to import)
 
     public, secret = (part.decode() for part in zmq.curve_keypair())
     return key_text(Key(public, secret, control or public))
 
 
 def _add_key(folder: Path, path: Path, name: str, roles: Collection[str]) -> None:
-    """Write a new key to a file, then allow it."""
+    """Write a new key to a file and allow it."""
     if not _NAME.fullmatch(name):
-        raise UserError(f"no key can be called {name!r}; use letters, digits, '-' and '_'")
+        raise UserError(f"{name!r} is not a valid name; use letters, digits, '-' and '_'")
     for role in roles:
         if not _ROLE.fullmatch(role):
             raise UserError(
-                f"{role!r} is no role; use client, operator, service:KIND or subscriber:SESSION"
+                f"{role!r} is not a role; use client, operator, service:KIND or subscriber:SESSION"
             )
-    guests = _read_guests(folder / _ALLOWED)
-    if any(guest.name == name for guest in guests.values()):
-        raise UserError(f"a key is called {name!r}; first 'kouxing keys revoke {name}'")
+    grants = _read_grants(folder / _ALLOWED)
+    if any(grant.name == name for grant in grants.values()):
+        raise UserError(f"the name {name!r} is taken; run 'kouxing keys revoke {name}' first")
     text = _new_key(read_key(folder / "control.key").public)
-    guests[json.loads(text)["public"]] = Guest(name, tuple(roles))
-    _check_number(guests)
+    grants[json.loads(text)["public"]] = Grant(name, tuple(roles))
+    _check_number(grants)
     _write(path, text)
-    _write(folder / _ALLOWED, _lines(guests))
+    _write(folder / _ALLOWED, _lines(grants))
 
 
 def read_key(path: Path) -> Key:
@@ -249,7 +248,7 @@ def read_key(path: Path) -> Key:
     Raises
     ------
     UserError
-        If it cannot be read, or others could read it, too.
+        If it cannot be read, or other users can read it.
     """
     try:
         key = Key(**json.loads(_read(path)))
@@ -257,51 +256,52 @@ def read_key(path: Path) -> Key:
             return key
     except (ValueError, TypeError):
         pass
-    raise UserError(f"{path} is no key file; without it a new key is made on control's machine")
+    raise UserError(f"{path} is not a key file; delete it and restart on control's machine")
 
 
-def _read_guests(path: Path) -> dict[str, Guest]:
-    guests = _parse_guests(path)
+def _read_grants(path: Path) -> dict[str, Grant]:
+    grants = _parse_grants(path)
     try:
-        _check_number(guests)
+        _check_number(grants)
     except UserError as error:
         raise UserError(f"{path}: {error}") from None
-    return guests
+    return grants
 
 
-def _parse_guests(path: Path) -> dict[str, Guest]:
+def _parse_grants(path: Path) -> dict[str, Grant]:
     if not path.exists():
         return {}
-    guests = {}
+    grants = {}
     for line in _read(path).splitlines():
         public, *named = line.split() or [""]
         name, *roles = named or [""]
         is_whole = _PUBLIC.fullmatch(public) and _NAME.fullmatch(name)
         if not (is_whole and all(map(_ROLE.fullmatch, roles))):
             raise UserError(f"{path}: {line!r} is not PUBLIC-KEY NAME ROLE...")
-        guests[public] = Guest(name, tuple(roles))
-    return guests
+        grants[public] = Grant(name, tuple(roles))
+    return grants
 
 
-def _check_number(guests: Guests) -> None:
-    """Refuse more than the services can be told."""
-    for guest in guests.values():
-        if len(guest.roles) > MAX_ROLES:
+def _check_number(grants: Grants) -> None:
+    """Reject more keys or roles than one message to the services holds."""
+    for grant in grants.values():
+        if len(grant.roles) > MAX_ROLES:
             raise UserError(
-                f"{guest.name} has {len(guest.roles)} roles, a key may have {MAX_ROLES};"
-                " 'subscriber:*' follows all sessions"
+                f"{grant.name} has {len(grant.roles)} roles, but the maximum is {MAX_ROLES};"
+                " use 'subscriber:*' to follow all sessions"
             )
-    if len(guests) > MAX_KEYS:
+    if len(grants) > MAX_KEYS:
         raise UserError(
-            f"{len(guests)} keys would be allowed, {MAX_KEYS} may be; 'kouxing keys revoke' some"
+            f"{len(grants)} keys are too many, the maximum is {MAX_KEYS};"
+            " revoke some with 'kouxing keys revoke'"
         )
-    if len(_lines(guests)) > _MAX_ALLOWED_BYTES:
-        raise UserError("the keys have too many roles in all; 'kouxing keys revoke' some")
+    if len(_lines(grants)) > _MAX_ALLOWED_BYTES:
+        raise UserError("the keys have too many roles; revoke some with 'kouxing keys revoke'")
 
 
-def _lines(guests: Guests) -> str:
+def _lines(grants: Grants) -> str:
     return "".join(
-        f"{public} {' '.join((name, *roles))}\n" for public, (name, roles) in guests.items()
+        f"{public} {' '.join((name, *roles))}\n" for public, (name, roles) in grants.items()
     )
 
 
@@ -311,8 +311,8 @@ def _locked_folder() -> Iterator[Path]:
         folder = key_folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
-        raise UserError(f"no place for keys: {error}; name a folder by XDG_STATE_HOME") from None
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
+        raise UserError(f"cannot create a folder for keys: {error}; set XDG_STATE_HOME") from None
     try:
         _check_private(folder, 0o700)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -322,21 +322,21 @@ def _locked_folder() -> Iterator[Path]:
 
 
 def _credential(name: str) -> Path | None:
-    """Return a file that whoever started this process gives it, if it does."""
+    """Return a file in ``$CREDENTIALS_DIRECTORY``, None if it does not exist."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     path = Path(folder, name) if folder else None
     return path if path and path.exists() else None
 
 
 def _check_private(path: Path, mode: int) -> None:
-    """Refuse what others can read; root may give a credential to this process's group."""
+    """Reject a file that other users can read. Credentials may be readable by the group."""
     about = path.stat()
     is_given = path.parent == Path(os.environ.get("CREDENTIALS_DIRECTORY", ""))
     owners, others = ({0, os.geteuid()}, 0o037) if is_given else ({os.geteuid()}, 0o077)
     if about.st_uid not in owners:
-        raise UserError(f"{path} belongs to another user; keys must be your own")
+        raise UserError(f"{path} belongs to another user; change its owner")
     if about.st_mode & others:
-        raise UserError(f"others can read {path}; 'chmod {mode:o} {path}', then start again")
+        raise UserError(f"other users can read {path}; run 'chmod {mode:o} {path}' and restart")
 
 
 def _read(path: Path) -> str:
@@ -344,11 +344,11 @@ def _read(path: Path) -> str:
         _check_private(path, 0o600)
         return path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read: {error}") from None
+        raise UserError(f"cannot read {path}: {error}") from None
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file that nobody else can read, whole or not at all."""
+    """Write a private file atomically."""
     new = path.with_name(f"{path.name}.new")
     try:
         new.unlink(missing_ok=True)
@@ -357,4 +357,4 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
         new.replace(path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+        raise UserError(f"cannot write {path}: {error.strerror}") from None

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 
 from kouxing.shared.bus import Socket
-from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.speech import AcknowledgePhones
 
@@ -95,7 +95,7 @@ class ReliableReceiver:
         self._epoch = -1
         self._last = 0
         self._acknowledged = 0
-        self._peer = NOBODY
+        self._peer = NO_PEER
 
     def receive(self, message: Message, sender: Peer) -> bool:
         """Return whether a message is the next one; all others must be ignored.
@@ -124,7 +124,7 @@ class ReliableReceiver:
 
     def acknowledge(self) -> None:
         """Send an acknowledgement to the sender of the last message, if there was a message."""
-        if self._peer is NOBODY:
+        if self._peer is NO_PEER:
             return
         self._acknowledged = self._last
         acknowledgement = dataclasses.replace(

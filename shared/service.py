@@ -22,7 +22,7 @@ from kouxing.shared.clock import ClockOffset, StallDetector, now_ns
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import is_loopback, split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Guest, Peer, own_key, refusal, save_guests
+from kouxing.shared.keys import Grant, Peer, load_key, rejection_hint, save_grants
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler, MessageLoop
 from kouxing.shared.metrics import BusyShare, give_back_memory, memory_mb
@@ -81,7 +81,7 @@ class Service(MessageLoop):
         self.config = config
         self.name = self.kind.name
         self.instance = config.instance or f"{self.name}-{secrets.token_hex(3)}"
-        self.key = None if config.insecure else own_key(self.name, self.kind.key_roles)
+        self.key = None if config.insecure else load_key(self.name, self.kind.key_roles)
         self.control_endpoint = with_key(config.control, self.key.control if self.key else "")
         super().__init__(Bus(self.key, extra_connections=extra_connections))
         self.stall = StallDetector(time.monotonic())
@@ -368,7 +368,7 @@ class Service(MessageLoop):
         """Log what to do if control does not accept the key; runs on a thread, as it waits."""
         with contextlib.suppress(UserError), Bus(self.key) as bus:
             if bus.is_refused(self.control_endpoint):
-                LOG.warning(refusal(self.control_endpoint, self.name, self.kind.key_roles))
+                LOG.warning(rejection_hint(self.control_endpoint, self.name, self.kind.key_roles))
 
     def _on_heartbeat_reply(self, reply: HeartbeatReply, _sender: Peer) -> None:
         self._reply_s = time.monotonic()
@@ -388,13 +388,13 @@ class Service(MessageLoop):
         """Let these keys connect, and no others."""
         if self.bus.zap is None:
             return
-        guests = {key: Guest(allowed.name, tuple(allowed.roles)) for key, allowed in keys.items()}
+        grants = {key: Grant(allowed.name, tuple(allowed.roles)) for key, allowed in keys.items()}
         try:
-            save_guests(guests)
+            save_grants(grants)
             self.bus.zap.refresh()
         except UserError as error:
             LOG.error("the allowed keys apply only until this process ends: %s", error)
-            self.bus.zap.allow(guests)
+            self.bus.zap.allow(grants)
 
 
 def _pulse_supervisor() -> None:

@@ -1,4 +1,4 @@
-"""Says which keys may connect to this process's sockets: the ZAP handler (ZeroMQ RFC 27)."""
+"""The ZAP handler (ZeroMQ RFC 27): checks the key of each new connection."""
 
 from __future__ import annotations
 
@@ -10,63 +10,64 @@ from zmq.utils import z85
 
 from kouxing.shared.errors import UserError
 from kouxing.shared.kernel_sockets import network_of
-from kouxing.shared.keys import Guests, guests_file, read_guests
+from kouxing.shared.keys import Grants, grants_file, read_grants
 from kouxing.shared.logs import LOG
 
 
 class Zap:
-    """The keys that may connect.
+    """The keys that may connect to this process's sockets.
 
     Parameters
     ----------
-    cut
-        Ends the connections of keys that are allowed no longer, or not for the same.
+    disconnect
+        Called with the keys that were revoked or have other roles now.
 
     Attributes
     ----------
-    guests
-        Who may connect, by public key; read again whenever the list has changed.
+    grants
+        Name and roles of each allowed key. The file is read again after every change.
     version
-        Of the list.
+        Version of that file.
     required_roles
-        Role that a key needs, by setting of the socket; any allowed key may connect to the others.
+        Role that a key needs, by the configuration key of the socket. Every allowed key may
+        connect to the other sockets.
 
     Raises
     ------
     UserError
-        As ``read_guests``.
+        If the list of keys cannot be read (see ``read_grants``).
     """
 
-    def __init__(self, cut: Callable[[Collection[str]], None]) -> None:
-        self._file = guests_file()
+    def __init__(self, disconnect: Callable[[Collection[str]], None]) -> None:
+        self._file = grants_file()
         self.version = self._newest_version()
-        self.guests: Guests = read_guests()
+        self.grants: Grants = read_grants()
         self.required_roles: dict[str, str] = {}
-        self._cut = cut
+        self._disconnect = disconnect
         self._lock = threading.Lock()
 
     def refresh(self) -> None:
-        """Let changes of the list take effect."""
-        with self._lock:  # whoever comes second has the new list, too
+        """Read the list again if it has changed."""
+        with self._lock:  # the second of two callers also waits for the new list
             version = self._newest_version()
             if version == self.version:
                 return
-            before = self.guests
+            before = self.grants
             try:
-                self.guests = read_guests()
+                self.grants = read_grants()
             except UserError as error:
-                LOG.error("the allowed keys stay as they were: %s", error)
+                LOG.error("keeping the previous list of allowed keys: %s", error)
             self.version = version
-        self._cut_changed(before)
+        self._disconnect_changed(before)
 
-    def allow(self, guests: Guests) -> None:
-        """Let these connect and no others, until the file changes."""
+    def allow(self, grants: Grants) -> None:
+        """Use these keys until the file changes."""
         with self._lock:
-            before, self.guests = self.guests, guests
-        self._cut_changed(before)
+            before, self.grants = self.grants, grants
+        self._disconnect_changed(before)
 
-    def _cut_changed(self, before: Guests) -> None:
-        self._cut({key for key, guest in before.items() if self.guests.get(key) != guest})
+    def _disconnect_changed(self, before: Grants) -> None:
+        self._disconnect({key for key, grant in before.items() if self.grants.get(key) != grant})
 
     def _newest_version(self) -> tuple[int, int]:
         try:
@@ -76,13 +77,13 @@ class Zap:
         return about.st_ino, about.st_mtime_ns
 
     def may_connect(self, public: str, domain: str) -> bool:
-        """Return whether a key may connect to the socket of some setting."""
+        """Return whether a key may connect to a socket, given its configuration key."""
         self.refresh()
-        guest = self.guests.get(public)
-        if guest is None:
+        grant = self.grants.get(public)
+        if grant is None:
             return False
-        wanted = self.required_roles.get(domain)
-        return wanted is None or any(role.partition(":")[0] == wanted for role in guest.roles)
+        required = self.required_roles.get(domain)
+        return required is None or any(role.partition(":")[0] == required for role in grant.roles)
 
 
 def answer_handshakes(
@@ -90,17 +91,16 @@ def answer_handshakes(
     zap: Zap | None,
     is_blocked: Callable[[str], bool],
 ) -> None:
-    """Answer libzmq on a thread of its own, until the context ends.
+    """Start a thread that answers libzmq's requests until the context ends.
 
-    A refusal is a temporary one (status 300): who is refused tries again, for the key, or the
-    address, may be allowed any moment.
+    A rejection is temporary (status 300), so that the peer retries: its key may be allowed later.
 
     Parameters
     ----------
     context
-        Of the sockets.
+        Context of the sockets.
     zap
-        Says which keys may connect; None: all is plain.
+        Allowed keys; None without encryption.
     is_blocked
         Returns whether a key or, without keys, an address cannot connect for now.
     """
@@ -120,9 +120,9 @@ def answer_handshakes(
                 except zmq.ContextTerminated:
                     return
                 _version, request, domain, address, _identity, _mechanism, *keys = parts
-                public = z85.encode(keys[0]) if keys else b""  # none where all is plain
-                is_guest = may_connect(address.decode(), domain.decode(), public.decode())
-                reply = (b"200", b"", public) if is_guest else (b"300", b"not allowed", b"")
+                public = z85.encode(keys[0]) if keys else b""  # without encryption
+                is_allowed = may_connect(address.decode(), domain.decode(), public.decode())
+                reply = (b"200", b"", public) if is_allowed else (b"300", b"not allowed", b"")
                 socket.send_multipart([b"1.0", request, *reply, b""])
 
     threading.Thread(target=answer, name="zap", daemon=True).start()

@@ -12,7 +12,7 @@ from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.endpoints import key_of, with_key
-from kouxing.shared.keys import Key, own_key
+from kouxing.shared.keys import Key, load_key
 from kouxing.shared.wire.codec import decode, encode
 from kouxing.shared.wire.control import Heartbeat, SessionStarted, StartSession
 from kouxing.shared.wire.message import Message
@@ -42,7 +42,7 @@ class Stage:
         self.buses = []
         self.services = []
         for kind in PROVIDED:
-            bus = Bus(None if insecure else own_key(kind, (f"service:{kind}",)))
+            bus = Bus(None if insecure else load_key(kind, (f"service:{kind}",)))
             service = bus.connect_dealer(self.control.endpoints["commands"])
             service.send(beat(kind))
             self.buses.append(bus)

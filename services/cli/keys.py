@@ -14,11 +14,11 @@ from rich.table import Table
 from kouxing.services.kinds import KINDS
 from kouxing.shared.keys import (
     CLIENT,
-    add_guest,
+    add_key,
     key_folder,
-    own_key,
-    read_guests,
-    revoke_guest,
+    load_key,
+    read_grants,
+    revoke_key,
     user_key,
 )
 from kouxing.shared.terminal import print_message
@@ -30,7 +30,7 @@ app = typer.Typer(no_args_is_help=True, help="Keys that may connect to the servi
 def init() -> None:
     """Create all keys of a system on this machine: those of its services and of your commands."""
     for kind in KINDS.values():
-        own_key(kind.name, kind.key_roles)
+        load_key(kind.name, kind.key_roles)
     user_key()
     print_message(f"the keys are in {key_folder()}")
 
@@ -53,7 +53,7 @@ def add(
     """Create a key for another machine, and allow it at once."""
     roles = roles or [CLIENT]
     path = output or Path(f"{name}.key")
-    add_guest(name, roles, path)
+    add_key(name, roles, path)
     kinds = [role.removeprefix("service:") for role in roles if role.startswith("service:")]
     print_message(
         f"wrote {path}; move it to ~/.local/state/kouxing/{(kinds or [CLIENT])[0]}.key on the other"
@@ -65,13 +65,13 @@ def add(
 def list_keys() -> None:
     """List the allowed keys with their roles."""
     table = Table("name", "roles", "public key", box=box.SIMPLE)
-    for public, guest in sorted(read_guests().items(), key=lambda item: item[1].name):
-        table.add_row(guest.name, escape(", ".join(guest.roles)), escape(public))
+    for public, grant in sorted(read_grants().items(), key=lambda item: item[1].name):
+        table.add_row(grant.name, escape(", ".join(grant.roles)), escape(public))
     Console().print(table)
 
 
 @app.command()
 def revoke(name: Annotated[str, typer.Argument(help="Name in 'kouxing keys list'.")]) -> None:
     """Revoke a key. Its connections end at once."""
-    revoke_guest(name)
+    revoke_key(name)
     print_message(f"revoked the key of {name}")

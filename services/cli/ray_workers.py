@@ -24,7 +24,7 @@ from kouxing.services.cli.supervisor import ONE_THREAD
 from kouxing.services.kinds import KINDS
 from kouxing.shared.config import Bound, Settings, bound_keys, variable
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import key_text, own_key
+from kouxing.shared.keys import key_text, load_key
 from kouxing.shared.service import DRAIN_TIMEOUT_S
 from kouxing.shared.service_kind import ServiceKind
 
@@ -120,7 +120,7 @@ class RayWorkers:
             If a setting is wrong, or the workers' key is missing.
         """
         insecure = settings.load(kind.config_type).insecure
-        key = "" if insecure else key_text(own_key(kind.name, (f"service:{kind.name}",)))
+        key = "" if insecure else key_text(load_key(kind.name, (f"service:{kind.name}",)))
         running = set(_names(kind.name))
         wanted = {f"{kind.name}-{index}" for index in range(number)}
         for name in sorted(wanted - running):

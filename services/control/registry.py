@@ -14,7 +14,7 @@ from operator import itemgetter
 from kouxing.services.control.load import RETRY_AFTER_S, SAME_LOAD, WorkerLoad
 from kouxing.services.kinds import PROVIDERS
 from kouxing.shared.endpoints import with_key
-from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
@@ -117,7 +117,7 @@ class Registry:
             self._services[instance] = record
             heartbeat = kept
             self._num_of_key[peer.key] += 1
-            if peer != NOBODY:
+            if peer != NO_PEER:
                 self._by_peer[peer] = instance
             if heartbeat.role == "observer":
                 self._observers.add(instance)
@@ -187,7 +187,7 @@ class Registry:
 
     def is_back(self, instance: str, peer: Peer) -> bool:
         """Return whether a new service is a lost one, the same process, and not lost after all."""
-        return self._lost.pop(instance, NOBODY) == peer
+        return self._lost.pop(instance, NO_PEER) == peer
 
     def displaced_by(self, heartbeat: Heartbeat, peer: Peer) -> str:
         """Return the worker whose endpoints a new one provides: it has crashed. Empty if none."""
@@ -221,7 +221,7 @@ class Registry:
         for instance, record in self._services.items():
             if self.age_s(instance, now_s) <= self._lost_after_s:
                 return
-            if record.peer != NOBODY:
+            if record.peer != NO_PEER:
                 yield instance
 
     def is_observer(self, instance: str) -> bool:

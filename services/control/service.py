@@ -30,7 +30,7 @@ from kouxing.shared.bus import COMMANDS
 from kouxing.shared.clock import now_ns
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.logs import LOG
 from kouxing.shared.message_loop import Handler
 from kouxing.shared.service import Service
@@ -122,7 +122,7 @@ class ControlService(Service):
 
     def deliver_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Register control itself like any other service."""
-        self._registry.add(heartbeat, NOBODY, time.monotonic())
+        self._registry.add(heartbeat, NO_PEER, time.monotonic())
 
     def gauges(self) -> dict[str, float]:
         """Return how many sessions and services there are."""
@@ -169,8 +169,8 @@ class ControlService(Service):
             return None
         self._told_keys[heartbeat.instance] = zap.version
         return {
-            public: AllowedKey(name=guest.name, roles=list(guest.roles))
-            for public, guest in zap.guests.items()
+            public: AllowedKey(name=grant.name, roles=list(grant.roles))
+            for public, grant in zap.grants.items()
         }
 
     # --- requests ------------------------------------------------------------------------------
@@ -212,8 +212,8 @@ class ControlService(Service):
         """Refuse a sender whose key has none of some roles; with insecure = true nobody."""
         if self.bus.zap is None or not roles:
             return
-        guest = self.bus.zap.guests.get(sender.key)
-        if guest is None or not set(roles) & set(guest.roles):
+        grant = self.bus.zap.grants.get(sender.key)
+        if grant is None or not set(roles) & set(grant.roles):
             text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
             raise Refusal(ErrorCode.NOT_ALLOWED, text)
 
@@ -299,9 +299,9 @@ class ControlService(Service):
         """Return whether somebody may open sessions, or is a service: the page's token lets it."""
         if self.bus.zap is None:
             return True
-        guest = self.bus.zap.guests.get(asker.key)
-        return guest is not None and any(
-            role == "client" or role.startswith("service:") for role in guest.roles
+        grant = self.bus.zap.grants.get(asker.key)
+        return grant is not None and any(
+            role == "client" or role.startswith("service:") for role in grant.roles
         )
 
     def _service_state(

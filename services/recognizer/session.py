@@ -16,7 +16,7 @@ from kouxing.services.recognizer.synthesizer_link import SynthesizerLink
 from kouxing.shared.bus import Socket
 from kouxing.shared.clock import MAX_GAP_S, MEDIA_RATE_HZ, to_samples, to_seconds
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import NOBODY
+from kouxing.shared.keys import NO_PEER
 from kouxing.shared.phones.events import LipFrame, Phone, SpeechChange, Waveform
 from kouxing.shared.wire.audio import AudioChunk, Sound
 from kouxing.shared.wire.control import StartSession
@@ -75,7 +75,7 @@ class RecognizerSession:
         self.link = SynthesizerLink()
         self.replay_window = ReplayWindow()
         self.order = AudioOrder()
-        self.client = NOBODY  # sender of the newest audio
+        self.client = NO_PEER  # sender of the newest audio
         self.mouth_profile_error = ""  # why the profile is not used; empty once reported
         self.end: AudioChunk | None = None  # the last chunk, if it has arrived
         self.is_finished = False  # all audio up to the end is decoded

@@ -17,7 +17,7 @@ from kouxing_client import Client, KouxingError, Refused, Session, Sound
 
 from kouxing.evaluation.system.attackers import connect
 from kouxing.shared.bus import Bus, Socket
-from kouxing.shared.keys import own_key, user_key
+from kouxing.shared.keys import load_key, user_key
 from kouxing.shared.wire.audio import AcknowledgeAudio, AudioChunk
 from kouxing.shared.wire.control import Heartbeat, SessionInput
 from kouxing.shared.wire.face import FapFrame
@@ -189,7 +189,7 @@ def test_garbage_on_every_port_harms_nobody(system: System, witness: Session) ->
     kinds = (zmq.DEALER, zmq.SUB, zmq.XSUB, zmq.PUSH)
     with zmq.Context() as context:
         for endpoint, kind in itertools.product(system.endpoints().values(), kinds):
-            for key in (user_key(), own_key("driver", ())):
+            for key in (user_key(), load_key("driver", ())):
                 with garbage_socket(context, kind) as raw:
                     connect(raw, endpoint, key)
                     throw_garbage(raw, kind)
@@ -310,7 +310,7 @@ def test_a_jump_of_years_in_media_time_makes_no_frames_for_them(
 
 
 def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) -> None:
-    with Bus(own_key("recognizer", ())) as bus:
+    with Bus(load_key("recognizer", ())) as bus:
         stranger = bus.connect_dealer(system.endpoints()["phone_input"])
         for epoch in (0, 2, 2**53):
             stranger.send(
@@ -334,7 +334,7 @@ def test_progress_of_another_epoch_is_ignored(system: System, witness: Session) 
 def test_a_false_recognizer_is_not_given_sessions(
     system: System, client: Client, witness: Session, endpoints: dict[str, str]
 ) -> None:
-    with Bus(own_key("recognizer", ())) as bus:
+    with Bus(load_key("recognizer", ())) as bus:
         stranger = bus.connect_dealer(system.control)
         stranger.send(
             Heartbeat(
@@ -354,7 +354,7 @@ def test_a_false_recognizer_is_not_given_sessions(
 def test_an_observer_that_never_answers_delays_no_session(
     system: System, client: Client, witness: Session
 ) -> None:
-    with Bus(own_key("gateway", ("service:gateway",))) as bus:
+    with Bus(load_key("gateway", ("service:gateway",))) as bus:
         mute = bus.connect_dealer(system.control)
         heartbeat = Heartbeat(
             service="gateway", instance="mute", role="observer", state="ready", sent_ns=0

@@ -15,7 +15,7 @@ from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, fin
 from kouxing.services.control.registry import MAX_SERVICES_OF_KEY
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import add_guest, key_folder, own_key, revoke_guest, user_key
+from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
 from kouxing.shared.wire.control import Event, Heartbeat, SessionInput
 from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Error
@@ -62,12 +62,12 @@ def answer(socket: Socket, kind: type[M], deadline_s: float = 20.0) -> M:
 def test_nobody_speaks_for_a_service_of_another_key(
     system: System, client: Client, witness: Session, name: str, forged: dict[str, object]
 ) -> None:
-    own_key("driver", ("service:driver",))
+    load_key("driver", ("service:driver",))
     before = {each.instance for each in client.status().services}
     (recognizer,) = (each for each in before if each.startswith("recognizer"))
     if "instance" in forged:
         forged = {**forged, "instance": recognizer}
-    with Bus(own_key(name, ())) as bus:
+    with Bus(load_key(name, ())) as bus:
         stranger = bus.connect_dealer(system.control)
         stranger.send(replace(HEARTBEAT, **forged))  # type: ignore[arg-type]
         assert answer(stranger, Error).code == "not-allowed"
@@ -80,7 +80,7 @@ def test_nobody_speaks_for_a_service_of_another_key(
 def test_only_a_sessions_own_worker_says_that_it_is_idle(
     system: System, client: Client, witness: Session
 ) -> None:
-    with Bus(own_key("driver", ("service:driver",))) as bus:
+    with Bus(load_key("driver", ("service:driver",))) as bus:
         stranger = bus.connect_dealer(system.control)
         idle = {witness.name: SessionInput(idle_s=1e9)}
         stranger.send(replace(HEARTBEAT, sessions=idle))
@@ -125,7 +125,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
         Progress(state=AudioState.ENDED),
     ]
     endpoint = system.endpoints()["phone_input"]
-    with Bus(own_key("driver", ("service:driver",))) as bus:
+    with Bus(load_key("driver", ("service:driver",))) as bus:
         stranger = bus.connect_dealer(endpoint)
         for number, message in enumerate(forged, start=1):
             stranger.send(
@@ -147,7 +147,7 @@ def test_only_the_sessions_recognizer_moves_its_face(
 @pytest.fixture
 def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
     """A client of another machine, whose key, ``laptop``, has the role of a subscriber."""
-    add_guest("laptop", ("subscriber:shown",), tmp_path / "laptop.key")
+    add_key("laptop", ("subscriber:shown",), tmp_path / "laptop.key")
     with monkeypatch.context() as there:
         there.setenv("XDG_STATE_HOME", str(tmp_path))
         key_folder().mkdir(mode=0o700)
@@ -156,7 +156,7 @@ def keyed(tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch) -> It
     with Client(system.control, key=key, timeout_s=5.0) as made:
         yield made
     with contextlib.suppress(UserError):  # revoked already
-        revoke_guest("laptop")
+        revoke_key("laptop")
 
 
 def test_a_key_may_do_what_its_roles_say(keyed: Client, client: Client, witness: Session) -> None:
@@ -175,7 +175,7 @@ def test_a_revoked_key_is_cut_while_it_follows(
     samples = samples_of_file(DEMO / "hello-female.wav")
     shown.push(samples[:16000])
     assert followed.get(20.0) is not None
-    revoke_guest("laptop")
+    revoke_key("laptop")
     frames = shown.frames()
     with contextlib.suppress(KouxingError):
         while keyed.status():  # until control has seen it
@@ -191,7 +191,7 @@ def test_a_revoked_key_is_cut_while_it_follows(
 
 
 def test_very_many_false_services_leave_the_status_readable(system: System, client: Client) -> None:
-    with Bus(own_key("lamp", ("service:lamp",))) as bus:
+    with Bus(load_key("lamp", ("service:lamp",))) as bus:
         stranger = bus.connect_dealer(system.control)
         metrics = {f"{number:0128}": 0.0 for number in range(64)}
         for number in range(MAX_SERVICES_OF_KEY + 100):

@@ -17,7 +17,7 @@ import pytest
 import zmq
 
 from kouxing.evaluation.system.attackers import connect
-from kouxing.shared.keys import Key, key_folder, own_key, user_key
+from kouxing.shared.keys import Key, key_folder, load_key, user_key
 from tests.documents import code_blocks
 from tests.e2e.following import samples_of_file, stream
 from tests.system import ROOT, VOWELS_FILE, System
@@ -142,7 +142,7 @@ def test_the_same_request_twice_is_carried_out_once(spread: System) -> None:
 
 def test_an_observer_of_a_kind_that_control_does_not_know_takes_part(spread: System) -> None:
     stranger = Stranger()
-    lamp = stranger.socket(zmq.DEALER, spread.control, own_key("lamp", ("service:lamp",)))
+    lamp = stranger.socket(zmq.DEALER, spread.control, load_key("lamp", ("service:lamp",)))
     heartbeat: dict[str, Any] = {
         "service": "lamp",
         "instance": "lamp-1",

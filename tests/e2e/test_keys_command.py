@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kouxing.services.kinds import KINDS
-from kouxing.shared.keys import key_folder, read_guests
+from kouxing.shared.keys import key_folder, read_grants
 from tests.e2e.following import stream
 from tests.system import System, kouxing, own_addresses
 
@@ -33,7 +33,7 @@ def test_init_makes_the_keys_of_all_services(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert kouxing("keys", "init").returncode == 0
-    roles = {guest.name: guest.roles for guest in read_guests().values()}
+    roles = {grant.name: grant.roles for grant in read_grants().values()}
     assert roles.keys() == {*KINDS, "client"} - {"control"}
     assert roles["gateway"] == ("service:gateway", "client")
     assert {path.stem for path in key_folder().glob("*.key")} == {*KINDS, "client"}

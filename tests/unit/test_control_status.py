@@ -12,7 +12,7 @@ import pytest
 from kouxing.services.control import service as control_service
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.endpoints import key_of
-from kouxing.shared.keys import own_key
+from kouxing.shared.keys import load_key
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
 from tests.control_stage import Stage
@@ -127,7 +127,7 @@ def test_the_pages_token_is_told_to_those_who_may_open_sessions_and_to_services(
     told: dict[str, str] = {}
     with contextlib.closing(Stage(insecure=False)) as stage, contextlib.ExitStack() as buses:
         for role in ("service:gateway", "client", "subscriber:*", "subscriber:s", "operator"):
-            bus = buses.enter_context(Bus(own_key(f"key-{len(told)}", (role,))))
+            bus = buses.enter_context(Bus(load_key(f"key-{len(told)}", (role,))))
             asker = bus.connect_dealer(stage.control.endpoints["commands"])
             if role.startswith("service"):
                 asker.send(beat)

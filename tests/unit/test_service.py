@@ -14,7 +14,7 @@ from kouxing.services.control.config import ControlConfig
 from kouxing.services.control.service import ControlService
 from kouxing.shared.bus import Bus
 from kouxing.shared.config import ServiceConfig
-from kouxing.shared.keys import NOBODY, Peer
+from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.service import RESYNC_AFTER_S, SESSIONS_PER_HEARTBEAT, Service
 from kouxing.shared.service_kind import ServiceKind
 from kouxing.shared.wire.control import (
@@ -160,7 +160,7 @@ class Control:
         self.stops: list[str] = []  # what a heartbeat is answered with
         self.beats: list[Heartbeat] = []
         self.starts: list[StartSession] = []
-        self.peer = NOBODY
+        self.peer = NO_PEER
 
     def answer(self) -> None:
         assert self.socket.wait(20.0)

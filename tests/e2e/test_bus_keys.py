@@ -21,7 +21,7 @@ from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.config import ServiceConfig
 from kouxing.shared.endpoints import split_endpoint, with_key
 from kouxing.shared.errors import UserError
-from kouxing.shared.keys import Guest, Key, add_guest, key_folder, own_key, revoke_guest
+from kouxing.shared.keys import Grant, Key, add_key, key_folder, load_key, revoke_key
 from kouxing.shared.service import Service
 from kouxing.shared.wire.codec import encode
 from kouxing.shared.wire.control import AllowedKey
@@ -30,7 +30,7 @@ from kouxing.shared.wire.message import Message
 from kouxing.shared.wire.session import Joined, StatusRequest
 from tests.system import ROOT
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.e2e
 LOCAL = "tcp://127.0.0.1:*"
 
 
@@ -43,7 +43,7 @@ class Server:
     """Sockets that are bound with control's key."""
 
     def __init__(self) -> None:
-        self.key = own_key("control", ())
+        self.key = load_key("control", ())
         self.bus = Bus(self.key)
 
     def router(self, name: str, role: str = "") -> tuple[Socket, str]:
@@ -63,7 +63,7 @@ def server() -> Iterator[Server]:
 
 
 def key_of(name: str, *roles: str) -> Key:
-    return own_key(name, roles)
+    return load_key(name, roles)
 
 
 def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
@@ -73,7 +73,7 @@ def messages_of(there: Socket, timeout_s: float = 0.5) -> list[Message]:
     return found
 
 
-def test_a_message_comes_with_the_key_of_its_sender(server: Server) -> None:
+def test_a_message_has_the_key_of_its_sender(server: Server) -> None:
     router, endpoint = server.router("control.commands")
     key = key_of("laptop", "client")
     with Bus(key) as bus:
@@ -96,24 +96,24 @@ def test_a_message_comes_with_the_key_of_its_sender(server: Server) -> None:
         ("service", ("client", "operator"), False),
     ],
 )
-def test_a_socket_takes_keys_of_its_roles_only(
+def test_a_socket_accepts_only_keys_of_its_role(
     server: Server, required: str, roles: tuple[str, ...], gets_in: bool
 ) -> None:
     router, endpoint = server.router("some.setting", role=required)
-    with Bus(key_of("guest", *roles)) as bus:
+    with Bus(key_of("grant", *roles)) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
         assert router.wait(5.0 if gets_in else 0.5) == gets_in
         assert bus.is_refused(endpoint) != gets_in
 
 
-def test_a_key_of_another_system_does_not_get_in(
+def test_rejects_a_key_of_another_system(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     router, endpoint = server.router("control.commands")
     with monkeypatch.context() as there:
         there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-        key, control = key_of("guest", "client"), key_of("control")
+        key, control = key_of("grant", "client"), key_of("control")
     with Bus(key) as bus:
         bus.connect_dealer(endpoint).send(StatusRequest(request="1"))
         assert not router.wait(0.5)
@@ -121,37 +121,37 @@ def test_a_key_of_another_system_does_not_get_in(
         assert bus.is_refused(with_key(router.endpoint, control.public))
 
 
-def test_one_key_has_not_all_connections_wherever_they_come_from(
+def test_one_key_cannot_use_all_connections(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
     monkeypatch.setattr(kernel_sockets, "network_of", lambda host: host)  # each is one of its own
     router, endpoint = server.router("recognizer.audio")
-    key = key_of("guest", "client")
+    key = key_of("grant", "client")
     with zmq.Context() as context:
-        guests = [context.socket(zmq.DEALER) for _ in range(7)]
-        ends = [guest.get_monitor_socket(zmq.EVENT_DISCONNECTED) for guest in guests]
-        for number, guest in enumerate(guests, start=2):
-            connect(guest, endpoint.replace("tcp://", f"tcp://127.0.0.{number}:0;"), key)
-            guest.send_multipart(encode(StatusRequest(request="1")))
+        grants = [context.socket(zmq.DEALER) for _ in range(7)]
+        ends = [grant.get_monitor_socket(zmq.EVENT_DISCONNECTED) for grant in grants]
+        for number, grant in enumerate(grants, start=2):
+            connect(grant, endpoint.replace("tcp://", f"tcp://127.0.0.{number}:0;"), key)
+            grant.send_multipart(encode(StatusRequest(request="1")))
             assert router.wait(5.0)
             list(router.receive())
         assert ends[-1].poll(20_000)
         assert not any(end.poll(0) for end in ends[:-1])
-        for guest, end in zip(guests, ends, strict=True):
-            guest.disable_monitor()
+        for grant, end in zip(grants, ends, strict=True):
+            grant.disable_monitor()
             end.close()
-            guest.close(linger=0)
+            grant.close(linger=0)
 
 
-def test_nobody_is_refused_where_nobody_listens(server: Server) -> None:
+def test_an_unused_port_does_not_refuse(server: Server) -> None:
     with Bus(server.key) as bus:
         assert not bus.is_refused(with_key("tcp://127.0.0.1:1", server.key.public))
 
 
-def test_who_hangs_does_not_answer_and_refuses_nobody() -> None:
+def test_a_hung_control_does_not_refuse() -> None:
     program = (
-        "import sys, time; from tests.unit.test_bus_keys import Server;"
+        "import sys, time; from tests.e2e.test_bus_keys import Server;"
         "_, endpoint = Server().router('control.commands');"
         "print(endpoint, flush=True); time.sleep(600)"
     )
@@ -181,8 +181,8 @@ def test_who_hangs_does_not_answer_and_refuses_nobody() -> None:
         b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n\x01\x00" + b"\x03\x00hi",
     ],
 )
-def test_old_zeromq_and_browsers_are_cut(greeting: bytes, with_keys: bool) -> None:
-    with Bus(own_key("control", ()) if with_keys else None) as bus:
+def test_disconnects_old_zeromq_and_browsers(greeting: bytes, with_keys: bool) -> None:
+    with Bus(load_key("control", ()) if with_keys else None) as bus:
         router = bus.bind_router(LOCAL, "control.commands")
         _, port = split_endpoint(router.endpoint, "")
         with socket.create_connection(("127.0.0.1", int(port)), timeout=5.0) as browser:
@@ -195,7 +195,7 @@ def test_old_zeromq_and_browsers_are_cut(greeting: bytes, with_keys: bool) -> No
         assert not router.wait(0.1)
 
 
-def test_a_subscriber_gets_the_sessions_of_its_role_only(server: Server) -> None:
+def test_a_subscriber_receives_only_the_sessions_of_its_role(server: Server) -> None:
     publisher, endpoint = server.publisher()
     with Bus(key_of("screen", "subscriber:mine")) as bus:
         subscriber = bus.connect_subscriber(endpoint)
@@ -211,22 +211,22 @@ def test_a_subscriber_gets_the_sessions_of_its_role_only(server: Server) -> None
         assert kinds == [(Joined, "mine"), (FapFrame, "mine")]
 
 
-def test_a_key_is_allowed_and_revoked_while_the_socket_is_bound(
+def test_allows_and_revokes_a_key_while_running(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     router, endpoint = server.router("control.commands")
-    add_guest("laptop", ("client",), tmp_path / "laptop.key")
+    add_key("laptop", ("client",), tmp_path / "laptop.key")
     (tmp_path / "other" / "kouxing").mkdir(parents=True, mode=0o700)
     (tmp_path / "other" / "kouxing").chmod(0o700)
     (tmp_path / "laptop.key").rename(tmp_path / "other" / "kouxing" / "client.key")
     with monkeypatch.context() as there:
         there.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-        key = own_key("client", ())
+        key = load_key("client", ())
     with Bus(key) as bus:
         dealer = bus.connect_dealer(endpoint)
         dealer.send(StatusRequest(request="1"))
         assert len(messages_of(router, 2.0)) == 1
-        revoke_guest("laptop")
+        revoke_key("laptop")
         assert server.bus.zap is not None
         server.bus.zap.refresh()
         dealer.send(StatusRequest(request="2"))
@@ -234,14 +234,14 @@ def test_a_key_is_allowed_and_revoked_while_the_socket_is_bound(
         assert bus.is_refused(endpoint)
 
 
-class Fleeting(dict[str, Guest]):
-    """Guests who are revoked as soon as somebody has asked for one."""
+class Fleeting(dict[str, Grant]):
+    """Grants who are revoked as soon as somebody has asked for one."""
 
     def __contains__(self, key: object) -> bool:
         return self.pop(str(key), None) is not None
 
 
-def test_a_key_that_is_revoked_while_its_subscription_is_handled_harms_nobody(
+def test_survives_a_key_that_is_revoked_during_its_subscription(
     server: Server,
 ) -> None:
     publisher, endpoint = server.publisher()
@@ -249,7 +249,7 @@ def test_a_key_that_is_revoked_while_its_subscription_is_handled_harms_nobody(
         bus.connect_subscriber(endpoint).subscribe(FapFrame, None)
         assert publisher.wait(5.0)
         assert server.bus.zap is not None
-        server.bus.zap.guests = Fleeting(server.bus.zap.guests)
+        server.bus.zap.grants = Fleeting(server.bus.zap.grants)
         assert list(publisher.receive()) == []
 
 
@@ -259,7 +259,7 @@ class Recognizer(Service):
     kind = KINDS["recognizer"]
 
 
-def test_a_list_that_cannot_be_written_counts_as_long_as_the_service_runs(
+def test_uses_a_list_that_cannot_be_written_until_the_service_ends(
     server: Server,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -279,13 +279,13 @@ def test_a_list_that_cannot_be_written_counts_as_long_as_the_service_runs(
         key_folder().chmod(0o755)  # nothing is written there
         allowed = {key.public: AllowedKey(name="laptop", roles=["client"])}
         service._allow_keys(allowed)
-        assert "until this process ends: others can read" in caplog.text
+        assert "until this process ends: other users can read" in caplog.text
         assert not bus.is_refused(endpoint)
         service._allow_keys({})
         assert bus.is_refused(endpoint)
 
 
-def test_a_list_that_is_broken_changes_nothing(server: Server) -> None:
+def test_ignores_a_broken_list(server: Server) -> None:
     router, endpoint = server.router("control.commands")
     with Bus(key_of("laptop", "client")) as bus:
         assert not bus.is_refused(endpoint)
@@ -297,14 +297,14 @@ def test_a_list_that_is_broken_changes_nothing(server: Server) -> None:
 @pytest.mark.parametrize(
     ("endpoint", "is_plain", "said"),
     [
-        ("tcp://127.0.0.1:1", False, "there, but not here"),
-        ("tcp://127.0.0.1:1 " + "a" * 40, True, "here, but not there"),
-        ("tcp://-:1", True, "is no endpoint"),
+        ("tcp://127.0.0.1:1", False, "only the service at .* has insecure"),
+        ("tcp://127.0.0.1:1 " + "a" * 40, True, "only this process has insecure"),
+        ("tcp://-:1", True, "is not an endpoint"),
         ("tcp://127.0.0.1:0 short", False, "cannot connect"),
-        ("udp://127.0.0.1:1", True, "is no endpoint"),
+        ("udp://127.0.0.1:1", True, "is not an endpoint"),
     ],
 )
-def test_an_endpoint_that_cannot_be_connected_to_is_an_error(
+def test_rejects_an_endpoint_that_cannot_be_connected_to(
     server: Server, endpoint: str, is_plain: bool, said: str
 ) -> None:
     with Bus(None if is_plain else server.key) as bus, pytest.raises(UserError, match=said):
