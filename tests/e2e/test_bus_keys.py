@@ -1,4 +1,4 @@
-"""Who may connect to a socket that is bound with a key, and what they may do there."""
+"""Access to bound sockets: keys, roles, revoked keys and old clients."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def test_a_message_may_arrive_in_pieces(bus: Bus) -> None:
         other = bus.connect_dealer(audio.endpoint)
         for begin in range(0, len(data), len(data) // 4):
             slow.sendall(data[begin : begin + len(data) // 4])
-            for number in range(20):  # others' messages are delivered meanwhile
+            for number in range(20):  # other messages are delivered in between
                 other.send(Progress(sequence=number, level_db=0.0))
                 time.sleep(0.005)
                 taken += audio.receive()
@@ -163,7 +163,7 @@ def test_disconnects_a_peer_that_sends_only_bad_messages(bus: Bus) -> None:
     audio = bus.bind_router(LOCAL, "audio")
     with connected(port_of(audio)) as hostile:
         hostile.settimeout(0.001)
-        bad = 10 * (frame(b"nothing/s/", more=True) + frame(b"\x80"))  # credit comes back meanwhile
+        bad = 10 * (frame(b"nothing/s/", more=True) + frame(b"\x80"))  # the budget recovers in between
         unsent = bad
         end_s = time.monotonic() + LIMIT_S
         while time.monotonic() < end_s:
