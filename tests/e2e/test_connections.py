@@ -163,7 +163,7 @@ def test_disconnects_a_peer_that_sends_only_bad_messages(bus: Bus) -> None:
     audio = bus.bind_router(LOCAL, "audio")
     with connected(port_of(audio)) as hostile:
         hostile.settimeout(0.001)
-        bad = 10 * (frame(b"nothing/s/", more=True) + frame(b"\x80"))  # the budget recovers in between
+        bad = 10 * (frame(b"nothing/s/", more=True) + frame(b"\x80"))  # budget recovers
         unsent = bad
         end_s = time.monotonic() + LIMIT_S
         while time.monotonic() < end_s:
