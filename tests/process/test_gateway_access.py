@@ -1,4 +1,4 @@
-"""Who may reach the gateway: https with a token, other pages, frames."""
+"""Access to the gateway over HTTP: paths, host names, origins, tokens and certificates."""
 
 from __future__ import annotations
 
@@ -18,38 +18,13 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from kouxing.evaluation.system.chromium import wait_until
+from tests.process.gateway_system import wait_until
 from tests.scripted_system import Gateway
 from tests.system import ROOT, free_port
 
 pytestmark = pytest.mark.process
 
 NO_CONTROL = "tcp://127.0.0.1:9"
-
-
-@pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("https") / "kouxing.pem"
-
-
-@pytest.fixture(scope="module")
-def gateway(certificate: Path) -> Iterator[Gateway]:
-    gateway = Gateway(
-        NO_CONTROL,
-        free_port(),
-        host="0.0.0.0",  # noqa: S104 - with https and a token
-        certificate=str(certificate),
-        token="secret",
-        names="face.example",
-        allowed_origins="https://tool.example",
-        frame_ancestors="https://tool.example https://other.example:8443",
-        senders=f"vmc://192.0.2.7 vts://127.0.0.1:{free_port()}",
-    )
-    wait_until(lambda: certificate.is_file() and certificate.read_bytes(), 60)
-    yield gateway
-    assert gateway.stop() == 0
-
-
 UPGRADE = {
     "Connection": "Upgrade",
     "Upgrade": "websocket",
@@ -58,29 +33,34 @@ UPGRADE = {
 }
 
 
-def get(gateway: Gateway, certificate: Path, path: str, headers: dict[str, str]) -> HTTPResponse:
-    return ask(gateway, certificate, "GET", path, headers)
+class Site:
+    """A gateway that is asked over http, or over https with a certificate."""
+
+    def __init__(self, certificate: Path | None = None, **settings: str) -> None:
+        if certificate is not None:
+            settings["certificate"] = str(certificate)
+        self.certificate = certificate
+        self.gateway = Gateway(NO_CONTROL, free_port(), **settings)
+        self.port = urlsplit(self.gateway.page).port
+
+    def ask(
+        self, path: str, method: str = "GET", body: str | None = None, **headers: str
+    ) -> HTTPResponse:
+        """Return the head of an answer."""
+        with contextlib.closing(self._connection()) as connection:
+            wait_until(lambda: can_connect(connection))
+            connection.request(method, f"/{path}", body, headers)
+            return connection.getresponse()
+
+    def _connection(self) -> HTTPConnection:
+        if self.certificate is None:
+            return HTTPConnection("127.0.0.1", self.port, timeout=60)
+        wait_until(lambda: bool(self.certificate and self.certificate.is_file()))
+        tls = ssl.create_default_context(cafile=self.certificate)  # also checks the names
+        return HTTPSConnection("127.0.0.1", self.port, timeout=60, context=tls)
 
 
-def ask(
-    gateway: Gateway,
-    certificate: Path,
-    method: str,
-    path: str,
-    headers: dict[str, str],
-    body: str | None = None,
-) -> HTTPResponse:
-    """Return the head of an answer."""
-    tls = ssl.create_default_context(cafile=certificate)  # names are checked, too
-    with contextlib.closing(
-        HTTPSConnection("127.0.0.1", urlsplit(gateway.page).port, timeout=60, context=tls)
-    ) as connection:
-        wait_until(lambda: can_connect(connection), 60)
-        connection.request(method, f"/{path}", body, headers)
-        return connection.getresponse()
-
-
-def can_connect(connection: HTTPSConnection) -> bool:
+def can_connect(connection: HTTPConnection) -> bool:
     try:
         connection.connect()
     except ConnectionRefusedError:
@@ -88,78 +68,139 @@ def can_connect(connection: HTTPSConnection) -> bool:
     return True
 
 
-@pytest.mark.parametrize("path", ["viewer", "microphone", "whip", "learn-mouth", "senders"])
-def test_sessions_need_the_token(gateway: Gateway, certificate: Path, path: str) -> None:
-    for query in ("", "?token=wrong"):
-        assert get(gateway, certificate, path + query, UPGRADE).status == 403
+@pytest.fixture(scope="module")
+def local() -> Iterator[Site]:
+    """A gateway on loopback without a token."""
+    site = Site()
+    yield site
+    assert site.gateway.stop() == 0
 
 
-def test_the_token_opens_and_the_page_itself_needs_none(
-    gateway: Gateway, certificate: Path
+@pytest.fixture(scope="module")
+def public(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A gateway on all addresses, with https and a token."""
+    site = Site(
+        tmp_path_factory.mktemp("https") / "kouxing.pem",
+        host="0.0.0.0",  # noqa: S104 - with https and a token
+        token="secret",
+        names="face.example",
+        allowed_origins="https://tool.example",
+        frame_ancestors="https://tool.example https://other.example:8443",
+        senders=f"vmc://192.0.2.7 vts://127.0.0.1:{free_port()}",
+    )
+    yield site
+    assert site.gateway.stop() == 0
+
+
+@pytest.mark.parametrize(
+    ("path", "headers", "status"),
+    [
+        ("viewer", {"Origin": "http://evil.example", **UPGRADE}, 403),
+        ("microphone", {"Origin": "null", **UPGRADE}, 403),
+        ("", {"Host": "evil.example"}, 403),
+        ("viewer?session=..%2F", UPGRADE, 400),
+        ("viewer?shapes=face", UPGRADE, 400),
+        ("viewer?shapes=vrm&format=xml", UPGRADE, 400),
+        ("..%2Fservice.py", {}, 404),
+        ("package.json", {}, 404),
+        ("tests%2Fplayout.test.js", {}, 404),
+        ("tests/playout.test.js", {}, 404),
+        ("modules/three/build/..%2Fpackage.json", {}, 404),
+        ("modules/face_mesh/package.json", {}, 404),
+        ("modules/face_mesh/..%2F..%2Fthree%2Fpackage.json", {}, 404),
+    ],
+)
+def test_rejects_foreign_pages_and_other_files(
+    local: Site, path: str, headers: dict[str, str], status: int
 ) -> None:
-    assert get(gateway, certificate, "viewer?token=secret", UPGRADE).status == 101
-    page = get(gateway, certificate, "", {})
+    assert local.ask(path, **headers).status == status
+
+
+def test_the_policies_allow_functions_from_text_only_to_the_face_mesh(local: Site) -> None:
+    page = local.ask("").headers["Content-Security-Policy"]
+    assert "default-src 'self'" in page
+    assert "unsafe" not in page
+    frame = local.ask("face-mesh.html").headers
+    assert "script-src 'self' 'unsafe-eval'" in frame["Content-Security-Policy"]
+    assert "frame-ancestors 'self'" in frame["Content-Security-Policy"]
+    assert frame["Permissions-Policy"] == "camera=(), microphone=()"
+
+
+@pytest.mark.parametrize(
+    ("name", "content_type"),
+    [
+        ("face_mesh/face_mesh.js", "javascript"),
+        ("face_mesh/face_mesh.binarypb", "application/octet-stream"),
+        ("face_mesh/face_mesh_solution_simd_wasm_bin.wasm", "application/wasm"),
+        ("three/build/three.module.js", "javascript"),
+    ],
+)
+def test_serves_the_modules_of_the_page(local: Site, name: str, content_type: str) -> None:
+    answer = local.ask(f"modules/{name}")
+    assert answer.status == 200
+    assert answer.headers["Content-Type"].partition(";")[0].endswith(content_type)
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+
+@pytest.mark.parametrize("path", ["viewer", "microphone", "whip", "learn-mouth", "senders"])
+def test_sessions_and_uploads_require_the_token(public: Site, path: str) -> None:
+    for query in ("", "?token=wrong"):
+        assert public.ask(path + query, **UPGRADE).status == 403
+
+
+def test_the_token_opens_sessions_and_the_page_requires_none(public: Site) -> None:
+    assert public.ask("viewer?token=secret", **UPGRADE).status == 101
+    page = public.ask("")
     assert page.status == 200
     ancestors = "frame-ancestors https://tool.example https://other.example:8443"
     assert page.headers["Content-Security-Policy"].endswith(ancestors)
 
 
-def test_whip_takes_the_token_as_its_clients_send_it_and_answers_pages_that_may_connect(
-    gateway: Gateway, certificate: Path
-) -> None:
-    headers = {"Origin": "https://tool.example"}
-    asked = ask(gateway, certificate, "OPTIONS", "whip", headers)
-    assert asked.status == 204
-    assert "Authorization" in asked.headers["Access-Control-Allow-Headers"]
-    evil = ask(gateway, certificate, "OPTIONS", "whip", {"Origin": "https://evil.example"})
-    assert evil.status == 403
+def test_whip_accepts_bearer_tokens_from_allowed_origins(public: Site) -> None:
+    preflight = public.ask("whip", "OPTIONS", Origin="https://tool.example")
+    assert preflight.status == 204
+    assert "Authorization" in preflight.headers["Access-Control-Allow-Headers"]
+    assert public.ask("whip", "OPTIONS", Origin="https://evil.example").status == 403
     for token, status in (("wrong", 403), ("secret", 404)):
-        given = {**headers, "Authorization": f"Bearer {token}"}
-        ended = ask(gateway, certificate, "DELETE", "whip/unknown", given)
-        assert ended.status == status
+        headers = {"Origin": "https://tool.example", "Authorization": f"Bearer {token}"}
+        assert public.ask("whip/unknown", "DELETE", **headers).status == status
 
 
 @pytest.mark.parametrize(
     ("origin", "status"), [("https://tool.example", 101), ("https://evil.example", 403)]
 )
-def test_only_pages_that_are_named_may_connect(
-    gateway: Gateway, certificate: Path, origin: str, status: int
-) -> None:
-    headers = {**UPGRADE, "Origin": origin}
-    assert get(gateway, certificate, "viewer?token=secret", headers).status == status
+def test_only_allowed_origins_may_connect(public: Site, origin: str, status: int) -> None:
+    assert public.ask("viewer?token=secret", Origin=origin, **UPGRADE).status == status
 
 
 @pytest.mark.parametrize(
-    ("url", "origin", "status"),
+    ("url", "headers", "status"),
     [
-        ("vmc://192.0.2.7", None, 200),  # of the configuration
-        ("vmc://192.0.2.7:39539", None, 422),
-        ("vmc://evil.example", None, 422),
-        ("vmc://127.0.0.1:39539", "https://evil.example", 403),
+        ("vmc://192.0.2.7", {}, 200),  # in the configuration
+        ("vmc://192.0.2.7:39539", {}, 422),
+        ("vmc://evil.example", {}, 422),
+        ("vmc://127.0.0.1:39539", {"Origin": "https://evil.example"}, 403),
     ],
 )
-def test_a_page_sends_to_this_machine_and_to_what_is_configured(
-    gateway: Gateway, certificate: Path, url: str, origin: str | None, status: int
+def test_a_page_sends_only_to_this_machine_and_to_configured_addresses(
+    public: Site, url: str, headers: dict[str, str], status: int
 ) -> None:
-    headers = {"Origin": origin} if origin else {}
     body = json.dumps({"start": url})
-    assert ask(gateway, certificate, "POST", "senders?token=secret", headers, body).status == status
+    assert public.ask("senders?token=secret", "POST", body, **headers).status == status
 
 
 @pytest.mark.parametrize(
     ("host", "status"),
     [
-        ("evil.example", 403),  # resolves to this machine: DNS rebinding
+        ("evil.example", 403),  # DNS rebinding
         ("face.example", 200),
         (f"{socket.gethostname()}:8080", 200),
         ("192.0.2.7:8080", 200),
         ("localhost", 200),
     ],
 )
-def test_only_its_own_names_are_answered(
-    gateway: Gateway, certificate: Path, host: str, status: int
-) -> None:
-    page = get(gateway, certificate, "", {"Host": host})
+def test_answers_only_under_its_own_names(public: Site, host: str, status: int) -> None:
+    page = public.ask("", Host=host)
     assert page.status == status
     assert page.headers["X-Content-Type-Options"] == "nosniff"
     assert page.headers["Referrer-Policy"] == "no-referrer"
@@ -167,30 +208,36 @@ def test_only_its_own_names_are_answered(
     assert "Set-Cookie" not in page.headers
 
 
-def test_the_made_certificate_is_for_its_owner_alone(gateway: Gateway, certificate: Path) -> None:
-    assert stat.S_IMODE(certificate.stat().st_mode) == 0o600
+def test_only_the_owner_can_read_the_certificate(public: Site) -> None:
+    assert public.ask("").status == 200
+    assert public.certificate is not None
+    assert stat.S_IMODE(public.certificate.stat().st_mode) == 0o600
 
 
-def test_plain_http_to_a_proxy_needs_a_token_too_which_is_made_and_shown() -> None:
-    process = subprocess.Popen(
+def gateway_process(**settings: str) -> subprocess.Popen[str]:
+    names = {f"KOUXING_{name.upper()}": value for name, value in settings.items()}
+    return subprocess.Popen(
         [sys.executable, "-m", "kouxing.services.gateway"],
         cwd=ROOT,
-        env={
-            **os.environ,
-            "KOUXING_CONTROL": NO_CONTROL,
-            "KOUXING_GATEWAY_HOST": "0.0.0.0",  # noqa: S104
-            "KOUXING_GATEWAY_PORT": "0",
-            "KOUXING_GATEWAY_PLAIN_HTTP": "true",
-            "KOUXING_ADVERTISE": "127.0.0.1",
-        },
+        env={**os.environ, "KOUXING_CONTROL": NO_CONTROL, "KOUXING_GATEWAY_PORT": "0", **names},
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def test_plain_http_for_a_proxy_creates_and_prints_a_token() -> None:
+    process = gateway_process(
+        gateway_host="0.0.0.0",  # noqa: S104
+        gateway_plain_http="true",
+        advertise="127.0.0.1",
+    )
     try:
         assert process.stderr is not None
-        shown = (re.search(r"page=http://127.0.0.1:(\d+)/#token=([\w-]{22})", line)
-                 for line in process.stderr)  # fmt: skip
-        port, token = next(filter(None, shown)).groups()
+        matches = (
+            re.search(r"page=http://127.0.0.1:(\d+)/#token=([\w-]{22})", line)
+            for line in process.stderr
+        )
+        port, token = next(filter(None, matches)).groups()
         for query, status in (("", 403), (f"?token={token}", 101)):
             with contextlib.closing(HTTPConnection("127.0.0.1", int(port), timeout=60)) as http:
                 http.request("GET", f"/viewer{query}", headers=UPGRADE)
@@ -201,31 +248,17 @@ def test_plain_http_to_a_proxy_needs_a_token_too_which_is_made_and_shown() -> No
 
 
 @pytest.mark.parametrize(
-    ("settings", "named"),
+    ("settings", "text"),
     [
-        ({"HOST": "0.0.0.0"}, "gateway.certificate=kouxing.pem"),  # noqa: S104
-        ({"CERTIFICATE": __file__}, "gateway.certificate: "),
-        ({"CERTIFICATE": "/no/such/folder/new.pem"}, "No such file or directory"),
-        (
-            {"SENDERS": "vmc://127.0.0.1 http://127.0.0.1"},
-            "a list of addresses such as vmc://127.0.0.1:39540",
-        ),
-        ({"FRAME_ANCESTORS": "https://a.example; script-src *"}, "a list of origins"),
+        ({"gateway_host": "0.0.0.0"}, "gateway.certificate=kouxing.pem"),  # noqa: S104
+        ({"gateway_certificate": __file__}, "gateway.certificate: "),
+        ({"gateway_certificate": "/no/such/folder/new.pem"}, "No such file or directory"),
+        ({"gateway_senders": "vmc://127.0.0.1 http://127.0.0.1"}, "vmc://127.0.0.1:39540"),
+        ({"gateway_frame_ancestors": "https://a.example; script-src *"}, "https://example.org"),
     ],
 )
-def test_what_is_wrong_is_named(settings: dict[str, str], named: str) -> None:
-    result = subprocess.run(
-        [sys.executable, "-m", "kouxing.services.gateway"],
-        cwd=ROOT,
-        env={
-            **os.environ,
-            "KOUXING_GATEWAY_PORT": "0",
-            **{f"KOUXING_GATEWAY_{key}": value for key, value in settings.items()},
-        },
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert result.returncode == 2
-    assert named in result.stderr
+def test_reports_wrong_settings(settings: dict[str, str], text: str) -> None:
+    process = gateway_process(**settings)
+    _, log = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert text in log

@@ -1,4 +1,4 @@
-"""What the gateway's port bears: half requests, too many connections, floods of commands."""
+"""Limits of the gateway's port: incomplete requests, and too many connections."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import urlsplit
 
 import aiohttp
 import pytest
@@ -23,6 +24,7 @@ from kouxing.services.gateway.viewers import Viewers
 from kouxing.services.gateway.web_server import WebServer
 from kouxing.services.gateway.whip import WhipClients
 from kouxing.shared.metrics import Metrics
+from tests.process.gateway_system import GatewayProcess, ScriptedSystem
 
 pytestmark = pytest.mark.process
 
@@ -69,7 +71,7 @@ async def never_end(request: web.Request) -> web.StreamResponse:
 
 @asynccontextmanager
 async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterator[Served]:
-    """Serve with other limits; ``/long`` may take its time."""
+    """Serve with other limits; ``/long`` has no time limit."""
     for name, limit in {"_CHECK_S": 0.02, **limits}.items():
         monkeypatch.setattr(web_server, name, limit)
     bound = web_server.bind_port("127.0.0.1", 0)
@@ -89,14 +91,14 @@ async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterat
 
 
 async def check_open(answer: asyncio.StreamReader) -> None:
-    """Check that an endless answer has begun and goes on."""
+    """Check that an endless answer has started and continues."""
     await asyncio.wait_for(answer.readuntil(b"begun"), 20)
     with pytest.raises(TimeoutError):
         await asyncio.wait_for(answer.read(), 0.2)
 
 
 @pytest.mark.parametrize("half", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
-def test_who_asks_for_nothing_is_sent_away(monkeypatch: pytest.MonkeyPatch, half: bytes) -> None:
+def test_closes_connections_without_a_request(monkeypatch: pytest.MonkeyPatch, half: bytes) -> None:
     async def wait() -> None:
         async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
             assert await asyncio.wait_for((await served.connect(half)).read(), 20) == b""
@@ -105,7 +107,7 @@ def test_who_asks_for_nothing_is_sent_away(monkeypatch: pytest.MonkeyPatch, half
     asyncio.run(wait())
 
 
-def test_who_has_asked_once_is_sent_away_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closes_idle_connections_after_a_request(monkeypatch: pytest.MonkeyPatch) -> None:
     async def wait() -> None:
         async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
             reader = await served.connect(b"GET / HTTP/1.1\r\nHost: a\r\n\r\nGET / HT")
@@ -115,7 +117,7 @@ def test_who_has_asked_once_is_sent_away_too(monkeypatch: pytest.MonkeyPatch) ->
     asyncio.run(wait())
 
 
-def test_an_answer_that_is_never_taken_ends_unless_it_may_take_its_time(
+def test_ends_slow_answers_except_on_unlimited_paths(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def wait() -> None:
@@ -136,7 +138,7 @@ def test_an_answer_that_is_never_taken_ends_unless_it_may_take_its_time(
         b"GET /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
     ],
 )
-def test_half_a_body_is_not_waited_for_but_a_whole_one_gives_its_answer_all_time(
+def test_a_body_has_a_deadline_and_its_answer_has_none(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, half: bytes
 ) -> None:
     async def wait() -> None:
@@ -154,7 +156,7 @@ def test_half_a_body_is_not_waited_for_but_a_whole_one_gives_its_answer_all_time
     assert not caplog.records
 
 
-def test_one_connection_too_many_is_refused_and_room_returns(
+def test_refuses_connections_above_the_limit_until_one_closes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async def fill() -> None:
@@ -182,9 +184,9 @@ CLIENTS: dict[str, Callable[[float], Handler]] = {
 
 
 @pytest.mark.parametrize("kind", CLIENTS)
-@pytest.mark.parametrize(("share", "num_of_address"), [(0.75, 3), (1.0, 4)])
-def test_one_address_has_not_all_places_unless_all_come_from_a_proxys(
-    monkeypatch: pytest.MonkeyPatch, kind: str, share: float, num_of_address: int
+@pytest.mark.parametrize(("share", "num_per_address"), [(0.75, 3), (1.0, 4)])
+def test_one_address_gets_only_its_share_unless_it_is_a_proxys(
+    monkeypatch: pytest.MonkeyPatch, kind: str, share: float, num_per_address: int
 ) -> None:
     for module, name in (
         (viewers, "MAX_VIEWERS"),
@@ -206,9 +208,9 @@ def test_one_address_has_not_all_places_unless_all_come_from_a_proxys(
                     return None if error.status == 503 else pytest.fail(str(error))
 
             held = [await connect("127.0.0.1") for _ in range(5)]
-            assert sum(each is not None for each in held) == num_of_address
+            assert sum(socket_ is not None for socket_ in held) == num_per_address
             others = [await connect("127.0.0.2") for _ in range(5)]
-            assert sum(each is not None for each in others) == 4 - num_of_address
+            assert sum(socket_ is not None for socket_ in others) == 4 - num_per_address
             assert held[0] is not None
             await held[0].close()
             async with asyncio.timeout(20):
@@ -218,7 +220,7 @@ def test_one_address_has_not_all_places_unless_all_come_from_a_proxys(
     asyncio.run(fill())
 
 
-def test_one_address_has_not_all_places_of_webrtc(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_address_gets_only_its_share_of_webrtc_clients(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(whip, "MAX_CLIENTS", 4)
 
     async def fill() -> None:
@@ -245,13 +247,13 @@ def test_one_address_has_not_all_places_of_webrtc(monkeypatch: pytest.MonkeyPatc
                     await asyncio.sleep(0.01)
                 assert await offer() == 503
                 is_over.set()
-                assert [await each for each in held] == [501, 501, 501]
-                assert await offer() == 501, "the places are free again"
+                assert [await status for status in held] == [501, 501, 501]
+                assert await offer() == 501, "the quota is released"
 
     asyncio.run(fill())
 
 
-def test_no_descriptor_left_is_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     class Exhausted(socket.socket):
         def accept(self) -> tuple[socket.socket, object]:
             if failures:
@@ -273,3 +275,20 @@ def test_no_descriptor_left_is_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
         await port.stop()
 
     asyncio.run(wait())
+
+
+def test_logs_requests_that_are_not_http_once() -> None:
+    system = ScriptedSystem()
+    gateway = GatewayProcess(system)
+    address = urlsplit(gateway.page)
+    for garbage in (b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01" * 100, b"\xff\x00" * 5000):
+        with socket.create_connection((address.hostname, address.port), 60) as client:
+            client.sendall(garbage)
+            assert b" 400 " in client.recv(100)
+    gateway.process.terminate()
+    assert gateway.process.stderr is not None
+    log = gateway.process.stderr.read()
+    gateway.stop()
+    system.close()
+    assert log.count("not HTTP") == 1
+    assert "Traceback" not in log
