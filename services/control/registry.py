@@ -1,7 +1,6 @@
-"""Which services are alive, what they provide, and which of them may serve a session.
+"""The running services, and what they provide.
 
-A worker provides endpoints and needs others, an observer takes part in every session. Control knows
-no kinds of service but those that must provide what it knows by name.
+A worker provides endpoints and needs others. An observer takes part in every session.
 """
 
 from __future__ import annotations
@@ -11,64 +10,51 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from operator import itemgetter
 
-from kouxing.services.control.load import RETRY_AFTER_S, SAME_LOAD, WorkerLoad
+from kouxing.services.control.load import WorkerLoad
+from kouxing.services.control.refusal import Refusal
 from kouxing.services.kinds import PROVIDERS
-from kouxing.shared.endpoints import with_key
+from kouxing.shared.endpoints import split_endpoint, with_key
+from kouxing.shared.errors import UserError
 from kouxing.shared.keys import NO_PEER, Peer
 from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import ErrorCode, SessionFacts
 
-CLIENT_NEEDS = ("audio", "phones", "faps")  # the endpoints that a client is told
-UNPACED_AUDIO = "unpaced_audio"  # instead of "audio", where a recognizer has it
 MAX_SERVICES = 2000
-MAX_SERVICES_OF_KEY = 1500
-MAX_CANDIDATES = 32  # workers of which the least loaded gets a session
-MAX_REMEMBERED = 1000  # lost services that are known again when they come back
-
-
-class Refusal(Exception):
-    """A request that control cannot meet."""
-
-    def __init__(self, code: ErrorCode, text: str, retry_after_s: float = 0.0) -> None:
-        super().__init__(text)
-        self.code = code
-        self.text = text
-        self.retry_after_s = retry_after_s
+MAX_SERVICES_PER_KEY = 1500
+MAX_REMEMBERED = 1000  # lost services that are recognized when they return
 
 
 @dataclass(slots=True)
 class ServiceRecord:
     """One running service."""
 
-    peer: Peer  # on control's socket; nobody for control itself
-    heartbeat: Heartbeat  # the one that registered it, without sessions
-    offered: Mapping[str, str]  # its endpoints without their key
-    received_s: float = 0.0  # when the newest came
-    state: str = "ready"  # as that said, and its figures
+    peer: Peer  # on control's socket; NO_PEER for control itself
+    heartbeat: Heartbeat  # the first one, with keys in its endpoints and without sessions
+    bare_endpoints: Mapping[str, str]  # without keys
+    heartbeat_s: float = 0.0  # when the newest heartbeat arrived
+    state: str = "ready"
     metrics: Mapping[str, float] = field(default_factory=dict)
 
 
 class Registry:
     """The services by instance.
 
-    Nothing here walks over all services at every heartbeat or tick: they are in the order of their
-    newest heartbeats, and indexed by whatever they are looked up by.
+    No heartbeat or tick iterates over all services: they are ordered by their newest heartbeat, and
+    every lookup has an index.
     """
 
-    def __init__(self, lost_after_s: float, max_load: float) -> None:
-        self._services: OrderedDict[str, ServiceRecord] = OrderedDict()  # the newest last
+    def __init__(self, lost_after_s: float) -> None:
+        self._services: OrderedDict[str, ServiceRecord] = OrderedDict()  # by newest heartbeat
         self._lost_after_s = lost_after_s
-        self._max_load = max_load  # of a worker
-        self._excused_s = 0.0  # that control itself did not listen, in all
+        self._paused_s = 0.0  # total time in which control itself did not run
         self._observers: set[str] = set()
         self._by_peer: dict[Peer, str] = {}
         self._by_connection: dict[int, str] = {}
         self._by_endpoint: dict[tuple[str, str], str] = {}  # by name and address
         self._providers: dict[str, dict[str, ServiceRecord]] = {}  # workers by endpoint
-        self._next_candidate = 0  # among a great many workers
-        self._num_of_key: Counter[str] = Counter()
-        self._loads: dict[str, WorkerLoad] = {}  # of workers, and of those whose sessions wait
-        self._lost: OrderedDict[str, Peer] = OrderedDict()  # the newest last
+        self._num_per_key: Counter[str] = Counter()
+        self._loads: dict[str, WorkerLoad] = {}  # of workers that run or have sessions
+        self._lost: OrderedDict[str, Peer] = OrderedDict()  # by time
 
     def __len__(self) -> int:
         return len(self._services)
@@ -80,94 +66,83 @@ class Registry:
         return self._services[instance]
 
     def sorted(self) -> list[ServiceRecord]:
-        """Return all services by name, but one of each kind first, then the second of each."""
-        numbers: Counter[str] = Counter()
+        """Return all services: one of each kind, then the second of each kind, and so on."""
+        counts: Counter[str] = Counter()
         ranked = []
         for instance, record in sorted(self._services.items()):
             kind = record.heartbeat.service
-            numbers[kind] += 1
-            ranked.append(((numbers[kind], instance), record))
+            counts[kind] += 1
+            ranked.append(((counts[kind], instance), record))
         return [record for _, record in sorted(ranked, key=itemgetter(0))]
 
+    # --- services come and go ------------------------------------------------------------------
+
     def check(self, heartbeat: Heartbeat, peer: Peer) -> None:
-        """Check that a heartbeat may be that of a service.
+        """Check that a heartbeat may register its service, or comes from its owner.
 
         Raises
         ------
         Refusal
-            The instance is another key's, or there are too many services.
+            The instance belongs to another key, an endpoint is malformed or belongs to another kind
+            of service, or there are too many services.
         """
-        known = self._services.get(heartbeat.instance)
-        if known is None:
-            if (
-                len(self._services) >= MAX_SERVICES
-                or self._num_of_key[peer.key] >= MAX_SERVICES_OF_KEY
-            ):
-                raise Refusal(ErrorCode.TOO_MANY_SERVICES, "there are too many services")
-        elif known.peer.key != peer.key:
-            raise Refusal(ErrorCode.NOT_ALLOWED, f"{heartbeat.instance} runs with another key")
+        record = self._services.get(heartbeat.instance)
+        if record is None or self.is_other_process(heartbeat, peer):
+            _check_endpoints(heartbeat)
+        if record is None:
+            is_full = len(self._services) >= MAX_SERVICES
+            if is_full or self._num_per_key[peer.key] >= MAX_SERVICES_PER_KEY:
+                raise Refusal(ErrorCode.TOO_MANY_SERVICES, "too many services are registered")
+        elif record.peer.key != peer.key:
+            text = f"{heartbeat.instance} is registered with another key"
+            raise Refusal(ErrorCode.NOT_ALLOWED, text)
 
     def add(self, heartbeat: Heartbeat, peer: Peer, now_s: float) -> None:
-        """Add a service, or note its newest heartbeat."""
+        """Register a service, or record its newest heartbeat."""
         instance = heartbeat.instance
         record = self._services.get(instance)
         if record is None:
-            kept = replace(heartbeat, endpoints=_keyed(heartbeat, peer), sessions={})
-            record = ServiceRecord(peer, kept, heartbeat.endpoints)
-            self._services[instance] = record
-            heartbeat = kept
-            self._num_of_key[peer.key] += 1
-            if peer != NO_PEER:
-                self._by_peer[peer] = instance
-            if heartbeat.role == "observer":
-                self._observers.add(instance)
-            elif heartbeat.role == "worker":
-                self._by_endpoint.update(dict.fromkeys(heartbeat.endpoints.items(), instance))
-                for endpoint in heartbeat.endpoints:
-                    self._providers.setdefault(endpoint, {})[instance] = record
+            record = self._services[instance] = self._register(heartbeat, peer)
         elif record.peer.connection != peer.connection:
             self._by_connection.pop(record.peer.connection, None)
         if peer.connection:
             self._by_connection[peer.connection] = instance
-        record.peer, record.received_s = peer, now_s - self._excused_s
+        record.peer, record.heartbeat_s = peer, now_s - self._paused_s
         record.state, record.metrics = heartbeat.state, heartbeat.metrics
         self._services.move_to_end(instance)
         if heartbeat.role == "worker":
             self.load(instance).measure(heartbeat.load, now_s)
 
-    def load(self, instance: str) -> WorkerLoad:
-        """Return the load of a worker, also of one that is lost and has sessions."""
-        return self._loads.setdefault(instance, WorkerLoad())
-
-    def forget_load(self, instance: str) -> None:
-        """Forget the load of a worker that has no sessions any more, if it is lost."""
-        if instance not in self._services:
-            self._loads.pop(instance, None)
-
-    def instance_of(self, peer: Peer) -> str:
-        """Return the service that a message comes from; empty if its sender is none."""
-        return self._by_peer.get(peer, "")
-
-    def instance_at(self, connection: int) -> str:
-        """Return the service whose newest heartbeat came through a connection; empty if none."""
-        return self._by_connection.get(connection, "")
+    def _register(self, heartbeat: Heartbeat, peer: Peer) -> ServiceRecord:
+        instance = heartbeat.instance
+        first = replace(heartbeat, endpoints=_with_keys(heartbeat, peer), sessions={})
+        record = ServiceRecord(peer, first, heartbeat.endpoints)
+        self._num_per_key[peer.key] += 1
+        if peer != NO_PEER:
+            self._by_peer[peer] = instance
+        if first.role == "observer":
+            self._observers.add(instance)
+        elif first.role == "worker":
+            self._by_endpoint.update(dict.fromkeys(first.endpoints.items(), instance))
+            for endpoint in first.endpoints:
+                self._providers.setdefault(endpoint, {})[instance] = record
+        return record
 
     def remove(self, instance: str) -> None:
-        """Forget a service, but for its name if the same process comes back."""
+        """Forget a service; remember its process in case it was declared lost by mistake."""
         record = self._services.pop(instance, None)
         if record is None:
             return
-        self._num_of_key[record.peer.key] -= 1
+        self._num_per_key[record.peer.key] -= 1
         self._observers.discard(instance)
         if self._by_peer.get(record.peer) == instance:
             del self._by_peer[record.peer]
         if self._by_connection.get(record.peer.connection) == instance:
             del self._by_connection[record.peer.connection]
-        for endpoint in record.heartbeat.endpoints.items():
-            if self._by_endpoint.get(endpoint) == instance:
-                del self._by_endpoint[endpoint]
-            if endpoint[0] in self._providers:
-                self._providers[endpoint[0]].pop(instance, None)
+        for name, address in record.heartbeat.endpoints.items():
+            if self._by_endpoint.get((name, address)) == instance:
+                del self._by_endpoint[name, address]
+            self._providers.get(name, {}).pop(instance, None)
         self._lost[instance] = record.peer
         self._lost.move_to_end(instance)
         if len(self._lost) > MAX_REMEMBERED:
@@ -175,111 +150,58 @@ class Registry:
         if not self.load(instance).num_sessions:
             self.forget_load(instance)
 
-    def differs(self, heartbeat: Heartbeat, peer: Peer) -> bool:
-        """Return whether a known instance is another process than before."""
-        known = self._services.get(heartbeat.instance)
-        return known is not None and (
-            known.peer != peer
-            or known.offered != heartbeat.endpoints
-            or known.heartbeat.role != heartbeat.role
-            or known.heartbeat.needs != heartbeat.needs
+    def is_other_process(self, heartbeat: Heartbeat, peer: Peer) -> bool:
+        """Return whether a known instance is now another process."""
+        record = self._services.get(heartbeat.instance)
+        return record is not None and (
+            record.peer != peer
+            or record.bare_endpoints != heartbeat.endpoints
+            or record.heartbeat.role != heartbeat.role
+            or record.heartbeat.needs != heartbeat.needs
         )
 
-    def is_back(self, instance: str, peer: Peer) -> bool:
-        """Return whether a new service is a lost one, the same process, and not lost after all."""
+    def pop_lost(self, instance: str, peer: Peer) -> bool:
+        """Return whether a new registration comes from a process that was declared lost."""
         return self._lost.pop(instance, NO_PEER) == peer
 
-    def displaced_by(self, heartbeat: Heartbeat, peer: Peer) -> str:
-        """Return the worker whose endpoints a new one provides: it has crashed. Empty if none."""
+    def displaced_by(self, heartbeat: Heartbeat, peer: Peer) -> str | None:
+        """Return the worker at the same endpoints as a new worker: it must have crashed."""
         if heartbeat.role != "worker":
-            return ""
-        endpoints = _keyed(heartbeat, peer)
-        for instance in {self.provider(*each) for each in endpoints.items()} - {""}:
-            if instance != heartbeat.instance and (
-                self._services[instance].heartbeat.endpoints == endpoints
-            ):
-                return instance
-        return ""
+            return None
+        endpoints = _with_keys(heartbeat, peer)
+        for item in endpoints.items():
+            instance = self.worker_at(*item)
+            if instance not in (None, heartbeat.instance):
+                record = self._services[instance]
+                if record.heartbeat.endpoints == endpoints:
+                    return instance
+        return None
 
-    def provider(self, endpoint: str, address: str) -> str:
-        """Return the worker that provides an endpoint at an address; empty if none does."""
-        return self._by_endpoint.get((endpoint, address), "")
+    # --- lookups -------------------------------------------------------------------------------
 
-    def excuse(self, pause_s: float) -> None:
-        """Note that control itself did not listen for some time."""
-        self._excused_s += pause_s
+    def instance_of(self, peer: Peer) -> str | None:
+        """Return the service that sends as a peer."""
+        return self._by_peer.get(peer)
 
-    def age_s(self, instance: str, now_s: float) -> float:
-        """Return how long ago a service's newest heartbeat came, without control's own pauses."""
-        return now_s - self._excused_s - self._services[instance].received_s
+    def instance_on(self, connection: int) -> str | None:
+        """Return the service whose newest heartbeat arrived on a connection."""
+        return self._by_connection.get(connection)
 
-    def silent(self, now_s: float) -> list[str]:
-        """Return the services whose last heartbeat is too old."""
-        return list(self._silent(now_s))
+    def worker_at(self, endpoint: str, address: str) -> str | None:
+        """Return the worker that provides an endpoint at an address."""
+        return self._by_endpoint.get((endpoint, address))
 
-    def _silent(self, now_s: float) -> Iterator[str]:
-        for instance, record in self._services.items():
-            if self.age_s(instance, now_s) <= self._lost_after_s:
-                return
-            if record.peer != NO_PEER:
-                yield instance
-
-    def is_observer(self, instance: str) -> bool:
-        """Return whether a service takes part in every session."""
-        return instance in self._observers
+    def providers(self, endpoint: str) -> Mapping[str, ServiceRecord]:
+        """Return the workers that provide an endpoint, by instance."""
+        return self._providers.get(endpoint, {})
 
     def observers(self) -> set[str]:
         """Return the services that take part in every session."""
         return set(self._observers)
 
-    def place(
-        self,
-        kept: Mapping[str, str],
-        now_s: float,
-        language: str | None = None,
-        *,
-        may_refuse: bool = False,
-    ) -> dict[str, str]:
-        """Choose a worker for every endpoint that a client needs, or that a chosen worker needs.
-
-        A worker that is chosen for one endpoint also serves the others it provides; otherwise the
-        least loaded ready worker is chosen. A new live session needs one that has room for it. One
-        that is placed again, or whose sound is faster than real time, is never refused for that.
-
-        Parameters
-        ----------
-        kept
-            Instance by endpoint: workers that stay.
-        now_s
-            The present.
-        language
-            Of a session that is placed again: no worker of another language will do.
-        may_refuse
-            Whether the session may be refused.
-
-        Returns
-        -------
-        dict
-            Instance by endpoint.
-
-        Raises
-        ------
-        Refusal
-            No ready worker provides one of the endpoints, or none has room.
-        """
-        workers: dict[str, str] = {}
-        wanted = list(CLIENT_NEEDS)
-        for endpoint in wanted:  # grows
-            placed = {*kept.values(), *workers.values()}
-            instance = kept.get(endpoint) or self._choose(
-                endpoint, placed, now_s, language, may_refuse=may_refuse
-            )
-            workers[endpoint] = instance
-            needs = self._services[instance].heartbeat.needs
-            wanted += [need for need in needs if need not in wanted]
-        if UNPACED_AUDIO in self._services[workers["audio"]].heartbeat.endpoints:
-            workers[UNPACED_AUDIO] = workers["audio"]
-        return workers
+    def is_observer(self, instance: str) -> bool:
+        """Return whether a service takes part in every session."""
+        return instance in self._observers
 
     def endpoints(self, workers: Mapping[str, str]) -> dict[str, str]:
         """Return the address of each endpoint in a placement."""
@@ -289,7 +211,7 @@ class Registry:
         }
 
     def facts(self, instances: Iterable[str]) -> SessionFacts:
-        """Return what these services together state about their sessions."""
+        """Return what services together state about their sessions."""
         stated = [asdict(self._services[instance].heartbeat.facts) for instance in instances]
         return SessionFacts(
             **{
@@ -298,63 +220,59 @@ class Registry:
             }
         )
 
-    def _choose(
-        self,
-        endpoint: str,
-        placed: set[str],
-        now_s: float,
-        language: str | None,
-        *,
-        may_refuse: bool,
-    ) -> str:
-        providers = self._providers.get(endpoint, {})
-        for instance in sorted(placed & providers.keys()):
-            if _may_serve(providers[instance], language):
-                return instance
-        names = [name for name, each in providers.items() if _may_serve(each, language)]
-        if not names:
-            kind = PROVIDERS.get(endpoint)
-            start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
-            missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
-            raise Refusal(
-                ErrorCode.NO_SERVICE, f"{missing}; {start} (or everything with 'kouxing run')"
-            )
-        best = min(self._candidates(names), key=lambda name: self._rank(name, now_s))
-        if may_refuse and not self._has_room(best, now_s):
-            best = min(names, key=lambda name: self._rank(name, now_s))
-        if may_refuse and not self._has_room(best, now_s):
-            text = (
-                f"every {PROVIDERS.get(endpoint, f'provider of {endpoint}')} has as many sessions "
-                f"as it can serve in time; try again in {RETRY_AFTER_S:g} s"
-            )
-            raise Refusal(ErrorCode.BUSY, text, RETRY_AFTER_S)
-        return best
+    # --- loads and silence ---------------------------------------------------------------------
 
-    def _has_room(self, instance: str, now_s: float) -> bool:
-        return self.load(instance).has_room(now_s, self._max_load)
+    def load(self, instance: str) -> WorkerLoad:
+        """Return the load of a worker, even of a lost one that has sessions."""
+        return self._loads.setdefault(instance, WorkerLoad())
 
-    def _candidates(self, names: list[str]) -> list[str]:
-        """Return some of the workers in turn where they are too many to compare all each time."""
-        if len(names) <= MAX_CANDIDATES:
-            return names
-        begin = self._next_candidate % len(names)
-        self._next_candidate = begin + MAX_CANDIDATES
-        return names[begin : self._next_candidate]
+    def forget_load(self, instance: str) -> None:
+        """Forget the load of a worker without sessions, if it is lost."""
+        if instance not in self._services:
+            self._loads.pop(instance, None)
 
-    def _rank(self, instance: str, now_s: float) -> tuple[int, int, str]:
-        """Return by what the least loaded worker is chosen; the load is too noisy for details."""
-        load = self.load(instance)
-        return round(load.expected(now_s) / SAME_LOAD), load.num_sessions, instance
+    def exclude_pause(self, pause_s: float) -> None:
+        """Exclude a time in which control did not run from the age of heartbeats."""
+        self._paused_s += pause_s
+
+    def age_s(self, instance: str, now_s: float) -> float:
+        """Return the age of a service's newest heartbeat, without control's own pauses."""
+        return now_s - self._paused_s - self._services[instance].heartbeat_s
+
+    def silent(self, now_s: float) -> list[str]:
+        """Return the services whose newest heartbeat is too old."""
+        return list(self._silent(now_s))
+
+    def _silent(self, now_s: float) -> Iterator[str]:
+        for instance, record in self._services.items():
+            if self.age_s(instance, now_s) <= self._lost_after_s:
+                return
+            if record.peer != NO_PEER:
+                yield instance
 
 
-def _keyed(heartbeat: Heartbeat, peer: Peer) -> dict[str, str]:
-    """Return a service's endpoints, those of a worker with the key of whom is bound there."""
+def _with_keys(heartbeat: Heartbeat, peer: Peer) -> dict[str, str]:
+    """Return a service's endpoints; a worker's carry its public key."""
     if heartbeat.role != "worker":
         return heartbeat.endpoints
-    return {name: with_key(each, peer.key) for name, each in heartbeat.endpoints.items()}
+    return {name: with_key(address, peer.key) for name, address in heartbeat.endpoints.items()}
 
 
-def _may_serve(record: ServiceRecord, language: str | None) -> bool:
-    return record.state == "ready" and (
-        language is None or record.heartbeat.facts.language in (None, language)
-    )
+def _check_endpoints(heartbeat: Heartbeat) -> None:
+    """Check that a worker may provide its endpoints, and that others can connect to them."""
+    if heartbeat.role != "worker":
+        return
+    if not heartbeat.endpoints:
+        raise Refusal(ErrorCode.BAD_MESSAGE, "a worker must name the endpoints that it provides")
+    for name, endpoint in heartbeat.endpoints.items():
+        provider = PROVIDERS.get(name, heartbeat.service)
+        if provider != heartbeat.service:
+            text = f"only a {provider} may provide {name!r}, and this is a {heartbeat.service}"
+            raise Refusal(ErrorCode.NOT_ALLOWED, text)
+        try:
+            host, port = split_endpoint(endpoint, name)
+        except UserError as error:
+            raise Refusal(ErrorCode.BAD_MESSAGE, str(error)) from None
+        if "*" in (host, port):
+            text = f"{name}: {endpoint!r} has no host or port to connect to"
+            raise Refusal(ErrorCode.BAD_MESSAGE, text)

@@ -11,8 +11,8 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
-from kouxing.services.control.registry import CLIENT_NEEDS
-from kouxing.services.control.service import Request
+from kouxing.services.control.placement import CLIENT_NEEDS
+from kouxing.services.control.requests import Request
 from kouxing.services.synthesizer.service import LOW_LEVEL_FAPS
 from kouxing.shared.face.faps import FAPS, MOUTH_FAPS
 from kouxing.shared.face.shapes import SHAPE_SETS

@@ -107,7 +107,8 @@ def test_any_rate_is_recognised(system: System, rate_hz: int) -> None:
 
 def test_int16_stereo_gives_the_phones_of_float_mono(system: System, collected: Collected) -> None:
     samples = samples_of_file(DEMO / "hello-female.wav")
-    stereo = np.rint(np.stack([samples, samples], axis=1) * 32768).clip(-32768, 32767)
+    stereo = np.stack([samples, samples], axis=1) * 32768
+    stereo = np.rint(stereo).clip(-32768, 32767).astype(np.int16)
     with Client(system.control) as client:
         session = client.open_session(encoding="s16le", num_channels=2, paced=False)
         result = stream_into(session, stereo, chunk=320)

@@ -12,7 +12,7 @@ from typing import TypeVar
 import pytest
 from kouxing_client import Client, FapFrame, KouxingError, Refused, Session, find_key
 
-from kouxing.services.control.registry import MAX_SERVICES_OF_KEY
+from kouxing.services.control.registry import MAX_SERVICES_PER_KEY
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.errors import UserError
 from kouxing.shared.keys import add_key, key_folder, load_key, revoke_key, user_key
@@ -194,9 +194,9 @@ def test_very_many_false_services_leave_the_status_readable(system: System, clie
     with Bus(load_key("lamp", ("service:lamp",))) as bus:
         stranger = bus.connect_dealer(system.control)
         metrics = {f"{number:0128}": 0.0 for number in range(64)}
-        for number in range(MAX_SERVICES_OF_KEY + 100):
+        for number in range(MAX_SERVICES_PER_KEY + 100):
             heartbeat = replace(HEARTBEAT, service="lamp", instance=f"{number:0128}")
             stranger.send(replace(heartbeat, metrics=metrics))
         assert answer(stranger, Error).code == "too-many-services"
         lamps = [each for each in client.status().services if each.service == "lamp"]
-        assert len(lamps) == MAX_SERVICES_OF_KEY
+        assert len(lamps) == MAX_SERVICES_PER_KEY

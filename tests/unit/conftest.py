@@ -6,9 +6,6 @@ from collections.abc import Iterator
 
 import pytest
 
-from kouxing.shared.bus import Bus, Socket
-from tests.control_stage import Stage
-
 
 @pytest.fixture
 def one_thread() -> Iterator[None]:
@@ -19,18 +16,3 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture
-def stage() -> Iterator[Stage]:
-    """Control without keys."""
-    made = Stage(insecure=True)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def client(stage: Stage) -> Iterator[Socket]:
-    """Provide a socket at that control."""
-    with Bus() as bus:
-        yield bus.connect_dealer(stage.control.endpoints["commands"])

@@ -29,7 +29,7 @@ from kouxing.shared.wire.session import Done, SessionFacts
 from kouxing.shared.wire.speech import Progress, Speech
 from tests.raw_bytes import answer_handshake
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.process
 
 
 class Slow(Service):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from kouxing.services.control import service as control_service
+from kouxing.services.control import status as control_status
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.endpoints import key_of
 from kouxing.shared.keys import load_key
@@ -17,7 +17,7 @@ from kouxing.shared.wire.control import Heartbeat
 from kouxing.shared.wire.session import Error, StatusReport, StatusRequest
 from tests.control_stage import Stage
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.process
 
 
 def ask(stage: Stage, client: Socket, **fields: object) -> StatusReport | Error:
@@ -48,7 +48,7 @@ def test_all_pages_together_have_everything_once(
     whole = ask(stage, client)
     assert isinstance(whole, StatusReport)
     assert whole.next is None
-    monkeypatch.setattr(control_service, "PAGE_BYTES", 700)
+    monkeypatch.setattr(control_status, "PAGE_BYTES", 700)
     services, sessions, after, num_pages = [], [], 0, 0
     while True:
         page = ask(stage, client, after=after)
@@ -69,8 +69,8 @@ def test_a_session_that_ended_between_two_pages_does_not_hide_another(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = open_sessions(stage, 4)
-    monkeypatch.setattr(control_service, "PAGE_BYTES", 0)
-    after, seen = control_service.FIRST_SESSION, []
+    monkeypatch.setattr(control_status, "PAGE_BYTES", 0)
+    after, seen = control_status.FIRST_SESSION, []
     while True:
         page = ask(stage, client, after=after)
         assert isinstance(page, StatusReport)
@@ -78,7 +78,7 @@ def test_a_session_that_ended_between_two_pages_does_not_hide_another(
             break
         seen += [state.session for state in page.sessions]
         if seen == names[:2]:
-            stage.control._end(stage.control._sessions.find(names[0]), "over")
+            stage.control._end_session(stage.control._sessions.find(names[0]), "over")
         after = page.next or 0
     assert seen == names
 
@@ -89,7 +89,7 @@ def test_of_one_session_it_has_that_and_its_services(stage: Stage, client: Socke
     assert isinstance(report, StatusReport)
     assert [state.session for state in report.sessions] == ["s1"]
     assert {state.instance for state in report.services} == {"recognizer", "synthesizer"}
-    stage.control._takes_over = False
+    stage.control._requests.defers = False
     assert getattr(ask(stage, client, session="none"), "code", "") == "unknown-session"
 
 
@@ -104,7 +104,7 @@ def test_the_first_page_has_a_service_of_every_kind(
     while len(stage.control._registry.sorted()) < 22:
         stage.control.step(0.01)
         list(client.receive())
-    monkeypatch.setattr(control_service, "PAGE_BYTES", 1000)
+    monkeypatch.setattr(control_status, "PAGE_BYTES", 1000)
     page = ask(stage, client)
     assert isinstance(page, StatusReport)
     assert page.next

@@ -18,7 +18,7 @@ from kouxing.shared.wire.session import OpenSession, SessionOpened
 from tests.control_stage import Stage
 from tests.forwarders import Link
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture(params=[True, False])

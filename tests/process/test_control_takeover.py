@@ -7,6 +7,7 @@ import time
 import pytest
 
 from kouxing.services.control import service as control_service
+from kouxing.services.control import takeover
 from kouxing.shared.bus import Bus, Socket
 from kouxing.shared.wire.control import SessionInput, SessionStarted, StartSession, StopSession
 from kouxing.shared.wire.face import FaceSettings
@@ -23,7 +24,7 @@ from kouxing.shared.wire.session import (
 from kouxing.shared.wire.speech import Speech
 from tests.control_stage import Stage, beat
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.process
 PLACED = {
     "audio": "tcp://127.0.0.1:1",
     "phones": "tcp://127.0.0.1:1",
@@ -35,8 +36,8 @@ PLACED = {
 @pytest.fixture(autouse=True)
 def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no limit of control pass by itself, however slow the machine is."""
-    monkeypatch.setattr(control_service, "TAKEOVER_S", 60.0)
-    monkeypatch.setattr(control_service, "START_LIMIT_S", 60.0)
+    monkeypatch.setattr(takeover, "TAKEOVER_S", 60.0)
+    monkeypatch.setattr(control_service, "START_TIMEOUT_S", 60.0)
 
 
 def served(endpoints: dict[str, str] = PLACED, **fields: object) -> SessionStarted:
@@ -77,7 +78,7 @@ def test_a_session_is_taken_over_as_it_was(stage: Stage, client: Socket) -> None
 
 def test_a_request_waits_until_its_session_is_known(stage: Stage, client: Socket) -> None:
     client.send(CloseSession(session="mine", token="t", request="1"))
-    while not stage.control._deferred:
+    while not stage.control._requests._deferred:
         stage.control.step(0.01)
     stage.services[0].send(served())
     assert answers(stage, client) == [Done(session="mine", request="1")]
@@ -106,7 +107,7 @@ def test_only_the_recognizer_of_a_session_brings_it(
         synthesizer.send(served())
     else:
         recognizer.send(served({**PLACED, "audio": "tcp://127.0.0.1:2"}))
-    stage.control._takeover_end_s = time.monotonic() + 0.5
+    stage.control._takeover.end_s = time.monotonic() + 0.5
     client.send(CloseSession(session="mine", token="t", request="1"))
     (answer,) = answers(stage, client)
     assert isinstance(answer, Error)
@@ -118,7 +119,7 @@ def test_a_session_whose_synthesizer_is_gone_gets_another_at_the_end(
 ) -> None:
     recognizer, synthesizer = stage.services
     recognizer.send(served({**PLACED, "faps": "tcp://127.0.0.1:3"}))
-    stage.control._takeover_end_s = time.monotonic() + 0.5
+    stage.control._takeover.end_s = time.monotonic() + 0.5
     starts: list[StartSession] = []
     while not starts or starts[-1].epoch == 4:
         told = answers(stage, synthesizer)
@@ -134,7 +135,7 @@ def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
     recognizer.send(serving)
     (seen,) = answers(stage, recognizer)
     assert not isinstance(seen, StopSession)
-    stage.control._takeover_end_s = 0.0
+    stage.control._takeover.end_s = 0.0
     stage.control.step(0.02)
     recognizer.send(serving)
     assert StopSession(session="mine") in answers(stage, recognizer, 2)
@@ -143,7 +144,7 @@ def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
 def test_a_client_is_told_again_that_its_session_moved(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_service, "MOVED_AGAIN_S", (0.1, 0.2))
+    monkeypatch.setattr(control_service, "REPEAT_MOVED_S", (0.1, 0.2))
     recognizer, synthesizer = stage.services
     client.send(OpenSession(session="mine", request="1"))
     for service in stage.services:

@@ -1,0 +1,93 @@
+"""Chooses workers for a session."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+from kouxing.services.control.load import EQUAL_LOAD, RETRY_AFTER_S
+from kouxing.services.control.refusal import Refusal
+from kouxing.services.control.registry import Registry, ServiceRecord
+from kouxing.services.kinds import PROVIDERS
+from kouxing.shared.wire.session import ErrorCode
+
+CLIENT_NEEDS = ("audio", "phones", "faps")  # endpoints that a client needs
+UNPACED_AUDIO = "unpaced_audio"  # replaces "audio" for sessions that are not paced
+
+
+class Placement:
+    """Places sessions on the workers with the least load."""
+
+    def __init__(self, registry: Registry, max_load: float) -> None:
+        self._registry = registry
+        self._max_load = max_load  # share of a worker's time for sessions
+
+    def place(
+        self,
+        kept: Mapping[str, str],
+        now_s: float,
+        language: str | None = None,
+        *,
+        may_refuse: bool = False,
+    ) -> dict[str, str]:
+        """Return a worker for each endpoint that a client or a chosen worker needs.
+
+        A worker that is chosen for one endpoint also serves its other endpoints. Workers in
+        ``kept`` stay. A session that moves needs a worker of its ``language``. If ``may_refuse``,
+        a session without room is refused; a session that moves or is not paced never is.
+
+        Raises
+        ------
+        Refusal
+            No ready worker provides one of the endpoints, or none has room.
+        """
+        workers: dict[str, str] = {}
+        needed = list(CLIENT_NEEDS)
+        for endpoint in needed:  # grows
+            placed = {*kept.values(), *workers.values()}
+            instance = kept.get(endpoint) or self._choose(
+                endpoint, placed, now_s, language, may_refuse=may_refuse
+            )
+            workers[endpoint] = instance
+            needs = self._registry[instance].heartbeat.needs
+            needed += [need for need in needs if need not in needed]
+        if UNPACED_AUDIO in self._registry[workers["audio"]].heartbeat.endpoints:
+            workers[UNPACED_AUDIO] = workers["audio"]
+        return workers
+
+    def _choose(
+        self,
+        endpoint: str,
+        placed: Collection[str],
+        now_s: float,
+        language: str | None,
+        *,
+        may_refuse: bool,
+    ) -> str:
+        providers = self._registry.providers(endpoint)
+        names = [name for name, record in providers.items() if _can_serve(record, language)]
+        for instance in sorted(placed):
+            if instance in names:
+                return instance
+        kind = PROVIDERS.get(endpoint)
+        if not names:
+            missing = f"no {kind} is running" if kind else f"no service provides {endpoint!r}"
+            start = f"start one with 'kouxing {kind}'" if kind else "start one that does"
+            text = f"{missing}; {start} (or everything with 'kouxing run')"
+            raise Refusal(ErrorCode.NO_SERVICE, text)
+        best = min(names, key=lambda name: self._rank(name, now_s))
+        if may_refuse and not self._registry.load(best).has_room(now_s, self._max_load):
+            text = (
+                f"every {kind or f'provider of {endpoint}'} is busy with other sessions; "
+                f"try again in {RETRY_AFTER_S:g} s"
+            )
+            raise Refusal(ErrorCode.BUSY, text, RETRY_AFTER_S)
+        return best
+
+    def _rank(self, instance: str, now_s: float) -> tuple[int, int, str]:
+        load = self._registry.load(instance)
+        return round(load.expected(now_s) / EQUAL_LOAD), load.num_sessions, instance
+
+
+def _can_serve(record: ServiceRecord, language: str | None) -> bool:
+    stated = record.heartbeat.facts.language
+    return record.state == "ready" and (language is None or stated in (None, language))

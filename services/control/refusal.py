@@ -1,0 +1,15 @@
+"""A request that control refuses."""
+
+from __future__ import annotations
+
+from kouxing.shared.wire.session import ErrorCode
+
+
+class Refusal(Exception):
+    """Control refuses a request; the sender gets an ``error`` with these fields."""
+
+    def __init__(self, code: ErrorCode, text: str, retry_after_s: float | None = None) -> None:
+        super().__init__(text)
+        self.code = code
+        self.text = text
+        self.retry_after_s = retry_after_s

@@ -1,0 +1,120 @@
+"""Answers requests: checks roles, and repeats the answer to a repeated request."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from kouxing.services.control.refusal import Refusal
+from kouxing.shared.bus import Bus, Socket
+from kouxing.shared.keys import Grant, Peer
+from kouxing.shared.message_loop import Handler
+from kouxing.shared.metrics import Metrics
+from kouxing.shared.wire.face import SetFace
+from kouxing.shared.wire.message import Message
+from kouxing.shared.wire.session import (
+    CloseSession,
+    Error,
+    ErrorCode,
+    FlushSession,
+    OpenSession,
+    StatusReport,
+    StatusRequest,
+)
+
+MAX_ANSWERS = 1000  # kept for repeated requests
+MAX_DEFERRED = 1000
+PREMATURE = (ErrorCode.UNKNOWN_SESSION, ErrorCode.NO_SERVICE)  # errors that may be temporary
+Request: TypeAlias = OpenSession | CloseSession | FlushSession | SetFace | StatusRequest
+
+
+class Requests:
+    """Answers requests on control's socket.
+
+    While ``defers`` is set, requests that fail with a temporary error wait for ``retry_deferred``.
+    """
+
+    def __init__(self, bus: Bus, commands: Socket, metrics: Metrics) -> None:
+        self.defers = False
+        self._bus = bus
+        self._commands = commands
+        self._metrics = metrics
+        self._answers: OrderedDict[tuple[Peer, int, str], Message] = OrderedDict()
+        self._deferred: list[tuple[Handler, Request, Peer]] = []
+
+    def handler(self, handle: Callable[[Any, Peer], Message | None], *roles: str) -> Handler:
+        """Return a handler that answers a request with the result of ``handle``.
+
+        If roles are given, the sender's key must have one of them.
+        """
+
+        def on_request(message: Request, sender: Peer) -> None:
+            if message.request is not None:
+                answer = self._answers.get((sender, sender.connection, message.request))
+                if answer is not None:
+                    self._commands.send(answer, to=sender)
+                    return
+            try:
+                self.check_role(sender, *roles)
+                answer = handle(message, sender)
+            except Refusal as refusal:
+                if self._can_defer(refusal):
+                    self._deferred.append((on_request, message, sender))
+                    return
+                self._metrics.count(f"refused_{refusal.code}")
+                answer = Error(
+                    session=message.session,
+                    code=refusal.code,
+                    text=refusal.text,
+                    request=message.request,
+                    retry_after_s=refusal.retry_after_s,
+                )
+            if answer is not None:
+                self.answer(sender, message.request, answer)
+
+        return on_request
+
+    def answer(self, sender: Peer, request: str | None, answer: Message) -> None:
+        """Send an answer, and keep it in case the request is repeated."""
+        if request is not None and not isinstance(answer, StatusReport):
+            self._answers[sender, sender.connection, request] = answer
+            if len(self._answers) > MAX_ANSWERS:
+                self._answers.popitem(last=False)
+        self._commands.send(answer, to=sender)
+
+    def check_role(self, sender: Peer, *roles: str) -> None:
+        """Reject a sender whose key has none of ``roles``; accept anyone if ``insecure``.
+
+        Raises
+        ------
+        Refusal
+            The key has none of the roles.
+        """
+        if self._bus.zap is None or not roles:
+            return
+        grant = self._grant(sender)
+        if grant is None or not set(roles) & set(grant.roles):
+            text = f"the key has no role {' or '.join(roles)}; see 'kouxing keys list'"
+            raise Refusal(ErrorCode.NOT_ALLOWED, text)
+
+    def may_see_token(self, sender: Peer) -> bool:
+        """Return whether a sender may have the page's token: it opens sessions, or is a service."""
+        if self._bus.zap is None:
+            return True
+        grant = self._grant(sender)
+        return grant is not None and any(
+            role == "client" or role.startswith("service:") for role in grant.roles
+        )
+
+    def retry_deferred(self) -> None:
+        """Handle the deferred requests again."""
+        deferred, self._deferred = self._deferred, []
+        for handle, message, sender in deferred:
+            handle(message, sender)
+
+    def _can_defer(self, refusal: Refusal) -> bool:
+        return self.defers and refusal.code in PREMATURE and len(self._deferred) < MAX_DEFERRED
+
+    def _grant(self, sender: Peer) -> Grant | None:
+        return None if self._bus.zap is None else self._bus.zap.grants.get(sender.key)

@@ -1,0 +1,127 @@
+"""One session at control, and the messages that describe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from kouxing.services.control.placement import UNPACED_AUDIO
+from kouxing.shared.keys import Peer
+from kouxing.shared.wire.control import StartSession
+from kouxing.shared.wire.face import CurrentFace
+from kouxing.shared.wire.session import (
+    OpenSession,
+    SessionFacts,
+    SessionMoved,
+    SessionOpened,
+    SessionState,
+)
+
+
+@dataclass(slots=True)
+class SessionRecord:
+    """One session."""
+
+    name: str
+    number: int  # grows from session to session
+    token: str
+    opening: OpenSession
+    client: Peer  # on control's socket
+    opened_s: float
+    started_s: float  # when its services were last told to start it, or a worker was lost
+    workers: dict[str, str]  # instance by endpoint, lost ones included
+    endpoints: dict[str, str]  # address by endpoint
+    facts: SessionFacts  # that its workers state
+    face: CurrentFace
+    waiting_for: set[str]  # instances that have not started it yet
+    deferred: set[str] = field(default_factory=set)  # of these, to be told after the others
+    lost: set[str] = field(default_factory=set)  # lost workers
+    epoch: int = 1
+    announced: bool = False  # the client has its endpoints
+    moved: bool = False  # it was placed again, and the client does not know yet
+    restored: bool = False  # an earlier control opened it
+    speaking: bool = False
+    speech_time: int = 0  # media time at which the newest speech started
+    next_sequence: int = 1  # first audio message that a new recognizer would need
+    resume_sequence: int | None = None  # first one that the client resends; None: none
+    media_time: int = 0  # its phones are final up to here
+
+    @property
+    def start_request(self) -> str:
+        """The request that services confirm when they have started it."""
+        return f"start-{self.name}-{self.epoch}"
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it waits for nothing."""
+        return self.announced and not (self.moved or self.waiting_for or self.lost)
+
+    @property
+    def missing_workers(self) -> set[str]:
+        """Its workers that have not started it yet."""
+        return self.waiting_for & {*self.workers.values()}
+
+    @property
+    def _audio(self) -> str:
+        """Where its client sends audio."""
+        live = self.endpoints["audio"]
+        return live if self.opening.paced else self.endpoints.get(UNPACED_AUDIO, live)
+
+    def start_message(self, now_s: float) -> StartSession:
+        """Return the message that starts it at a service."""
+        return StartSession(
+            session=self.name,
+            epoch=self.epoch,
+            request=self.start_request,
+            token=self.token,
+            encoding=self.opening.encoding,
+            sample_rate_hz=self.opening.sample_rate_hz,
+            num_channels=self.opening.num_channels,
+            record=self.opening.record,
+            paced=self.opening.paced,
+            facts=self.facts,
+            endpoints=self.endpoints,
+            face=self.face.at(now_s),
+            mouth_profile=self.opening.mouth_profile,
+            client=self.client.address,
+            client_key=self.client.key or None,
+            client_request=self.opening.request or None,
+            media_time=self.media_time,
+            speech_time=self.speech_time if self.speaking else None,
+        )
+
+    def opened_message(self, events: str) -> SessionOpened:
+        """Return the answer to its client; ``events`` is control's endpoint."""
+        return SessionOpened(
+            session=self.name,
+            epoch=self.epoch,
+            request=self.opening.request,
+            token=self.token,
+            events=events,
+            facts=self.facts,
+            audio=self._audio,
+            phones=self.endpoints["phones"],
+            faps=self.endpoints["faps"],
+        )
+
+    def moved_message(self) -> SessionMoved:
+        """Return the message to its client and its followers after it was placed again."""
+        return SessionMoved(
+            session=self.name,
+            epoch=self.epoch,
+            next_sequence=self.resume_sequence,
+            audio=self._audio,
+            phones=self.endpoints["phones"],
+            faps=self.endpoints["faps"],
+        )
+
+    def state(self, now_s: float) -> SessionState:
+        """Return its part of a status report."""
+        return SessionState(
+            session=self.name,
+            state="open" if self.announced else "starting",
+            age_s=now_s - self.opened_s,
+            speaking=self.speaking,
+            endpoints=self.endpoints,
+            workers=self.workers,
+            facts=self.facts,
+        )

@@ -1,0 +1,54 @@
+"""Collects the sessions of an earlier control, in the first seconds after startup."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from kouxing.services.control.registry import Registry
+from kouxing.shared.wire.control import Heartbeat, StartSession
+
+TAKEOVER_S = 5.0
+
+
+class Takeover:
+    """The sessions that services report after control has restarted, until ``end_s``."""
+
+    def __init__(self, registry: Registry, now_s: float) -> None:
+        self.is_active = True
+        self.end_s = now_s + TAKEOVER_S
+        self._registry = registry
+        self._reported: dict[str, StartSession] = {}  # sessions that are not restored yet
+        self._observed: dict[str, Collection[str]] = {}  # sessions by observer
+
+    def add(self, start: StartSession, instance: str) -> bool:
+        """Add a session that a service reports; return False if it may not do so."""
+        audio = self._registry[instance].heartbeat.endpoints.get("audio")
+        if not self.is_active or audio is None or start.endpoints.get("audio") != audio:
+            return False
+        self._reported[start.session] = start
+        return True
+
+    def record_observer(self, heartbeat: Heartbeat) -> None:
+        """Record the sessions that an observer already takes part in."""
+        if self.is_active and heartbeat.role == "observer":
+            self._observed[heartbeat.instance] = heartbeat.sessions.keys()
+
+    def pop_complete(self) -> list[StartSession]:
+        """Return the sessions whose workers are all back; at the end, all sessions."""
+        complete = [
+            start
+            for start in self._reported.values()
+            if not self.is_active
+            or all(self._registry.worker_at(*item) for item in start.endpoints.items())
+        ]
+        for start in complete:
+            del self._reported[start.session]
+        return complete
+
+    def uninformed_observers(self, session: str) -> set[str]:
+        """Return the observers that do not take part in a session yet."""
+        return {
+            instance
+            for instance in self._registry.observers()
+            if session not in self._observed.get(instance, ())
+        }

@@ -1,0 +1,25 @@
+"""Fixtures for tests of control."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from kouxing.shared.bus import Bus, Socket
+from tests.control_stage import Stage
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    """Control without keys."""
+    made = Stage(insecure=True)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def client(stage: Stage) -> Iterator[Socket]:
+    """Provide a socket at that control."""
+    with Bus() as bus:
+        yield bus.connect_dealer(stage.control.endpoints["commands"])
