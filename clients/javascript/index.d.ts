@@ -75,7 +75,7 @@ export interface SpeakerOptions {
   /** audio may come faster than real time, such as text-to-speech; it is played in real time */
   ahead?: boolean;
   /** the speaker's mouth profile, base64 */
-  voice?: string;
+  mouthProfile?: string;
   token?: string;
   /** called when the session has ended; null: without an error */
   closed?(error: Error | null): void;

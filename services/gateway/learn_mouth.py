@@ -97,7 +97,7 @@ class MouthLearner:
             LOG.error("learning a mouth failed: %s", result)
             raise UserError("learning failed; see the gateway's log")
         content, figures = result
-        return {"voice": base64.b64encode(content).decode(), **figures}
+        return {"mouth_profile": base64.b64encode(content).decode(), **figures}
 
 
 def _exchange(connection: Connection, recording: bytes) -> tuple[str, Any]:

@@ -75,7 +75,7 @@ def parse_hello(message: str) -> Hello:
     return Hello(
         pcm_format=pcm_format,
         is_ahead=bool(fields.get("ahead")),
-        mouth_profile=_parse_mouth_profile(fields.get("voice", "")),
+        mouth_profile=_parse_mouth_profile(fields.get("mouth_profile", "")),
     )
 
 
@@ -85,7 +85,8 @@ def _parse_mouth_profile(field: object) -> bytes:
     except ValueError:
         profile = None
     if profile is None or len(profile) > MAX_MOUTH_PROFILE_BYTES:
-        raise UserError(f"voice must be at most {MAX_MOUTH_PROFILE_BYTES >> 10} KiB in base64")
+        limit_kib = MAX_MOUTH_PROFILE_BYTES >> 10
+        raise UserError(f"mouth_profile must be at most {limit_kib} KiB in base64")
     return profile
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from kouxing.services.mouth_profiles.lip_tracks import MEASURES
 from kouxing.services.mouth_profiles.positions import POSITION_S
 from kouxing.services.recognizer.acoustic.load import load_model
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
-from kouxing.services.recognizer.lip_predictor import LIPS_PATH, LipPredictor, lip_predictor_for
+from kouxing.services.recognizer.lip_predictor import lip_predictor_for
 from kouxing.shared.errors import UserError
 
 
@@ -58,28 +57,16 @@ def learn_mouth_profile(recordings: Sequence[FilmedSpeech]) -> LearnedProfile:
     UserError
         If there is too little speech with lips in view.
     """
-    model, lips = load_models()
+    model = load_model()
+    lips = lip_predictor_for(model)
+    if lips is None or not isinstance(model, NeuralModel):
+        raise UserError("the shipped lip model and acoustic model do not match; reinstall kouxing")
     observations = Observations.join([observe(model, lips, filmed) for filmed in recordings])
     return LearnedProfile(
         content=fit_profile(observations).to_bytes(lips.digest),
         speech_s=len(observations) * POSITION_S,
         gain=measure_gain(lips, observations),
     )
-
-
-def load_models(path: Path = LIPS_PATH) -> tuple[NeuralModel, LipPredictor]:
-    """Load the shipped acoustic model and a lip model.
-
-    Raises
-    ------
-    UserError
-        If they do not fit each other.
-    """
-    model = load_model()
-    lips = lip_predictor_for(model, path)
-    if lips is None or not isinstance(model, NeuralModel):
-        raise UserError(f"{path} does not fit the neural acoustic model; train it again")
-    return model, lips
 
 
 def _plain(values: NDArray[np.float64]) -> list[float | None]:

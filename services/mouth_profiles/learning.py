@@ -30,7 +30,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from kouxing.services.mouth_profiles.lip_tracks import interpolate_track, lip_measures
+from kouxing.services.mouth_profiles.lip_tracks import (
+    correlate_curves,
+    interpolate_track,
+    lip_measures,
+)
 from kouxing.services.mouth_profiles.positions import POSITION_S, record_positions
 from kouxing.services.recognizer.acoustic.neural import NeuralModel
 from kouxing.services.recognizer.lip_frames import delay_for
@@ -135,7 +139,7 @@ def _camera_lag_s(filmed: FilmedSpeech, time_s: Array, predicted: Floats) -> flo
     figures = np.zeros(len(_LAGS_S))
     for index, lag_s in enumerate(_LAGS_S):
         shifted = interpolate_track(filmed.frame_s, tracked[:, 0], time_s + lag_s)
-        figures[index] = _correlate([(opening, shifted[:, None])])[0]
+        figures[index] = correlate_curves([(opening, shifted[:, None])])[0]
     figures = np.nan_to_num(figures)
     return float(_LAGS_S[figures.argmax()]) if figures.max() > _MIN_LAG_CORRELATION else 0.0
 
@@ -178,18 +182,17 @@ def measure_gain(lips: LipPredictor, observations: Observations) -> ProfileGain:
     first_held_out = round((1 - _HELD_OUT) * len(observations))
     profile = fit_profile(observations[:first_held_out])
     held_out = observations[first_held_out:]
-    adapted = apply_profile(profile, held_out)
     delay_s = delay_for(lips.delays_s, FACE_DELAY_S)
     delay = lips.delays_s.index(delay_s)
-    versions = (held_out.tracked, held_out.predicted, adapted)
-    curves = np.stack([lip_measures(faps[:, delay]) for faps in versions], axis=1)
+    versions = (held_out.tracked, held_out.predicted, apply_profile(profile, held_out))
+    tracked, before, after = (lip_measures(faps[:, delay]) for faps in versions)
     return ProfileGain(
         speech_s=len(held_out) * POSITION_S,
         delay_s=delay_s,
-        before=correlations([held_out], [held_out.predicted], delay),
-        after=correlations([held_out], [adapted], delay),
+        before=correlate_curves([(before, tracked)]),
+        after=correlate_curves([(after, tracked)]),
         time_s=held_out.known_s - delay_s,
-        curves=curves.transpose(2, 1, 0),
+        curves=np.stack([tracked, before, after]).transpose(2, 0, 1),
     )
 
 
@@ -197,38 +200,6 @@ def apply_profile(profile: MouthProfile, observations: Observations) -> Floats:
     """Predict the FAPs with a profile, (n, delays, 15)."""
     scaled: Floats = profile.scale * observations.predicted + profile.offset
     return scaled + np.tensordot(observations.hidden, profile.residual, axes=1)
-
-
-def correlations(parts: Sequence[Observations], predictions: Sequence[Floats], delay: int) -> Array:
-    """Correlate predictions, (n, delays, 15), with the tracked lips, at the delay of this index.
-
-    Returns
-    -------
-    NDArray
-        One figure for each of ``MEASURES``, pooled over the parts after removing their means.
-    """
-    return _correlate(
-        [
-            (lip_measures(faps[:, delay]), lip_measures(part.tracked[:, delay]))
-            for part, faps in zip(parts, predictions, strict=True)
-        ]
-    )
-
-
-def _correlate(pairs: Sequence[tuple[Array, Array]]) -> Array:
-    """Correlate predicted and tracked curves, (n, curves); NaN for one that does not move."""
-    figures = []
-    for measure in range(pairs[0][0].shape[1]):
-        sums = np.zeros((2, 2))
-        for pair in pairs:
-            both = np.stack([curves[:, measure] for curves in pair])
-            both = both[:, ~np.isnan(both).any(axis=0)]
-            if both.size:
-                centered = both - both.mean(axis=1, keepdims=True)
-                sums += centered @ centered.T
-        size = np.sqrt(sums[0, 0] * sums[1, 1])
-        figures.append(sums[0, 1] / size if size > 0 else np.nan)
-    return np.array(figures)
 
 
 def _is_tracked(observations: Observations) -> NDArray[np.bool_]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,6 +45,26 @@ def interpolate_track(frame_s: Array, values: Array, time_s: Array) -> Array:
     outside = (time_s < frame_s[0]) | (time_s > frame_s[-1])
     interpolated: Array = np.interp(time_s, frame_s, values)
     return np.where(is_gap | outside, np.nan, interpolated)
+
+
+def correlate_curves(pairs: Sequence[tuple[Array, Array]]) -> Array:
+    """Correlate predicted and tracked curves, (n, curves) each, pooled over the pairs.
+
+    Each pair's means are removed first. NaN values are ignored. The result is NaN for a curve that
+    does not move.
+    """
+    figures = []
+    for curve in range(pairs[0][0].shape[1]):
+        sums = np.zeros((2, 2))
+        for pair in pairs:
+            both = np.stack([curves[:, curve] for curves in pair])
+            both = both[:, ~np.isnan(both).any(axis=0)]
+            if both.size:
+                centered = both - both.mean(axis=1, keepdims=True)
+                sums += centered @ centered.T
+        size = np.sqrt(sums[0, 0] * sums[1, 1])
+        figures.append(sums[0, 1] / size if size > 0 else np.nan)
+    return np.array(figures)
 
 
 def level_track(samples: NDArray[np.float32]) -> list[tuple[float, float]]:

@@ -164,7 +164,7 @@ def test_whip_rejects_bodies_that_are_not_opus_offers(
 MALFORMED: list[str | bytes] = [
     "", "{", "null", "[]", "5", '"x"', '{"type": "x"}', '{"a":' * 1000, "\0", "人" * 1000,
     '{"sample_rate_hz": "x"}', '{"encoding": []}', '{"session": {}}', '{"lips": 1}',
-    '{"flush": "x"}', '{"express": {"joy": NaN}}', '{"voice": "%%"}', '{"eof": 1}',
+    '{"flush": "x"}', '{"express": {"joy": NaN}}', '{"mouth_profile": "%%"}', '{"eof": 1}',
     b"", b"\0", b"\xff" * 7, bytes(20_000), b"RIFF" + bytes(60),
 ]  # fmt: skip
 

@@ -265,8 +265,8 @@ async def test_a_session_gets_the_mouth_profile_of_its_microphone(
 ) -> None:
     profile = bytes(range(256)) * 256  # 64 KiB, the maximum
     async with connected(gateway.page, "microphone") as (microphone,):
-        voice = base64.b64encode(profile).decode()
-        await microphone.send_json({"sample_rate_hz": 16000, "voice": voice})
+        encoded = base64.b64encode(profile).decode()
+        await microphone.send_json({"sample_rate_hz": 16000, "mouth_profile": encoded})
         await receive_json(microphone, "opened")
     assert system.profiles == [profile]
 

@@ -16,6 +16,7 @@ import pytest
 from aiohttp import web
 
 from kouxing.services.gateway import learn_mouth
+from kouxing.services.gateway.access import AccessPolicy
 from kouxing.services.gateway.http import MAX_UPLOAD_BYTES, make_application
 from kouxing.services.gateway.learn_mouth import MouthLearner
 from kouxing.services.mouth_profiles.worker import Learn
@@ -66,7 +67,7 @@ class Gateway:
 async def serve(learn: Learn) -> AsyncIterator[Gateway]:
     learner = MouthLearner(learn)
     route = web.post("/learn-mouth", learner.serve)
-    runner = web.AppRunner(make_application(page_asset="", routes=[route]))
+    runner = web.AppRunner(make_application(head_file="", routes=[route], access=AccessPolicy()))
     await runner.setup()
     await web.TCPSite(runner, "127.0.0.1", 0).start()
     address = f"http://127.0.0.1:{runner.addresses[0][1]}/learn-mouth"
@@ -98,7 +99,7 @@ async def wait_until_ended(process: int) -> None:
 def test_answers_with_the_profile_and_its_figures() -> None:
     async def use(gateway: Gateway) -> None:
         profile = base64.b64encode(b"cba").decode()
-        assert await gateway.post() == (200, {"voice": profile, "after": {"opening": 0.5}})
+        assert await gateway.post() == (200, {"mouth_profile": profile, "after": {"opening": 0.5}})
 
     run(reverse, use)
 

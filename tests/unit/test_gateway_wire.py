@@ -30,7 +30,10 @@ def test_hello_describes_the_audio() -> None:
     assert hello.pcm_format.frame_bytes == 8
     assert wire.parse_hello('{"sample_rate_hz": 8000}').pcm_format.frame_bytes == 2
     assert hello.mouth_profile == b""
-    assert wire.parse_hello('{"sample_rate_hz": 8000, "voice": "YWJj"}').mouth_profile == b"abc"
+    assert (
+        wire.parse_hello('{"sample_rate_hz": 8000, "mouth_profile": "YWJj"}').mouth_profile
+        == b"abc"
+    )
 
 
 @pytest.mark.parametrize(
@@ -43,10 +46,13 @@ def test_hello_describes_the_audio() -> None:
         ({"sample_rate_hz": 16000, "num_channels": 3}, "num_channels"),
         ({"sample_rate_hz": 16000, "encoding": "opus"}, "encoding"),
         ({"sample_rate_hz": 16000, "encoding": ["s16le"]}, "encoding"),
-        ({"sample_rate_hz": 16000, "voice": "no base64!"}, "voice"),
-        ({"sample_rate_hz": 16000, "voice": "ü"}, "voice"),
-        ({"sample_rate_hz": 16000, "voice": ["YWJj"]}, "voice"),
-        ({"sample_rate_hz": 16000, "voice": "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)}, "voice"),
+        ({"sample_rate_hz": 16000, "mouth_profile": "no base64!"}, "mouth_profile"),
+        ({"sample_rate_hz": 16000, "mouth_profile": "ü"}, "mouth_profile"),
+        ({"sample_rate_hz": 16000, "mouth_profile": ["YWJj"]}, "mouth_profile"),
+        (
+            {"sample_rate_hz": 16000, "mouth_profile": "AAAA" * (MAX_MOUTH_PROFILE_BYTES // 3 + 1)},
+            "mouth_profile",
+        ),
         ([1], "object"),
     ],
 )

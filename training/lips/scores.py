@@ -19,7 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kouxing.corpora.lip_clips import LipClip
-from kouxing.services.mouth_profiles.lip_tracks import MEASURES, lip_measures, lip_tracks
+from kouxing.services.mouth_profiles.lip_tracks import (
+    MEASURES,
+    correlate_curves,
+    lip_measures,
+    lip_tracks,
+)
 from kouxing.services.recognizer.lip_predictor import CLOSURE
 from kouxing.training.lips.targets import Touch, opening
 
@@ -46,19 +51,15 @@ def correlations(
     clips: Sequence[LipClip], predictions: Predictions, delay: int, delay_s: float
 ) -> Array:
     """Correlate the three measures at one delay; NaN if a measure is not tracked."""
-    pairs = [_compare(clip, predictions[clip.name], delay, delay_s) for clip in clips]
-    figures = []
-    for measure in range(len(MEASURES)):
-        ours, theirs = (np.concatenate([pair[measure][side] for pair in pairs]) for side in (0, 1))
-        size = np.sqrt((ours @ ours) * (theirs @ theirs))
-        figures.append(float(ours @ theirs / size) if size > 0 else np.nan)
-    return np.array(figures)
+    return correlate_curves(
+        [_compare(clip, predictions[clip.name], delay, delay_s) for clip in clips]
+    )
 
 
 def _compare(
     clip: LipClip, predictions: Sequence[Prediction], delay: int, delay_s: float
-) -> list[tuple[Array, Array]]:
-    """Return predicted and tracked values of each measure at the clip's frames, means removed."""
+) -> tuple[Array, Array]:
+    """Return the predicted and the tracked measures at the clip's frames, (num_frames, 3)."""
     rest = np.zeros((1, len(MEASURES)))
     times, values = [np.array([-1.0])], [rest]
     for prediction in predictions:
@@ -67,15 +68,9 @@ def _compare(
         values += [rest, lip_measures(prediction.outputs[:, delay]), rest]
     time_s = np.concatenate(times)
     order = np.argsort(time_s, kind="stable")
-    predicted = np.concatenate(values)[order]
-    tracked = lip_measures(lip_tracks(clip.faps))
-    pairs = []
-    for measure in range(len(MEASURES)):
-        known = ~np.isnan(tracked[:, measure])
-        ours = np.interp(clip.time_s[known], time_s[order], predicted[:, measure])
-        theirs = tracked[known, measure]
-        pairs.append((ours - ours.mean(), theirs - theirs.mean()) if len(ours) else (ours, theirs))
-    return pairs
+    curves = np.concatenate(values)[order].T
+    predicted = [np.interp(clip.time_s, time_s[order], curve) for curve in curves]
+    return np.stack(predicted, axis=1), lip_measures(lip_tracks(clip.faps))
 
 
 @dataclass(slots=True)

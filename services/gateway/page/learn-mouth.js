@@ -212,7 +212,7 @@ export class MouthLesson {
       this.#fail(answer.error);
       return;
     }
-    const { voice: profile, before, after } = answer;
+    const { mouth_profile: profile, before, after } = answer;
     this.#learned = { profile, learntOn: Date.now(), before, after };
     this.#recording = null;
     this.#showResult(answer);

@@ -117,7 +117,7 @@ export class Microphone {
     socket.onopen = () => {
       const { sampleRate } = this.#context;
       const format = { sample_rate_hz: sampleRate, num_channels: 1, encoding: "s16le" };
-      socket.send(JSON.stringify({ ...format, voice: this.#handlers.mouthProfile() }));
+      socket.send(JSON.stringify({ ...format, mouth_profile: this.#handlers.mouthProfile() }));
     };
     socket.onmessage = (event) => {
       if (this.#socket !== socket) return;
