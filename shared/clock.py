@@ -1,4 +1,4 @@
-"""Media time, and the offset between two hosts' clocks.
+"""Media time, clock offsets and stalls.
 
 Media time is a sample index at 16 kHz, never a wall clock: it survives pauses, drift and hosts
 whose clocks disagree. Wall clocks are compared only to report latencies between hosts.

@@ -347,7 +347,7 @@ class Service(MessageLoop):
         )
 
     def _next_sessions(self, sessions: dict[str, SessionInput]) -> dict[str, SessionInput]:
-        """Return the sessions for the next heartbeat: of a worker with many, some in turn."""
+        """Return the sessions for the next heartbeat; a worker with many reports them in turn."""
         if self.kind.role != "worker" or len(sessions) <= SESSIONS_PER_HEARTBEAT:
             return sessions
         names = list(sessions)
@@ -398,7 +398,7 @@ class Service(MessageLoop):
 
 
 def _pulse_supervisor() -> None:
-    """Write a heartbeat byte to the supervisor's pipe, if there is one."""
+    """Write a heartbeat byte to the supervisor's pipe, if the pipe exists."""
     if pulse := os.environ.get(PULSE_VARIABLE):
         with contextlib.suppress(OSError):  # the pipe is full, or the supervisor is gone
             os.write(int(pulse), b".")

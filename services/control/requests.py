@@ -84,12 +84,12 @@ class Requests:
         self._commands.send(answer, to=sender)
 
     def check_role(self, sender: Peer, *roles: str) -> None:
-        """Reject a sender whose key has none of ``roles``; accept anyone if ``insecure``.
+        """Reject a sender unless its key has one of ``roles``; accept anyone if ``insecure``.
 
         Raises
         ------
         Refusal
-            The key has none of the roles.
+            If the key lacks these roles.
         """
         if self._bus.zap is None or not roles:
             return

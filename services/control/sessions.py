@@ -245,8 +245,8 @@ class Sessions:
     def move(self, record: SessionRecord, now_s: float) -> bool:
         """Place a session again after it lost workers; return whether that succeeded.
 
-        The recognizer is told after the synthesizer: if it stays, the synthesizer's phones are
-        known by then; a new synthesizer must have the session before it resumes the face.
+        The recognizer is told last. By then the synthesizer has reported its final phones, and a
+        new synthesizer has the session, so that the recognizer can resume the face there.
         """
         kept = {name: i for name, i in record.workers.items() if i not in record.lost}
         try:

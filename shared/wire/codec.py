@@ -1,8 +1,8 @@
-"""Messages to and from the parts of a ZeroMQ message.
+"""Encodes messages to the two parts of a ZeroMQ message, and decodes them.
 
-Two parts: the topic, which subscriptions match by prefix, and a msgpack map. Audio and FAP values
-are binary fields of the map rather than parts of their own: every message then has one shape, and
-at these sizes (under 2 KiB as a rule) the copy costs less than the bookkeeping.
+The first part is the topic, which subscriptions match by prefix; the second is a msgpack map. Audio
+and FAP values are fields of the map. They are small, usually under 2 KiB, so copying them costs
+less than separate parts.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ MAX_TOPIC_BYTES = 96
 
 
 class BadMessage(Exception):
-    """Parts that are no message.
+    """The parts are not a message.
 
-    ``reason`` is a short word for counting, ``version`` the protocol version of the sender.
+    ``reason`` is a short word for counters, ``version`` the sender's protocol version.
     """
 
     def __init__(self, reason: str, text: str, version: int = VERSION) -> None:
@@ -39,7 +39,7 @@ _VERSION_DECODER = msgspec.msgpack.Decoder(_VersionOnly)
 
 
 def topic(kind: type[Message], session: str) -> bytes:
-    """Return the topic of a message; it ends in a slash, so none is a prefix of another."""
+    """Return the topic of a message; it ends in a slash, so no topic is a prefix of another."""
     return f"{kind.kind}/{session}/".encode()
 
 
@@ -49,20 +49,18 @@ def encode(message: Message) -> list[bytes]:
 
 
 def encoded_size(structure: object) -> int:
-    """Return the bytes that a structure takes in the body of a message."""
+    """Return the size of a structure in the body of a message, bytes."""
     return len(_ENCODER.encode(structure))
 
 
 def decode(parts: Sequence[bytes]) -> Message:
-    """Return the message in two parts.
-
-    Unknown fields are ignored.
+    """Decode a message; unknown fields are ignored.
 
     Raises
     ------
     BadMessage
-        Wrong number of parts, an unknown kind or version, or a field of the wrong type, range or
-        size.
+        If the number of parts is wrong, the kind or version is unknown, or a field has the wrong
+        type or range.
     """
     if len(parts) != 2:
         raise BadMessage("parts", f"expected 2 parts (topic, body), got {len(parts)}")
@@ -76,7 +74,7 @@ def decode(parts: Sequence[bytes]) -> Message:
         _check_version(kind, _version_of(body))
         raise BadMessage(
             "kind",
-            f"unknown message kind {kind[:32]!r}; {DOCUMENT} has those of version {VERSION}",
+            f"unknown message kind {kind[:32]!r}; {DOCUMENT} lists the kinds of version {VERSION}",
         )
     try:
         message: Message = decoder.decode(body)
@@ -93,9 +91,8 @@ def _check_version(kind: str, version: int) -> None:
     if version != VERSION:
         raise BadMessage(
             "version",
-            f"{kind[:32]!r} is a message of protocol version {version}, and version {VERSION} is "
-            f"spoken here: upgrade the program that sent it ({DOCUMENT} describes version "
-            f"{VERSION})",
+            f"{kind[:32]!r} is a message of protocol version {version}, but this program uses "
+            f"version {VERSION}: upgrade the sender ({DOCUMENT} describes version {VERSION})",
             version,
         )
 

@@ -24,7 +24,7 @@ ShapeWeights = Annotated[bytes, Meta(max_length=4 * MAX_SHAPES)]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FaceSettings:
-    """How a session's face moves. A setting that is None stays as it is."""
+    """How a session's face moves. A setting without a value does not change."""
 
     lips: Name | None = None  # the lip model
     expressiveness: Annotated[float, Meta(ge=MIN_EXPRESSIVENESS, le=MAX_EXPRESSIVENESS)] | None = (

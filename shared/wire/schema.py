@@ -1,6 +1,6 @@
-"""The JSON schema of every message, made from the message classes.
+"""The JSON Schema of all messages.
 
-``python -m kouxing.shared.wire.schema > proto/schema.json`` rewrites it.
+``python -m kouxing.shared.wire.schema > proto/schema.json`` updates the file.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from kouxing.shared.wire.message import VERSION
 
 
 def schema() -> dict[str, object]:
-    """Return the schema: one definition per message, by its kind."""
+    """Return the schema, with one definition per kind of message."""
     references, definitions = msgspec.json.schema_components(
         MESSAGES.values(), ref_template="#/$defs/{name}"
     )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"kouxing protocol version {VERSION}",
-        "description": "Bodies are msgpack maps; what is base64 here is binary there.",
+        "description": "Bodies are msgpack maps; base64 strings stand for binary fields.",
         "properties": dict(zip(MESSAGES, references, strict=True)),
         "$defs": definitions,
     }

@@ -53,7 +53,7 @@ class ErrorCode(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionFacts:
-    """What a session's workers state about their results; each worker states some of it."""
+    """Facts about a session's results; each of its workers states some facts."""
 
     language: Name | None = None  # of the phones
     frame_rate_hz: Annotated[float, Meta(gt=0, le=1000)] | None = None  # of the FAP frames

@@ -166,31 +166,31 @@ def expected_rows(cls: type[Any]) -> list[list[str]]:
     ]
 
 
-def test_the_document_is_that_of_this_version() -> None:
+def test_documents_this_version() -> None:
     assert PROTOCOL.startswith(f"# The kouxing protocol, version {VERSION}\n")
 
 
-def test_the_common_fields_are_those_of_the_class() -> None:
+def test_documents_the_common_fields() -> None:
     assert [row[:4] for row in table(section("A message"))] == expected_rows(Message)
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
-def test_every_field_is_in_the_document_with_type_range_and_default(name: str) -> None:
+def test_documents_every_field_with_type_range_and_default(name: str) -> None:
     rows = table(section(f"`{name}`", MESSAGES_DOCUMENT))
     assert [row[:4] for row in rows] == expected_rows(STRUCTURES[name])
     assert all(row[4] for row in rows), "every field has its meaning"
 
 
-def test_the_document_describes_no_message_that_does_not_exist() -> None:
+def test_documents_no_other_message() -> None:
     described = re.findall(r"^### `([a-z-]+)`$", MESSAGES_DOCUMENT, re.MULTILINE)
     assert sorted(described) == sorted(STRUCTURES)
 
 
-def test_every_error_code_is_in_the_document() -> None:
+def test_documents_every_error_code() -> None:
     assert {row[0].strip("`") for row in table(section("Errors"))} == {*ErrorCode}
 
 
-def test_every_answer_is_in_the_document() -> None:
+def test_documents_every_answer() -> None:
     rows = [
         [set(re.findall(r"`([a-z-]+)`", cell)) for cell in row] for row in table(section("Answers"))
     ]
@@ -205,7 +205,7 @@ def test_every_answer_is_in_the_document() -> None:
     assert errors - {"request"} < {*ErrorCode}
 
 
-def test_every_fap_is_in_the_document() -> None:
+def test_documents_every_fap() -> None:
     assert table(section("FAPs", VALUES), -1) == [
         [
             str(fap.number),
@@ -219,19 +219,19 @@ def test_every_fap_is_in_the_document() -> None:
     assert list(LOW_LEVEL_FAPS) == list(range(2, 68)), "FAP 1 and 2 are never set"
 
 
-def test_every_unit_of_faps_is_in_the_document() -> None:
+def test_documents_every_unit_of_faps() -> None:
     assert {row[0] for row in table(section("FAPs", VALUES))} == {
         fap.fapu for fap in FAPS if fap.fapu
     }
 
 
-def test_every_shape_is_in_the_document() -> None:
+def test_documents_every_shape() -> None:
     assert table(section("Sets of shapes", VALUES)) == [
         [f"`{name}`", " ".join(shapes.names)] for name, shapes in SHAPE_SETS.items()
     ]
 
 
-def test_every_phone_is_in_the_document_and_its_example_has_it() -> None:
+def test_documents_every_phone_with_a_correct_example() -> None:
     inventory = load_inventory()
     rows = table(section("Phones", VALUES))
     assert [[row[0], row[1], row[4]] for row in rows] == [
@@ -246,11 +246,11 @@ def test_every_phone_is_in_the_document_and_its_example_has_it() -> None:
             assert symbol.strip("`") in syllable
 
 
-def test_every_event_is_in_the_document() -> None:
+def test_documents_every_event() -> None:
     assert {row[0].strip("`") for row in table(section("Events"))} == {*EventName}
 
 
-def test_the_sockets_carry_what_the_code_publishes_there() -> None:
+def test_documents_the_messages_of_each_publisher() -> None:
     published = {
         row[2].strip("`"): set(re.findall(r"`([a-z-]+)`", row[4]))
         for row in table(section("Sockets"))
@@ -261,7 +261,7 @@ def test_the_sockets_carry_what_the_code_publishes_there() -> None:
         assert published[endpoint] == kinds
 
 
-def test_the_order_of_the_mouth_is_in_the_document() -> None:
+def test_documents_the_order_of_lip_values() -> None:
     ranges: list[list[int]] = []
     for fap in MOUTH_FAPS:
         if ranges and fap == ranges[-1][-1] + 1:
@@ -275,17 +275,17 @@ def test_the_order_of_the_mouth_is_in_the_document() -> None:
     assert text in section("`lips`", MESSAGES_DOCUMENT)
 
 
-def test_the_limits_are_in_the_document() -> None:
+def test_documents_the_size_limits() -> None:
     assert f"at most {MAX_MESSAGE_BYTES // 2**20} MiB" in section("A message")
     assert f"{MAX_AUDIO_BYTES // 1024} KiB of audio" in section("A message")
 
 
 @pytest.mark.parametrize("cls", [SessionOpened, SessionMoved])
-def test_a_client_is_told_every_endpoint_that_control_places_for_it(cls: type[Message]) -> None:
+def test_messages_to_clients_contain_the_endpoints_they_need(cls: type[Message]) -> None:
     assert set(CLIENT_NEEDS) <= {field.name for field in dataclasses.fields(cls)}
 
 
-def test_the_schema_is_that_of_the_classes() -> None:
+def test_the_stored_schema_is_current() -> None:
     stored = json.loads((ROOT / "proto" / "schema.json").read_text(encoding="utf-8"))
     assert stored == json.loads(json.dumps(schema()))
 

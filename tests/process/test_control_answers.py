@@ -31,7 +31,7 @@ def stage(
     made.close()
 
 
-def test_a_request_that_is_repeated_has_the_same_answer(stage: Stage) -> None:
+def test_a_repeated_request_gets_the_same_answer(stage: Stage) -> None:
     client = stage.stranger(stage.control.key and user_key())
     first = stage.open(client, "mine")
     assert isinstance(first, SessionOpened)
@@ -65,7 +65,7 @@ def cut_off_before_it_is_told(stage: Stage, link: Link) -> tuple[zmq.Socket[byte
     return client, lost.token
 
 
-def test_who_is_cut_off_before_it_is_told_opens_the_session_anew(stage: Stage, link: Link) -> None:
+def test_a_client_that_missed_the_answer_opens_the_session_again(stage: Stage, link: Link) -> None:
     client, lost = cut_off_before_it_is_told(stage, link)
     opened = stage.open(client, "mine")
     assert isinstance(opened, SessionOpened)
@@ -74,7 +74,7 @@ def test_who_is_cut_off_before_it_is_told_opens_the_session_anew(stage: Stage, l
     assert stage.open(client, "mine") == opened
 
 
-def test_a_session_with_sound_is_not_opened_anew(stage: Stage, link: Link) -> None:
+def test_a_session_with_audio_is_not_opened_again(stage: Stage, link: Link) -> None:
     client, _ = cut_off_before_it_is_told(stage, link)
     record = stage.control._sessions.find("mine")
     recognizer = dataclasses.replace(
@@ -86,7 +86,7 @@ def test_a_session_with_sound_is_not_opened_anew(stage: Stage, link: Link) -> No
     assert getattr(stage.open(client, "mine"), "code", "") == "session-exists"
 
 
-def test_whoever_takes_anothers_name_and_key_gets_no_answer_of_it(stage: Stage) -> None:
+def test_a_connection_with_a_stolen_routing_id_gets_no_old_answer(stage: Stage) -> None:
     key = stage.control.key and user_key()
     assert isinstance(stage.open(stage.stranger(key), "mine"), SessionOpened)
     stolen = stage.open(stage.stranger(key), "mine")

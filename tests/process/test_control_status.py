@@ -41,7 +41,7 @@ def open_sessions(stage: Stage, number: int) -> list[str]:
     return names
 
 
-def test_all_pages_together_have_everything_once(
+def test_pages_contain_everything_once(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = open_sessions(stage, 5)
@@ -65,7 +65,7 @@ def test_all_pages_together_have_everything_once(
     assert sessions == names == [state.session for state in whole.sessions]
 
 
-def test_a_session_that_ended_between_two_pages_does_not_hide_another(
+def test_a_session_that_ends_between_pages_hides_no_other(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = open_sessions(stage, 4)
@@ -83,7 +83,7 @@ def test_a_session_that_ended_between_two_pages_does_not_hide_another(
     assert seen == names
 
 
-def test_of_one_session_it_has_that_and_its_services(stage: Stage, client: Socket) -> None:
+def test_reports_one_session_and_its_services(stage: Stage, client: Socket) -> None:
     open_sessions(stage, 3)
     report = ask(stage, client, session="s1")
     assert isinstance(report, StatusReport)
@@ -93,7 +93,7 @@ def test_of_one_session_it_has_that_and_its_services(stage: Stage, client: Socke
     assert getattr(ask(stage, client, session="none"), "code", "") == "unknown-session"
 
 
-def test_the_first_page_has_a_service_of_every_kind(
+def test_the_first_page_contains_a_service_of_every_kind(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in range(20):
@@ -111,7 +111,7 @@ def test_the_first_page_has_a_service_of_every_kind(
     assert {state.service for state in page.services} >= {"a-lamp", "recognizer", "synthesizer"}
 
 
-def test_the_pages_token_is_told_to_those_who_may_open_sessions_and_to_services(
+def test_only_clients_and_services_see_the_token_of_the_web_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))

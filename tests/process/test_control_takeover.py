@@ -61,7 +61,7 @@ def answers(stage: Stage, socket: Socket, num: int = 1) -> list[Message]:
     return received
 
 
-def test_a_session_is_taken_over_as_it_was(stage: Stage, client: Socket) -> None:
+def test_restores_a_session_unchanged(stage: Stage, client: Socket) -> None:
     recognizer, synthesizer = stage.services
     answers(stage, synthesizer)  # its heartbeat is answered
     answers(stage, recognizer)
@@ -76,7 +76,7 @@ def test_a_session_is_taken_over_as_it_was(stage: Stage, client: Socket) -> None
     assert answers(stage, client) == [Done(session="mine", request="1")]
 
 
-def test_a_request_waits_until_its_session_is_known(stage: Stage, client: Socket) -> None:
+def test_defers_a_request_until_its_session_is_restored(stage: Stage, client: Socket) -> None:
     client.send(CloseSession(session="mine", token="t", request="1"))
     while not stage.control._requests._deferred:
         stage.control.step(0.01)
@@ -84,7 +84,7 @@ def test_a_request_waits_until_its_session_is_known(stage: Stage, client: Socket
     assert answers(stage, client) == [Done(session="mine", request="1")]
 
 
-def test_a_client_that_asks_again_for_its_session_gets_it(stage: Stage) -> None:
+def test_repeats_the_answer_to_a_client_of_a_restored_session(stage: Stage) -> None:
     with Bus() as bus:
         client = bus.connect_dealer(stage.control.endpoints["commands"])
         client.send(OpenSession(session="other", request="1"))
@@ -99,7 +99,7 @@ def test_a_client_that_asks_again_for_its_session_gets_it(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("sender", ["synthesizer", "recognizer elsewhere"])
-def test_only_the_recognizer_of_a_session_brings_it(
+def test_only_the_recognizer_of_a_session_may_report_it(
     stage: Stage, client: Socket, sender: str
 ) -> None:
     recognizer, synthesizer = stage.services
@@ -114,7 +114,7 @@ def test_only_the_recognizer_of_a_session_brings_it(
     assert answer.code == "unknown-session"
 
 
-def test_a_session_whose_synthesizer_is_gone_gets_another_at_the_end(
+def test_moves_a_session_without_synthesizer_at_the_deadline(
     stage: Stage,
 ) -> None:
     recognizer, synthesizer = stage.services
@@ -128,7 +128,7 @@ def test_a_session_whose_synthesizer_is_gone_gets_another_at_the_end(
     assert starts[-1].endpoints["faps"] == PLACED["faps"]
 
 
-def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
+def test_stops_unknown_sessions_only_after_the_deadline(stage: Stage) -> None:
     recognizer, _ = stage.services
     answers(stage, recognizer)
     serving = beat("recognizer", sessions={"mine": SessionInput()})
@@ -141,7 +141,7 @@ def test_unknown_sessions_are_stopped_only_later(stage: Stage) -> None:
     assert StopSession(session="mine") in answers(stage, recognizer, 2)
 
 
-def test_a_client_is_told_again_that_its_session_moved(
+def test_repeats_session_moved_to_the_client(
     stage: Stage, client: Socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control_service, "REPEAT_MOVED_S", (0.1, 0.2))

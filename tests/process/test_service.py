@@ -78,7 +78,7 @@ def test_a_flood_of_messages_does_not_stop_ticks_and_heartbeats(slow: Slow) -> N
     assert slow.num_beats >= 2
 
 
-def test_what_is_not_expected_is_answered_counted_and_dropped(slow: Slow) -> None:
+def test_answers_counts_and_drops_unexpected_messages(slow: Slow) -> None:
     with Bus() as bus:
         sender = bus.connect_dealer(slow.input.endpoint)
         sender.send(Speech(session="s", active=True))
@@ -103,7 +103,7 @@ def test_a_paused_socket_keeps_its_messages(slow: Slow) -> None:
         handle(slow, 1)
 
 
-def test_a_message_for_which_no_file_can_be_opened_is_dropped(
+def test_drops_a_message_when_no_file_can_be_opened(
     slow: Slow,
 ) -> None:
     handle_progress = slow._on_progress
@@ -122,7 +122,7 @@ def test_a_message_for_which_no_file_can_be_opened_is_dropped(
 
 
 @pytest.mark.parametrize(("address", "warns"), [("10.0.0.1", True), ("127.0.0.1", False)])
-def test_an_open_service_that_others_reach_says_so(
+def test_warns_if_an_insecure_service_is_reachable_from_other_hosts(
     slow: Slow, caplog: pytest.LogCaptureFixture, address: str, warns: bool
 ) -> None:
     slow.endpoints = {"input": f"tcp://{address}:5570"}
@@ -209,9 +209,7 @@ def run_until(control: Control, worker: Worker, condition: Callable[[], bool]) -
         control.step()
 
 
-def test_one_that_stood_still_asks_control_before_it_goes_on(
-    control: Control, worker: Worker
-) -> None:
+def test_resyncs_with_control_after_a_stall(control: Control, worker: Worker) -> None:
     run_until(control, worker, lambda: bool(control.beats))
     with Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
@@ -226,7 +224,7 @@ def test_one_that_stood_still_asks_control_before_it_goes_on(
     assert worker.happened[:2] == ["stop s0", "input"]
 
 
-def test_one_that_stood_still_in_the_midst_of_its_work_asks_before_it_ticks(
+def test_resyncs_after_a_stall_in_a_handler_before_it_ticks(
     control: Control, worker: Worker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_until(control, worker, lambda: bool(control.beats))
@@ -249,7 +247,7 @@ def test_one_that_stood_still_in_the_midst_of_its_work_asks_before_it_ticks(
     assert worker.happened[-3:] == ["input", "stop s0", "tick"]
 
 
-def test_one_that_stood_still_goes_on_though_control_is_away(worker: Worker) -> None:
+def test_continues_after_a_stall_without_control(worker: Worker) -> None:
     with Bus() as bus:
         sender = bus.connect_dealer(worker.input.endpoint)
         sender.send(Progress(level_db=0.0))
@@ -277,7 +275,7 @@ def test_a_restarted_control_learns_the_sessions(
 @pytest.mark.parametrize(
     ("curve", "rest"), [(True, b""), (False, b"\x00\x05hello")], ids=["other keys", "no ZeroMQ"]
 )
-def test_it_registers_where_something_else_answered_before(
+def test_registers_at_an_address_where_another_program_answered_before(
     monkeypatch: pytest.MonkeyPatch, curve: bool, rest: bytes
 ) -> None:
     monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.3)
@@ -298,7 +296,7 @@ def test_it_registers_where_something_else_answered_before(
         service.bus.close()
 
 
-def test_where_control_hangs_what_is_meant_for_it_waits(
+def test_keeps_messages_for_a_control_that_hangs(
     monkeypatch: pytest.MonkeyPatch, control: Control, worker: Worker
 ) -> None:
     monkeypatch.setattr("kouxing.shared.service.NO_REPLY_S", 0.0)
@@ -311,7 +309,7 @@ def test_where_control_hangs_what_is_meant_for_it_waits(
     run_until(control, worker, lambda: len(control.beats) >= 3)
 
 
-def test_one_that_stops_says_so_before_it_finishes_its_sessions(control: Control) -> None:
+def test_reports_draining_before_it_finishes_its_sessions(control: Control) -> None:
     worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_PER_HEARTBEAT)
     run_until(control, worker, lambda: bool(control.beats))
     seen: list[Heartbeat] = []
@@ -327,7 +325,7 @@ def test_one_that_stops_says_so_before_it_finishes_its_sessions(control: Control
     assert {*seen[0].sessions} == {*worker.names}
 
 
-def test_heartbeats_name_a_great_many_sessions_in_turn(control: Control) -> None:
+def test_heartbeats_report_many_sessions_in_turn(control: Control) -> None:
     worker = Worker(control.socket.endpoint, num_sessions=2 * SESSIONS_PER_HEARTBEAT + 10)
     try:
         run_until(control, worker, lambda: len(control.beats) >= 3)
@@ -338,7 +336,7 @@ def test_heartbeats_name_a_great_many_sessions_in_turn(control: Control) -> None
     assert {*named} == {*worker.names}
 
 
-def test_a_process_ends_when_it_is_asked_for_its_health_and_its_loop_hangs(
+def test_a_health_check_ends_a_process_whose_loop_hangs(
     slow: Slow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ends: list[int] = []

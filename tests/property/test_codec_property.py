@@ -25,15 +25,13 @@ pytestmark = pytest.mark.property
 
 
 @given(st.lists(st.binary(max_size=200), max_size=4))
-def test_garbage_is_refused_and_nothing_else_happens(parts: list[bytes]) -> None:
+def test_rejects_garbage(parts: list[bytes]) -> None:
     with pytest.raises(BadMessage):
         decode(parts)
 
 
 @given(st.sampled_from(SAMPLES), st.data())
-def test_a_damaged_message_is_refused_or_still_a_valid_one(
-    message: Message, data: st.DataObject
-) -> None:
+def test_rejects_a_damaged_message_or_decodes_it(message: Message, data: st.DataObject) -> None:
     topic, body = encode(message)
     position = data.draw(st.integers(0, len(body) - 1))
     damaged = bytearray(body)
@@ -46,7 +44,7 @@ def test_a_damaged_message_is_refused_or_still_a_valid_one(
 
 
 @given(st.binary(max_size=1000), st.integers(0, 2**53), st.integers(0, 2**53))
-def test_audio_survives_the_wire(pcm: bytes, sequence: int, media_time: int) -> None:
+def test_decodes_encoded_audio(pcm: bytes, sequence: int, media_time: int) -> None:
     chunk = AudioChunk(
         session="s",
         token="t",
@@ -75,7 +73,7 @@ EVENTS: st.SearchStrategy[SoundEvent] = st.one_of(
 
 
 @given(EVENTS)
-def test_an_event_survives_the_wire_without_loss(event: SoundEvent) -> None:
+def test_converts_an_event_to_a_message_and_back(event: SoundEvent) -> None:
     message = message_of(event)
     assert decode(encode(message)) == message
     assert event_of(message) == event
@@ -93,7 +91,7 @@ def test_an_event_survives_the_wire_without_loss(event: SoundEvent) -> None:
         lip_to_teeth=st.floats(0, 1),
     )
 )
-def test_a_mouth_survives_the_wire_without_loss(frame: LipFrame) -> None:
+def test_converts_a_lip_frame_to_a_message_and_back(frame: LipFrame) -> None:
     message = message_of(frame)
     assert decode(encode(message)) == message
     read = event_of(message)

@@ -22,7 +22,7 @@ def test_media_time_is_samples_at_16_khz() -> None:
     assert duration_to_samples(-0.005) == -80
 
 
-def test_the_exchange_with_the_least_round_trip_gives_the_offset() -> None:
+def test_the_exchange_with_the_shortest_round_trip_gives_the_offset() -> None:
     clock = ClockOffset()
     assert clock.offset_ms == 0.0
     ahead_ns = 5_000_000

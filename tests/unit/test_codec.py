@@ -16,11 +16,11 @@ def parts_of(kind: str, session: str = "s", **fields: object) -> list[bytes]:
     return [f"{kind}/{session}/".encode(), msgpack.packb({"session": session, **fields})]
 
 
-def test_the_topic_ends_in_a_slash() -> None:
+def test_topics_end_in_a_slash() -> None:
     assert topic(FapFrame, "demo") == b"fap-frame/demo/"
 
 
-def test_fields_with_defaults_may_be_left_out() -> None:
+def test_fields_with_defaults_are_optional() -> None:
     message = decode(parts_of("open-session", request="r"))
     assert message == OpenSession(session="s", request="r")
 
@@ -58,15 +58,15 @@ def test_unknown_fields_are_ignored() -> None:
         ([b"done/other/", msgpack.packb({"session": "s", "request": "r"})], "topic"),
     ],
 )
-def test_what_is_no_message_is_refused_with_its_reason(parts: list[bytes], reason: str) -> None:
+def test_rejects_bad_messages_with_a_reason(parts: list[bytes], reason: str) -> None:
     with pytest.raises(BadMessage) as caught:
         decode(parts)
     assert caught.value.reason == reason
 
 
 @pytest.mark.parametrize("version", [1, 2, 65535])
-def test_another_version_is_named_with_what_to_do(version: int) -> None:
-    with pytest.raises(BadMessage, match="upgrade the program") as caught:
+def test_rejects_another_version_and_says_what_to_do(version: int) -> None:
+    with pytest.raises(BadMessage, match="upgrade the sender") as caught:
         decode(parts_of("open", request="r", version=version))
     assert caught.value.version == version
     assert f"'open' is a message of protocol version {version}" in str(caught.value)
@@ -74,7 +74,7 @@ def test_another_version_is_named_with_what_to_do(version: int) -> None:
 
 
 @pytest.mark.parametrize("confidence", [float("nan"), 1.5, -0.1, float("inf")])
-def test_a_confidence_outside_0_to_1_is_refused(confidence: float) -> None:
+def test_rejects_a_confidence_outside_0_to_1(confidence: float) -> None:
     with pytest.raises(BadMessage):
         decode(
             parts_of("phone", index=0, symbol="a", duration=1, confidence=confidence, final=True)
@@ -86,7 +86,7 @@ def test_binary_fields_are_binary_in_msgpack() -> None:
     assert msgpack.unpackb(body)["pcm"] == b"\x01\x02"
 
 
-def test_a_phone_survives_the_wire() -> None:
+def test_decodes_an_encoded_phone() -> None:
     phone = Phone(
         session="s", index=2, symbol="zh", duration=800, confidence=0.25, final=True, media_time=5
     )

@@ -33,7 +33,7 @@ def test_a_kind_has_classes_and_a_main_module(kind: ServiceKind) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "*"])
-def test_only_default_addresses_give_way_to_other_programs(host: str) -> None:
+def test_rejects_a_configured_port_that_is_taken(host: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         chosen = read_settings(assignments={"gateway.port": str(port)})

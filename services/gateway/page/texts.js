@@ -105,7 +105,7 @@ export const TEXTS = {
   },
   "error.bad-audio": { en: "{text}", zh: "音频有误（{text}）" },
   "error.busy": { en: "{text}", zh: "人太多了：请稍后再试（{text}）" },
-  "error.bad-voice": {
+  "error.bad-mouth-profile": {
     en: "The stored mouth profile does not fit this version. Press Learn my mouth and record again.",
     zh: "学到的口型不适用于当前版本：请重新“学我的口型”。",
   },

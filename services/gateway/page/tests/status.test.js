@@ -151,7 +151,7 @@ test("hints say what does not work and what to do", () => {
 test("errors are translated by their code, others are shown as they are", () => {
   assert.equal(errorText({ code: "refused", text: "no" }), "no");
   assert.equal(errorText({ code: "timeout", text: "no answer" }), "no answer");
-  assert.match(errorText({ code: "bad-voice", text: "old" }), /mouth profile does not fit/);
+  assert.match(errorText({ code: "bad-mouth-profile", text: "old" }), /mouth profile does not fit/);
 });
 
 test("reduced quality and the head's rotation are described", () => {
