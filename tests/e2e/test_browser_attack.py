@@ -1,4 +1,4 @@
-"""A web page of another origin cannot speak to a service, though browsers let it send bytes."""
+"""A page of another origin cannot send messages to a service, only meaningless bytes."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def zmtp1_frame(body: bytes, *, more: bool) -> bytes:
 
 
 def hidden(parts: list[bytes], shift: int) -> bytes:
-    """Return a request's body in which ZMTP 1 finds a message, wherever the headers' frames end.
+    """Return the body of a request that ZMTP 1 can read as a message.
 
-    An HTTP request begins like a frame, and so do its headers and the filler: each 1 is a length
-    or the flags of a frame with nothing in it. ``shift`` is 0 or 1: which of both it ends with.
+    ZMTP 1 reads the request line, the headers and the filler as frames. Every 1 in the filler is
+    either the length or the flags of an empty frame. ``shift`` (0 or 1) covers both cases.
     """
     frames = [zmtp1_frame(part, more=part is not parts[-1]) for part in parts]
     return b"\x01" * (600 + shift) + b"\x01\x00" + b"".join(frames)

@@ -1,4 +1,4 @@
-"""The subscribers of examples/subscribe follow a session, each in its language."""
+"""The programs in examples/subscribe follow a session."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.e2e
 
 @pytest.fixture
 def programs(tmp_path: Path) -> list[list[str]]:
-    """The commands that start them."""
+    """The commands of the programs."""
     shutil.copy(FOLDER / "follow.mjs", tmp_path)
     (tmp_path / "node_modules").symlink_to(ROOT / "proto" / "node" / "node_modules")
     program = tmp_path / "follow"
@@ -38,7 +38,7 @@ def programs(tmp_path: Path) -> list[list[str]]:
     ]
 
 
-def test_they_follow_a_face_to_its_end(system: System, programs: list[list[str]]) -> None:
+def test_follow_a_session_to_its_end(system: System, programs: list[list[str]]) -> None:
     name = "followed-by-examples"
     address = system.control.partition(" ")[0]
     with ExitStack() as stack, Client(system.control) as client:
@@ -49,24 +49,22 @@ def test_they_follow_a_face_to_its_end(system: System, programs: list[list[str]]
             for program in programs
         ]
         session = client.open_session(name=name, encoding="f32le", paced=False)
-        for each in running:
-            assert each.stdout is not None
-            assert each.stdout.readline() == f"following {name}\n"
+        for process in running:
+            assert process.stdout is not None
+            assert process.stdout.readline() == f"following {name}\n"
         stream_into(session, samples_of_file(VOWELS_FILE), chunk=1600)
-        outputs = [each.communicate(timeout=60)[0].splitlines() for each in running]
+        outputs = [process.communicate(timeout=60)[0].splitlines() for process in running]
         session.close()
-    assert [each.returncode for each in running] == [0, 0, 0]
+    assert [process.returncode for process in running] == [0, 0, 0]
     assert outputs[0] == outputs[1] == outputs[2]
     times_s, jaw = zip(*(map(float, line.split()) for line in outputs[0]), strict=True)
     assert len(jaw) > 100
     assert sorted(times_s) == list(times_s)
-    assert 0.2 < max(jaw) <= 1, "/a/ opens the jaw"
+    assert 0.2 < max(jaw) <= 1, "/a/ must open the jaw"
     assert min(jaw) == 0
 
 
-def test_they_follow_a_face_that_another_synthesizer_makes(
-    tmp_path: Path, programs: list[list[str]]
-) -> None:
+def test_follow_a_session_that_moves(tmp_path: Path, programs: list[list[str]]) -> None:
     samples = samples_of_file(VOWELS_FILE)[:48000]
     services = ("control", "recognizer", "synthesizer")
     with ExitStack() as stack, System(services, tmp_path) as system:
@@ -75,13 +73,15 @@ def test_they_follow_a_face_that_another_synthesizer_makes(
         address = system.control.partition(" ")[0]
         running = [
             stack.enter_context(
-                subprocess.Popen([*each, session.name, address], stdout=subprocess.PIPE, text=True)
+                subprocess.Popen(
+                    [*program, session.name, address], stdout=subprocess.PIPE, text=True
+                )
             )
-            for each in programs
+            for program in programs
         ]
-        for each in running:
-            assert each.stdout is not None
-            assert each.stdout.readline() == f"following {session.name}\n"
+        for process in running:
+            assert process.stdout is not None
+            assert process.stdout.readline() == f"following {session.name}\n"
         output = session.results(*KINDS, keep_all=True)
         collected = Collected()
         send(session, samples[:16000], output, collected, paced=True)
@@ -92,18 +92,16 @@ def test_they_follow_a_face_that_another_synthesizer_makes(
         send(session, samples[16000:], output, collected, paced=True)
         finish(session, output, collected)
         assert session.info["epoch"] > 1
-        outputs = [each.communicate(timeout=60)[0].splitlines() for each in running]
+        outputs = [process.communicate(timeout=60)[0].splitlines() for process in running]
         session.close()
-    assert [each.returncode for each in running] == [0, 0, 0]
+    assert [process.returncode for process in running] == [0, 0, 0]
     for lines in outputs:
         times = [round(16000 * float(line.split()[0])) for line in lines]
         assert times == sorted(times)
         assert {frame.media_time for frame in collected.frames} <= {*times}
 
 
-def test_the_one_in_c_sharp_follows_a_face_through_the_gateway(
-    system: System, tmp_path: Path
-) -> None:
+def test_the_csharp_program_follows_through_the_gateway(system: System, tmp_path: Path) -> None:
     program = tmp_path / "follow.exe"
     subprocess.run(["mcs", f"-out:{program}", FOLDER / "Follow.cs", STREAM], check=True)
     gateway = Gateway(system.control, free_port())
@@ -126,7 +124,7 @@ def test_the_one_in_c_sharp_follows_a_face_through_the_gateway(
 
 
 def open_jaw(client: Client, name: str, follower: subprocess.Popen[str]) -> float:
-    """Speak in a session until a program that follows it prints that the jaw is open."""
+    """Speak until the program prints that the jaw is open; return the opening."""
     assert follower.stdout is not None
     assert follower.stdout.readline() == "0.00\n", "a face at rest"
     session = client.open_session(name=name, encoding="f32le", paced=False)

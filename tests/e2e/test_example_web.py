@@ -1,4 +1,4 @@
-"""Examples that speak with the gateway: the voice assistant, and the avatar in a browser."""
+"""Examples that use the gateway: the voice assistant and the avatar in a browser."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def system() -> Iterator[System]:
 
 
 class Site(ThreadingHTTPServer):
-    """A folder on a port, as `python -m http.server` shows it."""
+    """Serves a folder like `python -m http.server`."""
 
     def __init__(self, folder: Path) -> None:
         class Handler(SimpleHTTPRequestHandler):
@@ -49,10 +49,10 @@ class Site(ThreadingHTTPServer):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """The avatar's page, and an avatar beside it."""
+    """The example's page with an avatar."""
     folder = tmp_path_factory.mktemp("site")
-    for each in (EXAMPLES / "browser-vrm").iterdir():
-        (folder / each.name).symlink_to(each)
+    for file in (EXAMPLES / "browser-vrm").iterdir():
+        (folder / file.name).symlink_to(file)
     export_glb(heads.load("woman", "coarse"), folder / "avatar.vrm")
     with Site(folder) as site:
         yield site
@@ -61,7 +61,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 @pytest.fixture(scope="module")
 def gateway(system: System, site: Site) -> Iterator[str]:
-    """Its address, once it is up."""
+    """The gateway's address."""
     gateway = Gateway(system.address, free_port(), allowed_origins=site.origin)
     with Client(system.address) as client:
         wait_until(lambda: len(client.status().services) == 4, 60)
@@ -69,7 +69,7 @@ def gateway(system: System, site: Site) -> Iterator[str]:
     assert gateway.stop() == 0
 
 
-def test_the_assistant_speaks_until_it_is_interrupted(system: System, gateway: str) -> None:
+def test_the_assistant_can_be_interrupted(system: System, gateway: str) -> None:
     recognizer = system.recognizer
     assert recognizer is not None
     program = [sys.executable, str(EXAMPLES / "voice-assistant" / "assistant.py"), gateway]
@@ -93,7 +93,7 @@ def test_the_assistant_speaks_until_it_is_interrupted(system: System, gateway: s
     assert spoken_s < 0.2 * len("you said a very long question") + 0.2 * len("you said no")
 
 
-def test_an_avatar_in_the_browser_takes_on_a_face(
+def test_the_avatar_shows_the_face_of_a_session(
     system: System, gateway: str, site: Site, tmp_path: Path
 ) -> None:
     browser = Browser(tmp_path, ROOT / "shared" / "demo" / "hello-female.wav")

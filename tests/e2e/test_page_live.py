@@ -1,4 +1,4 @@
-"""The page with the real services and a microphone that speaks: its delay, and crashes."""
+"""The page with real services and a speaking microphone: its delay, and crashes of services."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def browser(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> Itera
     browser = Browser(tmp_path_factory.mktemp("browser"), DEMO / "hello-female.wav")
     browser.command("Page.navigate", url=watched.page)
     browser.wait_for("document.getElementById('loading')?.hidden && window.kouxing.state.connected")
-    # What is announced, however short.
+    # Records all notices, including short ones.
     browser.evaluate(
-        "window.told = []; const notice = document.getElementById('notice');"
-        "new MutationObserver(() => window.told.push(notice.textContent))"
+        "window.notices = []; const notice = document.getElementById('notice');"
+        "new MutationObserver(() => window.notices.push(notice.textContent))"
         ".observe(notice, { childList: true, characterData: true, subtree: true })"
     )
     yield browser
@@ -41,14 +41,14 @@ def browser(watched: Watched, tmp_path_factory: pytest.TempPathFactory) -> Itera
 
 @pytest.fixture
 def live(browser: Browser) -> Browser:
-    """The browser while its microphone is shown."""
+    """The browser with a live microphone."""
     if browser.evaluate("document.getElementById('microphone').ariaPressed") == "false":
         browser.click("microphone")
     browser.wait_for(IS_LIVE)
     return browser
 
 
-def test_the_delay_is_shown_once_it_is_measured(browser: Browser) -> None:
+def test_shows_the_measured_delay(browser: Browser) -> None:
     assert browser.evaluate("window.kouxing.state.voiceToPictureMs") is None
     assert "ms" not in browser.evaluate(STATUS)
     browser.click("microphone")
@@ -60,48 +60,50 @@ def test_the_delay_is_shown_once_it_is_measured(browser: Browser) -> None:
 
 
 @pytest.mark.parametrize(
-    ("service", "told"),
+    ("service", "text"),
     [
         ("recognizer", "A service crashed"),
         ("synthesizer", "A service crashed"),
-        ("gateway", "The gateway stopped"),
+        ("gateway", "The gateway has stopped"),
     ],
 )
-def test_a_crash_is_told_and_the_microphone_goes_on(
-    watched: Watched, live: Browser, service: str, told: str
+def test_reports_a_crash_and_the_microphone_continues(
+    watched: Watched, live: Browser, service: str, text: str
 ) -> None:
     live.wait_for("document.getElementById('notice').textContent === ''")
-    live.evaluate("window.told = []")
+    live.evaluate("window.notices = []")
     watched.kill(service)
-    live.wait_for(f"window.told.some((text) => text.includes('{told}'))")
+    live.wait_for(f"window.notices.some((notice) => notice.includes('{text}'))")
     live.wait_for(f"window.kouxing.state.microphone && {IS_LIVE}")
 
 
-def test_the_script_of_the_documents_speaks_over_webrtc(browser: Browser) -> None:
+def test_the_script_in_the_documentation_speaks_over_webrtc(browser: Browser) -> None:
     (script,) = code_blocks(WEBRTC_PAGE, "js")
     browser.evaluate("window.logged = []; console.log = (value) => window.logged.push(value)")
-    told = browser.command("Runtime.evaluate", expression=script, replMode=True, awaitPromise=True)
-    assert "exceptionDetails" not in told, told
+    result = browser.command(
+        "Runtime.evaluate", expression=script, replMode=True, awaitPromise=True
+    )
+    assert "exceptionDetails" not in result, result
     browser.wait_for("window.logged.some((value) => value > 0.1)")
     browser.wait_for("window.logged.filter((value) => typeof value === 'string').length > 5")
     browser.evaluate("peer.close()")
 
 
-def test_nobody_notices_that_control_starts_again(watched: Watched, live: Browser) -> None:
+def test_a_restart_of_control_is_not_noticed(watched: Watched, live: Browser) -> None:
     live.wait_for("document.getElementById('notice').textContent === ''")
-    live.evaluate("window.told = []")
+    live.evaluate("window.notices = []")
     watched.kill("control")
     frames = live.evaluate("window.kouxing.state.numFrames")
     live.wait_for(f"window.kouxing.state.numFrames > {frames + 200}")
     assert live.evaluate(f"window.kouxing.state.microphone && {IS_LIVE}")
-    assert live.evaluate("window.told") == []
+    assert live.evaluate("window.notices") == []
 
 
 def test_an_abandoned_session_is_not_live(watched: Watched, live: Browser) -> None:
     watched.kill("gateway")
-    live.evaluate("document.getElementById('microphone').click()")  # nobody closes the session
+    live.evaluate("document.getElementById('microphone').click()")  # the session is not closed
     live.wait_for("window.kouxing.state.connected && window.kouxing.state.session !== null")
-    live.wait_for(f"{STATUS}.includes('waiting for speech')")  # once what was on its way has come
+    live.wait_for(f"{STATUS}.includes('waiting for speech')")  # after the last audio
     frames = live.evaluate("window.kouxing.state.numFrames")
-    live.wait_for(f"window.kouxing.state.numFrames > {frames + 50}")  # its face idles on
+    live.wait_for(f"window.kouxing.state.numFrames > {frames + 50}")  # its face still moves
     assert "waiting for speech" in live.evaluate(STATUS)

@@ -1,4 +1,4 @@
-"""The page elsewhere: by https, as a bare overlay, with a keyboard and a screen reader."""
+"""The page over https, as a bare overlay, with a keyboard and with a screen reader."""
 
 from __future__ import annotations
 
@@ -53,19 +53,19 @@ def visit(browser: Browser, address: str) -> None:
     browser.command("Page.navigate", url=address)
 
 
-def test_the_token_is_used_and_taken_out_of_the_address(browser: Browser, gateway: Gateway) -> None:
+def test_the_token_is_used_and_removed_from_the_url(browser: Browser, gateway: Gateway) -> None:
     visit(browser, gateway.page)
     browser.wait_for("document.getElementById('notice')?.textContent.includes('#token=')")
     visit(browser, f"{gateway.page}#token=a%2Bsecret")
     browser.wait_for(READY)
     assert browser.evaluate("location.href") == gateway.page
-    browser.click("microphone")  # https, and so the browser has one
+    browser.click("microphone")  # https gives access to the microphone
     browser.wait_for("window.kouxing.state.microphone")
     browser.click("microphone")
     browser.wait_for("!window.kouxing.state.microphone")
 
 
-def test_other_programs_are_sent_the_face_from_the_settings(
+def test_senders_are_started_and_stopped_in_the_settings(
     browser: Browser, gateway: Gateway
 ) -> None:
     visit(browser, f"{gateway.page}#token=a%2Bsecret")
@@ -77,7 +77,7 @@ def test_other_programs_are_sent_the_face_from_the_settings(
         browser.click("open-settings")
         browser.evaluate(f"document.getElementById('send-to').value = {url!r}")
         browser.evaluate("document.getElementById('send').requestSubmit()")
-        assert program.recv(2000)[0] == 6  # of Live Link Face's version
+        assert program.recv(2000)[0] == 6  # the version of Live Link Face
         browser.wait_for("/head, \\d+ frames/.test(document.getElementById('senders').innerText)")
         browser.evaluate("document.querySelector('#senders button').click()")
         browser.wait_for("document.getElementById('senders').children.length === 0")
@@ -89,7 +89,7 @@ def test_other_programs_are_sent_the_face_from_the_settings(
     browser.evaluate("document.getElementById('settings').hidePopover()")
 
 
-def test_the_bare_view_is_the_face_alone_on_a_transparent_background(
+def test_the_bare_view_shows_only_the_face_on_a_transparent_background(
     browser: Browser, gateway: Gateway
 ) -> None:
     visit(browser, f"{gateway.page}?view=bare&background=transparent#token=a%2Bsecret")
@@ -110,7 +110,7 @@ def test_the_bare_view_is_the_face_alone_on_a_transparent_background(
 
 @pytest.fixture(scope="module")
 def other_pages(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
-    """Serve pages that show a green face in a frame; return the port."""
+    """Serve a page that frames the face on green; yield the port."""
     folder = tmp_path_factory.mktemp("other")
     port, own_port = free_port(), free_port()
     gateway = Gateway("tcp://127.0.0.1:9", own_port, frame_ancestors=f"http://localhost:{port}")
@@ -138,7 +138,7 @@ def answers(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-def test_the_face_is_framed_by_a_page_that_is_named(browser: Browser, other_pages: int) -> None:
+def test_an_allowed_page_can_frame_the_face(browser: Browser, other_pages: int) -> None:
     visit(browser, f"http://localhost:{other_pages}/")
     browser.wait_for("document.readyState === 'complete'")
 
@@ -152,7 +152,7 @@ def test_the_face_is_framed_by_a_page_that_is_named(browser: Browser, other_page
     wait_until(has_face_on_green, 60)
 
 
-def test_no_other_page_can_frame_it(browser: Browser, other_pages: int) -> None:
+def test_other_pages_cannot_frame_the_face(browser: Browser, other_pages: int) -> None:
     browser.complaints.clear()
     visit(browser, f"http://127.0.0.1:{other_pages}/")
     browser.wait_for("document.readyState === 'complete'")
@@ -171,7 +171,7 @@ def press(browser: Browser, key: str) -> None:
         )
 
 
-def test_all_is_reached_by_keyboard_with_a_visible_focus(
+def test_the_keyboard_reaches_all_controls_with_a_visible_focus(
     browser: Browser, gateway: Gateway
 ) -> None:
     visit(browser, f"{gateway.page}#token=a%2Bsecret")
@@ -193,7 +193,7 @@ def test_all_is_reached_by_keyboard_with_a_visible_focus(
     assert browser.evaluate("document.activeElement.id") == "open-settings"
 
 
-def test_a_screen_reader_finds_names_and_is_not_flooded(browser: Browser, gateway: Gateway) -> None:
+def test_a_screen_reader_finds_names(browser: Browser, gateway: Gateway) -> None:
     visit(browser, f"{gateway.page}#token=a%2Bsecret")
     browser.wait_for(READY)
     browser.evaluate("document.getElementById('settings').showPopover()")
@@ -210,13 +210,13 @@ def test_a_screen_reader_finds_names_and_is_not_flooded(browser: Browser, gatewa
     for node in nodes:
         if not node.get("ignored") and node["role"]["value"] in roles:
             assert node["name"]["value"], node
-    # What is announced by itself changes seldom, and politely.
+    # Elements that are announced when they change; the others change too often.
     live = browser.evaluate(
         "Array.from(document.querySelectorAll('[role=status], [role=alert], output, [aria-live]'))"
-        ".filter((each) => each.getAttribute('aria-live') !== 'off').map((each) => each.id)"
+        ".filter((item) => item.getAttribute('aria-live') !== 'off').map((item) => item.id)"
     )
-    told = ["turned", "state", "notice", "send-problem", "lesson-advice", "lesson-problem"]
-    assert live == told
+    announced = ["turned", "state", "notice", "send-problem", "lesson-advice", "lesson-problem"]
+    assert live == announced
     browser.evaluate("document.getElementById('settings').hidePopover()")
 
 
@@ -224,21 +224,21 @@ def test_a_screen_reader_finds_names_and_is_not_flooded(browser: Browser, gatewa
 def test_text_on_a_pressed_button_has_contrast(browser: Browser, scheme: str) -> None:
     features = [{"name": "prefers-color-scheme", "value": scheme}]
     browser.command("Emulation.setEmulatedMedia", features=features)
-    colours = browser.evaluate(
+    colors = browser.evaluate(
         "(() => { const button = document.getElementById('record');"
         "button.style.transition = 'none'; button.setAttribute('aria-pressed', true);"
         "const style = getComputedStyle(button);"
-        "const found = [style.color, style.backgroundColor].map((text) => text.match(/[\\d.]+/g));"
-        "button.setAttribute('aria-pressed', false); return found; })()"
+        "const pair = [style.color, style.backgroundColor].map((text) => text.match(/[\\d.]+/g));"
+        "button.setAttribute('aria-pressed', false); return pair; })()"
     )
-    ink, back = (luminance([float(level) for level in colour[:3]]) for colour in colours)
+    ink, back = (luminance([float(level) for level in color[:3]]) for color in colors)
     assert (ink + 0.05) / (back + 0.05) >= 4.5  # WCAG 2.2, 1.4.3
 
 
 def luminance(levels: list[float]) -> float:
-    """Return the relative luminance of an sRGB colour (WCAG 2.2)."""
+    """Return the relative luminance of an sRGB color (WCAG 2.2)."""
     linear = [
         level / 12.92 if level <= 0.04045 else ((level + 0.055) / 1.055) ** 2.4
-        for level in (each / 255 for each in levels)
+        for level in np.array(levels) / 255
     ]
     return float(np.dot([0.2126, 0.7152, 0.0722], linear))

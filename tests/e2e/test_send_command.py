@@ -1,4 +1,4 @@
-"""``kouxing send`` beside a running system."""
+"""``kouxing send`` with a running system."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.system import ROOT, VOWELS_FILE, System, kouxing
 pytestmark = pytest.mark.e2e
 
 
-def test_each_session_of_a_name_moves_the_avatar(system: System) -> None:
+def test_sends_every_session_of_a_name(system: System) -> None:
     samples = samples_of_file(VOWELS_FILE)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as program:
         program.bind(("127.0.0.1", 0))
@@ -42,7 +42,7 @@ def test_each_session_of_a_name_moves_the_avatar(system: System) -> None:
                 while jaw_opening(program) < 0.1:
                     pass
                 session.close()
-                while jaw_opening(program) > 0.01:  # what was sent before, then a face at rest
+                while jaw_opening(program) > 0.01:  # until the face is at rest
                     pass
         sender.send_signal(signal.SIGINT)
         assert sender.wait(60) == 0
@@ -56,7 +56,7 @@ def jaw_opening(program: socket.socket) -> float:
             return float(messages["/kouxing/jawOpen"][0])
 
 
-def test_what_is_no_address_is_refused(system: System) -> None:
+def test_rejects_a_wrong_address(system: System) -> None:
     result = kouxing("send", "http://127.0.0.1", control=system.control)
     assert result.returncode == 2
     assert "write vmc://HOST" in result.stderr

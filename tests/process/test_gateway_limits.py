@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
@@ -22,18 +23,20 @@ from kouxing.services.gateway.http import WebSockets
 from kouxing.services.gateway.microphone import Microphones
 from kouxing.services.gateway.viewers import Viewers
 from kouxing.services.gateway.web_server import WebServer
-from kouxing.services.gateway.whip import WhipClients
+from kouxing.services.gateway.whip import MISSING, WhipClients
 from kouxing.shared.metrics import Metrics
-from tests.process.gateway_system import GatewayProcess, ScriptedSystem
+from tests.process.gateway_system import GatewayProcess, ScriptedSystem, async_test
 
 pytestmark = pytest.mark.process
 
 UPGRADE = b"GET /long HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: upgrade\r\n\r\n"
+SDP = {"Content-Type": "application/sdp"}
+UNUSED: Any = None
 
 
 @dataclass
 class Served:
-    """A server with an application of one short and one endless answer."""
+    """A server with short and endless answers."""
 
     address: tuple[str, int]
     refused: list[str] = field(default_factory=list)
@@ -76,184 +79,185 @@ async def serve(monkeypatch: pytest.MonkeyPatch, **limits: float) -> AsyncIterat
         monkeypatch.setattr(web_server, name, limit)
     bound = web_server.bind_port("127.0.0.1", 0)
     served = Served(bound.getsockname())
-    port = WebServer(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
+    server = WebServer(bound, None, on_refused=served.refused.append, on_bad_request=lambda: None)
     application = web.Application()
     application.add_routes(
         [web.get("/", answer), web.get("/slow", never_end), web.route("*", "/long", never_end)]
     )
-    await port.start(application, {"/long"})
+    await server.start(application, {"/long"})
     try:
         yield served
     finally:
-        await port.stop()
+        await server.stop()
         for writer in served.writers:
             writer.close()
 
 
-async def check_open(answer: asyncio.StreamReader) -> None:
+async def read_to_end(reader: asyncio.StreamReader) -> bytes:
+    return await asyncio.wait_for(reader.read(), 20)
+
+
+async def check_open(reader: asyncio.StreamReader) -> None:
     """Check that an endless answer has started and continues."""
-    await asyncio.wait_for(answer.readuntil(b"begun"), 20)
+    await asyncio.wait_for(reader.readuntil(b"begun"), 20)
     with pytest.raises(TimeoutError):
-        await asyncio.wait_for(answer.read(), 0.2)
+        await asyncio.wait_for(reader.read(), 0.2)
 
 
-@pytest.mark.parametrize("half", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
-def test_closes_connections_without_a_request(monkeypatch: pytest.MonkeyPatch, half: bytes) -> None:
-    async def wait() -> None:
-        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
-            assert await asyncio.wait_for((await served.connect(half)).read(), 20) == b""
-            assert await served.answers()
-
-    asyncio.run(wait())
-
-
-def test_closes_idle_connections_after_a_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def wait() -> None:
-        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
-            reader = await served.connect(b"GET / HTTP/1.1\r\nHost: a\r\n\r\nGET / HT")
-            received = await asyncio.wait_for(reader.read(), 20)
-            assert received.endswith(b"here")
-
-    asyncio.run(wait())
+@pytest.mark.parametrize("part", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: a\r\nX: "])
+@async_test
+async def test_closes_connections_without_a_request(
+    monkeypatch: pytest.MonkeyPatch, part: bytes
+) -> None:
+    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
+        assert await read_to_end(await served.connect(part)) == b""
+        assert await served.answers()
 
 
-def test_ends_slow_answers_except_on_unlimited_paths(
+@async_test
+async def test_closes_idle_connections_after_a_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2) as served:
+        reader = await served.connect(b"GET / HTTP/1.1\r\nHost: a\r\n\r\nGET / HT")
+        assert (await read_to_end(reader)).endswith(b"here")
+
+
+@async_test
+async def test_ends_slow_answers_except_on_unlimited_paths(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def wait() -> None:
-        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2, ANSWER_TIMEOUT_S=0.5) as served:
-            long = await served.connect(b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n")
-            slow = await served.connect(b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n")
-            assert b"begun" in await asyncio.wait_for(slow.read(), 20)
-            await check_open(long)
-
-    asyncio.run(wait())
+    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.2, ANSWER_TIMEOUT_S=0.5) as served:
+        long = await served.connect(b"GET /long HTTP/1.1\r\nHost: a\r\n\r\n")
+        slow = await served.connect(b"GET /slow HTTP/1.1\r\nHost: a\r\n\r\n")
+        assert b"begun" in await read_to_end(slow)
+        await check_open(long)
 
 
 @pytest.mark.parametrize(
-    "half",
+    "part",
     [
         b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
         b"POST /long HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n1\r\n1\r\n",
         b"GET /long HTTP/1.1\r\nHost: a\r\nContent-Length: 9\r\n\r\n1",
     ],
 )
-def test_a_body_has_a_deadline_and_its_answer_has_none(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, half: bytes
+@async_test
+async def test_a_body_has_a_deadline_and_its_answer_has_none(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, part: bytes
 ) -> None:
-    async def wait() -> None:
-        async with serve(monkeypatch, BODY_TIMEOUT_S=0.3) as served:
-            post = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n"
-            whole = [await served.connect(post), await served.connect(UPGRADE)]
-            served.writers[0].write(b"12")
-            held = await served.connect(half)
-            with contextlib.suppress(ConnectionResetError):
-                assert await asyncio.wait_for(held.read(), 20) == b""
-            for reader in whole:
-                await check_open(reader)
-
-    asyncio.run(wait())
+    async with serve(monkeypatch, BODY_TIMEOUT_S=0.3) as served:
+        post = b"POST /long HTTP/1.1\r\nHost: a\r\nContent-Length: 2\r\n\r\n"
+        complete = [await served.connect(post), await served.connect(UPGRADE)]
+        served.writers[0].write(b"12")
+        incomplete = await served.connect(part)
+        with contextlib.suppress(ConnectionResetError):
+            assert await read_to_end(incomplete) == b""
+        for reader in complete:
+            await check_open(reader)
     assert not caplog.records
 
 
-def test_refuses_connections_above_the_limit_until_one_closes(
+@async_test
+async def test_refuses_connections_above_the_limit_until_one_closes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def fill() -> None:
-        async with serve(monkeypatch, IDLE_TIMEOUT_S=0.5, MAX_CONNECTIONS=6) as served:
-            held = [await served.connect() for _ in range(5)]
-            with contextlib.suppress(ConnectionResetError):
-                assert await (await served.connect()).read() == b""
-            assert served.refused == ["127.0.0.1"]
-            for reader in held:
-                assert await asyncio.wait_for(reader.read(), 20) == b""
-            async with asyncio.timeout(20):
-                while not await served.answers():
-                    await asyncio.sleep(0.02)
-
-    asyncio.run(fill())
+    async with serve(monkeypatch, IDLE_TIMEOUT_S=0.5, MAX_CONNECTIONS=6) as served:
+        accepted = [await served.connect() for _ in range(5)]
+        with contextlib.suppress(ConnectionResetError):
+            assert await (await served.connect()).read() == b""
+        assert served.refused == ["127.0.0.1"]
+        for reader in accepted:
+            assert await read_to_end(reader) == b""
+        async with asyncio.timeout(20):
+            while not await served.answers():
+                await asyncio.sleep(0.02)
 
 
-NOTHING: Any = None
 CLIENTS: dict[str, Callable[[float], Handler]] = {
-    "viewers": lambda share: (
-        Viewers(WebSockets(), share, Metrics(), NOTHING, NOTHING, NOTHING).serve
-    ),
-    "microphones": lambda share: Microphones(WebSockets(), share, NOTHING).serve,
+    "viewers": lambda share: Viewers(WebSockets(), share, Metrics(), UNUSED, UNUSED, UNUSED).serve,
+    "microphones": lambda share: Microphones(WebSockets(), share, UNUSED).serve,
 }
 
 
 @pytest.mark.parametrize("kind", CLIENTS)
 @pytest.mark.parametrize(("share", "num_per_address"), [(0.75, 3), (1.0, 4)])
-def test_one_address_gets_only_its_share_unless_it_is_a_proxys(
+@async_test
+async def test_one_address_gets_only_its_share_unless_it_is_a_proxys(
     monkeypatch: pytest.MonkeyPatch, kind: str, share: float, num_per_address: int
 ) -> None:
-    for module, name in (
-        (viewers, "MAX_VIEWERS"),
-        (microphone, "MAX_MICROPHONES"),
-    ):
-        monkeypatch.setattr(module, name, 4)
+    monkeypatch.setattr(viewers, "MAX_VIEWERS", 4)
+    monkeypatch.setattr(microphone, "MAX_MICROPHONES", 4)
+    application = web.Application()
+    application.add_routes([web.get("/", CLIENTS[kind](share))])
+    async with TestServer(application) as server, AsyncExitStack() as stack:
 
-    async def fill() -> None:
-        application = web.Application()
-        application.add_routes([web.get("/", CLIENTS[kind](share))])
-        async with TestServer(application) as server, AsyncExitStack() as stack:
+        async def connect(address: str) -> aiohttp.ClientWebSocketResponse | None:
+            connector = aiohttp.TCPConnector(local_addr=(address, 0))
+            http = await stack.enter_async_context(aiohttp.ClientSession(connector=connector))
+            try:
+                return await http.ws_connect(server.make_url("/"))
+            except aiohttp.WSServerHandshakeError as error:
+                return None if error.status == 503 else pytest.fail(str(error))
 
-            async def connect(address: str) -> aiohttp.ClientWebSocketResponse | None:
-                connector = aiohttp.TCPConnector(local_addr=(address, 0))
-                http = await stack.enter_async_context(aiohttp.ClientSession(connector=connector))
-                try:
-                    return await http.ws_connect(server.make_url("/"))
-                except aiohttp.WSServerHandshakeError as error:
-                    return None if error.status == 503 else pytest.fail(str(error))
-
-            held = [await connect("127.0.0.1") for _ in range(5)]
-            assert sum(socket_ is not None for socket_ in held) == num_per_address
-            others = [await connect("127.0.0.2") for _ in range(5)]
-            assert sum(socket_ is not None for socket_ in others) == 4 - num_per_address
-            assert held[0] is not None
-            await held[0].close()
-            async with asyncio.timeout(20):
-                while await connect("127.0.0.1") is None:
-                    await asyncio.sleep(0.02)
-
-    asyncio.run(fill())
+        first = [await connect("127.0.0.1") for _ in range(5)]
+        assert sum(client is not None for client in first) == num_per_address
+        second = [await connect("127.0.0.2") for _ in range(5)]
+        assert sum(client is not None for client in second) == 4 - num_per_address
+        assert first[0] is not None
+        await first[0].close()
+        async with asyncio.timeout(20):
+            while await connect("127.0.0.1") is None:
+                await asyncio.sleep(0.02)
 
 
-def test_one_address_gets_only_its_share_of_webrtc_clients(monkeypatch: pytest.MonkeyPatch) -> None:
+@asynccontextmanager
+async def whip_offer(clients: WhipClients) -> AsyncIterator[Callable[[], Any]]:
+    """Serve WebRTC clients; yield a function that posts an offer."""
+    application = web.Application()
+    application.add_routes([web.post("/", clients.serve_post)])
+    async with TestServer(application) as server, aiohttp.ClientSession() as http:
+
+        async def offer() -> tuple[int, str]:
+            async with http.post(server.make_url("/"), data="v=0", headers=SDP) as response:
+                return response.status, await response.text()
+
+        yield offer
+
+
+@async_test
+async def test_one_address_gets_only_its_share_of_webrtc_clients(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(whip, "MAX_CLIENTS", 4)
+    clients = WhipClients(0.75, UNUSED, UNUSED, [])
+    may_end = asyncio.Event()
 
-    async def fill() -> None:
-        clients = WhipClients(0.75, NOTHING, NOTHING, [])
-        is_over = asyncio.Event()
+    async def make_peer(_client: object) -> None:
+        await may_end.wait()
+        raise web.HTTPNotImplemented
 
-        async def wait(_client: object) -> None:
-            await is_over.wait()
-            raise web.HTTPNotImplemented
-
-        monkeypatch.setattr(clients, "_make_peer", wait)
-        application = web.Application()
-        application.add_routes([web.post("/", clients.serve_post)])
-        async with TestServer(application) as server, aiohttp.ClientSession() as http:
-
-            async def offer() -> int:
-                headers = {"Content-Type": "application/sdp"}
-                async with http.post(server.make_url("/"), data="v=0", headers=headers) as answer:
-                    return answer.status
-
-            held = [asyncio.create_task(offer()) for _ in range(3)]
-            async with asyncio.timeout(20):
-                while len(clients) < 3:
-                    await asyncio.sleep(0.01)
-                assert await offer() == 503
-                is_over.set()
-                assert [await status for status in held] == [501, 501, 501]
-                assert await offer() == 501, "the quota is released"
-
-    asyncio.run(fill())
+    monkeypatch.setattr(clients, "_make_peer", make_peer)
+    async with whip_offer(clients) as offer, asyncio.timeout(20):
+        waiting = [asyncio.create_task(offer()) for _ in range(3)]
+        while len(clients) < 3:
+            await asyncio.sleep(0.01)
+        assert (await offer())[0] == 503
+        may_end.set()
+        assert [(await task)[0] for task in waiting] == [501] * 3
+        assert (await offer())[0] == 501, "the quota must be released"
 
 
-def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+@async_test
+async def test_whip_without_aiortc_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "aiortc", None)
+    monkeypatch.delitem(sys.modules, "kouxing.services.gateway.webrtc", raising=False)
+    clients = WhipClients(1.0, UNUSED, UNUSED, ["127.0.0.1"])
+    async with whip_offer(clients) as offer:
+        assert await offer() == (501, MISSING)
+    assert len(clients) == 0
+
+
+@async_test
+async def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     class Exhausted(socket.socket):
         def accept(self) -> tuple[socket.socket, object]:
             if failures:
@@ -261,20 +265,15 @@ def test_survives_running_out_of_descriptors(monkeypatch: pytest.MonkeyPatch) ->
             return super().accept()
 
     failures = ["Too many open files"]
-
-    async def wait() -> None:
-        monkeypatch.setattr(web_server, "_RETRY_S", 0.05)
-        bound = web_server.bind_port("127.0.0.1", 0)
-        exhausted = Exhausted(fileno=bound.detach())
-        port = WebServer(exhausted, None, on_refused=lambda _: None, on_bad_request=lambda: None)
-        application = web.Application()
-        application.add_routes([web.get("/", answer)])
-        await port.start(application, set())
-        assert await Served(exhausted.getsockname()).answers()
-        assert not failures
-        await port.stop()
-
-    asyncio.run(wait())
+    monkeypatch.setattr(web_server, "_RETRY_S", 0.05)
+    exhausted = Exhausted(fileno=web_server.bind_port("127.0.0.1", 0).detach())
+    server = WebServer(exhausted, None, on_refused=lambda _: None, on_bad_request=lambda: None)
+    application = web.Application()
+    application.add_routes([web.get("/", answer)])
+    await server.start(application, set())
+    assert await Served(exhausted.getsockname()).answers()
+    assert not failures
+    await server.stop()
 
 
 def test_logs_requests_that_are_not_http_once() -> None:
