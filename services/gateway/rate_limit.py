@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 
 BURST_S = 5.0  # allowed lead over real time; a network that stalled delivers a burst
 COMMAND_S = 0.05  # a command costs as much as this duration of audio
@@ -17,6 +16,6 @@ class RateLimit:
 
     async def wait(self, duration_s: float) -> None:
         """Charge for data of a given duration; return when more may be read."""
-        now_s = time.monotonic()
+        now_s = asyncio.get_running_loop().time()
         self._used_until_s = max(self._used_until_s, now_s) + duration_s
         await asyncio.sleep(max(0.0, self._used_until_s - now_s - BURST_S))
