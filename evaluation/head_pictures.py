@@ -1,4 +1,4 @@
-"""Pictures of every head: for the page's chooser, and sheets for the docs."""
+"""Draw every head: small pictures for the page, and sheets for the docs."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Float32 = NDArray[np.float32]
 _TURNS_DEG = (0.0, 40.0)
 _HEAD_PX, _VISEME_PX, _CHOICE_PX = (240, 200), (160, 160), (160, 160)
 _VISEMES_A_ROW = 9
-_SCALE = 2  # drawn so much larger, for smooth edges
+_SCALE = 2  # pictures are drawn larger and reduced, for smooth edges
 
 
 def head_names() -> list[str]:
-    """Name the heads of the package, the default one first."""
+    """Return the names of the package's heads, the default one first."""
     names = (path.stem for path in ASSETS.glob("*.npz"))
     return sorted(names, key=lambda name: (name != DEFAULT_HEAD, name))
 
@@ -80,7 +80,7 @@ def draw_sheets(folder: Path) -> list[Path]:
 
 
 def _spoken(viseme: str) -> Float32:
-    """FAPs (68,) of a viseme's target as the services make it by default."""
+    """Return the FAPs (68,) of a viseme's target with the default expressiveness."""
     faps = np.zeros(NUM_FAPS, np.float32)
     faps[np.array(MOUTH_FAPS) - 1] = load_parameters().target[VISEME_INDEX[viseme]]
     Expressiveness(SynthesizerConfig().expressiveness).scale(faps)

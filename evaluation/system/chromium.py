@@ -15,32 +15,32 @@ import aiohttp
 
 from kouxing.shared.errors import UserError
 
-_PATIENCE_S = 60.0
+_TIMEOUT_S = 60.0
 
 
 def is_installed() -> bool:
-    """Say whether there is a Chromium."""
+    """Whether Chromium is installed."""
     return _program() is not None
 
 
 class Chromium:
-    """A headless Chromium with one page, which the processor draws.
+    """A headless Chromium with one page, drawn without a GPU.
 
     Parameters
     ----------
     folder
-        For its profile.
+        Folder for the profile.
     size_px
-        Of the page.
+        Size of the page.
     microphone
-        WAV file that is heard again and again.
+        WAV file that the microphone repeats.
     camera
-        MJPEG file that is seen again and again, 30 pictures a second.
+        MJPEG file that the camera repeats at 30 frames per second.
 
     Raises
     ------
     UserError
-        If no Chromium is installed.
+        If Chromium is not installed.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Chromium:
     ) -> None:
         program = _program()
         if program is None:
-            raise UserError("no Chromium is installed")
+            raise UserError("Chromium is not installed; install the package chromium")
         self._process = subprocess.Popen(  # noqa: S603 - found on the path
             [
                 program,
@@ -73,7 +73,7 @@ class Chromium:
         self._num_sent = 0
         self.complaints: list[str] = []
         port_file = folder / "DevToolsActivePort"
-        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _PATIENCE_S)
+        wait_until(lambda: port_file.is_file() and "\n" in port_file.read_text(), _TIMEOUT_S)
         self._port = int(port_file.read_text().split()[0])
         self._loop.run_until_complete(self._connect())
         self.command("Runtime.enable")
@@ -88,7 +88,7 @@ class Chromium:
         self._socket = await self._http.ws_connect(url, max_msg_size=0)
 
     def close(self) -> None:
-        """End the program."""
+        """Close the browser."""
 
         async def close() -> None:
             await self._socket.close()
@@ -97,7 +97,7 @@ class Chromium:
         self._loop.run_until_complete(close())
         self._loop.close()
         self._process.terminate()
-        self._process.wait(_PATIENCE_S)
+        self._process.wait(_TIMEOUT_S)
 
     def command(self, method: str, **parameters: object) -> dict[str, Any]:
         """Run a command of the protocol."""
@@ -108,7 +108,7 @@ class Chromium:
         message = {"id": self._num_sent, "method": method, "params": parameters}
         await self._socket.send_json(message)
         while True:
-            answer = await self._socket.receive_json(timeout=_PATIENCE_S)
+            answer = await self._socket.receive_json(timeout=_TIMEOUT_S)
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
                 self.complaints.append(json.dumps(answer["params"]))
             if answer.get("id") == self._num_sent:
@@ -118,7 +118,7 @@ class Chromium:
                 return result
 
     def resize(self, width_px: int, height_px: int, *, mobile: bool = False) -> None:
-        """Give the window another size, as a phone's if ``mobile``."""
+        """Resize the window; ``mobile`` emulates a phone."""
         self.command(
             "Emulation.setDeviceMetricsOverride",
             width=width_px,
@@ -128,7 +128,7 @@ class Chromium:
         )
 
     def cpu_s(self) -> float:
-        """Return the processor time of the process that draws, s."""
+        """Return the CPU time of the process that draws, seconds."""
         return self._loop.run_until_complete(self._cpu_s())
 
     async def _cpu_s(self) -> float:
@@ -137,7 +137,7 @@ class Chromium:
         async with self._http.ws_connect(url) as socket:
             await socket.send_json({"id": 1, "method": "SystemInfo.getProcessInfo"})
             processes = (await socket.receive_json())["result"]["processInfo"]
-        return float(sum(each["cpuTime"] for each in processes if each["type"] == "GPU"))
+        return float(sum(process["cpuTime"] for process in processes if process["type"] == "GPU"))
 
     def evaluate(self, script: str) -> Any:
         """Return the value of an expression of the page."""
@@ -149,7 +149,7 @@ class Chromium:
         return result["result"].get("value")
 
     def click(self, name: str) -> None:
-        """Click on an element as a person does, where it is drawn; so the page may play sound."""
+        """Click on an element with the mouse, so that the page may play sound."""
         x, y = self.evaluate(
             "(async () => {"
             "const drawn = () => new Promise((done) => requestAnimationFrame(done));"
@@ -162,14 +162,14 @@ class Chromium:
                 "Input.dispatchMouseEvent", type=event, x=x, y=y, button="left", clickCount=1
             )
 
-    def wait_for(self, condition: str, limit_s: float = _PATIENCE_S) -> None:
+    def wait_for(self, condition: str, limit_s: float = _TIMEOUT_S) -> None:
         """Wait until an expression becomes true."""
 
         def holds() -> bool:
             try:
                 return bool(self.evaluate(condition))
             except RuntimeError as error:
-                if "navigated" in str(error):  # another page is just taking its place
+                if "navigated" in str(error):  # the page is being replaced
                     return False
                 raise
 
@@ -181,13 +181,7 @@ class Chromium:
 
 
 def wait_until(condition: Callable[[], object], limit_s: float) -> None:
-    """Wait until a condition holds.
-
-    Raises
-    ------
-    TimeoutError
-        If it does not in time.
-    """
+    """Wait until a condition holds; raises TimeoutError after ``limit_s``."""
     end_s = time.monotonic() + limit_s
     while not condition():
         if time.monotonic() > end_s:

@@ -1,4 +1,4 @@
-"""What a fault does to a live face: how long it stood, what was lost, and how far it jumped."""
+"""Effects of a fault on a live face: how long it stopped, what was lost, how far it jumped."""
 
 from __future__ import annotations
 
@@ -13,43 +13,45 @@ from kouxing.evaluation.system.live import Seen
 from kouxing.shared.clock import MEDIA_RATE_HZ
 from kouxing.shared.face.faps import FAPS
 
-UNSEEN = 1.0  # FAP units; a smaller step is none
-LATE_S = 0.06  # after the sound that a frame needs; one that comes later is not in time
-CALM_S = 1.0  # in which no frame is late: then all are in time again
+MIN_STEP = 1.0  # FAP units; a smaller step is invisible
+LATE_S = 0.06  # a frame is late if it arrives more than this after its audio
+CALM_S = 1.0  # without late frames; after that, frames are on time again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Continuity:
-    """Figures of one session against the same sound undisturbed."""
+    """One session compared with the same audio without a fault."""
 
-    stood_s: float  # longest time without a frame of a new media time, while sound came
-    late_s: float  # after the fault, until frames were in time again
+    stood_s: float  # longest time without a new frame while there was audio
+    late_s: float  # after the fault, until frames were on time again
     phones: int  # without the fault
     phones_lost: int
     phones_doubled: int
     phones_changed: int
     frames_lost: int
-    frames_doubled: int  # whose media time had been shown before
-    rest_frames: int  # that lead a silent client's face to rest; nobody was silent
-    largest_step: float  # of all FAPs, each as a multiple of its largest step undisturbed
+    frames_doubled: int  # whose media time had been received before
+    rest_frames: int  # frames of a silent client, though the client was not silent
+    largest_step: float  # of all FAPs, relative to the largest step without a fault
     largest_step_fap: str
-    late_p50_ms: float  # after the sound that a frame needs was due
+    late_p50_ms: float  # after the audio of a frame was due
     late_p95_ms: float
 
 
 def compare(
     seen: Seen, undisturbed: Seen, silence: str, delay_s: float, *, fault_s: float
 ) -> Continuity:
-    """Compare what came with what comes of the same sound without a fault.
+    """Compare a session with one without a fault.
 
     Parameters
     ----------
+    seen, undisturbed
+        Results with and without the fault.
     silence
-        The phone that is no speech.
+        Symbol of silence.
     delay_s
-        How much later than its sound a frame is made.
+        Delay of the synthesizer.
     fault_s
-        When it happened.
+        Time of the fault.
     """
     arrived_s = np.array([arrival_s for arrival_s, _ in seen.frames])
     times = np.array([frame.media_time for _, frame in seen.frames], np.int64)
@@ -59,13 +61,13 @@ def compare(
     errors = count_errors(
         *([phone.symbol for phone in each.final_phones(silence)] for each in (undisturbed, seen))
     )
-    due_s = seen.begin_s + delay_s + times / MEDIA_RATE_HZ
+    due_s = seen.start_s + delay_s + times / MEDIA_RATE_HZ
     is_live = is_new & (arrived_s < seen.live_until_s)
     late_s = (arrived_s - due_s)[is_live]
     steps = largest_steps(seen.faps)
-    ratios = steps / np.maximum(largest_steps(undisturbed.faps), UNSEEN)
+    ratios = steps / np.maximum(largest_steps(undisturbed.faps), MIN_STEP)
     return Continuity(
-        stood_s=float(np.diff([seen.begin_s, *arrived_s[is_live], seen.live_until_s]).max()),
+        stood_s=float(np.diff([seen.start_s, *arrived_s[is_live], seen.live_until_s]).max()),
         late_s=_late_until_s(due_s[is_live], late_s, fault_s) - fault_s,
         phones=errors.reference,
         phones_lost=errors.deletions,
@@ -82,16 +84,16 @@ def compare(
 
 
 def worst(faces: Sequence[Continuity]) -> Continuity:
-    """Return the worst of each figure of several sessions with the same sound."""
+    """Return the worst value of each figure of several sessions."""
     largest = max(faces, key=lambda face: face.largest_step)
-    numbers = {each.name for each in fields(Continuity)} - {"largest_step_fap"}
+    numbers = {field.name for field in fields(Continuity)} - {"largest_step_fap"}
     return replace(
         largest, **{name: max(getattr(face, name) for face in faces) for name in numbers}
     )
 
 
 def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault_s: float) -> float:
-    """Return when the last of the frames came that a fault has made late."""
+    """Return when the last frame arrived that the fault made late."""
     until_s = fault_s
     for due, late in sorted(zip(due_s, late_s, strict=True)):
         if due > until_s + CALM_S:
@@ -102,7 +104,7 @@ def _late_until_s(due_s: NDArray[np.float64], late_s: NDArray[np.float64], fault
 
 
 def largest_steps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the largest change of each FAP from one frame to the next, of shape (68,)."""
+    """Return the largest change of each FAP from one frame to the next, shape (68,)."""
     steps: NDArray[np.float32] = np.abs(np.diff(faps, axis=0)).max(axis=0)
     return steps
 
@@ -110,16 +112,16 @@ def largest_steps(faps: NDArray[np.float32]) -> NDArray[np.float32]:
 def staleness(
     followed: Sequence[tuple[float, int]], seen: Seen, since_s: float
 ) -> NDArray[np.float64]:
-    """Return how old frames were when another subscriber got them, in seconds.
+    """Return how late another subscriber received frames, in seconds.
 
     Parameters
     ----------
     followed
-        Arrival and media time at that subscriber.
+        Arrival and media time of each frame at that subscriber.
     seen
-        What came in time.
+        Results of a subscriber without delays.
     since_s
-        Arrivals before this do not count.
+        Earlier arrivals do not count.
     """
     in_time_s = {frame.media_time: arrival_s for arrival_s, frame in reversed(seen.frames)}
     return np.array(

@@ -1,4 +1,4 @@
-"""Returns each packet that is led to a TUN device some time later, in order.
+"""Delay packets: return each packet that is routed to a TUN device some time later, in order.
 
 usage: python -m kouxing.evaluation.system.delay DEVICE DELAY_MS JITTER_MS
 """
@@ -21,22 +21,22 @@ _IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
 
 
 def main(device: str, delay_s: float, jitter_s: float) -> None:
-    """Run until the process is ended."""
+    """Run until the process is killed."""
     tun = os.open("/dev/net/tun", os.O_RDWR)
     fcntl.ioctl(tun, _TUNSETIFF, struct.pack("16sH22x", device.encode(), _IFF_TUN | _IFF_NO_PI))
     subprocess.run(["ip", "link", "set", device, "up"], check=True)  # noqa: S603, S607
-    chance = random.Random(0)  # noqa: S311 - no secret
-    waiting: deque[tuple[float, bytes]] = deque()  # when it is due, packet
+    rng = random.Random(0)  # noqa: S311 - no secret
+    queue: deque[tuple[float, bytes]] = deque()  # due time, packet
     due_s = 0.0
     while True:
-        left_s = max(0.0, waiting[0][0] - time.monotonic()) if waiting else None
+        left_s = max(0.0, queue[0][0] - time.monotonic()) if queue else None
         if select.select([tun], [], [], left_s)[0]:
             packet = os.read(tun, MAX_PACKET_BYTES)
-            wait_s = delay_s + chance.uniform(-jitter_s, jitter_s)
+            wait_s = delay_s + rng.uniform(-jitter_s, jitter_s)
             due_s = max(due_s, time.monotonic() + wait_s)
-            waiting.append((due_s, packet))
-        while waiting and waiting[0][0] <= time.monotonic():
-            os.write(tun, waiting.popleft()[1])
+            queue.append((due_s, packet))
+        while queue and queue[0][0] <= time.monotonic():
+            os.write(tun, queue.popleft()[1])
 
 
 if __name__ == "__main__":

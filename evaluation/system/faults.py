@@ -1,10 +1,9 @@
-"""What faults do to a live face: services killed and frozen, load, slow subscribers, networks.
+"""Measure what faults do to a live face: killed and frozen services, load, networks.
 
-For each fault the services run as under ``kouxing run``, on ports of their own, or each on a host
-of its own (``evaluation.system.network``). A sentence is streamed again and again at real pace, in
-the midst of it something breaks, and what a subscriber saw is compared with the same sound
-undisturbed (``evaluation.system.continuity``). What is sudden happens at several instants, in a
-session each; the worst of each figure counts.
+For each fault the services run as under ``kouxing run``, on free ports, or on virtual hosts
+(``network.py``). A sentence is streamed in real time until something breaks. What a subscriber
+receives is compared with the same audio without a fault (``continuity.py``). A sudden fault happens
+at several instants, in one session each. The worst value of each figure counts.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kouxing.evaluation.system.continuity import Continuity, compare, staleness, worst
-from kouxing.evaluation.system.live import Seen, Wire, speak, speak_undisturbed
+from kouxing.evaluation.system.live import EpochMonitor, Seen, speak, speak_undisturbed
 from kouxing.evaluation.system.network import Link, Network
 from kouxing.evaluation.system.systems import ON_HOSTS, SPARE, HostsSystem, LocalSystem, System
 from kouxing.services.recognizer.front_end.resample import to_16_khz
@@ -51,107 +50,100 @@ def spin(*_):
     while time.monotonic() < end_s:
         pass
 signal.signal(signal.SIGUSR1, spin)
-"""  # in a service: its loop hangs, its other threads do not
+"""  # runs in a service: its loop hangs, its other threads continue
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """How long a session and its fault take, in seconds."""
+    """Durations of a session and its fault, seconds."""
 
-    length_s: float = 24.0  # of the sound
+    length_s: float = 24.0  # of the audio
     fault_at_s: float = 8.0
-    also_at_s: tuple[float, ...] = (3.2, 4.6)  # in sessions of their own
-    frozen_s: float = 10.0  # a service, or others busy
-    stopped_s: float = 60.0  # a subscriber, for which the sound is longer
-    cut_s: float = 2.0  # a link
+    also_at_s: tuple[float, ...] = (3.2, 4.6)  # in other sessions
+    frozen_s: float = 10.0  # how long a service or the machine is blocked
+    stopped_s: float = 60.0  # how long a subscriber is stopped
+    cut_s: float = 2.0  # how long a host is cut off
 
 
 TIMING = Timing()
 
-Action = tuple[float, Callable[[], object]]  # seconds after the first sample, what is done then
+Action = tuple[float, Callable[[], object]]  # seconds after the first sample, function
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Something that breaks in a live session."""
+    """A fault in a live session."""
 
-    actions: Callable[[Any, str, Timing], list[Action]]  # of a system, in a session of some name
-    beside: str = ""  # service of which a second one runs; then nothing is started again
+    actions: Callable[[Any, str, Timing], list[Action]]  # by system and session name
+    spare: str = ""  # kind of which a second worker runs; then services do not restart
     num_sessions: int = 1
-    stops_subscriber: bool = False  # a second one
-    link: Link | None = None  # between hosts of their own; None: all is on this one
-    is_sudden: bool = True  # what it does depends on the instant
+    stops_subscriber: bool = False  # a second subscriber, not the measured one
+    link: Link | None = None  # between virtual hosts; None: everything runs on this host
+    is_sudden: bool = True  # the effect depends on the instant
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What a fault did."""
+    """Effects of a fault."""
 
     fault: str
-    failure: str  # why it could not be measured to its end; empty: it could
-    face: Continuity | None = None  # None: no frame came
-    old_frames: int = 0  # published in an earlier epoch after the first of a later one
-    num_refused: int = 0  # of several sessions
-    late_p95_ms: float | None = None  # the most of all sessions
-    stale_frames: int = 0  # of more than a second, that a subscriber got after it was stopped
+    failure: str  # why the session did not complete; empty: it did
+    face: Continuity | None = None  # None: no frame arrived
+    old_frames: int = 0  # of an earlier epoch, after the first of a later one
+    num_refused: int = 0  # sessions
+    late_p95_ms: float | None = None  # maximum over all sessions
+    stale_frames: int = 0  # over a second late, at a subscriber that had been stopped
     stalest_s: float = 0.0
-    load: float  # average of this machine's processes that run, over a minute
+    load: float  # load average of the last minute
 
 
 def _kill(service: str) -> Callable[[System, str, Timing], list[Action]]:
-    """Return a fault: the process that serves the session ends."""
-
-    def actions(system: System, session: str, timing: Timing) -> list[Action]:
-        return [_signal(system.process_of(session, service), signal.SIGKILL, timing.fault_at_s)]
-
-    return actions
+    """Return a fault that kills the process that serves the session."""
+    return lambda system, session, timing: [
+        _signal(system.process_of(session, service), signal.SIGKILL, timing.fault_at_s)
+    ]
 
 
 def _stop(service: str) -> Callable[[System, str, Timing], list[Action]]:
-    """Return a fault: the process that serves the session is stopped for some time."""
-
-    def actions(system: System, session: str, timing: Timing) -> list[Action]:
-        number = system.process_of(session, service)
-        return _stopped(number, timing.fault_at_s, timing.frozen_s)
-
-    return actions
+    """Return a fault that stops the process that serves the session for some time."""
+    return lambda system, session, timing: _stopped(
+        system.process_of(session, service), timing.fault_at_s, timing.frozen_s
+    )
 
 
 def _hang(service: str) -> Callable[[System, str, Timing], list[Action]]:
-    """Return a fault: the loop of the process that serves the session hangs for some time."""
-
-    def actions(system: System, session: str, timing: Timing) -> list[Action]:
-        return [_signal(system.process_of(session, service), signal.SIGUSR1, timing.fault_at_s)]
-
-    return actions
+    """Return a fault that blocks the loop of the process that serves the session."""
+    return lambda system, session, timing: [
+        _signal(system.process_of(session, service), signal.SIGUSR1, timing.fault_at_s)
+    ]
 
 
-def _signal(number: int, which: int, at_s: float) -> Action:
+def _signal(process_id: int, number: int, at_s: float) -> Action:
     def send() -> None:
-        with contextlib.suppress(ProcessLookupError):  # it was ended meanwhile
-            os.kill(number, which)
+        with contextlib.suppress(ProcessLookupError):  # the supervisor has ended it
+            os.kill(process_id, number)
 
     return at_s, send
 
 
-def _stopped(number: int, at_s: float, for_s: float) -> list[Action]:
+def _stopped(process_id: int, at_s: float, for_s: float) -> list[Action]:
     return [
-        _signal(number, signal.SIGSTOP, at_s),
-        _signal(number, signal.SIGCONT, at_s + for_s),
+        _signal(process_id, signal.SIGSTOP, at_s),
+        _signal(process_id, signal.SIGCONT, at_s + for_s),
     ]
 
 
 def _busy(_system: System, _session: str, timing: Timing) -> list[Action]:
-    """Return a fault: four processes a core do nothing but spin."""
-    spinning: list[subprocess.Popen[bytes]] = []
+    """Run four busy processes per core."""
+    busy: list[subprocess.Popen[bytes]] = []
 
     def start() -> None:
         for _ in range(4 * (os.cpu_count() or 1)):
             command = [sys.executable, "-c", f"import time\nwhile time.monotonic() < {end_s}: pass"]
-            spinning.append(subprocess.Popen(command, start_new_session=True))  # noqa: S603
+            busy.append(subprocess.Popen(command, start_new_session=True))  # noqa: S603
 
     def stop() -> None:
-        for process in spinning:
+        for process in busy:
             process.wait()
 
     stop_at_s = timing.fault_at_s + timing.frozen_s
@@ -163,17 +155,17 @@ def _nothing(_system: System, _session: str, _timing: Timing) -> list[Action]:
     return []
 
 
-def _cut(which: str, *, mended: bool) -> Callable[[HostsSystem, str, Timing], list[Action]]:
-    """Return a fault: a host is cut off, for some time or else for good.
+def _cut(which: str, *, is_mended: bool) -> Callable[[HostsSystem, str, Timing], list[Action]]:
+    """Return a fault that cuts off a host, for some time or permanently.
 
-    ``which`` is the client's host, or the kind of service that serves the session there.
+    ``which`` is the client's host, or the kind of the service that serves the session.
     """
 
     def actions(system: HostsSystem, session: str, timing: Timing) -> list[Action]:
         host = which if which == CLIENT else system.host_of(session, which)
         cut: Action = timing.fault_at_s, functools.partial(system.network.cut, host)
         mend: Action = timing.fault_at_s + timing.cut_s, system.network.mend
-        return [cut, mend] if mended else [cut]
+        return [cut, mend] if is_mended else [cut]
 
     return actions
 
@@ -181,12 +173,12 @@ def _cut(which: str, *, mended: bool) -> Callable[[HostsSystem, str, Timing], li
 _WORKERS = ("recognizer", "synthesizer")
 FAULTS = {
     "none": Fault(_nothing, is_sudden=False),
-    **{f"{each} killed": Fault(_kill(each)) for each in _WORKERS},
-    **{f"{each} killed, one more": Fault(_kill(each), each) for each in _WORKERS},
-    **{f"{each} stopped, one more": Fault(_stop(each), each) for each in _WORKERS},
-    **{f"{each} hangs, one more": Fault(_hang(each), each) for each in _WORKERS},
-    **{f"{each} stopped": Fault(_stop(each)) for each in _WORKERS},
-    **{f"{each} hangs": Fault(_hang(each)) for each in _WORKERS},
+    **{f"{worker} killed": Fault(_kill(worker)) for worker in _WORKERS},
+    **{f"{worker} killed, one more": Fault(_kill(worker), worker) for worker in _WORKERS},
+    **{f"{worker} stopped, one more": Fault(_stop(worker), worker) for worker in _WORKERS},
+    **{f"{worker} hangs, one more": Fault(_hang(worker), worker) for worker in _WORKERS},
+    **{f"{worker} stopped": Fault(_stop(worker)) for worker in _WORKERS},
+    **{f"{worker} hangs": Fault(_hang(worker)) for worker in _WORKERS},
     "control killed": Fault(_kill("control")),
     "busy machine": Fault(_busy, is_sudden=False),
     f"{NUM_SESSIONS} sessions": Fault(_nothing, num_sessions=NUM_SESSIONS, is_sudden=False),
@@ -198,10 +190,12 @@ FAULTS = {
         for delay_ms in (0, 20, 50)
         for loss in (0.0, 0.01, 0.03)
     },
-    "hosts, client cut off for 2 s": Fault(_cut(CLIENT, mended=True), link=Link()),
+    "hosts, client cut off for 2 s": Fault(_cut(CLIENT, is_mended=True), link=Link()),
     **{
-        f"hosts, {each} gone for good, one more": Fault(_cut(each, mended=False), each, link=Link())
-        for each in _WORKERS
+        f"hosts, {worker} gone for good, one more": Fault(
+            _cut(worker, is_mended=False), worker, link=Link()
+        )
+        for worker in _WORKERS
     },
 }
 
@@ -213,25 +207,31 @@ def measure(
     console: Console,
     timing: Timing,
 ) -> Iterator[Outcome]:
-    """Let faults happen, one after another; yield what each did.
+    """Run faults one after another; yield the effects of each.
 
     Parameters
     ----------
+    path
+        Audio file to stream.
     names
-        Of ``FAULTS``; empty: all.
+        Keys of ``FAULTS``. If empty, run all.
     logs
-        Folder for the services' logs, one in it for each fault and instant; None: none are kept.
+        Folder for the services' logs, with a subfolder for each fault and instant.
+    console
+        For progress messages.
+    timing
+        Durations.
 
     Raises
     ------
     UserError
-        If there is no such fault, or the file is no audio.
+        If a fault does not exist, or the file is not audio.
     """
     unknown = sorted(set(names) - set(FAULTS))
     if unknown:
-        raise UserError(f"{unknown[0]!r} is no fault; there are {', '.join(FAULTS)}")
+        raise UserError(f"no fault is named {unknown[0]!r}; choose from {', '.join(FAULTS)}")
     sentence = to_16_khz(*read_audio(path))
-    undisturbed: dict[int, Seen] = {}  # by the length of the sound
+    undisturbed: dict[int, Seen] = {}  # by the length of the audio
     for name in names or FAULTS:
         also_at_s = timing.also_at_s if FAULTS[name].is_sudden else ()
         outcomes = []
@@ -240,9 +240,9 @@ def measure(
             with tempfile.TemporaryDirectory() as temporary:
                 folder = Path(temporary) if logs is None else logs / f"{name}-{at_s:g}-s"
                 folder.mkdir(parents=True, exist_ok=True)
-                own = replace(timing, fault_at_s=at_s)
+                timing = replace(timing, fault_at_s=at_s)
                 try:
-                    outcome = _outcome(name, folder, sentence, undisturbed, own, console)
+                    outcome = _outcome(name, folder, sentence, undisturbed, timing, console)
                 except UserError as error:
                     outcome = Outcome(fault=name, failure=str(error), load=os.getloadavg()[0])
             outcomes.append(outcome)
@@ -250,27 +250,27 @@ def measure(
 
 
 def _worst(outcomes: Sequence[Outcome]) -> Outcome:
-    """Return the worst of each figure of one fault's outcomes."""
-    faces = [each.face for each in outcomes if each.face is not None]
-    late_ms = [each.late_p95_ms for each in outcomes if each.late_p95_ms is not None]
+    """Return the worst value of outcome figure."""
+    faces = [outcome.face for outcome in outcomes if outcome.face is not None]
+    late_ms = [outcome.late_p95_ms for outcome in outcomes if outcome.late_p95_ms is not None]
     return Outcome(
         fault=outcomes[0].fault,
-        failure="; ".join(sorted({each.failure for each in outcomes} - {""})),
+        failure="; ".join(sorted({outcome.failure for outcome in outcomes} - {""})),
         face=worst(faces) if faces else None,
-        old_frames=max(each.old_frames for each in outcomes),
-        num_refused=max(each.num_refused for each in outcomes),
+        old_frames=max(outcome.old_frames for outcome in outcomes),
+        num_refused=max(outcome.num_refused for outcome in outcomes),
         late_p95_ms=max(late_ms, default=None),
-        stale_frames=max(each.stale_frames for each in outcomes),
-        stalest_s=max(each.stalest_s for each in outcomes),
-        load=max(each.load for each in outcomes),
+        stale_frames=max(outcome.stale_frames for outcome in outcomes),
+        stalest_s=max(outcome.stalest_s for outcome in outcomes),
+        load=max(outcome.load for outcome in outcomes),
     )
 
 
 def show(outcomes: Collection[Outcome], console: Console) -> None:
-    """Print the figures as a table, and which sessions did not come to their end."""
+    """Print the figures as a table, and which sessions did not complete."""
     table = Table(
         "fault",
-        "stood s",
+        "stopped s",
         "late s",
         "phones lost, doubled, changed",
         "frames lost, doubled, old, at rest",
@@ -278,27 +278,27 @@ def show(outcomes: Collection[Outcome], console: Console) -> None:
         "p50, p95 ms",
         "load",
     )
-    for each in outcomes:
-        face = each.face
-        notes = [f"not completed: {each.failure}"] if each.failure else []
-        if each.num_refused:
-            notes.append(f"{each.num_refused} refused")
-        if each.stale_frames:
-            notes.append(f"{each.stale_frames} stale frames, of up to {each.stalest_s:.1f} s")
+    for outcome in outcomes:
+        face = outcome.face
+        notes = [f"not completed: {outcome.failure}"] if outcome.failure else []
+        if outcome.num_refused:
+            notes.append(f"{outcome.num_refused} refused")
+        if outcome.stale_frames:
+            notes.append(f"{outcome.stale_frames} stale frames, of up to {outcome.stalest_s:.1f} s")
         figures = ["no frame"]
         if face is not None:
             phones = face.phones_lost, face.phones_doubled, face.phones_changed
-            frames = face.frames_lost, face.frames_doubled, each.old_frames, face.rest_frames
+            frames = face.frames_lost, face.frames_doubled, outcome.old_frames, face.rest_frames
             figures = [
                 f"{face.stood_s:.2f}",
                 f"{face.late_s:.2f}",
                 f"{', '.join(map(str, phones))} of {face.phones}",
                 ", ".join(map(str, frames)),
                 f"{face.largest_step:.1f} x {face.largest_step_fap}",
-                f"{face.late_p50_ms:.0f}, {each.late_p95_ms:.0f}",
-                f"{each.load:.1f}",
+                f"{face.late_p50_ms:.0f}, {outcome.late_p95_ms:.0f}",
+                f"{outcome.load:.1f}",
             ]
-        table.add_row("; ".join([each.fault, *notes]), *figures)
+        table.add_row("; ".join([outcome.fault, *notes]), *figures)
     console.print(table)
 
 
@@ -310,14 +310,14 @@ def _system(fault: Fault, folder: Path, timing: Timing, console: Console) -> Ite
         )
         paths = [str(folder.resolve()), os.environ.get("PYTHONPATH", "")]
         settings = {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
-        with LocalSystem(folder, console, settings=settings, beside=fault.beside) as local:
+        with LocalSystem(folder, console, settings=settings, spare=fault.spare) as local:
             yield local
         return
-    hosts = [*ON_HOSTS, CLIENT, *([SPARE] if fault.beside else [])]
+    hosts = [*ON_HOSTS, CLIENT, *([SPARE] if fault.spare else [])]
     with (
         tempfile.TemporaryDirectory() as states,
         Network(hosts, fault.link) as network,
-        HostsSystem(folder, Path(states), network, fault.beside) as system,
+        HostsSystem(folder, Path(states), network, fault.spare) as system,
     ):
         yield system
 
@@ -344,25 +344,26 @@ def _outcome(
             undisturbed[len(sound)] = speak_undisturbed(client, sound)
         sessions, num_refused = _open_all(client, fault.num_sessions)
         silence = load_inventory(sessions[0].info["facts"]["language"] or DEFAULT_LANGUAGE).silence
-        publishers = [
-            each.endpoints["faps"] for each in client.status().services if "faps" in each.endpoints
-        ]
-        wire = Wire(sessions[0], publishers, system.key)
+        endpoints = [state.endpoints for state in client.status().services]
+        publishers = [each["faps"] for each in endpoints if "faps" in each]
+        monitor = EpochMonitor(sessions[0], publishers, system.key)
         actions = fault.actions(system, sessions[0].name, timing)
-        with _listener(system, sessions[0].name, stopped_s, timing, actions) as listened:
-            begin_s = time.monotonic()
+        with _second_subscriber(
+            system, sessions[0].name, stopped_s, timing, actions
+        ) as late_frames:
+            start_s = time.monotonic()
 
-            def meanwhile() -> None:
-                wire.take()
-                while actions and time.monotonic() > begin_s + actions[0][0]:
+            def on_step() -> None:
+                monitor.receive()
+                while actions and time.monotonic() > start_s + actions[0][0]:
                     actions.pop(0)[1]()
 
-            all_seen = speak(sessions, sound, meanwhile=meanwhile)
-        ages_s = staleness(listened, all_seen[0], begin_s + timing.fault_at_s + stopped_s)
+            all_seen = speak(sessions, sound, on_step=on_step)
+        ages_s = staleness(late_frames, all_seen[0], start_s + timing.fault_at_s + stopped_s)
         load = os.getloadavg()[0]
-        wire.close()
+        monitor.close()
         for session in sessions:
-            with contextlib.suppress(KouxingError):  # gone already
+            with contextlib.suppress(KouxingError):  # already closed
                 session.close()
     failures = [seen.error or "no last frame" for seen in all_seen if not seen.ended]
     faces = [
@@ -371,7 +372,7 @@ def _outcome(
             undisturbed[len(sound)],
             silence,
             delay_s,
-            fault_s=begin_s + timing.fault_at_s,
+            fault_s=start_s + timing.fault_at_s,
         )
         for seen in all_seen
         if seen.frames
@@ -380,7 +381,7 @@ def _outcome(
         fault=name,
         failure=", ".join(sorted(set(failures))),
         face=faces[0] if faces else None,
-        old_frames=wire.num_old,
+        old_frames=monitor.num_old,
         num_refused=num_refused,
         late_p95_ms=max((face.late_p95_ms for face in faces), default=None),
         stale_frames=int((ages_s > 1.0).sum()),
@@ -390,44 +391,40 @@ def _outcome(
 
 
 @contextlib.contextmanager
-def _listener(
+def _second_subscriber(
     system: System, session: str, stopped_s: float, timing: Timing, actions: list[Action]
 ) -> Iterator[list[tuple[float, int]]]:
-    """Follow a session in another process, to be stopped for some time; 0: do not.
+    """Follow a session in another process, which is stopped for some time.
 
     Yields
     ------
     list of tuple
-        Complete when the context ends: when each frame came, in s, and its media time.
+        Arrival in seconds and media time of each frame, when the context has ended.
     """
     frames: list[tuple[float, int]] = []
     if not stopped_s:
         yield frames
         return
-    listener = Listener(system.control, session)
-    actions += _stopped(listener.number, timing.fault_at_s, stopped_s)
+    subscriber = _SubscriberProcess(system.control, session)
+    actions += _stopped(subscriber.process_id, timing.fault_at_s, stopped_s)
     yield frames
-    frames += listener.frames()
-
-
-def _open(client: Client) -> Session:
-    return client.open_session(encoding="f32le")
+    frames += subscriber.frames()
 
 
 def _open_all(client: Client, num: int) -> tuple[list[Session], int]:
-    """Open sessions; return them and how many were refused, of which the first is not."""
-    sessions = [_open(client)]
+    """Open sessions; return them and the number of refused ones. The first is not refused."""
+    sessions = [client.open_session(encoding="f32le")]
     num_refused = 0
     for _ in range(num - 1):
         try:
-            sessions.append(_open(client))
+            sessions.append(client.open_session(encoding="f32le"))
         except Refused:
             num_refused += 1
     return sessions, num_refused
 
 
-class Listener:
-    """Another subscriber: a process that prints each frame, and when its lines came."""
+class _SubscriberProcess:
+    """A process that prints each frame; records when its lines arrive."""
 
     def __init__(self, control: str, session: str) -> None:
         environment = {**os.environ, variable(COMMON, "control"): control.partition(" ")[0]}
@@ -443,12 +440,12 @@ class Listener:
         self._reader.start()
 
     @property
-    def number(self) -> int:
-        """The number of the process."""
+    def process_id(self) -> int:
+        """Id of the process."""
         return self._process.pid
 
     def frames(self) -> list[tuple[float, int]]:
-        """Return when frames came, and their media times, once the session has ended."""
+        """Return arrival and media time of all frames, once the session has ended."""
         self._reader.join()
         self._process.wait()
         return self._frames

@@ -1,14 +1,14 @@
 """Latency and CPU cost of the chain, with real processes and real sockets.
 
-The services run as under ``kouxing run``, on ports of their own. A sentence is streamed in real
-time in 20 ms chunks. Two delays are measured for each FAP frame:
+The services run as under ``kouxing run``, on free ports. A sentence is streamed in real time in 20
+ms chunks. Two latencies are measured for each FAP frame:
 
-- *chunk to frame*: from sending the chunk that completes the synthesizer's input for the frame to
-  receiving the frame: the time that processes and sockets add;
-- *sound to frame*: from sending the last sample of the frame's own chunk: the same plus the
-  synthesizer's delay. A page that delays the sound by this much is in sync.
+- *chunk to frame*: from sending the chunk that completes the synthesizer's input to receiving the
+  frame. This is the time of processes and sockets;
+- *sound to frame*: from sending the last sample of the frame's own chunk. This adds the delay of
+  the synthesizer. A page that delays the sound by this time is in sync.
 
-CPU time is measured by the processes' own clocks, per second of audio.
+CPU time is measured by the processes, per second of audio.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from kouxing.shared.control_client import connect
 from kouxing.shared.errors import UserError
 
 CHUNK_S = 0.02
-END_LIMIT_S = 30.0  # the last frame must come within this time
+END_LIMIT_S = 30.0  # for the last frame
 
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Figures of one run, ready for a table or JSON."""
+    """Figures of one run."""
 
     chunk_to_frame_ms: dict[str, float]
     sound_to_frame_ms: dict[str, float]
@@ -47,12 +47,12 @@ class Latency:
 
 
 def measure(path: Path, num_repeats: int, console: Console) -> Latency:
-    """Start the services, stream the file, stop them; return the figures.
+    """Start the services, stream the file and return the figures.
 
     Raises
     ------
     UserError
-        If the file is no audio or the services cannot start.
+        If the file is not audio or the services cannot start.
     """
     samples, rate_hz = read_audio(path)
     delay_s = SynthesizerConfig().delay_ms / 1e3
@@ -66,7 +66,7 @@ def measure(path: Path, num_repeats: int, console: Console) -> Latency:
             stream(client, np.ascontiguousarray(samples), rate_hz, delay_s)[1:]
             for _ in range(num_repeats)
         ]
-        time.sleep(1.0)  # until the last heartbeats
+        time.sleep(1.0)  # for the last heartbeats
         after = _cpu_s(client)
     audio_s = num_repeats * len(samples) / rate_hz
     to_frame_ms, from_sound_ms = (np.concatenate(part) * 1e3 for part in zip(*delays, strict=True))
@@ -97,7 +97,7 @@ def show(latency: Latency, console: Console) -> None:
 def stream(
     client: Client, samples: NDArray[np.float32], rate_hz: int, delay_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Stream in real time; return media time and both delays of every frame, in seconds."""
+    """Stream in real time; return media time and both latencies of every frame, seconds."""
     session = client.open_session(
         encoding="f32le", sample_rate_hz=rate_hz, num_channels=samples.shape[1]
     )
@@ -110,12 +110,12 @@ def stream(
         for frame in output.available(timeout_s):
             arrived.append((frame.time_s, time.perf_counter()))
 
-    begin_s = time.perf_counter()
-    for number, begin in enumerate(range(0, len(samples) - chunk + 1, chunk), start=1):
-        while (left_s := begin_s + number * CHUNK_S - time.perf_counter()) > 0:
+    start_s = time.perf_counter()
+    for number, start in enumerate(range(0, len(samples) - chunk + 1, chunk), start=1):
+        while (left_s := start_s + number * CHUNK_S - time.perf_counter()) > 0:
             receive(left_s)
-        if not session.try_push(samples[begin : begin + chunk].astype("<f4").tobytes()):
-            raise UserError("the recognizer takes no audio; this machine is too busy to measure on")
+        if not session.try_push(samples[start : start + chunk].astype("<f4").tobytes()):
+            raise UserError("the recognizer does not accept audio; this machine is too busy")
         sent_s.append(time.perf_counter())
     live_until_s = time.perf_counter()
     session.finish()
@@ -123,7 +123,7 @@ def stream(
     while not output.has_ended:
         receive(1.0)
         if time.perf_counter() > end_s:
-            raise UserError("the last frame did not come; this machine is too busy to measure on")
+            raise UserError("the last frame did not arrive; this machine is too busy")
     session.close()
     times, to_frame, from_sound = [], [], []
     for media_s, arrival_s in arrived:
@@ -137,7 +137,7 @@ def stream(
 
 
 def percentiles(values_ms: NDArray[np.float64]) -> dict[str, float]:
-    """Return the percentiles that the tables show."""
+    """Return the 50th, 95th and 99th percentile."""
     return {f"p{percent}": float(np.percentile(values_ms, percent)) for percent in (50, 95, 99)}
 
 

@@ -1,4 +1,4 @@
-"""Live sessions at real pace, and what their subscribers see of them."""
+"""Stream sessions in real time and record what a subscriber receives."""
 
 from __future__ import annotations
 
@@ -17,23 +17,22 @@ from kouxing.shared.keys import Key
 from kouxing.shared.wire import face
 
 CHUNK = MEDIA_RATE_HZ // 50  # samples: 20 ms
-END_LIMIT_S = 15.0  # after the last sample the last frame must come within this time
-SLOWEST = 5.0  # times its length that sound may take that is not paced
-
+END_LIMIT_S = 15.0  # from the last sample to the last frame
+MAX_UNPACED_FACTOR = 5.0  # longest time for unpaced audio, relative to its length
 NUM_TRIES = 3
 
 
 @dataclass(slots=True)
 class Seen:
-    """What one subscriber saw of a session, in the order in which it came."""
+    """Results of a session in the order in which a subscriber received them."""
 
     frames: list[tuple[float, FapFrame]] = field(default_factory=list)  # arrival, s
     phones: list[Phone] = field(default_factory=list)
     speech: list[Speech] = field(default_factory=list)
     ended: bool = False
-    error: str = ""  # why the session broke off
-    begin_s: float = 0.0  # when the first sample was due
-    live_until_s: float = 0.0  # when the last one was
+    error: str = ""  # why the session failed
+    start_s: float = 0.0  # when the first sample was due
+    live_until_s: float = 0.0  # when the last sample was due
 
     @property
     def faps(self) -> NDArray[np.float32]:
@@ -42,7 +41,7 @@ class Seen:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all frames and phones came, from one recognizer and synthesizer."""
+        """Whether all frames and phones arrived, from one recognizer and one synthesizer."""
         last = {phone.index: phone for phone in self.phones}
         frames = [frame.sequence for _, frame in self.frames]
         return (
@@ -54,36 +53,36 @@ class Seen:
         )
 
     def final_phones(self, silence: str) -> list[Phone]:
-        """Return the final phones without silence and those withdrawn, of all epochs in order.
+        """Return the final phones of all epochs in order, without silence and withdrawn phones.
 
-        A new recognizer begins with a speech message; where it goes on, phones of earlier epochs
-        are void.
+        A new recognizer starts with a speech message. From there on, the phones of earlier epochs
+        are invalid.
         """
         last = {(phone.epoch, phone.index): phone for phone in self.phones}
         final = [phone for phone in last.values() if phone.final and phone.duration > 0]
-        begins = {each.epoch: each.media_time for each in self.speech if each.sequence == 1}
-        for epoch, begin in begins.items():
+        starts = {speech.epoch: speech.media_time for speech in self.speech if speech.sequence == 1}
+        for epoch, start in starts.items():
             final = [
                 phone
                 for phone in final
-                if phone.epoch >= epoch or phone.media_time + phone.duration / 2 < begin
+                if phone.epoch >= epoch or phone.media_time + phone.duration / 2 < start
             ]
         final.sort(key=lambda phone: phone.media_time)
         return [phone for phone in final if phone.symbol != silence]
 
 
-class Wire:
-    """All FAP frames of a session that any synthesizer publishes, of whatever epoch."""
+class EpochMonitor:
+    """Receives a session's FAP frames from all synthesizers, also those of earlier epochs."""
 
     def __init__(self, session: Session, endpoints: Sequence[str], key: Key) -> None:
         self._bus = Bus(key)
         self._socket: Socket = self._bus.connect_subscriber(*endpoints)
         self._socket.subscribe(face.FapFrame, session.name)
         self._epoch = 0
-        self.num_old = 0  # frames that came after the first of a later epoch
+        self.num_old = 0  # frames of an earlier epoch, after the first of a later one
 
-    def take(self) -> None:
-        """Take what has come."""
+    def receive(self) -> None:
+        """Process the frames that have arrived."""
         for received in self._socket.receive():
             frame = received.message
             if isinstance(frame, face.FapFrame):
@@ -91,7 +90,7 @@ class Wire:
                 self._epoch = max(self._epoch, frame.epoch)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Close the socket."""
         self._bus.close()
 
 
@@ -100,34 +99,36 @@ def speak(
     sound: NDArray[np.float32],
     *,
     paced: bool = True,
-    meanwhile: Callable[[], None] = lambda: None,
+    on_step: Callable[[], None] = lambda: None,
 ) -> list[Seen]:
-    """Stream the same sound into sessions, each to its end; return what their openers saw.
+    """Stream the same audio into sessions and return what each of them received.
 
     Parameters
     ----------
     sessions
-        Open ones that take 32-bit floats at 16 kHz.
+        Open sessions with 32-bit floats at 16 kHz.
     sound
         Samples, shape (n,).
-    meanwhile
-        Called again and again.
+    paced
+        Send in real time; otherwise as fast as the session accepts.
+    on_step
+        Called every few milliseconds.
     """
     speakers = [_Speaker(session, sound, paced=paced) for session in sessions]
     while any(speaker.is_speaking for speaker in speakers):
         for speaker in speakers:
             speaker.step(0.005 if speaker is speakers[0] else 0.0)
-        meanwhile()
+        on_step()
     return [speaker.seen for speaker in speakers]
 
 
 def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
-    """Return what is seen of a sound without any fault, as fast as it is taken.
+    """Return what a session receives for audio without any fault; it is not paced.
 
     Raises
     ------
     UserError
-        If something of it is missing each time, as on a machine that is too busy.
+        If results are missing every time, as on a machine that is too busy.
     """
     for _ in range(NUM_TRIES):
         session = client.open_session(encoding="f32le", paced=False)
@@ -135,7 +136,7 @@ def speak_undisturbed(client: Client, sound: NDArray[np.float32]) -> Seen:
         session.close()
         if seen.is_whole:
             return seen
-    raise UserError("sound without a fault is not shown whole; this machine is too busy")
+    raise UserError("results are missing without any fault; this machine is too busy")
 
 
 class _Speaker:
@@ -147,18 +148,18 @@ class _Speaker:
         self._num_sent = 0
         self._paced = paced
         self._has_finished = False
-        begin_s = time.monotonic()
+        start_s = time.monotonic()
         length_s = len(sound) / MEDIA_RATE_HZ
-        self._give_up_s = begin_s + length_s * (1.0 if paced else SLOWEST) + END_LIMIT_S
-        self.seen = Seen(begin_s=begin_s, live_until_s=begin_s + length_s)
+        self._deadline_s = start_s + length_s * (1.0 if paced else MAX_UNPACED_FACTOR) + END_LIMIT_S
+        self.seen = Seen(start_s=start_s, live_until_s=start_s + length_s)
 
     @property
     def is_speaking(self) -> bool:
-        is_late = time.monotonic() > self._give_up_s
+        is_late = time.monotonic() > self._deadline_s
         return not (self.seen.ended or self.seen.error or is_late)
 
     def step(self, wait_s: float) -> None:
-        """Send what is due, and take what has come."""
+        """Send due audio and receive results."""
         try:
             for error in self._session.take_errors():
                 self.seen.error = str(error)
@@ -184,5 +185,5 @@ class _Speaker:
     def _num_due(self) -> int:
         if not self._paced:
             return len(self._chunks)
-        due = int((time.monotonic() - self.seen.begin_s) * MEDIA_RATE_HZ) // CHUNK
+        due = int((time.monotonic() - self.seen.start_s) * MEDIA_RATE_HZ) // CHUNK
         return min(due, len(self._chunks))

@@ -1,9 +1,8 @@
-"""Hosts on this machine: network namespaces around a router, which loses, delays and cuts.
+"""Virtual hosts: network namespaces around a router that loses, delays and blocks packets.
 
-Each host is joined to the router by a veth pair. All packets between two hosts pass the router
-once. There nftables drops some of them, and a TUN device leads them through
-``evaluation.system.delay``, since not every kernel has netem. Needs Linux, root, iproute2 and
-nftables.
+A veth pair connects each host to the router. nftables drops packets there. A TUN device sends them
+through ``evaluation.system.delay``, because not every kernel has netem. This needs Linux, root,
+iproute2 and nftables.
 """
 
 from __future__ import annotations
@@ -31,43 +30,43 @@ _READY_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """How packets get from one host to another; they keep their order."""
+    """Properties of the connection between two hosts; packets keep their order."""
 
     delay_ms: float = 0.0
-    loss: float = 0.0  # share of packets that do not arrive
+    loss: float = 0.0  # share of lost packets
 
     @property
     def jitter_ms(self) -> float:
-        """How much more or less the delay may be, at random."""
+        """Largest random change of the delay."""
         return self.delay_ms / 5
 
 
 class Network:
-    """Hosts by name, each with one address.
+    """Hosts with one address each.
 
     Parameters
     ----------
     hosts
-        Their names, at most 250, of up to 15 letters.
+        Up to 250 names of up to 15 letters.
     link
-        Between any two of them.
+        Connection between any two hosts.
 
     Raises
     ------
     UserError
-        If this is not root on a Linux system with ``TOOLS``, or namespaces are forbidden.
+        If this process is not root, a tool is missing, or namespaces are forbidden.
     """
 
     def __init__(self, hosts: Sequence[str], link: Link) -> None:
         missing = [tool for tool in TOOLS if shutil.which(tool) is None]
         if missing or os.geteuid() != 0:
             need = f"install {' and '.join(missing)}" if missing else "run it as root"
-            raise UserError(f"hosts on this machine are network namespaces of Linux: {need}")
+            raise UserError(f"virtual hosts need network namespaces of Linux: {need}")
         self._addresses = {host: f"10.77.{n}.2" for n, host in enumerate(hosts, start=1)}
         self._link = link
         self._name = f"kouxing-{secrets.token_hex(3)}"
         self._router = f"{self._name}-router"
-        self._delaying: subprocess.Popen[bytes] | None = None
+        self._delayer: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
         try:
@@ -78,37 +77,37 @@ class Network:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._delaying is not None:
-            self._delaying.terminate()
-            self._delaying.wait()
+        if self._delayer is not None:
+            self._delayer.terminate()
+            self._delayer.wait()
         for namespace in (self._router, *map(self._namespace, self._addresses)):
-            with contextlib.suppress(UserError):  # it was not made
+            with contextlib.suppress(UserError):  # it does not exist
                 _call("ip", "netns", "delete", namespace)
 
     def bound(self, host: str) -> str:
-        """Return the address that services of a host bind."""
+        """Return the address that services on a host bind."""
         return self._addresses[host]
 
     def address(self, host: str, seen_from: str) -> str:
-        """Return the address of a host for those on another one."""
+        """Return the address of a host as seen from another one."""
         return self._addresses[host]
 
     def command(self, host: str, *command: str) -> list[str]:
-        """Return the command that runs another one on a host."""
+        """Return a command line that runs a command on a host."""
         return _command(self._namespace(host), *command)
 
     def on(self, host: str) -> contextlib.AbstractContextManager[None]:
-        """Let this thread, and threads it starts meanwhile, open their sockets on a host."""
+        """Open the sockets of this thread, and of threads that it starts, on a host."""
         return _in(self._namespace(host))
 
     def cut(self, host: str) -> None:
-        """Lose all packets from and to a host from now on; no connection learns of it."""
+        """Drop all packets from and to a host, without closing connections."""
         address = self._addresses[host]
         for side in ("saddr", "daddr"):
             self._rule(f"ip {side} {address} drop", chain="cuts")
 
     def mend(self) -> None:
-        """End all cuts."""
+        """Connect all hosts again."""
         self._on_router("nft", "flush", "chain", "inet", "network", "cuts")
 
     def _build(self) -> None:
@@ -135,21 +134,21 @@ class Network:
             self._on_router("nft", f"add chain inet network {chain} {form}")
         if self._link.loss:
             share = round(1e4 * self._link.loss)
-            once = f'iifname != "{DELAY_DEVICE}"'  # a delayed packet is forwarded twice
-            self._rule(f"{once} numgen random mod 10000 < {share} drop", chain="loss")
+            not_delayed = f'iifname != "{DELAY_DEVICE}"'  # a delayed packet is forwarded twice
+            self._rule(f"{not_delayed} numgen random mod 10000 < {share} drop", chain="loss")
         if self._link.delay_ms:
             self._delay()
 
     def _delay(self) -> None:
-        """Lead what comes from hosts through a process that returns it later."""
+        """Send all packets of hosts through a process that returns them later."""
         module = [sys.executable, "-m", "kouxing.evaluation.system.delay", DELAY_DEVICE]
         delay_ms = str(self._link.delay_ms), str(self._link.jitter_ms)
-        self._delaying = subprocess.Popen(  # noqa: S603 - our own module
+        self._delayer = subprocess.Popen(  # noqa: S603 - our own module
             _command(self._router, *module, *delay_ms)
         )
         end_s = time.monotonic() + _READY_S
         while DELAY_DEVICE not in self._on_router("ip", "-brief", "link", "show", "up"):
-            if time.monotonic() > end_s or self._delaying.poll() is not None:
+            if time.monotonic() > end_s or self._delayer.poll() is not None:
                 raise UserError("packets cannot be delayed; is there /dev/net/tun?")
             time.sleep(0.02)
         self._on_router("ip", "route", "add", "default", "dev", DELAY_DEVICE, "table", "77")
@@ -167,21 +166,12 @@ class Network:
 
 
 def _command(namespace: str, *command: str) -> list[str]:
-    """Return the command that runs another one in a namespace.
-
-    As 'ip netns exec', which does not run below another root directory.
-    """
+    """Return a command line for a namespace, like 'ip netns exec', which fails in a chroot."""
     return ["nsenter", f"--net=/run/netns/{namespace}", *command]
 
 
 def _call(*command: str) -> str:
-    """Run a command and return what it prints.
-
-    Raises
-    ------
-    UserError
-        With what it says, if it fails.
-    """
+    """Run a command and return its output; raises UserError with its errors if it fails."""
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     if result.returncode != 0:
         raise UserError(f"{' '.join(command)}: {result.stderr.strip()}")
@@ -190,16 +180,16 @@ def _call(*command: str) -> str:
 
 @contextlib.contextmanager
 def _in(namespace: str) -> Iterator[None]:
-    with Path("/proc/thread-self/ns/net").open() as own:
-        with Path("/run/netns", namespace).open() as other:
-            _enter(other.fileno())
+    with Path("/proc/thread-self/ns/net").open() as previous:
+        with Path("/run/netns", namespace).open() as target:
+            _enter(target.fileno())
         try:
             yield
         finally:
-            _enter(own.fileno())
+            _enter(previous.fileno())
 
 
 def _enter(namespace: int) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.setns(namespace, _CLONE_NEWNET) != 0:
-        raise UserError(f"a network namespace cannot be entered: {os.strerror(ctypes.get_errno())}")
+        raise UserError(f"cannot enter a network namespace: {os.strerror(ctypes.get_errno())}")

@@ -1,4 +1,4 @@
-"""Cost of an image: the renderer by stages, the encoder, the head's file."""
+"""Cost of an image: the stages of the renderer, the encoder, and the file of the head."""
 
 from __future__ import annotations
 
@@ -27,41 +27,42 @@ CASES: tuple[tuple[str, Detail, tuple[int, int], int, bool], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """Figures of one run, ready for a table or JSON."""
+    """Figures of one run."""
 
     opengl: str  # renderer and version
     images_per_s: dict[str, float]  # by case, without encoding
-    stages_ms: dict[str, dict[str, float]]  # by case and stage, median
+    stages_ms: dict[str, dict[str, float]]  # median, by case and stage
     asset_bytes: int
     load_s: dict[str, float]  # by detail
 
 
 def measure() -> Rendering:
-    """Render the default head, speaking and blinking.
+    """Render the default head while it speaks and blinks.
 
     Raises
     ------
     UserError
-        If nothing can be drawn on this system.
+        If OpenGL is not available.
     """
     rates, stages = {}, {}
     load_s: dict[str, float] = {}
     opengl = ""
     for name, detail, size, samples, encoded in CASES:
-        begin_s = time.perf_counter()
+        start_s = time.perf_counter()
         head = Head.load(detail=detail)
-        load_s[detail] = time.perf_counter() - begin_s
+        load_s[detail] = time.perf_counter() - start_s
         renderer = Renderer(head, *size, samples=samples)
         opengl = renderer.description
         frames = [_frame(number) for number in range(NUM_IMAGES)]
-        images = [renderer.draw(faps) for faps in frames[:10]]  # warm
-        begin_s = time.perf_counter()
+        images = [renderer.draw(faps) for faps in frames[:10]]  # warm up
+        start_s = time.perf_counter()
         for faps in frames:
             renderer.draw(faps)
-        rates[name] = NUM_IMAGES / (time.perf_counter() - begin_s)
-        each = [renderer.stages_s(faps) for faps in frames]
+        rates[name] = NUM_IMAGES / (time.perf_counter() - start_s)
+        times_s = [renderer.stages_s(faps) for faps in frames]
         stages[name] = {
-            stage: 1e3 * float(np.median([times[stage] for times in each])) for stage in each[0]
+            stage: 1e3 * float(np.median([stages_s[stage] for stages_s in times_s]))
+            for stage in times_s[0]
         }
         if encoded:
             stages[name]["encode"] = _encode_ms(images)
@@ -79,11 +80,11 @@ def show(rendering: Rendering, console: Console) -> None:
         table.add_row(case, f"{rate:.0f}", *(f"{ms[n]:.1f}" if n in ms else "" for n in names))
     console.print(table)
     loading = ", ".join(f"{detail} {took:.2f} s" for detail, took in rendering.load_s.items())
-    console.print(f"the head: {rendering.asset_bytes / 1e6:.2f} MB, loaded in: {loading}")
+    console.print(f"the head: {rendering.asset_bytes / 1e6:.2f} MB, load time: {loading}")
 
 
 def _frame(number: int) -> NDArray[np.float32]:
-    """Make the FAPs (68,) of an image: visemes in turn, blinks, a nodding head."""
+    """Return the FAPs (68,) of an image: one viseme after another, blinks and nods."""
     amount = np.float32(0.5 - 0.5 * np.cos(number * 0.7))
     faps: NDArray[np.float32] = VISEMES[1 + number // 5 % 14] * amount
     faps[18:20] = 500 * amount
@@ -95,7 +96,7 @@ def _encode_ms(images: list[NDArray[np.uint8]]) -> float:
     height_px, width_px = images[0].shape[:2]
     with tempfile.TemporaryDirectory() as folder:
         with VideoWriter(Path(folder) / "bench.mp4", width_px, height_px, 25.0, None) as writer:
-            begin_s = time.perf_counter()
+            start_s = time.perf_counter()
             for number in range(NUM_IMAGES):
                 writer.write_image(images[number % len(images)])
-        return 1e3 * (time.perf_counter() - begin_s) / NUM_IMAGES
+        return 1e3 * (time.perf_counter() - start_s) / NUM_IMAGES

@@ -1,4 +1,4 @@
-"""CPU cost of one recognizer with several sessions at once: all that it does but messages."""
+"""CPU cost of one recognizer that serves several sessions, without its messages."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ def _cpu_s(
     samples: NDArray[np.float32],
     num_sessions: int,
 ) -> float:
-    """Let every session go once around the recording, each from a place of its own."""
+    """Run every session once through the recording, each from another starting point."""
     streams = [recognizer.create_stream(lips=lips) for _ in range(num_sessions)]
     starts = np.arange(num_sessions) * len(samples) // num_sessions
     sounds = [np.roll(samples, -start) for start in starts]
-    begin_s = time.process_time()
+    start_s = time.process_time()
     for at in range(0, len(samples), CHUNK):
         for stream, sound in zip(streams, sounds, strict=True):
             stream.accept_waveform(sound[at : at + CHUNK])
         recognizer.decode_streams(streams)
         for stream in streams:
             recognizer.get_result(stream)
-    cpu_s = time.process_time() - begin_s
+    cpu_s = time.process_time() - start_s
     return cpu_s * MEDIA_RATE_HZ / len(samples) / num_sessions

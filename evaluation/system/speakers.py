@@ -1,4 +1,4 @@
-"""Many speakers at once, from one process: each with a voice and a place in the text of its own."""
+"""Many speakers in one process, with different voices and positions in the text."""
 
 from __future__ import annotations
 
@@ -17,44 +17,44 @@ from kouxing.shared.audio_file import read_audio
 from kouxing.shared.clock import MEDIA_RATE_HZ
 
 CHUNK_S = CHUNK / MEDIA_RATE_HZ
-VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, times those of the recording
-_PLACE = 0.618  # of the text, from one speaker to the next: no two are near each other
+VOICES = (1.0, 0.86, 1.14, 0.93, 1.07)  # pitch and formants, relative to the recording
+_OFFSET = 0.618  # from one speaker to the next, relative to the text: no two are close
 
 
 def read_text(paths: Sequence[Path]) -> NDArray[np.float32]:
-    """Return the recordings one after another, 16 kHz mono, shape (n,).
+    """Concatenate recordings: 16 kHz mono, shape (n,).
 
     Raises
     ------
     UserError
-        If a file is no audio.
+        If a file is not audio.
     """
     return np.concatenate([to_16_khz(*read_audio(path)) for path in paths])
 
 
 def voiced(text: NDArray[np.float32], number: int) -> NDArray[np.float32]:
-    """Return what a speaker says: the text from a place of its own, in its own voice."""
-    begun = np.roll(text, -round(number * _PLACE * len(text)) % len(text))
+    """Return the audio of a speaker: the text from another position, in another voice."""
+    rotated = np.roll(text, -round(number * _OFFSET * len(text)) % len(text))
     voice = VOICES[number % len(VOICES)]
-    return begun if voice == 1.0 else to_16_khz(begun[:, None], round(MEDIA_RATE_HZ * voice))
+    return rotated if voice == 1.0 else to_16_khz(rotated[:, None], round(MEDIA_RATE_HZ * voice))
 
 
 @dataclass(slots=True)
 class Spoken:
-    """A speaker's session, and when its frames came."""
+    """A speaker's session, and the arrival times of its frames."""
 
     session: Session
-    sound: bytes  # 16-bit samples, spoken again and again
-    begin_s: float = 0.0  # when the first sample was due, by ``time.perf_counter``
+    sound: bytes  # 16-bit samples, repeated
+    start_s: float = 0.0  # when the first sample was due, by ``time.perf_counter``
     num_sent: int = 0  # chunks
-    num_full: int = 0  # of them, those that the queue did not take
-    num_rest: int = 0  # frames that lead to rest, as if the speaker had fallen silent
-    arrived_s: dict[int, float] = field(default_factory=dict)  # by media time, first arrival
+    num_full: int = 0  # chunks that the queue did not accept
+    num_rest: int = 0  # frames of a silent client, though the speaker was not silent
+    arrived_s: dict[int, float] = field(default_factory=dict)  # first arrival, by media time
 
     @property
     def due_s(self) -> float:
-        """When the last sample of the next chunk is spoken."""
-        return self.begin_s + (self.num_sent + 1) * CHUNK_S
+        """When the last sample of the next chunk is due."""
+        return self.start_s + (self.num_sent + 1) * CHUNK_S
 
     def send(self) -> None:
         """Send the next chunk."""
@@ -65,56 +65,55 @@ class Spoken:
             self.session.skip(CHUNK)
             self.num_full += 1
 
-    def take(self, frame: FapFrame) -> None:
-        """Note that a frame came."""
+    def record(self, frame: FapFrame) -> None:
+        """Record the arrival of a frame."""
         if frame.media_time not in self.arrived_s:
             self.arrived_s[frame.media_time] = time.perf_counter()
-        elif frame.media_time > 0:  # before that the speaker has not begun
+        elif frame.media_time > 0:  # earlier, the speaker has not started
             self.num_rest += 1
 
     def delays_s(self, delay_s: float, from_s: float, until_s: float) -> Iterator[float]:
-        """Yield how long after their sound frames came, beyond the delay they are made with.
+        """Yield the latencies of all frames whose audio was due in an interval, seconds.
 
-        Of all frames whose sound was complete in a time, by the wall clock; those that did not
-        come count as if they had come at its end. A chunk counts as spoken when it is due, so a
-        client or a service that is late is not excused.
+        The synthesizer's delay is subtracted. Missing frames count as if they had arrived at the
+        end. A chunk counts from when it was due, so a late client makes figures worse.
         """
         rate_hz = self.session.info["facts"]["frame_rate_hz"]
-        for number in range(int((until_s - self.begin_s) * rate_hz)):
+        for number in range(int((until_s - self.start_s) * rate_hz)):
             media_time = round(number / rate_hz * MEDIA_RATE_HZ)
             needed = -(-(media_time + round(delay_s * MEDIA_RATE_HZ)) // CHUNK)  # chunks
-            due_s = self.begin_s + max(1, needed) * CHUNK_S
+            due_s = self.start_s + max(1, needed) * CHUNK_S
             if from_s <= due_s < until_s:
                 yield min(self.arrived_s.get(media_time, until_s), until_s) - due_s
 
 
 class Crowd:
-    """Sessions of one client, spoken into in real time, their chunks evenly spread.
+    """Sessions of one client with audio in real time, whose chunks are spread evenly.
 
     Parameters
     ----------
     client
-        Opens the sessions, and closes them with its bus.
+        Client that opens the sessions.
     text
-        What is spoken, as from ``read_text``.
+        Audio of ``read_text``.
     num_speakers
-        How many sessions are asked for.
+        Number of requested sessions.
 
     Attributes
     ----------
     spoken
-        The sessions that were admitted.
+        Admitted sessions.
     refusals
-        How many were refused, by code.
+        Number of refused sessions, by code.
     lateness_s
-        How long after they were due chunks were sent.
+        How late each chunk was sent.
     """
 
     def __init__(self, client: Client, text: NDArray[np.float32], num_speakers: int) -> None:
         self.spoken: list[Spoken] = []
         self.refusals: dict[str, int] = {}
         self.lateness_s: list[float] = []
-        self._turn = 0  # of the speakers
+        self._turn = 0  # index of the next speaker
         for number in range(num_speakers):
             try:
                 session = client.open_session()
@@ -126,17 +125,17 @@ class Crowd:
     def _follow(self, session: Session, sound: NDArray[np.float32]) -> Spoken:
         pcm = np.round(np.clip(sound, -1.0, 1.0) * 32767).astype("<i2").tobytes()
         spoken = Spoken(session, pcm)
-        session.results(FapFrame, on_result=spoken.take)
+        session.results(FapFrame, on_result=spoken.record)
         return spoken
 
     def start(self) -> None:
-        """Let all begin to speak."""
+        """Start all speakers."""
         now_s = time.perf_counter()
-        for number, each in enumerate(self.spoken):
-            each.begin_s = now_s + CHUNK_S * number / len(self.spoken)
+        for number, spoken in enumerate(self.spoken):
+            spoken.start_s = now_s + CHUNK_S * number / len(self.spoken)
 
     def speak_until(self, end_s: float) -> None:
-        """Speak and listen up to a time of ``time.perf_counter``."""
+        """Speak until a time of ``time.perf_counter``."""
         while (now_s := time.perf_counter()) < end_s:
             if not self.spoken:
                 time.sleep(end_s - now_s)
@@ -151,9 +150,9 @@ class Crowd:
                 self._turn = (self._turn + 1) % len(self.spoken)
                 if self._turn == 0:
                     for spoken in self.spoken:
-                        spoken.session.take_errors()  # refused audio is missing among the frames
+                        spoken.session.take_errors()  # refused audio shows as missing frames
 
     def close(self) -> None:
         """End all sessions."""
-        for each in self.spoken:
-            each.session.close()
+        for spoken in self.spoken:
+            spoken.session.close()

@@ -1,4 +1,4 @@
-"""Services to measure: on this host as under ``kouxing run``, or each on a host of its own."""
+"""Start the services to measure: on this host like ``kouxing run``, or on virtual hosts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kouxing.shared.keys import CLIENT, Key, control_endpoint, read_key, user_ke
 SPARE = "spare"  # instance of a second worker of a kind, and its host
 READY_S = 60.0
 ON_HOSTS = ("control", "recognizer", "synthesizer")
-PORTS = {  # where services are bound that have hosts of their own
+PORTS = {  # of services on virtual hosts
     "control": {"control": 5550, "events": 5551},
     "recognizer": {"audio": 5560, "phones": 5561, "unpaced_audio": 5562},
     "synthesizer": {"phone_input": 5570, "faps": 5571},
@@ -32,57 +32,55 @@ PORTS = {  # where services are bound that have hosts of their own
 
 
 class System(Protocol):
-    """Running services, and where a client finds them."""
+    """Running services and their addresses."""
 
     control: str  # address and key
     key: Key  # of a client
 
     def on_client(self) -> contextlib.AbstractContextManager[None]:
-        """Let this thread open its sockets where clients are."""
+        """Open the sockets of this thread on the client's host."""
 
     def process_of(self, session: str, service: str) -> int:
-        """Return the number of the process that serves a session."""
+        """Return the id of the process that serves a session."""
 
 
 class Hosts(Protocol):
-    """Where the services of a ``HostsSystem`` run, such as a ``Network``."""
+    """Hosts of a ``HostsSystem``, such as a ``Network``."""
 
     def bound(self, host: str) -> str:
-        """Return the address that services of a host bind."""
+        """Return the address that services on a host bind."""
 
     def address(self, host: str, seen_from: str) -> str:
-        """Return the address of a host for those on another one."""
+        """Return the address of a host as seen from another one."""
 
     def command(self, host: str, *command: str) -> list[str]:
-        """Return the command that runs another one on a host."""
+        """Return a command line that runs a command on a host."""
 
     def on(self, host: str) -> contextlib.AbstractContextManager[None]:
-        """Let this thread open its sockets on a host."""
+        """Open the sockets of this thread on a host."""
 
     def cut(self, host: str) -> None:
-        """Let nothing pass from and to a host from now on."""
+        """Drop all packets from and to a host."""
 
     def mend(self) -> None:
-        """End all cuts."""
+        """Connect all hosts again."""
 
 
 class LocalSystem:
-    """Services on ports of their own of this host, and perhaps a second one of a kind.
-
-    A service that ends is started again, unless there is a second one.
+    """Services on free ports of this host. A service that ends restarts, unless it has a spare.
 
     Parameters
     ----------
     folder
-        Where their logs go.
+        Folder for the logs.
     services
-        Which run.
+        Kinds of services.
     settings
-        Added to their environment.
-    beside
-        The kind of which there is a second one, or nothing.
+        Additional environment variables.
+    spare
+        Kind of which a second one runs, or nothing.
     insecure
-        Whether they run without keys.
+        Run without keys.
     """
 
     def __init__(
@@ -92,7 +90,7 @@ class LocalSystem:
         *,
         services: Collection[str] = tuple(KINDS),
         settings: Mapping[str, str] | None = None,
-        beside: str = "",
+        spare: str = "",
         insecure: bool = False,
     ) -> None:
         environment = {
@@ -104,12 +102,12 @@ class LocalSystem:
         }
         self.control = control_endpoint(environment["KOUXING_CONTROL"], insecure=insecure)
         self.key = user_key()
-        self._beside = beside
-        self._spare = f"{beside}-2"
+        self._spare_kind = spare
+        self._spare_name = f"{spare}-2"
         more = {
-            name: {**own, variable(beside, "instance"): SPARE}
+            name: {**own, variable(spare, "instance"): SPARE}
             for name, own in more_workers(read_settings(), 2).items()
-            if name == self._spare
+            if name == self._spare_name
         }
         self.supervisor = Supervisor([], folder, console, environment, services=services, more=more)
 
@@ -117,7 +115,7 @@ class LocalSystem:
         try:
             self.supervisor.start()
             self.supervisor.wait_ready(self.control)
-            if not self._beside:
+            if not self._spare_kind:
                 self.supervisor.watch()
         except BaseException:
             self.__exit__()
@@ -128,33 +126,33 @@ class LocalSystem:
         self.supervisor.stop()
 
     def on_client(self) -> contextlib.AbstractContextManager[None]:
-        """Do nothing: there is one host only."""
+        """Do nothing: there is only one host."""
         return contextlib.nullcontext()
 
     def process_of(self, session: str, service: str) -> int:
-        """Return the number of the process that serves a session."""
+        """Return the id of the process that serves a session."""
         is_spare = instance_of(self, session, service) == SPARE
-        return self.supervisor.process_number(self._spare if is_spare else service)
+        return self.supervisor.process_number(self._spare_name if is_spare else service)
 
 
 class HostsSystem:
-    """Control, recognizer and synthesizer on a host each, and perhaps a second one of a kind.
+    """Control, recognizer and synthesizer on one host each, and perhaps a spare worker.
 
-    Their keys are made on control's host and brought to the others, as docs/hosts.md says.
+    The keys are created on control's host and copied to the others, as in docs/hosts.md.
     """
 
-    def __init__(self, logs: Path, states: Path, network: Hosts, beside: str = "") -> None:
+    def __init__(self, logs: Path, states: Path, network: Hosts, spare: str = "") -> None:
         self.network = network
         self._logs = logs
-        self._states = states  # of each host, with its keys
-        self._services = {each: each for each in ON_HOSTS}  # by host
-        if beside:
-            self._services[SPARE] = beside
+        self._states = states  # folders of the hosts' keys
+        self._services = {name: name for name in ON_HOSTS}  # by host
+        if spare:
+            self._services[SPARE] = spare
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         for host, service in self._services.items():
             if host != "control":
-                self._bring_key(host, service, f"service:{service}")
-        self._bring_key(CLIENT, CLIENT, "client")
+                self._add_key(host, service, f"service:{service}")
+        self._add_key(CLIENT, CLIENT, "client")
         self.key = read_key(self._state(CLIENT) / "kouxing" / f"{CLIENT}.key")
         self.control = f"{self._control_for(CLIENT)} {self.key.control}"
 
@@ -175,11 +173,11 @@ class HostsSystem:
             process.wait()
 
     def on_client(self) -> contextlib.AbstractContextManager[None]:
-        """Let this thread open its sockets on the client's host."""
+        """Open the sockets of this thread on the client's host."""
         return self.network.on(CLIENT)
 
     def process_of(self, session: str, service: str) -> int:
-        """Return the number of the process that serves a session."""
+        """Return the id of the process that serves a session."""
         return self._processes[self.host_of(session, service)].pid
 
     def host_of(self, session: str, service: str) -> str:
@@ -206,8 +204,8 @@ class HostsSystem:
     def _control_for(self, host: str) -> str:
         return f"tcp://{self.network.address('control', host)}:{PORTS['control']['control']}"
 
-    def _bring_key(self, host: str, name: str, role: str) -> None:
-        """Make a key on control's host and copy it to another."""
+    def _add_key(self, host: str, name: str, role: str) -> None:
+        """Create a key on control's host and move it to another."""
         subprocess.run(  # noqa: S603 - our own module
             [sys.executable, "-m", "kouxing", "keys", "add", host, "--role", role],
             env={**os.environ, "XDG_STATE_HOME": str(self._state("control"))},
@@ -230,13 +228,7 @@ def start(
     environment: Mapping[str, str],
     command: Iterable[str] = (),
 ) -> subprocess.Popen[bytes]:
-    """Start a service whose log lines go to a file of its instance's name.
-
-    Parameters
-    ----------
-    command
-        What runs it, such as on another host.
-    """
+    """Start a service that logs to ``INSTANCE.log``; ``command`` runs it, on another host."""
     with (folder / f"{instance}.log").open("wb") as log:
         return subprocess.Popen(  # noqa: S603 - our own module
             [*command, sys.executable, "-m", f"kouxing.services.{service}"],
@@ -247,25 +239,19 @@ def start(
 
 
 def wait_until_ready(system: System, instances: Iterable[str]) -> None:
-    """Wait until control knows services.
-
-    Raises
-    ------
-    UserError
-        If it does not in time.
-    """
+    """Wait until services have registered at control; raises UserError after READY_S."""
     end_s = time.monotonic() + READY_S
     while True:
         with contextlib.suppress(UserError):  # control may not run yet
-            if {*instances} <= {each.instance for each in status(system).services}:
+            if {*instances} <= {state.instance for state in status(system).services}:
                 return
         if time.monotonic() > end_s:
-            raise UserError("the services did not start")
+            raise UserError(f"the services did not start within {READY_S:g} s")
         time.sleep(0.1)
 
 
 def status(system: System) -> Status:
-    """Return what control says."""
+    """Return the status report of control."""
     with system.on_client(), connect(system.control, key=system.key, timeout_s=2.0) as client:
         return client.status()
 

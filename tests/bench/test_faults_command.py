@@ -48,4 +48,4 @@ def test_a_crash_loses_nothing_and_the_command_says_so(
 def test_an_unknown_fault_is_named() -> None:
     result = CliRunner().invoke(app, ["faults", "--fault", "flood"])
     assert result.exit_code != 0
-    assert "'flood' is no fault" in str(result.exception)
+    assert "no fault is named 'flood'" in str(result.exception)

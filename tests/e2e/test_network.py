@@ -65,11 +65,11 @@ def live(client: Client, system: HostsSystem, host: str = "", *, cut_s: float = 
         (CUT_AT_S + cut_s, system.network.mend),
     ]
 
-    def meanwhile() -> None:
+    def on_step() -> None:
         if host and steps and time.monotonic() > begin_s + steps[0][0]:
             steps.pop(0)[1]()
 
-    (seen,) = speak([session], SAMPLES, meanwhile=meanwhile)
+    (seen,) = speak([session], SAMPLES, on_step=on_step)
     session.close()
     assert seen.ended, seen.error
     return seen

@@ -25,7 +25,7 @@ class _Session:
 
 
 def _spoken(arrived_s: dict[int, float]) -> Spoken:
-    return Spoken(cast(Session, _Session()), b"", begin_s=100.0, arrived_s=arrived_s)
+    return Spoken(cast(Session, _Session()), b"", start_s=100.0, arrived_s=arrived_s)
 
 
 def test_a_frame_is_due_with_the_last_chunk_that_it_needs() -> None:
@@ -43,9 +43,9 @@ def test_frames_that_do_not_come_count_as_late() -> None:
 def test_a_frame_of_rest_is_no_arrival() -> None:
     spoken = _spoken({})
     frame = FapFrame(media_time=320, values=array("f", bytes(272)))
-    spoken.take(frame)
+    spoken.record(frame)
     arrived_s = dict(spoken.arrived_s)
-    spoken.take(frame)
+    spoken.record(frame)
     assert (spoken.arrived_s, spoken.num_rest) == (arrived_s, 1)
 
 
@@ -53,7 +53,7 @@ def test_rest_before_a_speaker_begins_is_not_counted() -> None:
     spoken = _spoken({})
     frame = FapFrame(media_time=0, values=array("f", bytes(272)))
     for _ in range(3):
-        spoken.take(frame)
+        spoken.record(frame)
     assert spoken.num_rest == 0
 
 
