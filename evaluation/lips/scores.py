@@ -268,7 +268,7 @@ def score_lip_models(
     model = load_live_model()
     lips = lip_predictor_for(model)
     visemes = DynamicVisemes(load_parameters(parameters), model.inventory)
-    models = {name: make(model.inventory) for name, make in lip_models().items()}
+    models = {name: info.load(model.inventory) for name, info in lip_models().items()}
     schemes = all_schemes(visemes, models | {"dynamic-visemes": visemes})
     scores = []
     clips = clips_to_score(folder, parameters, sources=sources)

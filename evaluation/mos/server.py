@@ -81,7 +81,7 @@ class ListeningTest:
     async def _add_answer(self, request: web.Request) -> web.Response:
         judge, answer = self._judge(request), await _read_answer(request)
         next_place = self._next_place(judge)
-        if answer["place"] == next_place:
+        if next_place is not None and answer["place"] == next_place:
             cell = places_of_judge(judge, self._study)[next_place]
             end = answer["language"], time.time()
             self._store.add(
